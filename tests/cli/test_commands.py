@@ -68,9 +68,21 @@ def test_a_sweep_as_tables_for_other_programs(command, tmp_path):
     for columns in (parquet, text):
         assert columns["x_mm"] == samples.x_mm.tolist()
         assert np.column_stack([columns[name] for name in "ABC"]).tolist() == samples.charge_pC.tolist()
-    code, _, err = command(*SMALL, "--probe", "circle:1.0", "--probe", "circle:2.0", "-o", tmp_path / "c.csv")
-    assert code == 2
-    assert "a table of presses has one probe" in err
+    refused = {
+        "a table of presses has one probe": (
+            "--probe",
+            "circle:1.0",
+            "--probe",
+            "circle:2.0",
+            "-o",
+            tmp_path / "c.csv",
+        ),
+        "the dataset that belongs beside": ("-o", tmp_path / "b.parquet"),
+        "is already there": ("-o", "."),
+    }
+    for said, words in refused.items():
+        code, _, err = command(*SMALL, *words)
+        assert (code, said in " ".join(err.split())) == (2, True)
 
 
 def test_a_stopped_sweep_says_how_to_go_on_and_leaves_no_process(tmp_path):

@@ -8,12 +8,22 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from msgspec.structs import fields
 
-from isocharge.serve import Frame, encode_frame
+from isocharge.common.errors import DeviceError
+from isocharge.serve import Frame, device_from_table, encode_frame, flags
 from isocharge.serve.frames.stuffing import cobs_decode
 from isocharge.serve.frames.text import TextParser
+from isocharge.serve.live.device import CommonMode
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
+from isocharge.serve.signal_chain.contact import TouchRule
+from isocharge.serve.signal_chain.hum import HumRule
+from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve.signal_chain.memory import MemoryRule
+from isocharge.serve.signal_chain.tare import TareRule
+from isocharge.serve.tracking.film_follower import FollowRule
+from isocharge.serve.tracking.tracker import TrackRule
 
 SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
@@ -79,6 +89,77 @@ def on_free_ports(example):
             free.bind(("127.0.0.1", 0))
             example = example.replace(port, str(free.getsockname()[1]))
     return example
+
+
+def test_every_flag_is_explained():
+    words = {value for name, value in vars(flags).items() if name.isupper() and isinstance(value, str)}
+    assert words == set(flags.MEANINGS)
+    table = PAGES["predictions.md"].partition("| flag |")[2]
+    assert words <= set(re.findall(r"`(\w+)`", table))
+
+
+REQUIRED = {
+    "saturation": {"limit_pC": 1500.0},
+    "leak": {"tau_s": 10.0},
+    "frames": {"format": "described", "sync": "55", "length": 2, "fields": [{"name": "A", "type": "u8"}]},
+}
+
+
+CRC = {"width": 8, "polynomial": "07"}
+
+
+def known_keys(table):
+    """The keys that the reader of a device file knows beside an unknown one, in its own words."""
+    with pytest.raises(DeviceError, match="unknown key") as refused:
+        device_from_table(table, "device.toml")
+    return set(str(refused.value).partition("known are ")[2].split(", "))
+
+
+def documented(begin, end):
+    """The keys in the first cells of the tables between two texts of the page."""
+    section = PAGES["device_file.md"].partition("## Every key")[2].partition(begin)[2].partition(end)[0]
+    cells = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
+    return {key for cell in cells for key in re.findall(r"`([\w.]+)`", cell)}
+
+
+def test_every_key_of_the_device_file_is_explained_and_exists():
+    """Both ways, by what the reader itself says that it knows."""
+    described = REQUIRED["frames"]
+    common = {"format", "request", "request_Hz", "echo"}
+    assert documented("`[frames]`:", "More keys of described") == known_keys({"frames": {"zz": 1}})
+    assert (
+        documented("More keys of described", "The keys of a field")
+        == known_keys({"frames": described | {"zz": 1}}) - common
+    )
+    field = described["fields"][0] | {"zz": 1}
+    assert documented("The keys of a field", "key of a checksum") == known_keys(
+        {"frames": described | {"fields": [field]}}
+    )
+    assert documented("key of a checksum", "`[channels]`") == known_keys(
+        {"frames": described | {"length": 3, "checksum": CRC | {"zz": 1}}}
+    )
+    assert documented("`[gain]`", "The stages") == known_keys({"gain": {"zz": 1}})
+    stages = known_keys({"zz": {}}) - {"name", "frames", "channels", "gain"}
+    keys = {f"{stage}.{key}" for stage in stages for key in known_keys({stage: {"zz": 1}}) - {"on"}}
+    assert documented("The stages", "\n#") == keys
+
+
+def test_every_default_of_a_stage_is_the_rule_s():
+    """Numbers in the tables are those of the code."""
+    rules = {"hum": HumRule, "tare": TareRule, "leak": LeakRule, "memory": MemoryRule, "touch": TouchRule}
+    rules |= {"track": TrackRule, "follow": FollowRule, "common_mode": CommonMode}
+    section = PAGES["device_file.md"].partition("The stages.")[2].partition("\n#")[0]
+    assert section.count("| `") > 15
+    for line in section.splitlines():
+        if not line.startswith("| `"):
+            continue
+        keys, values = re.findall(r"`([\w.]+)`", line.split("|")[1]), line.split("|")[2].replace("`", "").split(",")
+        for key, value in zip(keys, values, strict=True):
+            stage, name = key.split(".")
+            if value.strip() != "required":
+                default = {item.name: item.default for item in fields(rules[stage])}[name]
+                words = "true" if default is True else "alike" if default is None else f"{default:g}"
+                assert value.strip() == words, key
 
 
 @pytest.mark.parametrize("row", re.findall(r"^\| .*? \| `(.*)` \|$", PAGES["frames.md"], re.MULTILINE))

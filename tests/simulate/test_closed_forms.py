@@ -3,10 +3,13 @@
 For the linear theories Green's function of the disk is known, and a disk that presses is an integral of it.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import dblquad, solve_bvp
+from scipy.interpolate import CubicSpline
 from scipy.special import iv, ivp, kv, kvp
 
 from isocharge.simulate import (
@@ -17,7 +20,9 @@ from isocharge.simulate import (
     SolveSettings,
     Theory,
     deflection,
+    load_sensor,
     press,
+    touch_charge,
     touch_stress,
 )
 
@@ -179,6 +184,84 @@ def test_taut_plate_under_a_centred_disk(tension_MPa):
             np.testing.assert_allclose(deflection(solved, ring(r * film.radius)), expected, atol=2e-5 * centre)
 
 
+def charge_of_a(radius: float, stress: Callable[[float], tuple[float, float]]) -> float:
+    """Charge of electrode A of "four-25um-uniaxial", pC, from (s_r, s_theta), MPa, at r / a, by scipy's integral."""
+
+    def density(y: float, x: float) -> float:
+        r, c2 = np.hypot(x, y), x**2 / (x**2 + y**2)
+        radial, hoop = stress(r / radius)
+        return 20.0 * (radial * c2 + hoop * (1 - c2)) + 2.0 * (radial * (1 - c2) + hoop * c2)
+
+    return dblquad(density, 8.5, 11.5, -1.5, 1.5)[0]
+
+
+def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float, at: np.ndarray) -> np.ndarray:
+    """Scaled deflection, radial and hoop stress at the radii r / a, shape (3, n).
+
+    Solves for (u, phi = r S_r (1 + A^2 u'), w) in the scaled variables of mechanics.energy, load one. Radial balance is
+    phi' = S_theta (1 + A^2 u / r), vertical balance r S_r w' = - min(1, (r / R)^2) / 2 pi.
+    """
+    plane, start = 1.0 / (1.0 - poisson**2), 1e-4
+
+    def fields(r: np.ndarray, u: np.ndarray, phi: np.ndarray) -> tuple[np.ndarray, ...]:
+        """u', w', S_r, S_theta: one scalar equation per radius, by Newton from von Karman's answer."""
+        hoop_strain = u / r + 0.5 * amplitude2 * (u / r) ** 2
+        tilt = -np.minimum(1.0, (r / share) ** 2) / (2.0 * np.pi * phi)  # w' over 1 + A^2 u'
+        slope = np.zeros_like(r)
+        for _ in range(30):
+            stretch = 1.0 + amplitude2 * slope
+            radial = plane * (slope + 0.5 * amplitude2 * slope**2 + 0.5 * (tilt * stretch) ** 2 + poisson * hoop_strain)
+            radial += tension
+            by_slope = plane * stretch * (1.0 + amplitude2 * tilt**2)
+            slope -= (radial * stretch - phi / r) / (by_slope * stretch + amplitude2 * radial)
+        hoop = hoop_strain + poisson * (radial - tension) + tension
+        return slope, tilt * stretch, radial, hoop
+
+    def equations(r: np.ndarray, y: np.ndarray) -> np.ndarray:
+        slope, fall, _, hoop = fields(r, y[0], y[1])
+        return np.stack([slope, hoop * (1.0 + amplitude2 * y[0] / r), fall])
+
+    def ends(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
+        """At the centre radial and hoop stretch are one; the rim is clamped."""
+        slope = fields(np.array([start]), inner[:1], inner[1:2])[0][0]
+        return np.array([slope - inner[0] / start, outer[0], outer[2]])
+
+    r = np.unique(np.concatenate([np.geomspace(start, 1.0, 200), np.linspace(start, share, 50), [share]]))
+    bend = np.cbrt(r**2 + share**2)
+    guess = np.stack([0.1 * r * (1 - r), (0.3 / bend + tension) * r, 0.8 * (bend[-1] - bend)])
+    found = solve_bvp(equations, ends, r, guess, tol=1e-9, max_nodes=100_000)
+    assert found.success, found.message
+    u, phi, w = found.sol(at)
+    _, _, radial, hoop = fields(at, u, phi)
+    return np.stack([w, radial - tension, hoop - tension])
+
+
+@pytest.mark.parametrize(
+    ("share", "force", "poisson", "tension"),
+    [
+        (0.02, 1e-7, 0.34, 0.0),  # von Karman
+        (0.98, 1e-7, 0.3, 0.4),
+        (0.02, 5.0, 0.34, 0.0),  # Green-Lagrange, A^2 = 0.013
+        (0.3, 100.0, 0.34, 0.2),  # far beyond any film: A^2 = 0.1
+    ],
+)
+def test_axisymmetric_membrane(share, force, poisson, tension):
+    amplitude2 = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
+    film = replace(SLACK, poisson=poisson, pretension=tension * SLACK.young * amplitude2)
+    solved = press(
+        film, Circle(share * film.radius), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=REFINED)
+    )
+    at = np.array([0.005, 0.015, 0.1, 0.4, 0.8, 0.97])
+    for r, (depth, along, around) in zip(at, axisymmetric(share, amplitude2, poisson, tension, at).T, strict=True):
+        points = ring(r * film.radius)
+        radial, hoop, shear = radial_and_hoop(touch_stress(solved, points) / (film.young * amplitude2), points)
+        sunk = deflection(solved, points) / (film.radius * np.sqrt(amplitude2))
+        np.testing.assert_allclose(sunk, depth, rtol=3e-6)
+        np.testing.assert_allclose(radial, along, rtol=3e-5)
+        np.testing.assert_allclose(hoop, around, rtol=1e-4)
+        np.testing.assert_allclose(shear, 0.0, atol=3e-5 * along)
+
+
 def test_hencky():
     """A probe over the whole film is a uniform dead pressure q: N_r(0) = b0 / 4 (q^2 a^2 E h)^(1/3) with
     b0 = 1.7244 at Poisson 0.3 (Hencky 1915; digits of Fichter 1997)."""
@@ -188,3 +271,14 @@ def test_hencky():
     expected = 1.7244 / 4.0 * np.cbrt(pressure**2 * film.radius**2 * film.young * film.thickness)
     centre = touch_stress(solved, np.zeros((1, 2)))[0] * film.thickness
     np.testing.assert_allclose(centre[:2], expected, rtol=1e-4)
+
+
+def test_charge_of_a_centred_press_is_the_integral_of_the_boundary_value_problem():
+    """The output itself: electrode A integrated over from scipy's stresses, no code of ours but the solve."""
+    sensor, force = load_sensor("four-25um-uniaxial"), 1.0
+    amplitude2 = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
+    solved = press(sensor.film, Circle(1.0), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=REFINED))
+    at = np.linspace(8.4, 11.7, 40) / 45.0
+    _, *stresses = axisymmetric(1.0 / 45.0, amplitude2, 0.34, 0.0, at)
+    expected = charge_of_a(45.0, CubicSpline(at, SLACK.young * amplitude2 * np.stack(stresses, axis=1)))
+    assert touch_charge(sensor, solved)[0] == pytest.approx(expected, rel=1e-5)

@@ -5,6 +5,7 @@
 """
 
 import json
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -27,6 +28,9 @@ from isocharge.simulate import (
 from isocharge.simulate.solver.error_estimate import estimated_error
 
 HERE = Path(__file__).parent
+
+
+ACCURACY = (HERE.parents[1] / "simulate" / "docs" / "accuracy.md").read_text("utf-8")
 
 
 @dataclass(frozen=True)
@@ -121,3 +125,25 @@ def test_charges_and_deflection(case):
             worst = max(worst, float(error.max() / np.abs(expected).max()))
     assert deflection(solved, np.array([case.at]))[0] == pytest.approx(case.deflection, rel=1e-3)
     assert worst <= estimated_error(solved) + 3e-4
+
+
+def worst_errors(case) -> tuple[float, float]:
+    """Error of a press's charges relative to the largest, and of its deflection."""
+    solved = solve(case.film, case.probe, case.at, case.force)
+    charges = [
+        np.abs(touch_charge(case.sensor(k), solved) - q).max() / np.abs(q).max() for k, q in case.charges.items()
+    ]
+    return max(charges), float(abs(deflection(solved, [case.at])[0] / case.deflection - 1.0))
+
+
+@pytest.mark.slow
+def test_accuracy_table_is_what_the_solver_gives():
+    """Every figure of simulate/docs/accuracy.md, to a digit: figures this small differ between libraries."""
+    rows = re.findall(r"^\| (.+) \| (\d+) um \| (\d+) \| ([\d.]+) % \| ([\d.]+) % \|$", ACCURACY, re.MULTILINE)
+    assert len(rows) == 9
+    for source, thickness, count, *shown in rows:
+        cases = [case for case in CASES if (case.source, f"{1e3 * case.film.thickness:.0f}") == (source, thickness)]
+        assert len(cases) == int(count)
+        np.testing.assert_allclose(
+            np.max([worst_errors(case) for case in cases], axis=0), 0.01 * np.array(shown, dtype=float), atol=2e-5
+        )

@@ -184,7 +184,8 @@ def _npy(array: Array) -> bytes:
 
 def draft_of(target: Path) -> Path:
     """Folder of a target's draft."""
-    return target.with_name(f"{target.name}.part")
+    named = target if target.name else target.absolute()  # "."
+    return named.parent / f"{named.name}.part"
 
 
 def refuse_finished(target: Path) -> None:

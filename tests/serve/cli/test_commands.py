@@ -188,6 +188,18 @@ def test_a_name_that_is_none(models, run, name):
         run("stream", "linear", "--port", "p", "--models", models, "--name", name)
 
 
+def test_a_recording_that_was_killed_is_readable(board, models, start, tmp_path, run):
+    """It lacks at most the records of the chunk that was being made."""
+    path = tmp_path / "touch.rec"
+    process = start("stream", "linear", "--port", board.url, "--record", path, "--models", models)
+    lines = [process.stdout.readline() for _ in range(1000)]
+    process.kill()
+    process.wait()
+    replayed = run("replay", path, "--models", models).stdout.splitlines(keepends=True)
+    assert replayed
+    assert replayed[:1000] == lines[: len(replayed)]
+
+
 def test_a_new_tare_is_asked_for_by_a_signal(models, run):
     rest = lambda level, count: [(level, level + 1.0, level + 2.0)] * count  # noqa: E731
     asked = (interrupt(signal.SIGUSR1) for _ in range(1))
@@ -282,6 +294,12 @@ def test_a_closed_stdin_is_empty(models):
 def test_a_closed_stderr_changes_nothing(models, presses):
     done = bash(f"{ISOCHARGE} serve predict linear {presses} --models {models} 2>&-")
     assert (done.returncode, done.stdout.count("\n")) == (0, 3)
+
+
+def test_an_empty_token_is_refused(models):
+    """As `--token ''` is: whoever sets it means to have one."""
+    done = bash(f"{ISOCHARGE} serve http --models {models} --port 0", ISOCHARGE_TOKEN="")
+    assert (done.returncode, "token: expected printable ASCII" in done.stderr) == (2, True)
 
 
 def test_a_slow_reader_stops_neither_chain_nor_recording(models, film, tmp_path, start):

@@ -45,6 +45,20 @@ def test_serves_until_told_to_stop(start, number):
     assert err == "serving linear/1; Ctrl-C stops\n"
 
 
+def test_killed_and_started_again(start):
+    """On the same port, with a connection that was open when it was killed."""
+    process = start("--port", 0)
+    url = process.stdout.readline().strip()
+    with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2]))) as held:
+        held.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
+        assert held.recv(12) == b"HTTP/1.1 200"
+        process.kill()
+        process.wait()
+        again = start("--port", url.rpartition(":")[2])
+        assert again.stdout.readline().strip() == url
+    assert ask(url)[0] == 200
+
+
 def test_bad_starts(command, models, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "damaged").mkdir()

@@ -6,12 +6,13 @@ import time
 import numpy as np
 import pytest
 
-from isocharge.common.errors import ChargeError, PortError
+from isocharge.common.errors import ChargeError, ModelError, PortError
 from isocharge.serve import (
     Chain,
     Chunk,
     Frame,
     Policy,
+    Predictor,
     TouchStream,
     device_from_table,
     encode_frame,
@@ -89,6 +90,19 @@ def test_latest_alone_tells_what_happened_before_it(predictor):
     (record,) = touch.feed(back)
     assert record.flags == ("reconnected", "gap", "tare")
     assert touch.counts.skipped == 9 + 4 + 1 + 2
+
+
+def test_another_model_of_the_same_electrodes(film, make_film, predictor, tmp_path):
+    touch = TouchStream(predictor, chain=CHAIN, frame_id="left")
+    rest = list(touch.feed(chunk(*frames(np.tile(OFFSET, (10, 1))))))
+    touch.use(Predictor(film.write(tmp_path, version=2)))
+    raw = tuple((pressed(film) + OFFSET).tolist())
+    (record,) = touch.feed(chunk(Frame(10, 50_000, raw)))
+    assert (rest[-1].model, record.model, record.flags, record.frame_id) == ("linear/1", "linear/2", (), "left")
+    assert record.force_N == pytest.approx(0.5, rel=1e-5)
+    with pytest.raises(ModelError, match=r"linear/1: expected the electrodes \('A', 'B', 'C'\) of linear/2"):
+        touch.use(Predictor(make_film(4).write(tmp_path / "four")))
+    assert touch.predictor.metadata.label == "linear/2"
 
 
 def test_record_out_of_contact(play):

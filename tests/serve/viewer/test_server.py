@@ -20,6 +20,7 @@ from websockets.exceptions import ConnectionClosedError, InvalidStatus
 
 from isocharge.common.errors import OriginError, TokenError
 from isocharge.serve.network.address import Token
+from isocharge.serve.viewer import server
 from isocharge.serve.viewer.server import BYTES_AT_ONCE, VIEWERS, Access, Budget
 
 
@@ -133,6 +134,15 @@ def followed(place):
     )
     assert b" 101 " in client.recv(100)
     return client
+
+
+def test_who_reads_no_answers_is_not_read_either(start_page, monkeypatch):
+    """Pongs that nobody takes would fill the memory."""
+    monkeypatch.setattr(server, "BYTES_AT_ONCE", 1 << 40)
+    with followed(urlsplit(start_page().url)) as hostile:
+        hostile.settimeout(1.0)
+        with pytest.raises(TimeoutError):
+            hostile.sendall(FLOODS["long pings"] * 200_000)  # 26 MB, more than the system's buffers
 
 
 @pytest.mark.parametrize("kind", FLOODS)

@@ -1,6 +1,10 @@
 """A run that was stopped goes on, and writes what it would have written; nothing else is touched or trusted."""
 
 import re
+import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from pathlib import Path
@@ -174,3 +178,52 @@ def test_what_would_fail_again_leaves_nothing(tmp_path, error):
     with pytest.raises(type(error)):
         save_and_raise(tmp_path / "new" / "out", error)
     assert list(tmp_path.iterdir()) == []
+
+
+DRIVER = """
+import os, sys
+from pathlib import Path
+sys.path[:0] = {path!r}
+from isocharge.simulate import *
+from isocharge.common.progress import listening
+from isocharge.simulate.execution.workers import local_workers
+
+def killed(title, done, *_):
+    if title == "pressing" and done >= 20:
+        os.kill(os.getpid(), 9)
+
+if __name__ == "__main__":
+    membrane = Theory(stretching=True, bending=False, pretensioned=False)
+    quick = SolveSettings(theory=membrane, resolution=Resolution(4, 8, 4))
+    sweep = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7)
+    with local_workers(2) as executor, listening(killed):
+        print(executor.submit(os.getpid).result(), flush=True)
+        run_sweep(Path(sys.argv[1]), load_sensor("three-25um-biaxial"), (Circle(1.0),), sweep, quick, shard=10,
+                  executor=executor)
+"""
+
+
+def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path, whole):
+    """SIGKILL between two shards; no worker outlives it."""
+    script = tmp_path / "driver.py"
+    script.write_text(DRIVER.format(path=sys.path))
+    run = subprocess.run([sys.executable, script, tmp_path / "presses"], capture_output=True, text=True, timeout=100)
+    assert run.returncode == -signal.SIGKILL, run.stderr
+    assert not (tmp_path / "presses").exists()
+    assert draft_of(tmp_path / "presses").exists()
+    for pid in map(int, run.stdout.split()):
+        deadline = time.monotonic() + 10.0
+        while is_running(pid) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert not is_running(pid)
+    executor = Counting()
+    sweep_to(tmp_path / "presses", executor=executor)
+    assert files(tmp_path / "presses") == whole[0]
+    assert executor.jobs < whole[1]
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False

@@ -1,5 +1,7 @@
 """Footprints and their notation."""
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -69,6 +71,16 @@ def test_notation_is_in_mm():
 def test_wrong_notation_is_shown(text):
     with pytest.raises(SceneError, match=f"probe '{text}': expected 'circle:R', 'rectangle:WxH', 'triangle:S'"):
         parse_probe(text)
+
+
+NEARLY = st.from_regex(r"(circle|rectangle|triangle|polygon):[0-9.,;x@e+-]{0,14}", fullmatch=True)
+
+
+@given(text=st.text(max_size=12) | NEARLY)
+@COMMON
+def test_any_text_is_a_probe_or_a_scene_error(text):
+    with suppress(SceneError):
+        assert parse_probe(text).reach > 0.0
 
 
 @pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])

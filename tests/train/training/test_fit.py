@@ -10,7 +10,7 @@ import torch
 from isocharge.common.errors import ConfigError, InputError, OutputExists, TrainingError
 from isocharge.common.progress import listening
 from isocharge.common.resumable_run import resume_parts
-from isocharge.simulate import Domain, NoiseModel
+from isocharge.simulate import Dataset, Domain, NoiseModel, Samples
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config
 from isocharge.train.training import descent
 from isocharge.train.training.descent import Descent, TrainingStage
@@ -132,6 +132,32 @@ def test_a_seed_gives_the_same_network_and_leaves_the_callers_state_alone(datase
 def test_settings_that_do_not_fit_are_refused(dataset, config, error, message):
     with pytest.raises(error, match=message):
         fit(dataset, config)
+
+
+@pytest.mark.slow
+def test_coverage_where_the_truth_is_known(sensor):
+    """Charges whose logarithms are linear in the contact, noise in proportion: the posterior is Gaussian, its width
+    known, but at the edge."""
+    rng = np.random.default_rng(0)
+    count, radius, noise = 6_000, 8.0, NoiseModel("loud", 1.0, 0.02)
+    reach, angle = radius * np.sqrt(rng.uniform(size=count)), rng.uniform(-np.pi, np.pi, count)
+    force = np.exp(rng.uniform(np.log(0.05), np.log(2.0), count))
+    contact = np.stack([reach * np.cos(angle), reach * np.sin(angle), np.log(force)], axis=1)
+    slope = np.array([[0.0, -0.1, 0.7], [0.1, 0.05, 0.7], [-0.1, 0.05, 0.7]])
+    charge = 1e4 * np.exp(contact @ slope.T)
+    samples = Samples(*contact[:, :2].T, force, np.full(count, "circle:1.0"), np.zeros(count), charge)
+    manifest = {"ranges": {"radius_mm": radius, "force_N": [0.05, 2.0]}, "solver": "made up"}
+    config = settings((24, 24), steps=600, misfit_steps=1, batch=512, noise=noise)
+    fitted = fit(Dataset(sensor, samples, manifest, "made up"), config)
+    good = fitted.test.within(6.5)
+    good = good[(good.contact[:, 2] > 0.06) & (good.contact[:, 2] < 1.7)]
+    found, std, _ = fitted.predict(good.noisy(noise, seed=4))
+    exact = np.sqrt(np.diag(np.linalg.inv(slope.T @ slope))) * 0.02  # of x, y (mm) and ln F; 1 pC is nothing here
+    ratio = std / exact / np.stack([np.ones(len(good)), np.ones(len(good)), found[:, 2]], axis=1)
+    assert np.median(ratio, axis=0) == pytest.approx([1.0, 1.0, 1.0], abs=0.15)
+    deviation = np.abs(found - good.contact) / std
+    assert np.mean(deviation < 1.0, axis=0) == pytest.approx([0.68] * 3, abs=0.08)
+    assert np.mean(deviation < 1.96, axis=0) == pytest.approx([0.95] * 3, abs=0.04)
 
 
 def test_the_loss_of_a_student_is_the_divergence_of_gaussians():

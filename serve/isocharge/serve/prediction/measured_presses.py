@@ -227,7 +227,9 @@ def write_presses(path: Path, presses: MeasuredPresses) -> None:
 
     Its name decides: Parquet if it ends in `.parquet`, else CSV.
     """
-    write_whole(path, parquet_bytes(presses.columns) if path.suffix == SUFFIX else presses_text(presses).encode())
+    write_whole(
+        path, parquet_bytes(presses.columns) if path.suffix.lower() == SUFFIX else presses_text(presses).encode()
+    )
 
 
 def presses_text(presses: MeasuredPresses) -> str:
@@ -256,7 +258,7 @@ def _check_electrodes(electrodes: tuple[str, ...]) -> None:
 def _open_table(path: Path, names: Sequence[str], expected: str) -> Iterator[CsvNumbers]:
     """The table of an open file; `names` have a meaning, and `expected` are those that the header should have."""
     header = f"a header with {expected}"
-    if Path(path).suffix == SUFFIX:
+    if Path(path).suffix.lower() == SUFFIX:
         yield CsvNumbers(parquet_lines(Path(path)), names, str(path), PressError, header)
         return
     try:

@@ -21,7 +21,7 @@ from isocharge.cli.shared.options import (
 )
 from isocharge.cli.shared.terminal import say
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
-from isocharge.common.errors import InputError
+from isocharge.common.errors import InputError, OutputExists
 from isocharge.common.extras import require
 from isocharge.common.files import refuse_existing
 from isocharge.common.resumable_run import refuse_finished
@@ -32,7 +32,7 @@ TABLES = (".csv", ".parquet")
 """Ends of the names of tables of presses."""
 
 SOLVER_MM, SOLVER_FORCE = 0.01, 1e-3
-"""What a solver's error of 0.06 % of a charge is, as an error of place, mm, and as a share of force."""
+"""What a solver's error of 0.05 % of a charge is at most, as an error of place, mm, and as a share of force."""
 
 
 class Orientation(StrEnum):
@@ -91,7 +91,7 @@ def sweep_command(
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
     film_sensor, probes = load_sensor(sensor), [parse_probe(text) for text in probe or ["circle:1.0"]]
-    table = output if output.suffix in TABLES else None
+    table = output if output.suffix.lower() in TABLES else None
     if table:
         refuse_existing(table)
         output = output.with_suffix("")
@@ -99,7 +99,12 @@ def sweep_command(
             raise InputError(
                 f"{table}: a table of presses has one probe in one orientation; give a folder, -o {output}"
             )
-        if table.suffix == ".parquet":
+        if output.exists():
+            raise OutputExists(
+                f"{output}, the dataset that belongs beside {table}, is already there and is not overwritten; choose "
+                "another name, or write its table as simulate/docs/datasets.md does"
+            )
+        if table.suffix.lower() == ".parquet":
             with require("parquet"):  # missed now, not after the sweep
                 import pyarrow  # noqa: F401
     refuse_finished(output)

@@ -3,7 +3,9 @@
 schemathesis makes requests from the OpenAPI document, good ones and bad ones, and compares answers with it.
 """
 
+import base64
 import gzip
+import hashlib
 import tracemalloc
 import zlib
 
@@ -395,6 +397,19 @@ def test_the_page_s_example_runs(ask):
     page = ask("GET", "/")[2].decode()
     body = page.split("-d &#x27;")[1].split("&#x27;")[0].replace("&quot;", '"')
     assert ask("POST", INFER, body.encode())[0] == 200
+
+
+def test_the_page_may_run_and_load_nothing(ask):
+    """Its one style is allowed by its hash, computed here from what was sent."""
+    _, headers, page = ask("GET", "/")
+    style = page.decode().split("<style>")[1].split("</style>")[0]
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    policy = dict(part.strip().split(" ", 1) for part in headers["content-security-policy"].split(";"))
+    assert policy.pop("style-src") == f"'sha256-{digest}'"
+    assert policy == dict.fromkeys(("default-src", "base-uri", "form-action", "frame-ancestors"), "'none'")
+    assert (headers["x-content-type-options"], headers["x-frame-options"]) == ("nosniff", "DENY")
+    assert " style=" not in page.decode()
+    assert "<script" not in page.decode()
 
 
 CHECKS = [
