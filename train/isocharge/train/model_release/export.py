@@ -201,7 +201,7 @@ def _check_finite(session: ort.InferenceSession, n_electrode: int) -> None:
 def _compare(
     session: ort.InferenceSession, exact: Exact, charge: Singles, floors: Sequence[float], slack: float
 ) -> None:
-    """The file must answer as the network does; below `floors` and `OF_STD` differences of contacts count absolutely."""
+    """The file must answer as the network does; below `floors` and `OF_STD` differences count absolutely."""
     answers = exact(charge.astype(float))
     least = np.maximum(floors, OF_STD * answers[1])
     for mine, (name, theirs) in zip(answers, run(session, charge).items(), strict=True):
