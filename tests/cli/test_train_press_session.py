@@ -256,7 +256,9 @@ def test_presses_of_a_machine_calibrate_a_film(command, desk, film, places):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "expected PRESSES.csv, or --next K"),
+        ([], "or --from FOLDER with --temperature C, got none of them"),
+        (["list.csv", "--temperature", "nan"], "--temperature: expected -100 to 200 degrees Celsius, got nan"),
+        (["--from", "film", "--temperature", "23", "--port", "some.bin"], "--temperature: presses from --port"),
         (["--next", "2"], "nothing is calibrated without PRESSES.csv"),
         (["list.csv", "--probe", "triangle:4.0"], "expected a round one"),
         (["--port", "some.bin", "list.csv"], "leave out PRESSES.csv, --next"),

@@ -431,7 +431,7 @@ def test_electrodes_with_traces_are_read_by_the_network_of_their_pads(problem):
     )
     charge = [touch_charge(sensor, press(sensor.film, probe, (x, y), force)) for x, y, force in contact[:10]]
     fitted = traced.fitted(
-        traced.prior.mean, (contact[10:], np.zeros((30, 3))), lambda at: np.ones((len(at), 4)), whole=False
+        traced.prior.mean, (contact[10:], np.zeros((30, 3))), lambda at: np.ones((len(at), 4)), release=False
     )
     off = fitted.predict(np.array(charge))[0] - contact[:10]
     assert fitted.sensor.electrodes == sensor.electrodes

@@ -13,7 +13,7 @@ from isocharge.serve import Predictor, check_presses, read_presses, write_presse
 from isocharge.simulate import Circle, load_sensor, press, touch_charge
 from isocharge.train import calibrate, read_earlier, write_calibration
 from isocharge.train.calibration.contacts import temperatures
-from isocharge.train.calibration.folder import result_table
+from isocharge.train.calibration.folder import read_moved, result_table
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
 
@@ -49,11 +49,10 @@ def day(problem):
     return calibrate(pressed(problem, 5, DAY), problem)
 
 
-@pytest.fixture
-def folder(day, tmp_path):
+def written(result, folder):
     """What the next calibration reads of the folder of this one."""
-    (tmp_path / "calibration.json").write_text(json.dumps(plain_values(result_table(day))))
-    return tmp_path
+    (folder / "calibration.json").write_text(json.dumps(plain_values(result_table(result))))
+    return folder
 
 
 def test_what_a_kelvin_does_is_learned_and_said(day):
@@ -61,26 +60,40 @@ def test_what_a_kelvin_does_is_learned_and_said(day):
     known = day.posterior.warming
     assert known.MPa_per_K == pytest.approx(-PER_K, abs=2.5 * known.std)
     assert known.std < 0.06
-    assert known.at_C == pytest.approx(21.5)
     assert day.posterior.parameters[0] == pytest.approx(1.1, abs=0.2)
     assert f"A kelvin more changes the pretension by {known.MPa_per_K:.3g}" in " ".join(day.summary)
 
 
-def test_the_film_at_another_temperature(day, folder, command):
-    code, out, _ = command(*CALIBRATE, "--from", folder, "--temperature", "20.5", "--json")
+def test_the_film_at_another_temperature(day, tmp_path, command):
+    _, out, _ = command(*CALIBRATE, "--from", written(day, tmp_path), "--temperature", "20.5", "--json")
     table, known = json.loads(out), day.posterior.warming
     change = 1e-6 * table["parameters"]["pretension"]["value"] - day.posterior.parameters[0]
-    assert code == 0
     assert change == pytest.approx(-known.MPa_per_K * (known.at_C - 20.5))
     assert table["temperature"]["at_C"] == 20.5
     assert table["error_left"]["force_percent"] > day.left.force_percent  # by what is not known of a kelvin
-    code, _, error = command(*CALIBRATE, "--from", folder, "--temperature", "60", "--json")
-    assert (code, "a temperature nearer to that of the presses" in " ".join(error.split())) == (2, True)
+    assert table["words"][1].startswith("The film was moved from 21.5 C")
 
 
-def test_another_morning_tells_more(day, folder, problem):
+def test_there_and_back_is_the_same_film(day, tmp_path, problem):
+    """Film and change are one Gaussian, and a temperature a linear map of it."""
+    there = read_moved(written(day, tmp_path), problem, 23.5)
+    back = read_moved(written(there, tmp_path), problem, 21.5).posterior
+    np.testing.assert_allclose(back.covariance, day.posterior.covariance, atol=2e-5)  # correlations have six digits
+    assert back.parameters == pytest.approx(day.posterior.parameters)
+
+
+@pytest.mark.parametrize(
+    ("std", "to_C", "why"), [(0.3, 20.5, "does not know what temp"), (0.03, 60.0, "nearer to that of the presses")]
+)
+def test_a_film_is_not_moved_farther_than_is_known(day, problem, tmp_path, std, to_C, why):
+    vague = replace(day.posterior, warming=day.posterior.warming._replace(std=std))
+    with pytest.raises(PressError, match=why):
+        read_moved(written(replace(day, posterior=vague), tmp_path), problem, to_C)
+
+
+def test_another_morning_tells_more(day, tmp_path, problem):
     """Three presses two degrees on: the film is given at their temperature, and a kelvin is known better."""
-    earlier = read_earlier(folder, problem, thermometer=True)
+    earlier = read_earlier(written(day, tmp_path), problem, knows_temperature=True)
     later = calibrate(pressed(problem, 6, np.full(3, 23.5)), replace(problem, earlier=earlier)).posterior
     assert later.warming.at_C == pytest.approx(23.5)
     assert later.warming.std < day.posterior.warming.std
@@ -94,6 +107,7 @@ def test_temperatures_in_a_file(tmp_path, problem):
     again = read_presses(tmp_path / "presses.csv", problem.electrodes)
     assert again == presses
     np.testing.assert_allclose(temperatures(again), [20.0, 21.0, 22.0, 22.0])
+    assert not again[[1, 3]].knows_temperature
     with pytest.raises(PressError, match=r"line 3, column 'temperature_C': expected a temperature of -100 to 200"):
         replace(presses, temperature_C=np.array([20.0, 295.0, 20.0, 20.0]))
 
@@ -103,6 +117,7 @@ def test_the_folder_at_another_temperature_fits(day, problem, tmp_path, command)
     """Presses at 20.5 C fit the film of that temperature, and not that of the day."""
     write_calibration(day, tmp_path / "day")
     assert command(*CALIBRATE, "--from", tmp_path / "day", "--temperature", "20.5", "-o", tmp_path / "cold")[0] == 0
+    assert "-biaxial`, moved from 21.5 C, day/1, to 20.5 C by the" in (tmp_path / "cold" / "card.md").read_text()
     presses = replace(pressed(problem, 7, np.full(10, 20.5)), temperature_C=None)
     checks = [check_presses(Predictor(tmp_path / name), presses) for name in ("day", "cold")]
     assert [check.fits for check in checks] == [False, True]

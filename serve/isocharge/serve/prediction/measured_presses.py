@@ -103,6 +103,11 @@ class MeasuredPresses:
         """Presses of which place and force are known, shape (n,)."""
         return np.asarray(np.isfinite(self.contact).all(axis=1))
 
+    @property
+    def knows_temperature(self) -> bool:
+        """Whether the temperature of one of them is known."""
+        return self.temperature_C is not None and bool(np.isfinite(self.temperature_C).any())
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, MeasuredPresses):
             return NotImplemented

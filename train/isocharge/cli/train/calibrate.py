@@ -23,13 +23,14 @@ from isocharge.cli.shared.terminal import say, this_command
 from isocharge.cli.train.press_session import PressPort, calibrate_at_port
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.json_values import plain_values
+from isocharge.serve.prediction.measured_presses import COLDEST_C, WARMEST_C
 from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, ProposedPress, calibrate, next_presses
-from isocharge.train.calibration.calibrate import film_without_presses
 from isocharge.train.calibration.folder import (
     SESSION,
     calibration_folder,
     read_earlier,
+    read_moved,
     result_table,
     write_calibration,
 )
@@ -133,25 +134,24 @@ def calibrate_command(
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
-    warmed = temperature_C is not None and earlier is not None and file is None and port is None
+    moved_to_C = temperature_C if earlier is not None and file is None else None
     of_port = yes or press_list is not None or fresh or device is not None
-    _check_usage(file, output, next_count, port, temperature_C, of_port=of_port, warmed=warmed)
+    _check_usage(file, output, next_count, port, temperature_C, of_port=of_port, moved=moved_to_C is not None)
     problem = replace(CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models), stress_limit=stress_limit)
     result, presses = None, None
     with calibration_folder(output, problem) if output is not None else nullcontext():
         if file is not None:
             presses = read_presses_of(file, problem.electrodes, position_std_mm, force_std)
-            if presses.temperature_C is None and temperature_C is not None:
+            if not presses.knows_temperature and temperature_C is not None:
                 presses = replace(presses, temperature_C=np.full(len(presses), temperature_C))
-        if earlier is not None:
-            thermometer = presses is not None and presses.temperature_C is not None
-            at_C = temperature_C if warmed else None
-            problem = replace(problem, earlier=read_earlier(earlier, problem, thermometer=thermometer, at_C=at_C))
+        if earlier is not None and moved_to_C is not None:
+            result = read_moved(earlier, problem, moved_to_C)
+        elif earlier is not None:
+            knows_temperature = presses is not None and presses.knows_temperature
+            problem = replace(problem, earlier=read_earlier(earlier, problem, knows_temperature=knows_temperature))
         if port is not None and output is not None:
             where = PressPort(port, device, baud, yes, press_list, until, fresh, position_std_mm, force_std)
             result = calibrate_at_port(where, problem, output, json_lines=json)
-        elif warmed:
-            result = film_without_presses(problem, f"no presses: {earlier} at {temperature_C:g} C")
         elif presses is not None:
             say(f"fitting the film to {len(presses)} presses")
             result = calibrate(presses, problem)
@@ -188,27 +188,32 @@ def _check_usage(
     temperature_C: float | None,
     *,
     of_port: bool,
-    warmed: bool,
+    moved: bool,
 ) -> None:
     """Refuse arguments that contradict each other."""
-    file_alone, nothing = port is None, port is None and file is None
+    nothing = port is None and file is None and not moved
     refuse(
         {
+            f"--temperature: expected {COLDEST_C:g} to {WARMEST_C:g} degrees Celsius, got {temperature_C}": (
+                temperature_C is not None and not COLDEST_C <= temperature_C <= WARMEST_C
+            ),
+            "--temperature: presses from --port are taken without it; leave one of them out": (
+                port and temperature_C is not None
+            ),
             "--port: presses come from the port and are proposed one by one; leave out PRESSES.csv, --next": (
                 port and (file or next_count)
             ),
             "--port: expected --output FOLDER for the presses and the model, got none": port and output is None,
             "--yes, --press-list, --fresh and --device belong to --port; give the port of the sensor": (
-                file_alone and of_port
-            ),
-            "expected PRESSES.csv, or --next K for presses to begin with, or --port URL, got none of them": (
-                nothing and not next_count and not warmed
+                port is None and of_port
             ),
             "--temperature: expected PRESSES.csv that were made at it, or --from FOLDER for it, got neither": (
-                temperature_C is not None and file is None and not warmed
+                nothing and temperature_C is not None
             ),
+            "expected PRESSES.csv, or --next K for presses to begin with, or --port URL, or --from FOLDER with "
+            "--temperature C, got none of them": nothing and not next_count,
             "--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out": (
-                nothing and output and not warmed
+                nothing and output
             ),
         }
     )

@@ -17,9 +17,9 @@ from isocharge.train.calibration.contact_error import ContactError, ContactSensi
 from isocharge.train.calibration.contacts import PressData, temperatures
 from isocharge.train.calibration.diagnosis import check_before, explain, find_mistakes, misfit, outside
 from isocharge.train.calibration.discrepancy import Hypothesis
-from isocharge.train.calibration.film_fit import MISTAKEN, PER_KELVIN, PROBABLE, FilmPosterior, fit_film
+from isocharge.train.calibration.film_fit import MISTAKEN, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
-from isocharge.train.calibration.quantities import IDENTIFIED, Quantity, quantities, summarise
+from isocharge.train.calibration.quantities import Quantity, quantities, summarise
 from isocharge.train.training.fit import Fitted
 
 UNEXPLAINED = 1e-6
@@ -62,12 +62,14 @@ class CalibrationResult:
         presses: The presses that were fitted.
         posterior: Best parameters, covariance, residuals.
         cautions: What the user should know, a sentence each.
+        moved: How an earlier calibration was moved to another temperature, without presses; empty with presses.
     """
 
     problem: CalibrationProblem
     presses: MeasuredPresses
     posterior: FilmPosterior
-    cautions: tuple[str, ...]
+    cautions: tuple[str, ...] = ()
+    moved: str = ""
 
     @cached_property
     def film(self) -> tuple[Sensor, Circle]:
@@ -91,20 +93,24 @@ class CalibrationResult:
 
     @cached_property
     def left_before(self) -> ContactError:
-        """The same before the presses."""
-        before, covariance = self.problem.before.of_unknowns, np.zeros_like(self.posterior.joint)
-        covariance[: len(before), : len(before)] = before
-        return self.sensitivity.left(covariance)
+        """The same before the presses, or before it was moved."""
+        before, covariance = self.problem.before, np.zeros_like(self.posterior.joint)
+        known = len(before.unknowns)
+        covariance[:known, :known] = before.of_unknowns
+        if not self.moved:
+            return self.sensitivity.left(covariance)
+        unknowns = np.pad(before.unknowns, (0, len(covariance) - known))
+        return ContactSensitivity.at(self.problem, unknowns).left(covariance)
 
     @property
     def fitted(self) -> Fitted:
         """The network of this film, for `evaluate` and `release`; what the film leaves is in its deviations."""
-        return self.fitted_film(self.posterior.parameters, whole=True)
+        return self.fitted_film(self.posterior.parameters, release=True)
 
-    def fitted_film(self, parameters: Array, *, whole: bool = False) -> Fitted:
+    def fitted_film(self, parameters: Array, *, release: bool = False) -> Fitted:
         """The network of a film near it, of these parameters; all else that is known of this film holds for it."""
         left = self.sensitivity.contact, np.einsum("nii->ni", self.sensitivity.covariance(self.posterior.joint))
-        return self.problem.fitted(parameters, left, self._factor, whole=whole)
+        return self.problem.fitted(parameters, left, self._factor, release=release)
 
     @cached_property
     def _factor(self) -> Callable[[Array], Array]:
@@ -134,12 +140,13 @@ class CalibrationResult:
     def summary(self) -> tuple[str, ...]:
         """The result in sentences."""
         noise, left, before = self.sensitivity.of_noise, self.left, self.left_before
+        when = "it was moved" if self.moved else "these presses"
         return (
             f"Not knowing the film leaves {left.position_mm:.2g} mm and {left.force_percent:.2g} % of the "
-            f"force (root mean square); before these presses it was {before.position_mm:.2g} mm and "
+            f"force (root mean square); before {when} it was {before.position_mm:.2g} mm and "
             f"{before.force_percent:.2g} %. Noise alone leaves {noise.position_mm:.2g} mm and "
             f"{noise.force_percent:.2g} %.",
-            *summarise(self.quantities),
+            *((f"The film was {self.moved}, without presses.",) if self.moved else summarise(self.quantities)),
             *self._of_temperature,
             "Forces are as right as the load cell, and places as the origin and the axes of the stage: an error of "
             "theirs is in every answer, beside these.",
@@ -152,7 +159,7 @@ class CalibrationResult:
         """What a kelvin does to the film, if that is known."""
         if (known := self.posterior.warming) is None:
             return
-        if known.std > IDENTIFIED * PER_KELVIN:
+        if not known.identified:
             yield f"The presses were made at {known.at_C:.1f} C; over more degrees they would tell what a kelvin does."
         else:
             yield (
@@ -204,8 +211,8 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
         presses = presses[~far]
     if misfit(presses, problem.charges) > MISLED and find_mistakes(presses, problem.charges):
         raise explain(presses, problem.charges, np.nan)
-    at_C = None if presses.temperature_C is None else float(temperatures(presses).mean())
-    if at_C is not None and problem.before.warming:
+    at_C = float(temperatures(presses).mean()) if presses.knows_temperature else None
+    if at_C is not None:
         problem = replace(problem, earlier=problem.before.at_temperature(at_C, problem.prior))
     data = PressData.of(presses, problem.noise, problem.charges)
     with threadpool_limits(1):  # many small matrices: a second thread only waits
@@ -222,17 +229,17 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
     return CalibrationResult(problem, presses, posterior, (*cautions, *_cautions(presses, problem, posterior)))
 
 
-def film_without_presses(problem: CalibrationProblem, why: str) -> CalibrationResult:
-    """The film as it is known beforehand, as a calibration; `why` is said as a caution."""
-    film, none, count = problem.before, np.empty(0), problem.charges.n_coefficient
+def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved: str) -> CalibrationResult:
+    """What `problem` knows before any press, `moved` to a film at another temperature, as a calibration."""
+    none, known, count = np.empty(0), len(film.unknowns), problem.charges.n_coefficient
     joint = np.zeros((film.parameters.size + count,) * 2)
-    joint[: len(film.of_unknowns), : len(film.of_unknowns)] = film.of_unknowns
+    joint[:known, :known] = film.of_unknowns
     posterior = FilmPosterior(
         parameters=film.parameters,
         covariance=film.covariance,
         coefficients=film.coefficients if film.coefficients.size else np.zeros(count),
         joint=joint,
-        warming=film.warming,
+        warming=film.warming and film.warming.of_unknowns(len(joint)),
         contact=np.empty((0, 3)),
         chi2=none,
         freedom=none,
@@ -244,7 +251,7 @@ def film_without_presses(problem: CalibrationProblem, why: str) -> CalibrationRe
     )
     electrodes = problem.electrodes
     presses = MeasuredPresses(np.empty((0, 3)), np.empty((0, len(electrodes))), none, none, electrodes, ())
-    return CalibrationResult(problem, presses, posterior, (why,))
+    return CalibrationResult(problem, presses, posterior, moved=moved)
 
 
 def _check_enough_known(presses: MeasuredPresses, problem: CalibrationProblem) -> None:
@@ -282,7 +289,9 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
     chance = MISTAKEN * (good if good <= FEW else 0) + min(left_out / (good * good), 0.5)
     joint, of_before, count = (1.0 - chance) * posterior.joint, before.of_unknowns, len(before.unknowns)
     joint[:count, :count] += chance * of_before
-    return replace(posterior, joint=joint, covariance=joint[: len(before.parameters), : len(before.parameters)])
+    warming, n = posterior.warming, len(before.parameters)
+    warming = warming and warming._replace(covariance=(1.0 - chance) * warming.covariance)
+    return replace(posterior, joint=joint, covariance=joint[:n, :n], warming=warming)
 
 
 def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> Iterator[str]:

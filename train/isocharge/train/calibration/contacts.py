@@ -131,10 +131,10 @@ class PressData:
 
 def temperatures(presses: MeasuredPresses) -> Array:
     """Of every press, shape (n,), degrees Celsius: between readings in the order of the presses; 0 without any."""
-    if presses.temperature_C is None:
+    if presses.temperature_C is None or not presses.knows_temperature:
         return np.zeros(len(presses))
     number, seen = np.arange(len(presses)), np.isfinite(presses.temperature_C)
-    return np.interp(number, number[seen], presses.temperature_C[seen]) if seen.any() else np.zeros(len(presses))
+    return np.interp(number, number[seen], presses.temperature_C[seen])
 
 
 class AdjustedContacts(NamedTuple):

@@ -32,7 +32,7 @@ from isocharge.train.calibration.contacts import (
 )
 from isocharge.train.calibration.discrepancy import SCATTERS, Hypothesis, Linearised, Mixture, weigh
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.problem import FilmEstimate, Warming
+from isocharge.train.calibration.problem import PER_KELVIN, FilmEstimate, Warming
 
 HEAVY_TAILS = 4.0
 """Degrees of freedom of Student's t by which presses are weighted while bad ones may be among them."""
@@ -75,9 +75,6 @@ lowers charges at random, a leak, lowers all of them on average, which presses c
 LINEAR = 0.2
 """Largest step of a parameter, in standard deviations of its prior, for which derivatives are not taken again."""
 
-PER_KELVIN = 0.4
-"""Standard deviation of the pretension's change with temperature, MPa/K: E da / (1 - nu), 0.3 to 0.44 on aluminium."""
-
 TINY = 1e-12
 """Derivative of a residual by the force that counts as none."""
 
@@ -116,7 +113,9 @@ class FilmPosterior(FilmEstimate):
 
     def scaled(self, factor: float) -> "FilmPosterior":
         """With all variances larger by a factor."""
-        warming = self.warming and self.warming._replace(std=self.warming.std * float(np.sqrt(factor)))
+        warming = self.warming and self.warming._replace(
+            std=self.warming.std * float(np.sqrt(factor)), covariance=self.warming.covariance * factor
+        )
         return replace(self, covariance=self.covariance * factor, joint=self.joint * factor, warming=warming)
 
     @property
@@ -124,12 +123,13 @@ class FilmPosterior(FilmEstimate):
         """Whether the film probably has what its parameters do not describe."""
         return sum(weight for each, weight in self.weights.items() if each.modes or each.size) > PROBABLE
 
-    def drifted(self, prior: FilmPrior, *, thermometer: bool = False) -> FilmEstimate:
+    def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> FilmEstimate:
         """See `FilmEstimate`; what the film has besides its parameters is known only if it probably has something."""
         if self.imperfect:
-            return super().drifted(prior, thermometer=thermometer)
-        known = FilmEstimate(self.parameters, self.covariance, warming=self.warming)
-        return known.drifted(prior, thermometer=thermometer)
+            return super().drifted(prior, knows_temperature=knows_temperature)
+        warming = self.warming and self.warming.of_unknowns(len(self.parameters))
+        known = FilmEstimate(self.parameters, self.covariance, warming=warming)
+        return known.drifted(prior, knows_temperature=knows_temperature)
 
     def probability(self, what: str) -> float:
         """Of the hypotheses with a "size", an "offset", a "drift" or a "scatter"."""
@@ -145,7 +145,7 @@ def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate, at_C: 
         before: What is known beforehand.
         at_C: Temperature of the film before and after, degrees Celsius, if it is known.
     """
-    problem = _Fit.of(charges, before, warmed=at_C is not None)
+    problem = _Fit.of(charges, before, knows_temperature=at_C is not None)
     keep, freedom = np.ones(len(data), dtype=bool), np.maximum(data.known.sum(axis=1) - 3.0, 0.0)
     solved = problem.solve(data, keep, problem.mean, Hypothesis())
     if len(data) >= FEWEST_TO_JUDGE and _suspicious(solved.contacts.chi2, freedom):
@@ -175,7 +175,7 @@ def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate, at_C: 
         covariance=joint[:n, :n],
         coefficients=unit[n:-NUISANCES],
         joint=joint,
-        warming=None if at_C is None else Warming(*per_kelvin, at_C),
+        warming=None if at_C is None else Warming(*per_kelvin, at_C, mixture.covariance[-NUISANCES, :-NUISANCES]),
         contact=with_force(contacts.contact),
         chi2=contacts.chi2,
         freedom=freedom,
@@ -240,17 +240,18 @@ class _Fit:
     covariance: Array
 
     @classmethod
-    def of(cls, charges: FilmCharges, before: FilmEstimate, *, warmed: bool = False) -> "_Fit":
+    def of(cls, charges: FilmCharges, before: FilmEstimate, *, knows_temperature: bool) -> "_Fit":
         """The coefficients are zero, if nothing is known of them; temperature counts if it is known."""
         n, known = len(before.parameters), before.unknowns.size
         size = n + charges.n_coefficient + NUISANCES
         mean, covariance = np.zeros(size), np.zeros((size, size))
         mean[:known] = np.concatenate([before.parameters / charges.prior.std, before.coefficients])
         covariance[:known, :known] = before.of_unknowns
-        if warmed:
-            warming = before.warming or Warming(0.0, PER_KELVIN)
+        if knows_temperature and (warming := before.warming):
             mean[-NUISANCES], covariance[-NUISANCES, -NUISANCES] = warming.MPa_per_K, warming.std**2
-            covariance[0, -NUISANCES] = covariance[-NUISANCES, 0] = warming.shared / charges.prior.std[0]
+            covariance[:known, -NUISANCES] = covariance[-NUISANCES, :known] = warming.covariance
+        elif knows_temperature:
+            covariance[-NUISANCES, -NUISANCES] = PER_KELVIN**2
         return cls(charges, mean, covariance)
 
     @property
@@ -276,15 +277,15 @@ class _Fit:
         begin = search_places(self.charges, film, data) if start is None else start
         return adjust_contacts(self.charges, film, data, begin)
 
-    def slopes(self, unit: Array, data: PressData, contacts: AdjustedContacts, *, besides: bool = True) -> Array:
+    def slopes(self, unit: Array, data: PressData, contacts: AdjustedContacts, *, coefficients: bool = True) -> Array:
         """Derivatives of the residuals by the unknowns once the contacts follow, (n, n_electrode + 3, n_unknown).
 
-        Those by what a film has besides its parameters take time; they are zero if they are not wanted.
+        Those by `coefficients` take time; they are zero if they are not wanted.
         """
         at, n = with_force(contacts.contact), len(self.charges.prior.names)
         films, shares = self._films(unit, data)
         parts = [self.charges.by_contact(film, at) for film in films]
-        by_contact, wanted = sum_over(parts, shares), None if besides else n
+        by_contact, wanted = sum_over(parts, shares), None if coefficients else n
         by_film = sum_over(
             [self.charges.by_parameter(film[:wanted], at, part) for film, part in zip(films, parts, strict=True)],
             shares,
@@ -304,7 +305,7 @@ class _Fit:
         data = data.scattered(hypothesis.scatter)
         covariance, root = self._before(hypothesis), np.sqrt(weight)
         active = np.diag(covariance) > 0.0
-        besides = bool(active[len(self.charges.prior.names) : -NUISANCES].any())
+        coefficients = bool(active[len(self.charges.prior.names) : -NUISANCES].any())
         of_prior = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(active, active)]))
         low, high = (bound[active] for bound in self.bounds)
         last: list[tuple[Array, _Solved]] = []
@@ -323,7 +324,7 @@ class _Fit:
 
         def jacobian(some: Array) -> Array:
             unit, contacts = solved_at(some)
-            rows = self.slopes(unit, data, contacts, besides=besides)[:, :, active] * root[:, None, None]
+            rows = self.slopes(unit, data, contacts, coefficients=coefficients)[:, :, active] * root[:, None, None]
             return np.concatenate([rows.reshape(-1, some.size), of_prior])
 
         begin = np.clip(start[active], low + MARGIN, high - MARGIN)

@@ -4,7 +4,7 @@
     FOLDER/<version>/model.onnx    the model of this film, with golden.json and card.md as every model
     FOLDER/<version>/sensor.toml   the calibrated sensor
     FOLDER/<version>/calibration.json    parameters, errors, correlations, what cannot be identified
-    FOLDER/<version>/presses.csv   the presses
+    FOLDER/<version>/presses.csv   the presses, unless it was moved to another temperature without any
     FOLDER/<version>/pretensions.npz     weights for `serve stream --follow`, with four electrodes or more
     FOLDER/<version>/calibration.png
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the last version's
@@ -41,7 +41,7 @@ from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses
 from isocharge.simulate.plots.figure import picture_bytes
 from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
-from isocharge.train.calibration.calibrate import CalibrationResult
+from isocharge.train.calibration.calibrate import CalibrationResult, film_without_presses
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.film_fit import FilmPosterior
 from isocharge.train.calibration.following import pretensions_of
@@ -170,9 +170,10 @@ def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
     files = {
         RESULT: json.dumps(plain_values(result_table(result)), indent=1, allow_nan=False).encode(),
         SENSOR: sensor_to_toml(result.film[0]).encode(),
-        PRESSES: presses_text(result.presses).encode(),
         PICTURE: picture_bytes(calibration_picture(result)),
     }
+    if not result.moved:
+        files[PRESSES] = presses_text(result.presses).encode()
     fitted = result.fitted
     if (pretensions := pretensions_of(result, fitted.network)) is not None:
         files[PRETENSIONS] = pretensions.to_bytes()
@@ -211,11 +212,16 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _temperature(posterior: FilmPosterior) -> dict[str, Any] | None:
-    """What temperature does to the pretension, in C and Pa/K, if that of the presses is known."""
+    """What temperature does to the pretension, in C and Pa/K, correlated with all unknowns, if it is known."""
     if (known := posterior.warming) is None:
         return None
-    units = FILE_UNITS["pretension"]
-    return {"at_C": known.at_C, "pretension_per_K": {"value": units * known.MPa_per_K, "std": units * known.std}}
+    units, count = FILE_UNITS["pretension"], len(posterior.joint if posterior.imperfect else posterior.covariance)
+    std = known.std * np.sqrt(np.diag(posterior.joint))
+    return {
+        "at_C": known.at_C,
+        "pretension_per_K": {"value": units * known.MPa_per_K, "std": units * known.std},
+        "correlations": np.round(known.covariance[:count] / std[:count], 6).tolist(),
+    }
 
 
 def _discrepancy(posterior: FilmPosterior) -> dict[str, Any] | None:
@@ -243,6 +249,7 @@ class _Parameter(Struct, frozen=True):
 class _Temperature(Struct, frozen=True):
     at_C: float
     pretension_per_K: _Parameter
+    correlations: list[float] = []  # older versions wrote none
 
 
 class _Discrepancy(Struct, frozen=True):
@@ -261,20 +268,39 @@ class _Earlier(Struct, frozen=True):
     temperature: _Temperature | None = None
 
 
-def read_earlier(
-    folder: Path, problem: CalibrationProblem, *, thermometer: bool = False, at_C: float | None = None
-) -> FilmEstimate:
+def read_earlier(folder: Path, problem: CalibrationProblem, *, knows_temperature: bool = False) -> FilmEstimate:
     """The film of an earlier calibration, with what may have drifted since.
 
     Args:
         folder: As `write_calibration` made it, or one of its version folders.
         problem: The new calibration.
-        thermometer: Whether the temperatures of the new presses are known.
-        at_C: Gives the film as it was calibrated, at this temperature, degrees Celsius, and without drift.
+        knows_temperature: Whether the temperatures of the new presses are known.
 
     Raises:
-        PressError: If the folder has no calibration, or one of other parameters, or does not know the temperature.
+        PressError: If the folder has no calibration, or one of other parameters.
     """
+    return _read(folder, problem)[1].drifted(problem.prior, knows_temperature=knows_temperature)
+
+
+def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> CalibrationResult:
+    """An earlier calibration at another temperature, degrees Celsius, without presses and without drift.
+
+    Raises:
+        PressError: As `read_earlier`, and if it is not known what temperature does to this film.
+    """
+    path, film = _read(folder, problem)
+    if film.warming is None or not film.warming.identified:
+        raise PressError(
+            f"{path}: this calibration does not know what temperature does to the film: it takes presses with a column "
+            "temperature_C, over a few degrees"
+        )
+    version = "/".join(path.parts[-3:-1])
+    moved = f"moved from {film.warming.at_C:.1f} C, {version}, to {to_C:.1f} C by the change that it knows"
+    return film_without_presses(replace(problem, earlier=film), film.at_temperature(to_C, problem.prior), moved)
+
+
+def _read(folder: Path, problem: CalibrationProblem) -> tuple[Path, FilmEstimate]:
+    """The file of an earlier calibration, and its film."""
     calibrated = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
     path, prior = [folder, *calibrated][-1] / RESULT, problem.prior
     table = read_json(path, "the calibration.json of `train calibrate`", PressError, _Earlier)
@@ -285,7 +311,7 @@ def read_earlier(
             f"{prior.sensor.name!r} with {', '.join(prior.names)}"
         )
     value, std = np.array([[entry.value, entry.std] for entry in table.parameters.values()]).T / _units(prior)
-    film = FilmEstimate(value, _covariance(path, table.correlations, std / prior.std), warming=_warming(table))
+    film = FilmEstimate(value, _covariance(path, table.correlations, std / prior.std))
     if (known := table.discrepancy) is not None:
         size, count = len(names) + problem.charges.n_coefficient, len(known.coefficients)
         if len(names) + count != size or len(known.std) != size:
@@ -294,14 +320,16 @@ def read_earlier(
             )
         joint = _covariance(path, known.correlations, np.array(known.std))
         film = replace(film, coefficients=np.array(known.coefficients), joint=joint)
-    return film.drifted(prior, thermometer=thermometer) if at_C is None else film.at_temperature(at_C, prior)
+    return path, film if table.temperature is None else replace(film, warming=_warming(path, table.temperature, film))
 
 
-def _warming(table: _Earlier) -> Warming | None:
-    if (room := table.temperature) is None:
-        return None
-    unit = FILE_UNITS["pretension"]
-    return Warming(room.pretension_per_K.value / unit, room.pretension_per_K.std / unit, room.at_C)
+def _warming(path: Path, known: _Temperature, film: FilmEstimate) -> Warming:
+    std = np.sqrt(np.diag(film.of_unknowns))
+    correlations = np.array(known.correlations or np.zeros(std.size))
+    if correlations.size != std.size:
+        raise PressError(f"{path}: temperature: expected {std.size} correlations, got {correlations.size}")
+    change, change_std = np.array([known.pretension_per_K.value, known.pretension_per_K.std]) / FILE_UNITS["pretension"]
+    return Warming(float(change), float(change_std), known.at_C, correlations * std * change_std)
 
 
 def _covariance(path: Path, correlations: list[list[float]], std: Array) -> Array:
@@ -318,6 +346,7 @@ def _card(result: CalibrationResult, about: ModelMetadata) -> str:
     """The text of the card."""
     sensor, probe = result.film
     low, high = about.force_range_N
+    made = f"{result.moved}," if result.moved else f"calibrated on {len(result.presses)} presses"
     sentences = "\n".join(f"- {sentence}" for sentence in result.summary)
     rows = "\n".join(
         f"| `{quantity.name}` | {quantity.meaning} | {quantity.value:.4g} | {quantity.std:.2g} | "
@@ -326,7 +355,7 @@ def _card(result: CalibrationResult, about: ModelMetadata) -> str:
     )
     return f"""# {about.name}, version {about.version}: a calibrated film
 
-The sensor `{sensor.name}`, calibrated on {len(result.presses)} presses with `{probe.notation}` (radius as found).
+The sensor `{sensor.name}`, {made} with `{probe.notation}` (radius as found).
 The model answers within {result.problem.domain.radius:g} mm of the centre, {low:g} to {high:g} N.
 
 {sentences}

@@ -28,13 +28,17 @@ def calibration_picture(result: CalibrationResult) -> Figure:
     """Maps of the error that the film leaves, quantities in units of what was assumed, residuals of the presses."""
     figure = new_figure(15.0, 9.4)
     (before, after), (identified, residuals) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
-    _draw_error(before, result, result.left_before, "before the presses")
-    shades = _draw_error(after, result, result.left, f"after {len(result.presses)} presses")
+    titles = "before the presses", f"after {len(result.presses)} presses"
+    if result.moved:
+        titles = "before it was moved", "moved to another temperature"
+    _draw_error(before, result, result.left_before, titles[0])
+    shades = _draw_error(after, result, result.left, titles[1])
     contact, bad = result.posterior.contact, result.posterior.bad
     after.plot(*contact[~bad, :2].T, "o", color="white", mec=INK, ms=6, label="presses")
     if bad.any():
         after.plot(*contact[bad, :2].T, "X", color=FELT, mec=INK, ms=9, label="left out")
-    after.legend(loc="upper right", fontsize=8)
+    if len(contact):
+        after.legend(loc="upper right", fontsize=8)
     label = "rms error of the position that the film leaves, mm"
     figure.colorbar(shades, ax=[before, after], label=label, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g")
     _draw_quantities(identified, result)

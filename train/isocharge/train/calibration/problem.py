@@ -1,6 +1,5 @@
 """What a calibration is about: the film as it is described, and the network for all films that fits its layout."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -33,9 +32,14 @@ REMOUNTED = 0.03
 UNSTEADY = 0.002
 """Standard deviation by which coefficients of a discrepancy may have changed."""
 
-
 THERMOMETER = 0.1
 """Standard deviation of the same for the pretension where the temperatures of both days are known: creep."""
+
+PER_KELVIN = 0.4
+"""Standard deviation of the pretension's change with temperature, MPa/K: E da / (1 - nu), 0.3 to 0.44 on aluminium."""
+
+IDENTIFIED = 0.5
+"""Standard deviation after the presses over that before, below which a quantity counts as identified, dimensionless."""
 
 
 class Warming(NamedTuple):
@@ -45,13 +49,23 @@ class Warming(NamedTuple):
         MPa_per_K: Change of the pretension.
         std: Its standard deviation, MPa/K.
         at_C: Temperature at which the film is given, degrees Celsius.
-        shared: Covariance of this change and the pretension, MPa^2/K, where the film was moved to that temperature.
+        covariance: Of this change and the film's unknowns, parameters over their prior standard deviations, shape
+            (n_unknown,), MPa/K.
     """
 
     MPa_per_K: float
     std: float
-    at_C: float = math.nan
-    shared: float = 0.0
+    at_C: float
+    covariance: Array
+
+    @property
+    def identified(self) -> bool:
+        """Whether presses have at least halved its standard deviation."""
+        return self.std <= IDENTIFIED * PER_KELVIN
+
+    def of_unknowns(self, count: int) -> "Warming":
+        """Beside the first unknowns of a film, or beside more, which do not depend on it."""
+        return self._replace(covariance=np.pad(self.covariance, (0, count))[:count])
 
 
 @dataclass(frozen=True)
@@ -83,13 +97,13 @@ class FilmEstimate:
         """Their covariance."""
         return self.joint if self.coefficients.size else self.covariance
 
-    def drifted(self, prior: FilmPrior, *, thermometer: bool = False) -> "FilmEstimate":
+    def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> "FilmEstimate":
         """What is left of an earlier estimate after the film may have drifted (`DRIFT`).
 
-        `thermometer` says that temperatures are known since as well.
+        `knows_temperature` says that temperatures are known since as well.
         """
         drift = np.array([DRIFT.get(name.partition(" ")[0], REMOUNTED) for name in prior.names])
-        if thermometer and self.warming:
+        if knows_temperature and self.warming:
             drift[0] = THERMOMETER
         wider, joint = self.covariance + np.diag(drift**2), self.joint
         if joint.size:
@@ -97,30 +111,31 @@ class FilmEstimate:
         return FilmEstimate(np.clip(self.parameters, *prior.bounds), wider, self.coefficients, joint, self.warming)
 
     def at_temperature(self, at_C: float, prior: FilmPrior) -> "FilmEstimate":
-        """The film at another temperature.
+        """The film at another temperature, a linear map of what is known: there and back is the same film.
+
+        Without `warming` nobody knows at which temperature it is given, and it stays as it is.
 
         Raises:
-            PressError: If it is not known what temperature does to this film, or a film is not followed so far.
+            PressError: If the films do not reach so far.
         """
         if self.warming is None:
-            raise PressError(
-                "this calibration does not know what temperature does to the film: it takes presses with a column "
-                "temperature_C, over a few degrees"
-            )
-        warmer = at_C - self.warming.at_C
-        parameters, wider = self.parameters.copy(), np.zeros_like(self.of_unknowns)
-        parameters[0] += warmer * self.warming.MPa_per_K
-        wider[0, 0] = (warmer * self.warming.std / prior.std[0]) ** 2
+            return self
+        warmer = (at_C - self.warming.at_C) / prior.std[0]
+        parameters, covariance = self.parameters.copy(), self.of_unknowns.copy()
+        parameters[0] += (at_C - self.warming.at_C) * self.warming.MPa_per_K
+        of_change = self.warming.covariance.copy()
+        covariance[0] += warmer * of_change
+        of_change[0] += warmer * self.warming.std**2
+        covariance[:, 0] += warmer * of_change
         low, high = (float(bound[0]) for bound in prior.bounds)
         if not low <= parameters[0] <= high:
             raise PressError(
                 f"at {at_C:g} C the pretension would be {parameters[0]:.2f} MPa; expected {low:g} to {high:g} MPa: a "
                 "temperature nearer to that of the presses"
             )
-        joint = self.joint + wider if self.joint.size else self.joint
-        covariance = self.covariance + wider[: len(parameters), : len(parameters)]
-        warming = self.warming._replace(at_C=at_C, shared=warmer * self.warming.std**2)
-        return FilmEstimate(parameters, covariance, self.coefficients, joint, warming)
+        n, warming = len(parameters), self.warming._replace(at_C=at_C, covariance=of_change)
+        joint = covariance if self.joint.size else self.joint
+        return FilmEstimate(parameters, covariance[:n, :n], self.coefficients, joint, warming)
 
 
 @dataclass(frozen=True)
@@ -180,27 +195,27 @@ class CalibrationProblem:
         self,
         parameters: Array,
         left: tuple[Array, Array],
-        besides: Callable[[Array], Array],
+        factor: Callable[[Array], Array],
         *,
-        whole: bool = True,
+        release: bool = True,
     ) -> Fitted:
-        """The network of a film, arguments as `FilmsModel.film` takes them, `besides` its factor.
+        """The network of a film, arguments as `FilmsModel.film` takes them.
 
         What the described electrodes have that the network's do not have is one more factor: its mean counts as gains,
-        and the network's last layer is changed for the rest. Only a `whole` one learns correlations and is judged.
+        and the network's last layer is changed for the rest. Only one for `release` learns correlations and is judged.
         """
-        about: dict[str, Any] = {} if whole else {"correlation": False, "fresh": 0}
+        about: dict[str, Any] = {} if release else {"correlation": False, "fresh": 0}
         if self.prior is self.films.prior:
-            return self.films.film(parameters, left=left, factor=besides, **about)
+            return self.films.film(parameters, left=left, factor=factor, **about)
         described, own = self.charges.forward_map(parameters), self.films.forward_map(parameters)
         scaled = parameters.copy()
         scaled[len(SHARED) :] += np.log(described.charges(left[0]) / own.charges(left[0])).mean(axis=0)
 
-        def factor(contact: Array) -> Array:
+        def over_network(contact: Array) -> Array:
             of_network = self.films.forward_map(scaled).charges(contact)
-            return np.asarray(besides(contact) * described.charges(contact) / of_network)
+            return np.asarray(factor(contact) * described.charges(contact) / of_network)
 
-        fitted = self.films.film(scaled, left=left, factor=factor, **about)
+        fitted = self.films.film(scaled, left=left, factor=over_network, **about)
         return replace(fitted, sensor=described.sensor)
 
     @property

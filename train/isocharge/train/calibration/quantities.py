@@ -14,10 +14,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.sensor.film_prior import FilmPrior
-from isocharge.train.calibration.problem import FilmEstimate
-
-IDENTIFIED = 0.5
-"""Standard deviation after the presses over that before, below which a quantity counts as identified, dimensionless."""
+from isocharge.train.calibration.problem import IDENTIFIED, FilmEstimate
 
 PERCENT = ", over the described one"
 """How quantities are given whose size is described, but not known."""
