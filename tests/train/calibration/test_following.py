@@ -178,6 +178,17 @@ def test_a_gain_that_is_wrong_is_not_followed(mine, problem, film, electrode, ch
     assert (FILM in records[-1].flags) == flagged
 
 
+def test_a_gain_that_goes_off_late_is_not_followed(mine, problem, film):
+    """By 0.3 MPa if 25 minutes of good touches had told the gains for good."""
+    follower, rng, pretensions = FilmFollower(Predictor(mine)), np.random.default_rng(4), []
+    charge = problem.noise.add(film(1.0).charges(draw_contacts(rng, problem.domain, 360)), rng)
+    charge[300:, 0] *= 0.985
+    for number, row in enumerate(charge):
+        follower.take(row, 5.0 * number)
+        pretensions.append(follower.film.pretension_MPa)
+    assert np.ptp(pretensions[299:]) < 0.1
+
+
 def test_between_its_pretensions_it_is_the_network_for_all_films(mine, problem):
     """Interpolated weights against the network that `calibrate` folds for that film."""
     known, folder = read_pretensions(mine / "1"), mine / "1"

@@ -3,11 +3,12 @@
 Four charges have one number to spare for three unknowns: the misfit. A film that has become tauter or slacker, as by a
 degree of the room, lets the misfits of all touches grow, and the pretension at which they are least is the film's. It
 is estimated by Bayes' rule on a fixed set of pretensions, with a random walk between touches; one touch gives one
-number, by its hardest frame. Gains drift as well, those of each electrode by 1 %, and the misfits of touches are linear
-in them: at every pretension there is a Kalman filter for the gains (Rao and Blackwell's way, Doucet et al. 2000), so
-that what gains explain as well is not taken for a change of the film. A touch that no pretension explains says next to
-nothing. When the last ones are of that kind (two contacts, the warmth of a hand), or are explained far better by a gain
-that is wrong, the film is not followed any farther: the model answers for the film as it was before them.
+number, by its hardest frame. Gains drift as well, those of each electrode by 1 % about one, and the misfits of touches
+are linear in them: at every pretension there is a Kalman filter for the gains (Rao and Blackwell's way, Doucet et al.
+2000), so that what gains explain as well is not taken for a change of the film. A touch that no pretension explains
+says next to nothing. When the last ones are of that kind (two contacts, the warmth of a hand), or are explained far
+better by a gain that is wrong, the film is not followed any farther: the model answers for the film as it was before
+them.
 """
 
 import math
@@ -53,6 +54,9 @@ EXPLAINED, SCATTER = 1.25, 5.0
 
 GAIN = 0.01
 """Standard deviation of the drift of a gain, and step of the differences by it."""
+
+GAIN_s = 1800.0
+"""Time in which a gain forgets where it was (Ornstein-Uhlenbeck): less, and a film that changes is followed late."""
 
 GAINS = np.outer([-1.0, 1.0], [0.03, 0.04, 0.06, 0.09]).ravel()
 """Wrong gains that are tried on each electrode in the place of another pretension."""
@@ -213,9 +217,11 @@ class FilmFollower:
 
     def _walk(self, clock_s: float) -> None:
         """Widen the distribution by the drift since the touch before, and by what may have changed at once."""
-        hours = 0.0 if self._when_s is None else max(clock_s - self._when_s, 0.0) / 3600.0
-        self._when_s, self._walked = clock_s, self._walked + self._drift**2 * hours
-        gains = np.concatenate([self._gain, self._spread.reshape(self._grid.size, -1)], axis=1)
+        seconds = 0.0 if self._when_s is None else max(clock_s - self._when_s, 0.0)
+        self._when_s, self._walked = clock_s, self._walked + self._drift**2 * seconds / 3600.0
+        kept = math.exp(-seconds / GAIN_s)
+        spread = kept**2 * self._spread + (1.0 - kept**2) * np.eye(self._gain.shape[1])
+        gains = np.concatenate([kept * self._gain, spread.reshape(self._grid.size, -1)], axis=1)
         mass = self._probability[:, None] * np.column_stack([np.ones(self._grid.size), gains])
         if (std := float(np.sqrt(self._walked))) >= STEP_MPa:
             reach = min(round(4.0 * std / STEP_MPa), self._grid.size)
