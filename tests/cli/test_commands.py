@@ -1,6 +1,5 @@
 """The command line as a user meets it: help, exit codes, data on stdout, words on stderr, nothing half-written."""
 
-import csv
 import io
 import json
 import os
@@ -56,18 +55,12 @@ SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1"]
 """A sweep of a small family."""
 
 
-def test_a_sweep_as_tables_for_other_programs(command, tmp_path):
-    """Read by pyarrow and by Python's csv, against the dataset beside them."""
-    tables = tmp_path / "a.parquet", tmp_path / "b.csv"
-    for table in tables:
-        assert command(*SMALL, "--samples", "5", "-o", table)[0] == 0
-    samples = read_dataset(tmp_path / "a").samples
-    parquet = read_table(tables[0]).to_pydict()
-    with tables[1].open(newline="") as lines:
-        text = {name: [float(row[name]) for row in rows] for rows in [list(csv.DictReader(lines))] for name in rows[0]}
-    for columns in (parquet, text):
-        assert columns["x_mm"] == samples.x_mm.tolist()
-        assert np.column_stack([columns[name] for name in "ABC"]).tolist() == samples.charge_pC.tolist()
+def test_a_sweep_as_a_table_for_other_programs(command, tmp_path):
+    """Read by pyarrow, against the dataset beside it."""
+    assert command(*SMALL, "--samples", "5", "-o", tmp_path / "a.parquet")[0] == 0
+    samples, columns = read_dataset(tmp_path / "a").samples, read_table(tmp_path / "a.parquet").to_pydict()
+    assert columns["x_mm"] == samples.x_mm.tolist()
+    assert np.column_stack([columns[name] for name in "ABC"]).tolist() == samples.charge_pC.tolist()
     refused = {
         "a table of presses has one probe": (
             "--probe",
@@ -77,7 +70,7 @@ def test_a_sweep_as_tables_for_other_programs(command, tmp_path):
             "-o",
             tmp_path / "c.csv",
         ),
-        "the dataset that belongs beside": ("-o", tmp_path / "b.parquet"),
+        "the dataset that belongs beside": ("-o", tmp_path / "a.csv"),
         "is already there": ("-o", "."),
     }
     for said, words in refused.items():
@@ -195,6 +188,7 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
     assert warm["charge_pC"]["B"] - cold["charge_pC"]["B"] == pytest.approx(-27.0)
 
 
+@pytest.mark.slow
 def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
     """Three uniaxial electrodes fold within 8 mm, and the user is told."""
     monkeypatch.setattr("isocharge.cli.shared.forward_maps.SAMPLES", 4000)
@@ -290,6 +284,7 @@ def quick(folder):
     return path
 
 
+@pytest.mark.slow
 def test_the_demo_end_to_end(command, tmp_path, monkeypatch):
     """The whole path with everything in it but the long sweep and training."""
     monkeypatch.setattr("isocharge.cli.demo.command.SAMPLES", 4000)

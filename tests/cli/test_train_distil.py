@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from isocharge.cli.train import distil
 from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
@@ -21,6 +23,7 @@ batch = 256
 """
 
 
+@pytest.mark.slow
 def test_a_student_serves(command, tmp_path, monkeypatch):
     """Of presses as MODEL knows them; 3,000 here, on a film that is solved once for all tests."""
     asked = []

@@ -39,6 +39,7 @@ def fitted(film, tmp_path_factory):
     return fit(read_dataset(write_sweep(tmp_path_factory.mktemp("taut") / "presses", (film,), sweep)), QUICK)
 
 
+@pytest.mark.slow
 def test_presses_with_negative_charges_are_located_as_well_as_others(film, fitted):
     some = fitted.test[np.arange(150)]
     charge = some.noisy(fitted.noise, 1)
@@ -54,6 +55,7 @@ def test_presses_with_negative_charges_are_located_as_well_as_others(film, fitte
         assert np.mean(np.abs(contact - some.contact)[rows] < std[rows]) == pytest.approx(0.68, abs=0.07)
 
 
+@pytest.mark.slow
 def test_its_model_is_served_and_its_misfit_sees_what_is_below_zero(fitted, tmp_path):
     """Four charges, three unknowns: 1 % of good presses exceed 2.58, the half-normal distribution's."""
     model = release(fitted, tmp_path / "models" / "taut")
