@@ -7,6 +7,7 @@ The folder of the project is the source, so links between pages hold here and wh
 
 import shutil
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ html_copy_source = html_show_sphinx = html_show_copyright = False
 html_title = project
 suppress_warnings = ["ref.python"]  # attributes of one name in many classes are not linked
 
+# Workers that have grown are renewed, and that is said in a warning.
+warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
 sphinx_gallery_conf = {
     "examples_dirs": [f"{name}/examples" for name in PORTIONS],
     "gallery_dirs": [f"{GALLERY}/{name}" for name in PORTIONS],
@@ -43,6 +46,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_signature": False,
     "write_computation_times": False,
+    "parallel": 2,
     "copyfile_regex": r".*\.csv",
 }
 
