@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.train.calibration.conftest import coarse  # noqa: F401  (a fixture of this module, too)
 
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, Screen, Stopped
 from isocharge.common.errors import PortLost
@@ -15,9 +16,7 @@ from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_fram
 from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, Watched
 from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
-from isocharge.train.calibration import contact_error
 from isocharge.train.calibration.folder import SESSION
-from isocharge.train.training import correlation
 
 NAMES = ("A", "B", "C", "D")
 RATE_HZ = 200.0
@@ -155,16 +154,6 @@ def test_presses_of_a_machine_are_those_of_its_list(capsys):
 def test_a_port_that_goes_away_under_a_machine_ends_the_session():
     with pytest.raises(PortLost, match="go on with row 2 of its list"):
         dialogue(TARED, STEADY, refused(AWAY), contacts=LIST)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _coarse():
-    """Errors over fewer contacts, fewer places to press, correlations from fewer examples: a fourth of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contact_error, "CONTACTS", 50)
-        patch.setattr(contact_error, "PLACES", 30)
-        patch.setattr(correlation, "EXAMPLES", 3_000)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -73,6 +73,24 @@ def test_nobody_gets_more_than_he_draws(page, record, viewer, turns):
     assert len(rows) < 600
 
 
+def test_a_stalled_viewer_holds_up_neither_reader_nor_others(page, record, viewer):
+    async def talk(client):
+        async with connect(page.live) as stalled:
+            stalled.transport.pause_reading()
+            seen = 0
+            await client.samples()
+            for _ in range(50):
+                put(page, record, 10)
+                seen += (await client.samples())[1]["records"].sum()
+            while seen < 500:
+                seen += (await client.samples())[1]["records"].sum()
+            stalled.transport.resume_reading()
+            return seen
+
+    assert viewer(page, talk) == 500
+    assert page.reader.dropped == 0
+
+
 def test_states_reach_the_viewer(page, viewer):
     async def talk(client):
         page.reader.tell(counters={"frames": 7}, recording="x.rec")

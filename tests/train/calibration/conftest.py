@@ -12,7 +12,7 @@ from isocharge.train.training import correlation
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _coarse():
+def coarse():
     """Errors over fewer contacts, fewer places to press, correlations from fewer examples: a fourth of the time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contact_error, "CONTACTS", 50)
