@@ -339,11 +339,11 @@ def test_what_no_film_explains_is_refused(problem):
 def test_proposed_presses_tell_more_than_random_ones(problem):
     left = [press.position_mm for press in next_presses(problem, 5)]
     assert left == sorted(left, reverse=True)
-    mean, at_random = problem.prior.mean, []
-    sensitivity = ContactSensitivity.at(problem, mean)
+    film, at_random = problem.expected, []
+    sensitivity, before = ContactSensitivity.at(problem, film.unknowns), np.linalg.inv(film.joint)
     for seed in range(8):
         at = draw_contacts(np.random.default_rng(seed), problem.domain, 5)
-        information = np.eye(mean.size) + information_of(problem, mean, at).sum(axis=0)
+        information = before + information_of(problem, film.unknowns, at).sum(axis=0)
         at_random.append(sensitivity.left(np.linalg.inv(information)).position_mm)
     assert left[-1] < 0.8 * np.median(at_random)
 

@@ -162,7 +162,7 @@ def calibrate_command(
             version = write_calibration(result, output, this_command())
             (output / SESSION).unlink(missing_ok=True)
             say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
-    known = result.posterior if result else problem.before
+    known = result.posterior if result else None
     proposed: list[ProposedPress] = []
     if next_count:
         proposed = next_presses(problem, next_count, known, position_std_mm=position_std_mm, force_std=force_std)

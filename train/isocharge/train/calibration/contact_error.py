@@ -196,7 +196,7 @@ def next_presses(
     Args:
         problem: The films.
         count: How many.
-        film: What is known by now: the posterior of a result; what is known before the first press if absent.
+        film: What is known by now: the posterior of a result; `problem.expected` if absent.
         position_std_mm: How well the presses' places will be known, mm.
         force_std: How well their forces will be known, share.
         avoid_mm: Places that cannot be pressed, shape (n, 2), mm; nothing within `AVOIDED_MM` of them is proposed.
@@ -205,7 +205,7 @@ def next_presses(
         PressError: If every place is to be avoided.
         SceneError: If even the smallest force exceeds the stress limit.
     """
-    film = film or problem.before
+    film = film or problem.expected
     sensitivity = ContactSensitivity.at(problem, film.unknowns)
     avoid_mm = np.empty((0, 2)) if avoid_mm is None else avoid_mm
     candidates = _candidates(problem.domain.radius, problem.proposed_forces, avoid_mm)

@@ -131,7 +131,7 @@ class PressSession:
             PressError: If every place was skipped.
         """
         if self._proposed is None:
-            film, avoid = self.problem.before, np.reshape(self._skipped, (-1, 2))
+            film, avoid = self.problem.expected, np.reshape(self._skipped, (-1, 2))
             count = len(self) + 1  # of a plan for presses that no film explains
             if self.result:
                 film, count = self.result.posterior, 1
