@@ -69,12 +69,13 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
     """
     examples = presses[np.arange(max(EXAMPLES, len(presses))) % len(presses)]
     charge, truth = examples.noisy(noise, seed), examples.contact
-    contact, std, _ = network.predict(charge)
-    errors = np.column_stack([truth[:, :2] - contact[:, :2], np.log(truth[:, 2] / contact[:, 2])])
     logs = network.inputs(charge)
+    features = network.layers.features(logs)
+    contact, std, *_ = network.of_answers(network.layers.from_features(features, logs))
+    errors = np.column_stack([truth[:, :2] - contact[:, :2], np.log(truth[:, 2] / contact[:, 2])])
     weight, bias = network.layers.last
     of_contact = weight[:, :KNOWN].any(axis=1)
-    features = np.hstack([network.layers.features(logs)[:, of_contact], logs])
+    features = np.hstack([features[:, of_contact], logs])
     deviation = errors / np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]])
     with threadpool_limits(1):  # many small steps: two threads take three times as long
         slopes, angles = _fit_angles(features, deviation)

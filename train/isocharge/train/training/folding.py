@@ -77,9 +77,10 @@ class FoldedLayers:
 
     def answers(self, logs: Array) -> Array:
         """Logarithms of the charges (n, n_electrode) to (n, n_answer), in double precision."""
-        return self._from_features(self.features(logs), logs)
+        return self.from_features(self.features(logs), logs)
 
-    def _from_features(self, features: Array, logs: Array) -> Array:
+    def from_features(self, features: Array, logs: Array) -> Array:
+        """The same from what `features` gives of them."""
         return np.asarray(features @ self.last[0] + self.last[1] + logs @ self.skip)
 
     def features(self, logs: Array) -> Array:
@@ -99,7 +100,7 @@ class FoldedLayers:
             wanted: From the present answers to these, both of shape (n, n_answer).
         """
         features = self.features(logs)
-        before = self._from_features(features, logs)
+        before = self.from_features(features, logs)
         change = wanted(before) - before
         design = np.column_stack([features, logs, np.ones(len(logs))])
         weights = np.vstack([self.last[0], self.skip, self.last[1]])
@@ -160,7 +161,10 @@ class FoldedNetwork:
 
     def outputs(self, charge: Array) -> tuple[Array, ...]:
         """As `predict`; between deviations and misfit contact_correlation (n, 3), if the network gives it."""
-        answers = self.layers.answers(self.inputs(charge))
+        return self.of_answers(self.layers.answers(self.inputs(charge)))
+
+    def of_answers(self, answers: Array) -> tuple[Array, ...]:
+        """The same from what the layers answer."""
         known, angles, vector = np.split(answers, [KNOWN, KNOWN + self.angles], axis=1)
         contact = np.concatenate([known[:, :2], np.exp(known[:, 2:3])], axis=1)
         correlation = (np.cos(angles) @ COSINES,) if self.angles else ()
