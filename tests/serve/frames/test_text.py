@@ -213,6 +213,14 @@ def test_clock_in_text_that_begins_anew_has_not_wrapped():
     assert clock.restarts == 1
 
 
+def test_number_in_text_that_begins_anew_has_not_wrapped():
+    parser, gaps = TextParser(), SequenceGaps()
+    for k in [*range(290, 301), *range(20)]:
+        for frame in feed(f"seq:{k},A:1", parser=parser):
+            gaps.update(frame.seq, parser.seq_modulus)
+    assert (gaps.lost, gaps.repeated, gaps.restarts) == (0, 0, 1)
+
+
 @pytest.mark.parametrize("modulus", [100, 256, 1000, 65536])
 def test_number_in_text_that_wraps(modulus):
     parser, gaps = TextParser(), SequenceGaps()

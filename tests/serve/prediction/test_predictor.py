@@ -161,6 +161,12 @@ def test_a_predictor_tells_whether_to_trust_a_contact(film, predictor):
     assert predictor.flags(predictor.predict(outside)) == ("outside",)
 
 
+@pytest.mark.parametrize("place", [(200.0, 0.0), (0.0, 200.0), (150.0, -150.0)])
+def test_what_is_far_from_the_film_is_no_measurement(models, film, caplog, place):
+    Predictor("linear", models=models).predict(film.charge_pC(*np.array([[*place, 1.0]]).T)[0])
+    assert len(caplog.messages) == 1
+
+
 def test_what_is_no_measurement_is_said_once(models, film, caplog):
     predictor = Predictor("linear", models=models)
     predictor.predict(film.charge_pC([0.0], [0.0], [5.9])[0])

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from isocharge.serve.signal_chain.chain import Chain, ChainState, advance
 from isocharge.serve.signal_chain.contact import Touch
@@ -54,6 +55,21 @@ def test_warming_that_is_inseparable_from_force_is_not_subtracted():
 def test_warming_of_a_quiet_film_stays_small():
     estimates, _ = warmed(UNIAXIAL, np.zeros(400))
     assert np.abs(estimates).max() < 5.0
+
+
+def test_charge_and_slope_are_estimated_by_a_kalman_filter():
+    """Of a slope that decays and walks at random, in matrices; the misfit weighs the sum of its direction's parts."""
+    rule, t, warmth_s, off_pC = ThermalRule(), 0.4, 1e3, 4.0
+    before, known = ThermalDrift(3.0, 40.0, covariance=5.0, rate_variance=20.0), np.array([[40.0, 5.0], [5.0, 20.0]])
+    flow = expm(t * np.array([[0.0, 1.0], [0.0, -1.0 / warmth_s]]))
+    walk = rule.wander_pC**2 * np.array([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]])
+    predicted = flow @ known @ flow.T + walk
+    across = np.linalg.svd(UNIAXIAL)[0][:, 3]
+    gain = predicted[:, 0] / (predicted[0, 0] + (rule.noise * 2.0 / across.sum()) ** 2)
+    after = track_thermal_drift(rule, before, PRESS + off_pC, misfit_of(UNIAXIAL), t, warmth_s=warmth_s)
+    found = after.charge_pC - 3.0, after.rate_pC_per_s, after.variance_pC2, after.covariance, after.rate_variance
+    left = predicted - np.outer(gain, predicted[0])
+    assert found == pytest.approx([*off_pC * gain, left[0, 0], left[0, 1], left[1, 1]], rel=1e-3)
 
 
 def test_misfit_is_evaluated_twenty_times_a_second():
