@@ -1,13 +1,13 @@
 """What README.md and the pages show is true: every example runs and prints what it says, links lead somewhere."""
 
 import re
-from pathlib import Path
 
 import pytest
 
-from isocharge.simulate import Circle, Sweep, load_sensor, run_sweep
+from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor
+from isocharge.simulate.dataset.sweep import write_sweep
+from kept import ROOT, kept
 
-ROOT = Path(__file__).parents[1]
 FOLDERS = ("simulate", "train", "serve")
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text("utf-8")
@@ -37,8 +37,8 @@ EXAMPLE_PAGES = [page for page in PAGES if not page.startswith(("serve/", "CONTR
 """Those of serve use ports (tests/serve), and CONTRIBUTING.md has recipes (tests/test_contributing.py)."""
 
 
-SLOW = ("simulate identify", "train report", "make paper")
-"""What takes an example of a README more than a few seconds."""
+SLOW = ("simulate identify", "train report", "make paper", "fit presses --config quick.toml")
+"""What takes an example of a README more than a few seconds, or stands in that of another."""
 
 
 def is_slow(example):
@@ -49,8 +49,8 @@ def is_slow(example):
 @pytest.fixture(scope="module")
 def presses(tmp_path_factory):
     """A dataset for the examples that begin with one."""
-    folder = tmp_path_factory.mktemp("data") / "presses"
-    return run_sweep(folder, load_sensor("three-25um-biaxial"), (Circle(1.0),), Sweep(samples=2000))
+    film = kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0))
+    return write_sweep(tmp_path_factory.mktemp("data") / "presses", (film,), Sweep(samples=2000))
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ from isocharge.simulate import (
     load_sensor,
     noise_model,
 )
+from isocharge.simulate.contours.candidates import NODE_SPACING, SeedGrid
 from isocharge.simulate.contours.fix import Meeting
 from kept import kept
 
@@ -57,6 +58,20 @@ def test_circles_are_trilaterated(layout):
     assert fix.found.mean() > 0.98  # two contours touch on the line between their electrodes
     assert errors(fix, contact).max() < 1e-3
     assert np.median(fix.spread[fix.found]) < 1e-5
+
+
+def test_seeds_are_as_far_from_contours_as_from_the_press():
+    """Charges (10 + x) F and (10 + y) F, whose contours are parallel to the axes."""
+    plane = FunctionMap(lambda c: (10.0 + c[:, :2]) * c[:, 2:], ("A", "B"), Domain(5.0, (0.5, 2.0)))
+    grid, at = SeedGrid.of(plane), draw(200, seed=2, radius=5.0, forces=(0.5, 2.0))
+    charge, away = plane.charges(at), np.linalg.norm(at[:, None, :2] - grid.at, axis=2)
+    assert away.min(axis=1).max() < 0.75 * NODE_SPACING
+    np.testing.assert_allclose(grid.distance(charge, at[:, 2:]), np.sqrt(0.5) * away, atol=0.02)
+    force = np.clip(charge.sum(axis=1)[:, None] / (20.0 + grid.at.sum(axis=1)), 0.5, 2.0)
+    np.testing.assert_allclose(grid.matching_force(charge), force, rtol=1e-3)
+    for x, outside in ((at[:, 0], False), (5.5, True), (-5.5, True)):
+        charge[:, 0] = (10.0 + x) * at[:, 2]
+        assert (grid.out_of_reach(charge, at[:, 2]) == outside).all()
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -1,5 +1,7 @@
 """A table of charges that the tests of layouts share, a small one: presses within 4 mm."""
 
+from dataclasses import replace
+
 import pytest
 
 from isocharge.simulate import Circle, load_sensor
@@ -16,5 +18,6 @@ def sensor():
 
 @pytest.fixture(scope="session")
 def tables(sensor):
-    sensors = (sensor, load_sensor("four-25um-uniaxial"))
-    return {s.name: kept(ChargeTable.solve, s, Circle(1.0), 1.0, RADIUS) for s in sensors}
+    """Of two sensors with the same film."""
+    table, uniaxial = kept(ChargeTable.solve, sensor, Circle(1.0), 1.0, RADIUS), load_sensor("four-25um-uniaxial")
+    return {sensor.name: table, uniaxial.name: replace(table, piezo=(uniaxial.piezo.d31, uniaxial.piezo.d32))}

@@ -1,8 +1,10 @@
 """The mesh's topology: what Euler and counting know of it."""
 
+import numpy as np
 import pytest
 
 from isocharge.simulate import Resolution
+from isocharge.simulate.mesh.refinement import RefinedTemplate
 from isocharge.simulate.mesh.template import Template, template
 
 RESOLUTIONS = (Resolution(2, 8, 1), Resolution(4, 16, 3, 2))
@@ -36,3 +38,17 @@ def test_euler_characteristic_of_a_disk(built):
     edges = set(edges_of(built))
     vertices = set().union(*edges)
     assert len(vertices) - len(edges) + built.n_element == 1
+
+
+def test_points_lie_in_the_parts_of_a_split_element():
+    """Quarters of the first, one of them halved across xi; a part's coordinates lead back to the point."""
+    base = template(Resolution(2, 8, 1), 3)
+    low = np.vstack([[(-1, -1), (0, -1), (-1, 0), (0, 0), (0.5, 0)], np.full((base.n_element - 1, 2), -1.0)])
+    size = np.vstack([np.ones((3, 2)), [(0.5, 1.0)] * 2, np.full((base.n_element - 1, 2), 2.0)])
+    parent = np.concatenate([np.zeros(5, dtype=int), np.arange(1, base.n_element)])
+    rng, refined = np.random.default_rng(0), RefinedTemplate(base, parent, low, size)
+    of_base, at = rng.integers(3, size=300), rng.uniform(-1.0, 1.0, (2, 300))
+    element, *local = refined.within(of_base, *at)
+    np.testing.assert_array_equal(parent[element], of_base)
+    assert np.abs(local).max() <= 1.0
+    np.testing.assert_allclose(low[element].T + 0.5 * size[element].T * (np.array(local) + 1.0), at)

@@ -1,5 +1,7 @@
 """Models of measured presses alone, of a sensor whose least error is known in closed form."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -97,7 +99,11 @@ def test_the_released_model_is_served_and_checked(alone, fresh, tmp_path):
     assert check_presses(predictor, presses).fits
     assert predictor.metadata.sensor == {"name": "pad", "electrodes": ["Q1", "Q2", "Q3", "Q4"]}
     assert read_presses(folder / "presses.csv") == l_shaped()
-    assert "1200 presses at 1200 places" in (folder / "card.md").read_text()
+    card, errors = (folder / "card.md").read_text(), predictor.metadata.errors
+    assert "1200 presses at 1200 places" in card
+    for share in ("68", "95"):
+        (percent,) = re.findall(rf"coverage of the {share} % intervals \| (\S+) %", card)
+        assert float(percent) == pytest.approx(100.0 * errors[f"coverage_{share}"], rel=1e-2)
 
 
 def test_the_outline_is_that_of_the_area():
