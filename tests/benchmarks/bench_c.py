@@ -86,11 +86,7 @@ def measure(model: Any, loops: dict[str, Any], seconds: float, calls: int, seed:
 
 
 def main() -> None:
-    parser = options(__doc__, "four-25um-biaxial")
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--calls", type=int, default=2000, help="calls that are timed at once")
-    parser.add_argument("--compiler", default="gcc")
-    asked = parser.parse_args()
+    asked = options(__doc__, "four-25um-biaxial", seconds=10.0, calls=2000, compiler="gcc")
     model = load_model(find_model(asked.model))
     compiler = subprocess.check_output([asked.compiler, "--version"], text=True).splitlines()[0]
     with tempfile.TemporaryDirectory() as folder:

@@ -83,11 +83,7 @@ def training_time(films: FilmsModel, folder: Path) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = options(__doc__, "four-25um-biaxial-films")
-    parser.add_argument("--films", type=int, default=4)
-    parser.add_argument("--seconds", type=float, default=2.0, help="for the times of predictions")
-    parser.add_argument("--train", type=Path, metavar="FOLDER")
-    chosen = parser.parse_args()
+    chosen = options(__doc__, "four-25um-biaxial-films", films=4, seconds=2.0, train=None)
     films = read_films(find_model(chosen.model))
     drawn = films.prior.draw(np.random.default_rng(chosen.seed), chosen.films)
     record: dict[str, Any] = {

@@ -303,13 +303,14 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
 
 
 def main() -> None:
-    parser = options(__doc__)
-    parser.add_argument("--environments", type=Path, default=Path("build/bench-environments"), metavar="DIR")
-    parser.add_argument("--without-rivals", action="store_true", help="only ours")
-    parser.add_argument("--rounds", type=int, default=12)
-    parser.add_argument("--requests", type=int, default=400, help="of each contender in a round")
-    parser.add_argument("--seconds", type=float, default=4.0, help="of each throughput measurement")
-    asked = parser.parse_args()
+    asked = options(
+        __doc__,
+        environments=Path("build/bench-environments"),
+        without_rivals=False,
+        rounds=12,
+        requests=400,
+        seconds=4.0,
+    )
     print_results("http", asked, measure(asked))
 
 

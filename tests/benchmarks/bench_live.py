@@ -9,7 +9,6 @@ pictures are and how many a second it draws.
     python tests/benchmarks/bench_live.py --rounds 4 --seconds 10 [--browser] [--rate-hz 1000]
 """
 
-import argparse
 import asyncio
 import json
 import multiprocessing
@@ -25,7 +24,7 @@ from pathlib import Path
 
 import bench_stream
 import numpy as np
-from shared import percentiles
+from shared import arguments, percentiles
 from websockets.asyncio.client import connect
 
 from isocharge.serve import Predictor, Recording, Script, wander
@@ -139,12 +138,7 @@ def one_round(port, viewers, seconds, folder, name, in_browser):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=4)
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--rate-hz", dest="rate_Hz", type=float, default=1000.0)
-    parser.add_argument("--browser", action="store_true")
-    options = parser.parse_args()
+    options = arguments(__doc__, rounds=4, seconds=10.0, rate_Hz=1000.0, browser=False)
     context = multiprocessing.get_context("spawn")
     pipe, far = context.Pipe()
     board = context.Process(target=bench_stream.board, args=(far, 3, presses(options.rate_Hz), 0), daemon=True)

@@ -31,10 +31,7 @@ def contenders(model: str, seed: int) -> dict[str, Callable[[], object]]:
 
 
 def main() -> None:
-    parser = options(__doc__)
-    parser.add_argument("--rounds", type=int, default=30)
-    parser.add_argument("--calls", type=int, default=2000, help="calls of each contender in a round")
-    asked = parser.parse_args()
+    asked = options(__doc__, rounds=30, calls=2000)
     durations = take_turns(contenders(asked.model, asked.seed), asked.rounds, asked.calls)
     print_results("predictor", asked, {"one press": list(rows(durations, "session.run"))})
 

@@ -137,9 +137,7 @@ def measure(asked: argparse.Namespace) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = options(__doc__)
-    parser.add_argument("--requests", type=int, default=1_000_000)
-    asked = parser.parse_args()
+    asked = options(__doc__, requests=1_000_000)
     print_results("soak", asked, measure(asked))
 
 

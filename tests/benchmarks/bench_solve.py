@@ -8,7 +8,6 @@ relative to itself, over the built-in sensors, against a solve of the same theor
 are read with 60 x 60 points; so they contain mesh and readout, but not what a theory leaves out.
 """
 
-import argparse
 import json
 import time
 from dataclasses import asdict, replace
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from shared import arguments
 
 from isocharge.serve.benchmark import machine
 from isocharge.simulate import (
@@ -144,11 +144,7 @@ def plot(result: dict, path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="CPU time of one press against the error of its charges.")
-    parser.add_argument("--positions", type=int, default=20, help="presses of each kind (default: 20)")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--plot", type=Path, help="write a picture")
-    asked = parser.parse_args()
+    asked = arguments(__doc__, positions=20, seed=1, plot=None)
     result = record(asked.positions, asked.seed)
     if asked.plot:
         plot(result, asked.plot)

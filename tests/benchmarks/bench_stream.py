@@ -86,10 +86,7 @@ def summary(latencies: np.ndarray, path: TouchStream, played: dict[str, int]) ->
 
 
 def main() -> None:
-    parser = options(__doc__)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--rate-hz", dest="rate_Hz", type=float, default=1000.0)
-    asked = parser.parse_args()
+    asked = options(__doc__, seconds=60.0, rate_Hz=1000.0)
     print_results("stream", asked, play(Predictor(asked.model), asked.seconds, asked.rate_Hz, asked.seed))
 
 

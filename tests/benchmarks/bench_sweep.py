@@ -8,7 +8,6 @@ and of the largest worker, added up. Then some of the presses, as many of each p
 mesh, and every charge is compared relative to itself.
 """
 
-import argparse
 import json
 import resource
 import tempfile
@@ -17,6 +16,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from shared import arguments
 
 from isocharge.common.progress import listening
 from isocharge.serve.benchmark import machine
@@ -49,13 +49,7 @@ def relative_error(dataset: Dataset, row: int) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sensor", default="four-25um-biaxial")
-    parser.add_argument("--samples", type=int, default=100_000)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--checks", type=int, default=60)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+    options = arguments(__doc__, sensor="four-25um-biaxial", samples=100_000, workers=2, checks=60, seed=0)
     sensor, sweep = load_sensor(options.sensor), Sweep(10.0, (0.05, 2.0), options.samples, options.seed, "random")
     began, solved_at = time.perf_counter(), []
 

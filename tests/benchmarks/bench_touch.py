@@ -225,12 +225,7 @@ def unplugging(predictor, times):
 
 
 def main():
-    parser = options(__doc__)
-    parser.add_argument("--presses", type=int, default=100)
-    parser.add_argument("--warm", action="store_true")
-    parser.add_argument("--memory", action="store_true")
-    parser.add_argument("--unplug", type=int, default=0)
-    asked = parser.parse_args()
+    asked = options(__doc__, presses=100, warm=False, memory=False, unplug=0)
     predictor, part = Predictor(asked.model), load_amplifier("bench")
     corners = np.array(predictor.metadata.working_area_mm) @ [1.0, 1j]
     radius_mm = float(np.abs(0.5 * (corners + np.roll(corners, 1))).min())

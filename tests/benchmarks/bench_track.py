@@ -153,13 +153,7 @@ def draw(rows: list[dict[str, float]], path: Path) -> None:
 
 
 def main() -> None:
-    parser = options(__doc__)
-    parser.add_argument("--paths", type=int, default=40)
-    parser.add_argument("--rate-hz", type=float, default=1000.0)
-    parser.add_argument("--force", type=float, default=1.0, help="N")
-    parser.add_argument("--noise", default="reference")
-    parser.add_argument("--plot", type=Path)
-    asked = parser.parse_args()
+    asked = options(__doc__, paths=40, rate_hz=1000.0, force=1.0, noise="reference", plot=None)
     touch = Predictor(asked.model)
     about = touch.metadata
     film = ForwardMap.build(sensor_from_dict(dict(about.sensor)), Circle(1.0), 8.0, about.force_range_N)

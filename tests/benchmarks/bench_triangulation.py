@@ -3,12 +3,12 @@
 python tests/benchmarks/bench_triangulation.py [--presses 2000]
 """
 
-import argparse
 import time
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
+from shared import arguments
 
 from isocharge.simulate import ChargeSpline, ForwardMap, Polygon, Sweep, Triangulation, load_sensor, noise_model
 
@@ -17,9 +17,7 @@ RADIUS, FORCES = 8.0, (0.05, 2.0)
 
 def main() -> None:
     """Three and four electrodes, clean and noisy, force known and unknown."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--presses", type=int, default=2000)
-    contact = Sweep(RADIUS, FORCES, parser.parse_args().presses, sampling="random").contacts()
+    contact = Sweep(RADIUS, FORCES, arguments(__doc__, presses=2000).presses, sampling="random").contacts()
     solved = ForwardMap.build(load_sensor("three-25um-biaxial"), Polygon.triangle(4.0), 10.0, FORCES)
     for layout in ("three", "four"):
         film = replace(solved, sensor=load_sensor(f"{layout}-25um-biaxial"))

@@ -7,12 +7,12 @@ Of 100 boards 93 are read with the weights of today, of the unseen ones 95.
     python tests/benchmarks/fit_recognition.py [--boards 200]
 """
 
-import argparse
 import runpy
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
+from shared import arguments
 
 from isocharge.serve.recognition.recognise import WEIGHTS, described_frames
 
@@ -31,9 +31,7 @@ def is_read(seed, weights):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--boards", type=int, default=200)
-    boards, weights = parser.parse_args().boards, WEIGHTS
+    boards, weights = arguments(__doc__, boards=200).boards, WEIGHTS
     count = lambda tried, first=10_000: sum(is_read(seed, tried) for seed in range(first, first + boards))  # noqa: E731
     best = count(weights)
     print(f"before: {best} of {boards}; unseen: {count(weights, 20_000)}")

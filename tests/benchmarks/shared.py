@@ -4,6 +4,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,20 @@ from isocharge.serve.benchmark import machine
 Calls = dict[str, Callable[[], object]]
 
 
-def options(page: str, model: str = "three-25um-biaxial") -> argparse.ArgumentParser:
-    """A parser with the options of every benchmark of a model."""
+def options(page: str, model: str = "three-25um-biaxial", **more: Any) -> argparse.Namespace:
+    """What was asked of a benchmark of a model, see `arguments`."""
+    return arguments(page, model=model, seed=0, json=False, **more)
+
+
+def arguments(page: str, **defaults: Any) -> argparse.Namespace:
+    """The command's options by name; a default says the type: False is a switch, None the path of a file."""
     parser = argparse.ArgumentParser(description=page, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", default=model, help="model name or path")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="one JSON object")
-    return parser
+    for name, default in defaults.items():
+        kind = {"action": "store_true"} if default is False else {"type": Path if default is None else type(default)}
+        parser.add_argument(
+            "--" + name.replace("_", "-").lower(), dest=name, default=default, help="%(default)s", **kind
+        )
+    return parser.parse_args()
 
 
 def print_results(name: str, asked: argparse.Namespace, results: dict[str, Any]) -> None:

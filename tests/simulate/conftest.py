@@ -107,8 +107,7 @@ def made_up() -> Callable[..., Equilibrium]:
         order: int = 5,
     ) -> Equilibrium:
         of = of or load_sensor("three-25um-biaxial").film
-        resolution = Resolution(order, 8, 5, 1)
-        mesh = place(of, probe, at, resolution, 0.05)
+        mesh = place(of, probe, at, Resolution(order, 8, 5, 1), 0.05)
         return Equilibrium(
             film=of,
             probe=probe,

@@ -46,8 +46,7 @@ def test_strain_of_a_film_with_a_round_coat_is_the_closed_form(stiffening):
     outer = 1.0 / (1.0 - nu**2)
     inner = (1.0 + stiffening) * outer
     system = [[0.0, 1.0, 1.0], [b, -b, -1.0 / b], [inner * (1.0 + nu), -outer * (1.0 + nu), outer * (1.0 - nu) / b**2]]
-    right = [-0.25 / outer, b**3 * (0.25 / outer - 0.25 / inner), 0.0]
-    c, _, _ = np.linalg.solve(system, right)
+    c, _, _ = np.linalg.solve(system, [-0.25 / outer, b**3 * (0.25 / outer - 0.25 / inner), 0.0])
     at = np.array([0.0, 0.5 * b])
     element, xi, eta, _ = mesh.locate(at + 0j)
     slope = mesh.gradient(element, xi, eta) @ field[mesh.template.nodes[element]]

@@ -213,8 +213,7 @@ def check_touch(records, model):
 def test_a_board_gets_to_a_right_touch(name, written):
     kind = ZOO[name]
     board = Board(kind)
-    examination = examined(board, kind, kind.gain)
-    stream = TouchStream(predictor(kind.model), load_device(written(examination)))
+    stream = TouchStream(predictor(kind.model), load_device(written(examined(board, kind, kind.gain))))
     chunks = [*board.chunks(480), *board.chunks(171, pressed=True)]
     check_touch([json.loads(record.to_json()) for chunk in chunks for record in stream.feed(chunk)], kind.model)
 

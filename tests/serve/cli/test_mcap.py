@@ -173,7 +173,6 @@ def test_lines_break_where_nothing_came(command, recorded, models, tmp_path, fig
             entry["timestamp"] += 3600.0
     path.write_text("\n".join([*lines, *map(json.dumps, later), ""]))
     assert command("serve", "plot", path, "--models", models, "-o", tmp_path / "touch.png")[0] == 0
-    minutes = bands_of(figures[0])["force"][:, 0]
-    assert minutes.max() == pytest.approx(60.0, abs=1.0)
+    assert bands_of(figures[0])["force"][:, 0].max() == pytest.approx(60.0, abs=1.0)
     force = next(b for axes in figures[0].axes for b in axes.collections if b.get_label() == "force")
     assert len(force.get_paths()) == 2

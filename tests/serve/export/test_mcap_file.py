@@ -230,8 +230,7 @@ def test_readers_of_mcap_find_schemas_index_and_checksums(tmp_path):
 @settings(max_examples=40, deadline=None)
 @given(record=records())
 def test_every_record_is_valid_under_its_schema(record):
-    schema = record_schema(ELECTRODES)
-    jsonschema_rs.Draft7Validator(schema).validate(json.loads(record.to_json()))
+    jsonschema_rs.Draft7Validator(record_schema(ELECTRODES)).validate(json.loads(record.to_json()))
 
 
 def test_the_schema_refuses_what_is_no_record():

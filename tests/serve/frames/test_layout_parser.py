@@ -180,8 +180,7 @@ length = 5
 fields = [{name = "seq", type = "u8"}, {type = "pad", value = "02"}, {name = "A", type = "i16"}]
 """
     layout = frame_layout(tomllib.loads(text), "test")
-    parser = DescribedParser(layout)
-    frames = parser.feed(bytes.fromhex("7E 01 02 10 00  7E 02 09 11 22  7E 03 02 20 00"))
+    frames = DescribedParser(layout).feed(bytes.fromhex("7E 01 02 10 00  7E 02 09 11 22  7E 03 02 20 00"))
     assert [(frame.seq, frame.values) for frame in frames] == [(1, (16.0,)), (3, (32.0,))]
     assert layout.encode(Frame(1, 0, (16.0,))) == bytes.fromhex("7E 01 02 10 00")
 

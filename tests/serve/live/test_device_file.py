@@ -112,8 +112,7 @@ def test_volts_on_a_feedback_capacitance(device):
 
 def test_other_names_of_number_and_clock(device):
     parser = device('[frames]\nformat = "text"\nseq = "n"\nt_ms = "up"\n').parser()
-    frames = parser.feed(b'\n{"n": 3, "up": 12, "A": 1}\n' * 3)
-    assert frames[-1] == Frame(3, 12000, (1.0,), names=("A",))
+    assert parser.feed(b'\n{"n": 3, "up": 12, "A": 1}\n' * 3)[-1] == Frame(3, 12000, (1.0,), names=("A",))
 
 
 def test_request_of_a_board(device):
@@ -178,8 +177,7 @@ def test_stage_that_is_switched_off_is_checked_too(device):
 def test_table_stays_as_it_came(device):
     """Recordings hold it; it makes the same device again."""
     board = device(FULL)
-    again = device_from_table(board.table, board.where)
-    assert again == board
+    assert device_from_table(board.table, board.where) == board
     assert board.table["tare"] == {"frames": 50}
 
 

@@ -86,8 +86,7 @@ def test_latest_alone_tells_what_happened_before_it(predictor):
     assert record.flags == ("gap", "repeat", "restart")
     (record,) = touch.feed(chunk(at(6), at(7)))
     assert record.flags == ()
-    back = chunk(at(8), at(9), at(11))._replace(outage_s=2.0)
-    (record,) = touch.feed(back)
+    (record,) = touch.feed(chunk(at(8), at(9), at(11))._replace(outage_s=2.0))
     assert record.flags == ("reconnected", "gap", "tare")
     assert touch.counts.skipped == 9 + 4 + 1 + 2
 
@@ -96,8 +95,7 @@ def test_another_model_of_the_same_electrodes(film, make_film, predictor, tmp_pa
     touch = TouchStream(predictor, chain=CHAIN, frame_id="left")
     rest = list(touch.feed(chunk(*frames(np.tile(OFFSET, (10, 1))))))
     touch.use(Predictor(film.write(tmp_path, version=2)))
-    raw = tuple((pressed(film) + OFFSET).tolist())
-    (record,) = touch.feed(chunk(Frame(10, 50_000, raw)))
+    (record,) = touch.feed(chunk(Frame(10, 50_000, tuple((pressed(film) + OFFSET).tolist()))))
     assert (rest[-1].model, record.model, record.flags, record.frame_id) == ("linear/1", "linear/2", (), "left")
     assert record.force_N == pytest.approx(0.5, rel=1e-5)
     with pytest.raises(ModelError, match=r"linear/1: expected the electrodes \('A', 'B', 'C'\) of linear/2"):

@@ -28,8 +28,7 @@ def test_tls_files_that_cannot_be_used(handler, tls_files, certificate, key):
 
 def test_a_unix_socket(handler, start_http, tmp_path):
     path = tmp_path / "touch.sock"
-    server = start_http(handler, uds=path)
-    assert server.url == f"unix:{path}"
+    assert start_http(handler, uds=path).url == f"unix:{path}"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert answer_of(path).startswith(b"HTTP/1.1 200")
 

@@ -125,8 +125,7 @@ def test_counters_do_not_fall_when_a_model_is_loaded_again(handler):
 
 def test_versions_that_serve_and_that_were_refused(film, tmp_path):
     film.write(tmp_path)
-    sensor = {"name": 'a "quoted"\nname\\', "film": {"radius_mm": 45.0}}
-    film.write(tmp_path, version=2, sensor=sensor)
+    film.write(tmp_path, version=2, sensor={"name": 'a "quoted"\nname\\', "film": {"radius_mm": 45.0}})
     (film.write(tmp_path, version=3) / "golden.json").unlink()
     store = open_model_store(tmp_path)
     samples = scrape(Handler(store))

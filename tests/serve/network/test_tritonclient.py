@@ -48,8 +48,7 @@ def tensor(module, values, datatype="FP32"):
 
 def expected(tmp_path, values):
     """What the same model answers in process."""
-    touch = Predictor(tmp_path / "models/linear")
-    columns = np.column_stack(touch.predict_batch(values))
+    columns = np.column_stack(Predictor(tmp_path / "models/linear").predict_batch(values))
     return {"contact": columns[:, :3], "contact_std": columns[:, 3:6], "misfit": columns[:, 6:7]}
 
 

@@ -56,8 +56,7 @@ def test_the_same_press_from_every_kind_of_file(read, text):
 
 
 def test_without_names_all_other_columns_are_electrodes(read, tmp_path):
-    text = "force_N,A,y_mm,x_mm,C\n0.5,10,2,1,30\n"
-    (tmp_path / "all.csv").write_text(text)
+    (tmp_path / "all.csv").write_text("force_N,A,y_mm,x_mm,C\n0.5,10,2,1,30\n")
     presses = read_presses(tmp_path / "all.csv")
     assert (presses.electrodes, presses.charge_pC.tolist(), presses.ignored) == (("A", "C"), [[10.0, 30.0]], ())
     assert presses.of_electrodes(("C", "A"), "mine").charge_pC.tolist() == [[30.0, 10.0]]

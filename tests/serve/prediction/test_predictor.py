@@ -171,8 +171,7 @@ def test_what_is_no_measurement_is_said_once(models, film, caplog):
     predictor = Predictor("linear", models=models)
     predictor.predict(film.charge_pC([0.0], [0.0], [5.9])[0])
     assert caplog.messages == []
-    contact = predictor.predict([9e9, 9e9, 9e9])
-    assert predictor.flags(contact) == ("outside", "beyond")
+    assert predictor.flags(predictor.predict([9e9, 9e9, 9e9])) == ("outside", "beyond")
     predictor.predict([9e9, 9e9, 9e9])
     (message,) = caplog.messages
     assert re.match(r"linear/1: \[9000000000.0, .* pC are far from any press .* mm, 1.125e\+07 N is no", message)

@@ -196,8 +196,7 @@ def test_a_press_that_dents_the_film_is_flagged(film):
     """One by one and in a batch, beside what else is to be said; a model that does not say from where says nothing."""
     yields = Validity.of(film.metadata(yield_force_N=0.8))
     contacts = [GOOD._replace(force_N=force_N) for force_N in (0.8, 0.81, 2.5)]
-    flags = [(), ("stress",), ("outside", "stress")]
-    assert [yields.flags(contact) for contact in contacts] == flags
+    assert [yields.flags(contact) for contact in contacts] == [(), ("stress",), ("outside", "stress")]
     assert yields.batch_flags(Contacts(*np.float32(contacts).T)) == [(), ("stress",), ("outside", "stress")]
     assert Validity.of(film.metadata()).flags(contacts[1]) == ()
 

@@ -119,14 +119,12 @@ def test_damage_does_not_hinder():
     damaged = np.frombuffer(board.data, np.uint8).copy()
     hit = rng.random(len(damaged)) < 0.003
     damaged[hit] ^= rng.integers(1, 256, hit.sum(), dtype=np.uint8)
-    table = recognise([damaged.tobytes()], FRAMES / RATE_HZ)
-    assert board.is_read_by(table)
+    assert board.is_read_by(recognise([damaged.tobytes()], FRAMES / RATE_HZ))
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_noise_is_not_recognised(seed):
-    data = np.random.default_rng(seed).bytes(20_000)
-    table = recognise([data], 2.0)
+    table = recognise([np.random.default_rng(seed).bytes(20_000)], 2.0)
     assert table is None
 
 
@@ -138,8 +136,7 @@ def test_constant_bytes_and_nothing_are_not_recognised():
 
 @pytest.mark.parametrize("per_datagram", [1, 3])
 def test_datagrams_of_bare_structs(per_datagram):
-    rng = np.random.default_rng(1)
-    values = rng.normal([5.0, -3.0, 0.0, 11.0], 0.3, (300, 4)).astype(np.float32)
+    values = np.random.default_rng(1).normal([5.0, -3.0, 0.0, 11.0], 0.3, (300, 4)).astype(np.float32)
     frames = [struct.pack("<I4f", k, *row) for k, row in enumerate(values)]
     chunks = [b"".join(frames[at : at + per_datagram]) for at in range(0, 300, per_datagram)]
     table = recognise(chunks, 1.5, are_datagrams=True)
@@ -150,8 +147,7 @@ def test_datagrams_of_bare_structs(per_datagram):
 def test_a_cyclic_check_without_a_name_is_described():
     """CRC-16 of an own start value over the payload alone: no catalogue has it."""
     crc = crcmod.mkCrcFun(0x11021, initCrc=0x1234, rev=False, xorOut=0x4321)
-    rng = np.random.default_rng(2)
-    rows = rng.normal([100, 200, -300], 20, (200, 3)).round().astype(int)
+    rows = np.random.default_rng(2).normal([100, 200, -300], 20, (200, 3)).round().astype(int)
     datas = [struct.pack(">H3h", k, *row) for k, row in enumerate(rows.tolist())]
     stream = b"".join(b"\xaa\x55" + data + struct.pack(">H", crc(data)) for data in datas)
     table = recognise([stream], 1.0)

@@ -54,8 +54,7 @@ def test_tare_waits_for_quiet():
     frames = rest(400)
     frames[:220] += np.linspace(900.0, 300.0, 220)[:, None]  # a finger that leaves after 220 frames
     readings = run(frames)
-    first = next(i for i, r in enumerate(readings) if r.tare is not None)
-    assert 300 < first <= 321
+    assert 300 < next(i for i, r in enumerate(readings) if r.tare is not None) <= 321
     np.testing.assert_allclose(readings[-1].tare.charge_pC, OFFSET, atol=2.0)
 
 
@@ -112,8 +111,7 @@ def test_drifted_base_releases_and_is_no_new_touch():
 def test_smallest_press_is_detected_at_once():
     frames = rest(400)
     frames[200:300] += 340.0 / 3.0
-    contact = [r.contact for r in run(frames)]
-    assert contact == [False] * 200 + [True] * 100 + [False] * 100
+    assert [r.contact for r in run(frames)] == [False] * 200 + [True] * 100 + [False] * 100
 
 
 def test_negative_charges_are_no_touch_and_are_flagged():

@@ -23,23 +23,20 @@ def mains(n, rate_Hz, amplitude_pC, frequency_Hz=50.0):
 @pytest.mark.parametrize("frequency_Hz", [50.0, 50.05])
 def test_hum_is_gone_after_two_seconds(rate_Hz, frequency_Hz):
     """The mains wander by 0.05 Hz; an eighth of the hum may then be left."""
-    raw = mains(int(4 * rate_Hz), rate_Hz, 5.0, frequency_Hz)
-    left = clean(raw, rate_Hz)[int(2 * rate_Hz) :]
+    left = clean(mains(int(4 * rate_Hz), rate_Hz, 5.0, frequency_Hz), rate_Hz)[int(2 * rate_Hz) :]
     assert np.abs(left).max() < (0.1 if frequency_Hz == 50.0 else 1.0)
 
 
 def test_touch_passes_hum_removal_without_delay_and_ringing():
     rate_Hz, at = 1000.0, 3000
     step = np.where(np.arange(6000)[:, None] < at, 0.0, 850.0) * np.ones(3)
-    out = clean(step + mains(6000, rate_Hz, 1.0), rate_Hz)
-    assert np.abs(out[at + 1 :] - 850.0).max() < 0.5
+    assert np.abs(clean(step + mains(6000, rate_Hz, 1.0), rate_Hz)[at + 1 :] - 850.0).max() < 0.5
     fixed_notch_rings_with = 850.0 * 2 / (np.pi * 0.5 * 2 * 50.0)  # step times relative width: for comparison
     assert fixed_notch_rings_with > 10.0
 
 
 def test_noise_is_hardly_raised_by_hum_removal():
-    noise = np.random.default_rng(0).normal(0.0, 0.3, (20_000, 3))
-    assert clean(noise, 1000.0)[2000:].std() < 1.05 * 0.3
+    assert clean(np.random.default_rng(0).normal(0.0, 0.3, (20_000, 3)), 1000.0)[2000:].std() < 1.05 * 0.3
 
 
 def test_hum_that_does_not_turn_between_frames_is_left():

@@ -14,8 +14,7 @@ RATE_HZ, TAU_S = 200.0, 2.0
 def integrator(charge_pC):
     """v[n] = a v[n-1] + q[n] - q[n-1] by its impulse response, from rest, for charges (n,)."""
     n = np.arange(len(charge_pC))
-    steps = np.diff(charge_pC, prepend=0.0)
-    return np.convolve(steps, np.exp(-n / (RATE_HZ * TAU_S)))[: len(n)]
+    return np.convolve(np.diff(charge_pC, prepend=0.0), np.exp(-n / (RATE_HZ * TAU_S)))[: len(n)]
 
 
 def pressed(*presses, seconds=20.0):
@@ -41,8 +40,7 @@ def undo(output_pC, rule=None, every=1, tau_s=TAU_S):
 
 
 def test_held_press_stays():
-    charge = pressed((3.0, 8.0, 400.0))
-    output = integrator(charge)
+    output = integrator(pressed((3.0, 8.0, 400.0)))
     assert output[2150] < 20.0  # what the amplifier still shows at the end of the press
     got, contact = undo(output)
     held = slice(700, 2180)
@@ -62,8 +60,7 @@ def test_inflow_is_learned_out_of_contact():
 
 
 def test_two_presses_in_a_row_do_not_spoil_each_other():
-    charge = pressed((3.0, 4.0, 400.0), (7.3, 4.0, 200.0))
-    got, contact = undo(integrator(charge))
+    got, contact = undo(integrator(pressed((3.0, 4.0, 400.0), (7.3, 4.0, 200.0))))
     np.testing.assert_allclose(got[1300, 0], 400.0, atol=0.5)
     np.testing.assert_allclose(got[2200, 0], 200.0, atol=4.0)  # the foot of the second is lost to the relaxing base
     assert np.count_nonzero(np.diff(contact.astype(int)) == 1) == 2
@@ -71,16 +68,14 @@ def test_two_presses_in_a_row_do_not_spoil_each_other():
 
 def test_lost_frames_cost_little():
     """Every second frame lost while pressed: the step is twice as long, and a is taken for it."""
-    charge = pressed((3.0, 8.0, 400.0))
-    got, _ = undo(integrator(charge), every=2)
+    got, _ = undo(integrator(pressed((3.0, 8.0, 400.0))), every=2)
     np.testing.assert_allclose(got[1000, 0], 400.0, atol=3.0)
 
 
 @pytest.mark.parametrize("error", [0.005, 0.05])
 def test_error_of_tau_costs_as_much_as_theory_says(error):
     """q' = q (1 + (tau / tau' - 1)(1 - exp(-t / tau))) in the limit of small steps, for a step held for t."""
-    charge = pressed((3.0, 8.0, 400.0))
-    got, _ = undo(integrator(charge), tau_s=TAU_S * (1 + error))
+    got, _ = undo(integrator(pressed((3.0, 8.0, 400.0))), tau_s=TAU_S * (1 + error))
     expected = 400.0 * (1 + (1 / (1 + error) - 1) * (1 - np.exp(-7.0 / TAU_S)))
     assert got[2000, 0] == pytest.approx(expected, abs=1.0)
 

@@ -103,8 +103,7 @@ def test_a_hand_over_the_film_is_no_touch_and_a_press_under_it_is_what_it_is():
 def test_bias_is_learned_beside_creep_and_warmth():
     t = times(70.0)
     film = np.outer(shown(t, (40.0, 60.0)), SHAPE) + np.outer(t, [1.0, -0.5, 0.7])
-    keep = np.exp(-1.0 / (RATE_HZ * 10.0))
-    output = lfilter([1.0, -1.0], [1.0, -keep], film, axis=0)
+    output = lfilter([1.0, -1.0], [1.0, -np.exp(-1.0 / (RATE_HZ * 10.0))], film, axis=0)
     got, _, _ = undo(output, MEMORY | {"leak": {"tau_s": 10.0}})
     assert np.abs(got[pressed(t, 40.1, 59.9)] / SHAPE - 1.0).max() < 0.012
 

@@ -156,8 +156,7 @@ def samples(force_N, bits=None):
     seed=st.integers(0, 1000),
 )
 def test_runs_stand_for_all(force_N, most, seed):
-    bits = np.random.default_rng(seed).integers(0, 1 << 12, len(force_N))
-    rows = samples(force_N, bits)
+    rows = samples(force_N, np.random.default_rng(seed).integers(0, 1 << 12, len(force_N)))
     shown = coalesce(rows, most)
     assert len(shown) == min(most, len(rows))
     assert shown["records"].sum() == len(rows)
@@ -178,8 +177,7 @@ def test_a_tap_is_shown(start, most):
 
 def test_the_newest_contact_counts():
     """While something touches, what is shown is where it is now, not where it was pressed hardest."""
-    shown = coalesce(samples(np.linspace(2.0, 1.0, 64)), 1)
-    assert shown["timestamp"][0] == 0.063
+    assert coalesce(samples(np.linspace(2.0, 1.0, 64)), 1)["timestamp"][0] == 0.063
 
 
 VIEWER = Path(str(files("isocharge.serve.viewer")))

@@ -78,8 +78,7 @@ def test_samples_arrive_whole_and_in_order():
     reader, page = make_link()
     for number in range(100):
         reader.put(bytes([number]) * 64)
-    data = page.take(64)
-    assert data == b"".join(bytes([number]) * 64 for number in range(100))
+    assert page.take(64) == b"".join(bytes([number]) * 64 for number in range(100))
     for piece, whole in ((SAMPLE + SAMPLE[:40], SAMPLE), (b"", b""), (SAMPLE[40:], SAMPLE)):
         reader.put(piece)
         assert page.take(64) == whole

@@ -26,8 +26,7 @@ sweeps = st.builds(
 @settings(deadline=None, max_examples=50)
 @given(sweeps, st.integers(1, 3))
 def test_every_press_is_inside_and_the_count_is_right(sweep, count):
-    probes = PROBES[:count]
-    presses = sweep.over(probes)
+    presses = sweep.over(PROBES[:count])
     low, high = sweep.force_range
     x, y, force = presses.contact.T
     assert np.hypot(x, y).max() <= sweep.radius * (1.0 + 1e-15)
@@ -52,8 +51,7 @@ def test_presses_are_uniform_over_the_disk_and_in_the_logarithm_of_the_force(sam
     squared, angle = (x**2 + y**2) / 64.0, np.arctan2(y, x)
     assert stats.kstest(squared, "uniform").pvalue > 0.05
     assert stats.kstest(angle, "uniform", args=(-np.pi, 2 * np.pi)).pvalue > 0.05
-    counts = np.histogram2d(squared, angle, bins=(8, 8))[0]
-    assert stats.chisquare(counts.ravel()).pvalue > 0.05
+    assert stats.chisquare(np.histogram2d(squared, angle, bins=(8, 8))[0].ravel()).pvalue > 0.05
 
 
 def test_sobol_presses_fill_gaps_better_than_chance():
@@ -63,8 +61,7 @@ def test_sobol_presses_fill_gaps_better_than_chance():
     chance = np.random.default_rng(4).random((1024, 2))
     for number in range(probes):
         x, y, _ = presses.contact[presses.probe == number].T
-        angle = np.mod(np.arctan2(y, x) / (2 * np.pi), 1.0)
-        unit = np.stack([(x**2 + y**2) / 64.0, angle], axis=1)
+        unit = np.stack([(x**2 + y**2) / 64.0, np.mod(np.arctan2(y, x) / (2 * np.pi), 1.0)], axis=1)
         assert stats.qmc.discrepancy(unit) < 0.1 * stats.qmc.discrepancy(chance)
 
 

@@ -113,8 +113,7 @@ def test_orientation_is_the_whole_turn_against_the_notation(tmp_path):
         assert (whole >= 0.0).all()
         assert (whole < 360.0).all()
     assert set(whole[read.probe == "triangle:4.0"].round(3).tolist()) != {330.0}
-    fixed = read_dataset(tmp_path / "fixed").samples
-    assert fixed.orientation_deg[:3].tolist() == [30.0, 330.0, 0.0]
+    assert read_dataset(tmp_path / "fixed").samples.orientation_deg[:3].tolist() == [30.0, 330.0, 0.0]
 
 
 def test_shards_and_tasks_keep_the_order(tmp_path):

@@ -41,8 +41,7 @@ def test_information_of_a_reading_by_integration():
 
 
 def test_linear_charges_give_the_covariance_of_least_squares():
-    rng = np.random.default_rng(0)
-    jacobian, white = rng.normal(size=(5, 4, 3)), 2.0
+    jacobian, white = np.random.default_rng(0).normal(size=(5, 4, 3)), 2.0
     limits = cramer_rao(np.zeros((5, 4)), jacobian, NoiseModel("white", white, 0.0))
     for each, covariance in zip(jacobian, limits.covariance, strict=True):
         np.testing.assert_allclose(covariance, white**2 * np.linalg.inv(each.T @ each), rtol=1e-8)

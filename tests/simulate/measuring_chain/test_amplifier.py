@@ -149,8 +149,7 @@ def test_wrong_file_is_refused(tmp_path, text, said):
 def test_infinity_is_no_leak_and_no_limit(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('like = "bench"\ntau_s = inf\nlimit_pC = inf\nbits = 0\n')
-    part = load_amplifier(str(path))
-    readings = part.start(3, 100.0, np.random.default_rng(1))(np.full((50, 3), 5e3))
+    readings = load_amplifier(str(path)).start(3, 100.0, np.random.default_rng(1))(np.full((50, 3), 5e3))
     assert np.isfinite(readings).all()
     assert readings[-1].min() > 4.5e3
 

@@ -38,8 +38,7 @@ NAMES = {
 
 @pytest.mark.parametrize(("terms", "name"), NAMES.items(), ids=str)
 def test_theory_has_the_name_of_its_terms_and_is_found_by_it(film, terms, name):
-    tense = terms[2]
-    film = thick(film, 0.025, 1.0 if tense else 0.0)
+    film = thick(film, 0.025, 1.0 if terms[2] else 0.0)
     assert Theory(*terms).name == name
     if terms == (False, False, False):
         with pytest.raises(SceneError, match="'linear membrane': a film without pretension has no stiffness in it"):

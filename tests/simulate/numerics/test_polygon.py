@@ -21,8 +21,7 @@ def convex(draw) -> np.ndarray:
     """A convex polygon with anticlockwise corners x + iy: the hull of random points."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     points = draw(st.floats(0.05, 2.0)) * rng.standard_normal((draw(st.integers(4, 12)), 2)) + rng.uniform(-1, 1, 2)
-    hull = points[ConvexHull(points).vertices]
-    return hull @ np.array([1.0, 1.0j])
+    return points[ConvexHull(points).vertices] @ np.array([1.0, 1.0j])
 
 
 def halves(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -48,8 +47,7 @@ def test_area_and_centroid_add_up(z):
 
 def test_convexity_excludes_a_dent_and_a_star():
     assert not is_convex(np.array([(0.0, 0.0), (2.0, 0.0), (0.5, 0.5), (0.0, 2.0)]))
-    star = np.exp(2j * np.pi * np.arange(5) * 2 / 5)
-    assert not is_convex(corners_of(star))
+    assert not is_convex(corners_of(np.exp(2j * np.pi * np.arange(5) * 2 / 5)))
     assert not is_convex(corners_of(np.array([0.0, 1.0, 1.0, 1.0j])))
 
 

@@ -51,7 +51,6 @@ def test_a_comb_covers_its_area(turn):
 
 
 def test_a_trace_is_as_wide_as_said_beyond_its_bends():
-    path = np.array([0.0, 4.0, 4.0 + 3.0j, 8.0 + 6.0j])
-    outline = trace_outline(path, 0.5)
+    outline = trace_outline(np.array([0.0, 4.0, 4.0 + 3.0j, 8.0 + 6.0j]), 0.5)
     np.testing.assert_allclose(area(outline), 0.5 * 12.0, rtol=1e-12)
     np.testing.assert_allclose(outline[[1, -2]], [4.25 - 0.25j, 3.75 + 0.25j], atol=1e-12)

@@ -200,8 +200,7 @@ def test_gain_multiplies_the_charge():
 
 
 def test_place_rotates_then_shifts():
-    calibration = Calibration(shift=(0.5, 0.0), rotation=np.pi / 2)
-    placed = calibration.place(np.array([[1.0, 0.0], [0.0, 2.0]]))
+    placed = Calibration(shift=(0.5, 0.0), rotation=np.pi / 2).place(np.array([[1.0, 0.0], [0.0, 2.0]]))
     np.testing.assert_allclose(placed, [[0.5, 1.0], [-1.5, 0.0]], atol=1e-15)
 
 

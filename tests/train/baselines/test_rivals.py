@@ -93,8 +93,7 @@ def test_a_band_without_presses_is_refused(task):
 def test_noise_is_added_to_clean_presses_and_not_to_measured_ones(task):
     noisy = task.presses(5)
     assert len(noisy) == len(task.train)  # a quick task takes one copy
-    sigma = np.hypot(1.0, 0.002 * task.train.charge)
-    assert 0.97 < rms((noisy.charge - task.train.charge) / sigma) < 1.03
+    assert 0.97 < rms((noisy.charge - task.train.charge) / np.hypot(1.0, 0.002 * task.train.charge)) < 1.03
     measured = LabelledPresses(task.train.contact, task.train.charge, measured=True)
     rig = type(task)(measured, measured, task.domain, task.noise)
     assert rig.presses(5) is measured

@@ -45,8 +45,7 @@ FOLLOWING = device_from_table({"follow": {"on": True}}, "test")
 
 def film_of(problem):
     """Parameters of a film that is not as described, at 1 MPa."""
-    parameters = problem.prior.draw(np.random.default_rng(1), 1)[0]
-    return np.append(1.0, parameters[1:])
+    return np.append(1.0, problem.prior.draw(np.random.default_rng(1), 1)[0][1:])
 
 
 def calibrated_files(sensor: str, seed: int) -> dict[str, bytes]:

@@ -98,8 +98,7 @@ def test_noisy_charges_show_a_fold_but_not_for_certain(fold, seen):
 def crossing(x, y, force):
     """ln Q along a nodal cubic (u^2, u^3 - a^2 u): x = 3 mm and x = -3 mm have the same charges, and nothing folds."""
     u, v = 0.1 * x, 0.1 * y
-    shapes = np.stack([0 * u, u**2, u * (u**2 - 0.09), v], axis=1)
-    return 1e4 * force[:, None] ** 0.7 * np.exp(shapes)
+    return 1e4 * force[:, None] ** 0.7 * np.exp(np.stack([0 * u, u**2, u * (u**2 - 0.09), v], axis=1))
 
 
 def test_contacts_far_apart_with_the_same_charges_are_a_caution():

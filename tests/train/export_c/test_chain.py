@@ -56,8 +56,7 @@ def recording(board, seed, electrodes=4, seconds=20.0):
     shape = rng.uniform(0.6, 1.4, electrodes)
     press = np.zeros(n)
     for begin in np.cumsum(rng.integers(200, 700, 8)):
-        length = int(rng.integers(20, 400))
-        press[begin : begin + length] = rng.uniform(20.0, 1500.0)
+        press[begin : begin + int(rng.integers(20, 400))] = rng.uniform(20.0, 1500.0)
     charge = press[:, None] * shape + 0.3 * rng.standard_normal((n, electrodes)) + rng.uniform(-20.0, 20.0, electrodes)
     charge += rng.uniform(0.0, 1.0) * np.sin(2 * np.pi * 60.0 * t_s)[:, None] + rng.uniform(-0.1, 0.1) * t_s[:, None]
     charge += np.where(press > 0, 30.0, 0.0)[:, None] * rng.random()
@@ -127,8 +126,7 @@ def test_single_precision_is_within_a_twentieth_of_a_picocoulomb(board, build, m
 
 
 def test_a_film_that_is_never_quiet_is_said_at_the_same_frame(build):
-    table = {"tare": {"frames": 20, "patience": 50}}
-    board = device_from_table(table, "board")
+    board = device_from_table({"tare": {"frames": 20, "patience": 50}}, "board")
     values = 100.0 * np.random.default_rng(0).standard_normal((70, 3))
     steps = np.full(70, 0.005)
     with pytest.raises(TareError):
@@ -193,8 +191,7 @@ def test_frames_without_a_zero_are_cut_at_254_bytes(exported, n):
 
 
 def test_the_clock_wraps_and_restarts_as_ours(exported):
-    rng = np.random.default_rng(0)
-    t_us = (4_294_000_000 + np.cumsum(rng.integers(0, 20_000, 500))) % T_US_MODULUS
+    t_us = (4_294_000_000 + np.cumsum(np.random.default_rng(0).integers(0, 20_000, 500))) % T_US_MODULUS
     t_us[300:] = (t_us[300:] - t_us[300] + 17) % T_US_MODULUS  # the board was reset
     t_us[400:] = (t_us[400:] + (1 << 31) + 500_000) % T_US_MODULUS  # half its range ahead counts as back
     clock = DeviceClock()

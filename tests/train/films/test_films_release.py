@@ -148,8 +148,7 @@ def solved(films, monkeypatch):
 @pytest.mark.usefixtures("solved")
 @pytest.mark.slow
 def test_a_tiny_fit_end_to_end(films, tmp_path):
-    network = fit_films(films.prior, TINY)
-    released = release_films(network, tmp_path / "tiny-films", command="a command")
+    released = release_films(fit_films(films.prior, TINY), tmp_path / "tiny-films", command="a command")
     model = load_model(released.folder)
     check_golden(model)
     assert model.metadata.made_with["command"] == "a command"

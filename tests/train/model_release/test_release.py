@@ -146,8 +146,7 @@ def test_what_is_evaluated_is_what_is_served(fitted, released):
     assert errors["force_p99_percent"] == pytest.approx(
         100.0 * np.percentile(np.abs(contact[:, 2] / fitted.test.contact[:, 2] - 1.0), 99), rel=1e-3
     )
-    half = fitted.test.within(4.0)
-    assert evaluate(fitted, half)["position_rms_mm"] < errors["position_rms_mm"]
+    assert evaluate(fitted, fitted.test.within(4.0))["position_rms_mm"] < errors["position_rms_mm"]
 
 
 def test_the_card_holds_on_other_presses_and_is_good_enough(truth, touch):
@@ -169,8 +168,7 @@ def test_the_card_holds_on_other_presses_and_is_good_enough(truth, touch):
 
 def test_the_deviations_are_honest(truth, touch):
     """68 % and 95 % intervals cover what they say, per coordinate and in every third of force and radius."""
-    charge = truth.noisy(REFERENCE, seed=7)
-    contact, std, _ = predict(touch)(charge)
+    contact, std, _ = predict(touch)(truth.noisy(REFERENCE, seed=7))
     deviation = np.abs(contact - truth.contact) / std
     assert np.all(np.abs(np.mean(deviation < 1.0, axis=0) - 0.68) < 0.025)
     assert np.all(np.abs(np.mean(deviation < 1.96, axis=0) - 0.95) < 0.012)
@@ -186,8 +184,7 @@ def test_the_deviations_are_honest(truth, touch):
 def whitened(truth, touch):
     """Contacts, and their errors in units of the joint covariance: standard normal and independent if that is right."""
     rows = truth[np.arange(30_000) % len(truth)]
-    columns = touch.predict_batch(rows.noisy(REFERENCE, seed=8))
-    found = np.stack(columns, axis=1).astype(float)
+    found = np.stack(touch.predict_batch(rows.noisy(REFERENCE, seed=8)), axis=1).astype(float)
     error = rows.contact - found[:, :3]
     error[:, 2] = found[:, 2] * np.log(rows.contact[:, 2] / found[:, 2])
     one, (xy, xf, yf) = np.ones(len(found)), found[:, 7:].T
@@ -263,8 +260,7 @@ def student(teacher, dataset, tmp_path_factory):
 def test_it_answers_as_its_teacher_does_and_names_it(teacher, student, dataset):
     charge = dataset.samples.charge_pC[:2_000]
     mine, theirs = (Predictor(model.folder).predict_batch(charge) for model in (student, teacher))
-    apart = np.hypot(mine.x_mm - theirs.x_mm, mine.y_mm - theirs.y_mm)
-    assert np.median(apart) < 0.15
+    assert np.median(np.hypot(mine.x_mm - theirs.x_mm, mine.y_mm - theirs.y_mm)) < 0.15
     assert np.median(np.abs(mine.force_N / theirs.force_N - 1.0)) < 0.01
     wider = np.log(mine.x_std_mm / theirs.x_std_mm)  # by what it knows less well
     assert -0.05 < np.median(wider) < 0.4

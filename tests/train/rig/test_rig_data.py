@@ -71,8 +71,7 @@ def test_what_does_not_count_is_said_and_too_few_presses_are_refused(truth, capl
     presses = measured(truth, 60)
     presses.contact[:3, 0] = 30.0
     presses.charge_pC[3, 1] = np.nan
-    data = rig_data(Rig(presses, DESCRIBED, PROBE), None, drawn=1000)
-    assert len(data.test) >= 10
+    assert len(rig_data(Rig(presses, DESCRIBED, PROBE), None, drawn=1000).test) >= 10
     assert "4 of 60 presses are left out: 1 with an unknown place, force or charge; 3 beyond 8 mm" in caplog.text
     with pytest.raises(PressError, match=r"at least 50 presses .* got 49 of 53.*isocharge train calibrate"):
         rig_data(Rig(presses[:53], DESCRIBED, PROBE), None)

@@ -48,8 +48,7 @@ def test_planted_correlations_are_found_and_other_answers_stay(trained):
     contact, std, _ = network.predict(charge)
     turn = np.tanh(np.log(charge[:, 0] / charge[:, 1]))
     planted = np.stack([0.9 * turn, 0.5 * np.ones_like(turn), 0.4 * turn], axis=1)
-    factor = np.linalg.cholesky(matrices(planted))
-    drawn = (factor @ RNG.standard_normal((len(charge), 3, 1)))[..., 0] * std
+    drawn = (np.linalg.cholesky(matrices(planted)) @ RNG.standard_normal((len(charge), 3, 1)))[..., 0] * std
     truth = np.column_stack([contact[:, :2] + drawn[:, :2], contact[:, 2] * np.exp(drawn[:, 2] / contact[:, 2])])
     turned = with_correlation(network, LabelledPresses(truth, charge), still, seed=0)
     *same, found, misfit = turned.outputs(charge)

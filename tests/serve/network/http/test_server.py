@@ -224,8 +224,7 @@ def test_half_a_connection_is_enough_for_answers(server, requests):
 
 def test_a_client_that_asks_whether_to_go_on(server):
     with connect(server) as connection:
-        request = infer(LAST + b"Expect: 100-continue\r\n")
-        connection.sendall(request.removesuffix(BODY))
+        connection.sendall(infer(LAST + b"Expect: 100-continue\r\n").removesuffix(BODY))
         assert connection.recv(100) == b"HTTP/1.1 100 Continue\r\n\r\n"
         connection.sendall(BODY)
         assert statuses(everything(connection)) == [200]

@@ -300,8 +300,7 @@ def test_bad_bodies_are_refused_with_the_reason(ask, case):
 @pytest.mark.parametrize("length", ["", "-1", "+5", "1_0", "1e3", "9999", "9" * 5000, "0x10", " 5", "٣"])
 def test_bad_header_lengths(handler, length):
     body, _ = binary_request(np.float32(PRESS))
-    headers = [(b"inference-header-content-length", length.encode())]
-    response = handler.answer("POST", INFER, headers, body)
+    response = handler.answer("POST", INFER, [(b"inference-header-content-length", length.encode())], body)
     assert response.status == 400
     assert b"Inference-Header-Content-Length: expected a whole number up to" in response.body
 
@@ -357,8 +356,7 @@ def test_bad_compression(ask, way, body, status, said):
 
 
 def test_a_body_beyond_the_limit(store):
-    handler = Handler(store, ServerLimits(body_bytes=100))
-    assert handler.answer("POST", INFER, [], bytes(101)).status == 413
+    assert Handler(store, ServerLimits(body_bytes=100)).answer("POST", INFER, [], bytes(101)).status == 413
 
 
 def test_errors_that_are_ours_are_logged_and_not_told(ask, store, monkeypatch, caplog):
