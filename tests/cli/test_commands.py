@@ -57,7 +57,7 @@ SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1"]
 
 def test_a_sweep_as_a_table_for_other_programs(command, tmp_path):
     """Read by pyarrow, against the dataset beside it."""
-    assert command(*SMALL, "--samples", "5", "-o", tmp_path / "a.parquet")[0] == 0
+    assert command(*SMALL, "--samples", "5", "--workers", "1", "-o", tmp_path / "a.parquet")[0] == 0
     samples, columns = read_dataset(tmp_path / "a").samples, read_table(tmp_path / "a.parquet").to_pydict()
     assert columns["x_mm"] == samples.x_mm.tolist()
     assert np.column_stack([columns[name] for name in "ABC"]).tolist() == samples.charge_pC.tolist()

@@ -286,20 +286,22 @@ def test_a_closed_stdout_is_told(models, presses, frames, tmp_path, words):
     assert not record.exists() or Recording(record).model == "linear/1"
 
 
-def test_a_closed_stdin_is_empty(models):
-    done = bash(f"{ISOCHARGE} serve predict linear - --models {models} <&-")
-    assert (done.returncode, "stdin: empty" in done.stderr) == (2, True)
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("predict linear - --models {models} <&-", "stdin: empty"),
+        ("http --models {models} --port 0", "token: expected printable ASCII"),
+    ],
+)
+def test_what_is_empty_is_refused(models, words, said):
+    """Also a token of the environment: whoever sets it means to have one."""
+    done = bash(f"{ISOCHARGE} serve {words.format(models=models)}", ISOCHARGE_TOKEN="")
+    assert (done.returncode, said in done.stderr) == (2, True)
 
 
 def test_a_closed_stderr_changes_nothing(models, presses):
     done = bash(f"{ISOCHARGE} serve predict linear {presses} --models {models} 2>&-")
     assert (done.returncode, done.stdout.count("\n")) == (0, 3)
-
-
-def test_an_empty_token_is_refused(models):
-    """As `--token ''` is: whoever sets it means to have one."""
-    done = bash(f"{ISOCHARGE} serve http --models {models} --port 0", ISOCHARGE_TOKEN="")
-    assert (done.returncode, "token: expected printable ASCII" in done.stderr) == (2, True)
 
 
 def test_a_slow_reader_stops_neither_chain_nor_recording(models, film, tmp_path, start):

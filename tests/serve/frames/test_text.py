@@ -213,21 +213,15 @@ def test_clock_in_text_that_begins_anew_has_not_wrapped():
     assert clock.restarts == 1
 
 
-def test_number_in_text_that_begins_anew_has_not_wrapped():
+@pytest.mark.parametrize(
+    ("begin", "end", "restarts"), [*((m - 20, m, 0) for m in (100, 256, 1000, 65536)), (290, 301, 1)]
+)
+def test_number_in_text_that_wraps_or_begins_anew(begin, end, restarts):
     parser, gaps = TextParser(), SequenceGaps()
-    for k in [*range(290, 301), *range(20)]:
+    for k in [*range(begin, end), *range(20)]:
         for frame in feed(f"seq:{k},A:1", parser=parser):
             gaps.update(frame.seq, parser.seq_modulus)
-    assert (gaps.lost, gaps.repeated, gaps.restarts) == (0, 0, 1)
-
-
-@pytest.mark.parametrize("modulus", [100, 256, 1000, 65536])
-def test_number_in_text_that_wraps(modulus):
-    parser, gaps = TextParser(), SequenceGaps()
-    for k in range(modulus - 20, modulus + 20):
-        for frame in feed(f"seq:{k % modulus},A:1", parser=parser):
-            gaps.update(frame.seq, parser.seq_modulus)
-    assert (gaps.lost, gaps.repeated, gaps.restarts) == (0, 0, 0)
+    assert (gaps.lost, gaps.repeated, gaps.restarts) == (0, 0, restarts)
 
 
 ENCODERS = {"binary": encode_frame} | {name: partial(encode_text, notation=name) for name in TEXT_FORMATS}

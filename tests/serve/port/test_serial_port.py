@@ -282,18 +282,14 @@ def test_the_echo_is_taken_out_however_it_is_cut(request_bytes, answer, cuts):
     assert asker.echo_share == 1.0
 
 
-def test_an_answer_that_is_no_echo_stays():
-    asker = Asker(Request(b"\x01\x04\x00", echo=True))
+@pytest.mark.parametrize(
+    ("request_bytes", "echo", "answer", "share"),
+    [(b"\x01\x04\x00", True, b"\x02\x04\x00\x10", 0.0), (b"?", False, b"?1\n", 1.0)],
+)
+def test_an_echo_is_counted_and_stays_where_it_is_not_expected(request_bytes, echo, answer, share):
+    asker = Asker(Request(request_bytes, echo=echo))
     asker.asked()
-    assert asker.heard(b"\x02\x04\x00\x10") == b"\x02\x04\x00\x10"
-    assert asker.echo_share == 0.0
-
-
-def test_an_echo_is_counted_and_stays_where_it_is_not_expected():
-    asker = Asker(Request(b"?", echo=False))
-    asker.asked()
-    assert asker.heard(b"?1\n") == b"?1\n"
-    assert asker.echo_share == 1.0
+    assert (asker.heard(answer), asker.echo_share) == (answer, share)
 
 
 def test_a_port_asks():
