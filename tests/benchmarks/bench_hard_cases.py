@@ -11,6 +11,7 @@ Every thirtieth, and all that own up to more than the 0.1 % that was asked for, 
 a mesh two orders higher; errors are of the charges of the built-in layouts, relative to the largest of a layout.
 """
 
+import argparse
 import json
 import multiprocessing
 import sys
@@ -20,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from shared import arguments
 
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
@@ -143,7 +143,13 @@ def tables(entries: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    asked = arguments(__doc__, draws=2000, seed=7, json=False, log=None, jobs=2)
+    parser = argparse.ArgumentParser(description="Presses drawn from all over the scenes.")
+    parser.add_argument("--draws", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of tables")
+    parser.add_argument("--log", type=Path, help="write each draw to this file, and go on from there")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    asked = parser.parse_args()
     entries = record(asked.draws, asked.seed, asked.jobs, asked.log)
     print(json.dumps({"seed": asked.seed, "draws": entries}) if asked.json else tables(entries))
 
