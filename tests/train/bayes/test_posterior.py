@@ -9,7 +9,7 @@ from scipy import stats
 from isocharge.common.errors import ChargeError, InputError
 from isocharge.simulate import Circle, Domain, NoiseModel, noise_model
 from isocharge.train import BayesLimit, BayesProblem, bayes_estimate, bayes_limit
-from isocharge.train.bayes.posterior import Posterior
+from isocharge.train.bayes.posterior import Cells, Posterior
 from isocharge.train.data.presses import draw_contacts
 
 REFERENCE, UNIT = noise_model("reference"), Domain(1.0, (1.0, 1.0 + 1e-9))
@@ -170,3 +170,14 @@ def test_errors_by_hand():
 def test_a_map_of_other_forces_is_refused(sensor, spline):
     with pytest.raises(InputError, match="expected the problem's"):
         bayes_estimate(BayesProblem(sensor, Circle(1.0), force_range=(0.1, 1.0)), np.ones((1, 3)), charge_map=spline)
+
+
+@pytest.mark.parametrize("radius", [0.4, 30.0])
+def test_cells_cover_the_disk_once(radius):
+    """Those of the first round, and the finer ones in their place."""
+    cells = Cells.roots(radius)
+    for parts in ([cells], [*cells.finer(radius)]):
+        insides = [(part.side**2 * share[:, None], centre) for part in parts for share, centre in [part.inside(radius)]]
+        area = sum(areas.sum() for areas, _ in insides)
+        assert area == pytest.approx(np.pi * radius**2, rel=2e-4)
+        assert np.abs(sum((areas * centre).sum(axis=0) for areas, centre in insides)).max() < 1e-6 * radius * area

@@ -5,6 +5,7 @@ import json
 import tracemalloc
 import zipfile
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from isocharge.common.errors import ModelError
 from isocharge.common.progress import listening
 from isocharge.common.resumable_run import resume_parts
-from isocharge.serve import Predictor, check_golden, load_model
+from isocharge.serve import Predictor, check_golden, find_model, load_model
 from isocharge.simulate import load_sensor, noise_model
 from isocharge.simulate.sensor.film_prior import FilmSpread
 from isocharge.train import FilmsConfig, fit_films, read_films, release_films
@@ -21,7 +22,7 @@ from isocharge.train.films import fit as films_fit
 from isocharge.train.films import release as films_release
 from isocharge.train.films.films_file import FILE, _npz, films_bytes, films_from_bytes
 from isocharge.train.films.fit import films_identity
-from isocharge.train.films.release import evaluate_films
+from isocharge.train.films.release import ROWS, FilmsErrors, evaluate_films, films_card
 from isocharge.train.training import correlation, descent
 
 
@@ -191,3 +192,15 @@ def test_the_film_that_is_assumed_has_the_lower_error(films):
     assert np.array_equal(errors.parameters, films.prior.mean)
     assert not np.array_equal(films.prior.mean, films.prior.described)
     assert errors.known["position_rms_mm"] < 0.5 * errors.unknown["position_rms_mm"]
+
+
+def test_the_card_says_what_was_measured(films):
+    about = load_model(find_model("four-25um-biaxial-films")).metadata
+    known = dict.fromkeys([key for _, key, _ in ROWS], 0.25) | {"coverage_68": 0.67, "coverage_95": 0.95}
+    errors = FilmsErrors(known, {key: 0.5 * value for key, value in known.items()}, about.errors, "a film")
+    card = films_card(films, errors, about, SimpleNamespace(domain=films.domain))
+    assert "| coverage of the 68 % intervals | 67 % | 33.5 % |" in card
+    assert "| coverage of the 95 % intervals | 95 % | 47.5 % |" in card
+    assert card.count(" | 0.25 ") == card.count(" | 0.125 ") == len(ROWS)
+    assert "| trained for the noise | reference: 1 pC and 0.2 % |" in card
+    assert "| Young's modulus; thickness | 20 %; 5 % |" in card
