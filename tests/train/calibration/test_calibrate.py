@@ -18,7 +18,7 @@ from isocharge.train import CalibrationProblem, calibrate, next_presses
 from isocharge.train.calibration import discrepancy
 from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
 from isocharge.train.calibration.contacts import PressData, with_force
-from isocharge.train.calibration.diagnosis import find_mistakes
+from isocharge.train.calibration.diagnosis import OFFSET, PRETENSIONS, find_mistakes, misfit
 from isocharge.train.calibration.film_charges import MODE_STDS
 from isocharge.train.calibration.film_fit import fit_film
 from isocharge.train.data.presses import draw_contacts
@@ -335,6 +335,14 @@ def test_a_mistake_is_found_where_there_is_one(problem, name):
     assert find_mistakes(presses, problem.charges) == []
     found = find_mistakes(presses_of(problem, *mistake(presses.contact, presses.charge_pC)), problem.charges)
     assert re.search(reason, "; ".join(found))  # turned axes and swapped columns are the same on this layout
+
+
+def test_a_factor_of_all_charges_alone_is_the_misfit(problem):
+    """Three times those of the film with the largest charges."""
+    film = np.append(min(PRETENSIONS) * problem.prior.spread.pretension, problem.prior.mean[1:])
+    at = draw_contacts(np.random.default_rng(3), problem.domain.within(6.0), 10)
+    presses = presses_of(problem, at, 3.0 * problem.charges.charges(film, at))
+    assert misfit(presses, problem.charges) == pytest.approx((np.log(3.0) / OFFSET) ** 2)
 
 
 @pytest.mark.parametrize("name", IMPOSSIBLE)
