@@ -102,3 +102,14 @@ def test_a_log_that_nobody_reads_holds_up_no_request(start):
     client.close()
     process.terminate()
     assert process.wait(timeout=20) == 0
+
+
+def test_the_token_is_in_no_line_of_the_log(start, film, tmp_path):
+    """Not even where a folder that is refused has its name."""
+    (film.write(tmp_path, name="sesame") / "golden.json").unlink()
+    film.write(tmp_path)
+    process = start("--port", 0, "--log", "json", "--token", "sesame", folder=tmp_path)
+    assert process.stdout.readline()
+    process.terminate()
+    said = process.communicate(timeout=20)[1]
+    assert ("[secret]" in said, "sesame" in said) == (True, False)
