@@ -40,7 +40,6 @@ bench: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_solve.py
 	$(BIN)/python tests/benchmarks/bench_model.py
 	$(BIN)/python tests/benchmarks/bench_predictor.py
-	$(BIN)/python tests/benchmarks/bench_c.py
 	$(BIN)/python tests/benchmarks/bench_stream.py
 	$(BIN)/python tests/benchmarks/bench_touch.py
 	$(BIN)/python tests/benchmarks/bench_http.py

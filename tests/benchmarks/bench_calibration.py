@@ -1,7 +1,7 @@
 """Error against number of presses: calibration, its alternatives and the linearised limit; coverage of the intervals.
 
-    python tests/benchmarks/bench_calibration.py [--sensor NAME ...] [--films 40] [--fine 8] [--coverage 100]
-        [--workers 2] [--seed 1] [-o FOLDER]
+    python tests/benchmarks/bench_calibration.py [--sensors NAME,...] [--films 40] [--fine 8] [--coverage 100]
+        [--workers 2] [--seed 1] [--output FOLDER]
 
 Films are drawn from the prior of the network for all films; presses are known to 0.1 mm and 1 %, charges have
 `reference` noise. Their truth comes from forward maps that are solved for each film, not from the family that the
@@ -10,7 +10,6 @@ family's.
 Writes calibration.json and calibration.png.
 """
 
-import argparse
 import json
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.ticker import FormatStrFormatter, NullFormatter, ScalarFormatter
+from shared import arguments
 
 from isocharge.serve import MeasuredPresses
 from isocharge.serve.benchmark import machine
@@ -33,7 +33,7 @@ from isocharge.train.baselines.gauss_newton import GaussNewton
 from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
 from isocharge.train.data.presses import draw_contacts, position_error
 
-SENSORS = ("four-25um-biaxial", "three-25um-biaxial", "four-25um-uniaxial")
+SENSORS = "four-25um-biaxial,three-25um-biaxial,four-25um-uniaxial"
 COUNTS = (1, 3, 5, 8, 15, 30)
 POSITION_MM, FORCE = 0.1, 0.01
 CONTACTS = 1000
@@ -199,19 +199,13 @@ def picture(tables: dict[str, dict[str, Any]], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sensor", action="append")
-    parser.add_argument("--films", type=int, default=40)
-    parser.add_argument("--fine", type=int, default=8)
-    parser.add_argument("--coverage", type=int, default=100)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("-o", "--output", type=Path, default=Path("build/calibration"))
-    options = parser.parse_args()
+    options = arguments(
+        __doc__, sensors=SENSORS, films=40, fine=8, coverage=100, workers=2, seed=1, output=Path("build/calibration")
+    )
     options.output.mkdir(parents=True, exist_ok=True)
     tables: dict[str, dict[str, Any]] = {}
     with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
-        for sensor in options.sensor or SENSORS:
+        for sensor in options.sensors.split(","):
             seeds = range(1000 * options.seed, 1000 * options.seed + options.films)
             jobs = [(sensor, seed, number < options.fine) for number, seed in enumerate(seeds)]
             tables[sensor] = summary(list(pool.map(study, jobs)))

@@ -1,18 +1,17 @@
 """An export on emulated Cortex-M boards: answers, instructions per prediction, flash, RAM; no times without a chip.
 
-    python tests/benchmarks/bench_cortex_m.py EXPORT [--json]
+    python tests/benchmarks/bench_cortex_m.py --export c [--json]
 
-EXPORT is a folder of `isocharge train export-c`. QEMU emulates Arm's MPS2 boards with a Cortex-M4F (AN386) and a
+The export is a folder of `isocharge train export-c`. QEMU emulates Arm's MPS2 boards with a Cortex-M4F (AN386) and a
 Cortex-M7 (AN500) and counts instructions (`-icount shift=0`). Flash and RAM are those of the smallest program that
 predicts, with its start-up code and the C library's functions; RAM is its data and its stack.
 """
 
-import argparse
-import json
 import subprocess
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
+
+from shared import arguments, print_results
 
 SOURCES = Path(__file__).parents[1] / "train" / "export_c" / "board"
 
@@ -32,24 +31,14 @@ COUNTED = (
 """The words that `measure.c` prints, in their order."""
 
 
-@dataclass(frozen=True)
-class Board:
-    """An emulated board: its name in QEMU, and what a compiler must know of its processor."""
-
-    machine: str
-    processor: str
+BOARDS = {"mps2-an386": "-mcpu=cortex-m4 -mfpu=fpv4-sp-d16", "mps2-an500": "-mcpu=cortex-m7 -mfpu=fpv5-sp-d16"}
+"""Emulated boards by their names in QEMU, and what a compiler must know of their processors."""
 
 
-BOARDS = {
-    "mps2-an386": Board("mps2-an386", "-mcpu=cortex-m4 -mfpu=fpv4-sp-d16"),
-    "mps2-an500": Board("mps2-an500", "-mcpu=cortex-m7 -mfpu=fpv5-sp-d16"),
-}
-
-
-def measure(export: Path, board: Board, folder: Path) -> dict[str, object]:
+def measure(export: Path, board: str, folder: Path) -> dict[str, object]:
     """Compile an export for a board, run it, and count."""
     measuring = _link(export, board, folder / "measure.elf", "measure.c", "isocharge_chain.c")
-    emulator = f"qemu-system-arm -M {board.machine} -icount shift=0 -display none -serial none -monitor none"
+    emulator = f"qemu-system-arm -M {board} -icount shift=0 -display none -serial none -monitor none"
     emulator += " -chardev stdio,id=out -semihosting-config enable=on,target=native,chardev=out -kernel"
     done = subprocess.run([*emulator.split(), measuring], capture_output=True, text=True, check=False, timeout=300)
     words = [int(word, 16) for word in done.stdout.split()]
@@ -64,9 +53,9 @@ def measure(export: Path, board: Board, folder: Path) -> dict[str, object]:
     }
 
 
-def _link(export: Path, board: Board, output: Path, main: str, *parts: str) -> Path:
+def _link(export: Path, board: str, output: Path, main: str, *parts: str) -> Path:
     """A program of an export for a board."""
-    words = [*board.processor.split(), *OPTIONS.split(), "-I", str(export), "-nostartfiles", "--specs=nano.specs"]
+    words = [*BOARDS[board].split(), *OPTIONS.split(), "-I", str(export), "-nostartfiles", "--specs=nano.specs"]
     words += ["-Wl,--gc-sections", "-T", str(SOURCES / "mps2.ld"), str(SOURCES / "start.c"), str(SOURCES / main)]
     words += [str(export / name) for name in ("isocharge_model.c", *parts)]
     subprocess.run(["arm-none-eabi-gcc", *words, "-lm", "-o", str(output)], check=True)
@@ -75,25 +64,14 @@ def _link(export: Path, board: Board, output: Path, main: str, *parts: str) -> P
 
 def _sizes(program: Path) -> tuple[int, int, int]:
     """Bytes of code and constants, of variables with a value, and of variables that start at zero."""
-    printed = subprocess.check_output(["arm-none-eabi-size", str(program)], text=True)
-    text, data, bss = printed.splitlines()[1].split()[:3]
+    text, data, bss = subprocess.check_output(["arm-none-eabi-size", program], text=True).splitlines()[1].split()[:3]
     return int(text), int(data), int(bss)
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("export", type=Path, help="folder of `isocharge train export-c`")
-    parser.add_argument("--json", action="store_true", help="one JSON object")
-    asked = parser.parse_args(arguments)
+def main() -> None:
+    asked = arguments(__doc__, export=Path("c"), json=False)
     with tempfile.TemporaryDirectory() as folder:
-        boards = {name: measure(asked.export, board, Path(folder)) for name, board in BOARDS.items()}
-    if asked.json:
-        print(json.dumps({"benchmark": "cortex_m", "export": str(asked.export), "boards": boards}))
-        return
-    for name, counted in boards.items():
-        print(f"{name} ({BOARDS[name].processor.split()[0].removeprefix('-mcpu=')}, emulated)")
-        for key, value in counted.items():
-            print(f"    {key.replace('_', ' ')}: {value}")
+        print_results("cortex_m", asked, {board: measure(asked.export, board, Path(folder)) for board in BOARDS})
 
 
 if __name__ == "__main__":

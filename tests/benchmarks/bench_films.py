@@ -8,7 +8,6 @@ on. Asked: an rms of at most 1.06 times that of the single network, a prediction
 released model of the same sensor, folding under 1 s. `--train FOLDER` times the training, too, from nothing.
 """
 
-import json
 import time
 from functools import partial
 from pathlib import Path
@@ -16,10 +15,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from shared import options
+from shared import in_turns, options, print_results
 
 from isocharge.serve import Predictor, find_model
-from isocharge.serve.benchmark import Contender, machine, take_turns
+from isocharge.serve.benchmark import Contender
 from isocharge.simulate import Sweep, read_dataset, run_sweep
 from isocharge.simulate.execution.workers import cores, local_workers
 from isocharge.simulate.numerics.statistics import rms
@@ -41,9 +40,7 @@ def one_film(films: FilmsModel, parameters: np.ndarray, seed: int) -> dict[str, 
     position = {name: rms(position_error(contact, presses.contact)) for name, contact in answers.items()}
     force = {name: 100.0 * rms(c[:, 2] / presses.contact[:, 2] - 1.0) for name, c in answers.items()}
     return {
-        "pretension_MPa": float(parameters[0]),
-        "radius_mm": single.domain.radius,
-        "presses": len(presses),
+        "pretension_MPa": round(float(parameters[0]), 2),
         "position_rms_mm": position,
         "force_rms_percent": force,
         "position_ratio": position["all films"] / position["alone"],
@@ -51,15 +48,12 @@ def one_film(films: FilmsModel, parameters: np.ndarray, seed: int) -> dict[str, 
     }
 
 
-def prediction_times(model: str, rival: str, seconds: float) -> dict[str, float]:
-    """Median time of one prediction, us, in turns."""
-    contenders = []
-    for name in (model, rival):
-        predictor = Predictor(find_model(name))
-        charges = [300.0 + 10.0 * k for k in range(len(predictor.metadata.electrodes))]
-        contenders.append(Contender(name, 1, partial(predictor.predict, charges)))
-    medians = {timing.name: timing.p50_us for timing in take_turns(contenders, seconds)}
-    return {**medians, "ratio": medians[model] / medians[rival]}
+def contender(name: str) -> Contender:
+    """A prediction of one press."""
+    predictor = Predictor(find_model(name))
+    return Contender(
+        name, 1, partial(predictor.predict, [300.0, 310.0, 320.0, 330.0][: len(predictor.metadata.electrodes)])
+    )
 
 
 def folding_time(films: FilmsModel, parameters: np.ndarray) -> float:
@@ -82,35 +76,17 @@ def training_time(films: FilmsModel, folder: Path) -> float:
 
 
 def main() -> None:
-    """Measure and print."""
-    chosen = options(__doc__, "four-25um-biaxial-films", films=4, seconds=2.0, train=None)
-    films = read_films(find_model(chosen.model))
-    drawn = films.prior.draw(np.random.default_rng(chosen.seed), chosen.films)
-    record: dict[str, Any] = {
-        "machine": machine(),
-        "model": chosen.model,
-        "seed": chosen.seed,
-        "prediction_us": prediction_times(chosen.model, films.prior.sensor.name, chosen.seconds),
-        "folding_s": folding_time(films, drawn[0]),
-        "films": [one_film(films, parameters, chosen.seed) for parameters in drawn],
+    asked = options(__doc__, "four-25um-biaxial-films", films=4, seconds=2.0, train=None)
+    films = read_films(find_model(asked.model))
+    drawn = films.prior.draw(np.random.default_rng(asked.seed), asked.films)
+    results: dict[str, Any] = {
+        "prediction": in_turns([contender(films.prior.sensor.name), contender(asked.model)], asked.seconds),
+        "folding, s": folding_time(films, drawn[0]),
+        "films": [one_film(films, parameters, asked.seed) for parameters in drawn],
     }
-    if chosen.train:
-        record["training_s"] = training_time(films, chosen.train)
-    print(json.dumps(record, indent=1) if chosen.json else summary(record))
-
-
-def summary(record: dict[str, Any]) -> str:
-    """The record as lines for people."""
-    lines = [
-        f"{film['pretension_MPa']:.2f} MPa: {film['position_rms_mm']['all films']:.4f} mm knowing the film, "
-        f"{film['position_rms_mm']['alone']:.4f} mm trained on it ({film['position_ratio']:.3f}); force "
-        f"{film['force_rms_percent']['all films']:.3f} and {film['force_rms_percent']['alone']:.3f} % "
-        f"({film['force_ratio']:.3f})"
-        for film in record["films"]
-    ]
-    times = ", ".join(f"{name} {value:.3f}" for name, value in record["prediction_us"].items())
-    training = [f"training: {record['training_s']:.0f} s"] if "training_s" in record else []
-    return "\n".join([*lines, f"prediction, us: {times}", f"folding: {record['folding_s']:.2f} s", *training])
+    if asked.train:
+        results["training, s"] = training_time(films, asked.train)
+    print_results("films", asked, results)
 
 
 if __name__ == "__main__":

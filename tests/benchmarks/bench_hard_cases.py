@@ -11,18 +11,16 @@ Every thirtieth, and all that own up to more than the 0.1 % that was asked for, 
 a mesh two orders higher; errors are of the charges of the built-in layouts, relative to the largest of a layout.
 """
 
-import argparse
 import json
 import multiprocessing
-import sys
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from isocharge.common.errors import SceneError, SolveError
+from isocharge.common.progress import track
 from isocharge.simulate import (
     Circle,
     Equilibrium,
@@ -110,18 +108,10 @@ def refined_error(found: Equilibrium) -> float:
     return max(errors)
 
 
-def record(draws: int, seed: int, jobs: int, log: Path | None) -> list[dict[str, Any]]:
-    """All draws; what a log already holds is not solved again."""
-    entries = [json.loads(line) for line in log.read_text().splitlines()] if log and log.exists() else []
-    missing = sorted(set(range(draws)) - {entry["number"] for entry in entries})
+def record(draws: int, seed: int, jobs: int) -> list[dict[str, Any]]:
+    """All draws."""
     with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=FRESH) as workers:
-        for entry in workers.imap_unordered(solve, [(seed, number) for number in missing]):
-            entries.append(entry)
-            if log:
-                with log.open("a") as file:
-                    file.write(json.dumps(entry) + "\n")
-            print(f"{len(entries)} of {draws}", file=sys.stderr, end="\r", flush=True)
-    return sorted(entries, key=lambda entry: int(entry["number"]))[:draws]
+        return [*track(workers.imap(solve, [(seed, number) for number in range(draws)]), "draws", draws)]
 
 
 def tables(entries: list[dict[str, Any]]) -> str:
@@ -143,14 +133,10 @@ def tables(entries: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Presses drawn from all over the scenes.")
-    parser.add_argument("--draws", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=7)
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of tables")
-    parser.add_argument("--log", type=Path, help="write each draw to this file, and go on from there")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
-    asked = parser.parse_args()
-    entries = record(asked.draws, asked.seed, asked.jobs, asked.log)
+    from shared import arguments  # found where this is the program, not where a test imports it
+
+    asked = arguments(__doc__, draws=2000, seed=7, json=False, jobs=2)
+    entries = record(asked.draws, asked.seed, asked.jobs)
     print(json.dumps({"seed": asked.seed, "draws": entries}) if asked.json else tables(entries))
 
 

@@ -1,18 +1,17 @@
 """HTTP: ours against a bare route, an idiomatic FastAPI service and Triton; all serve the same model file.
 
-    python tests/benchmarks/bench_http.py [--environments DIR] [--rounds 12] [--requests 400] [--seconds 4] [--json]
+    python tests/benchmarks/bench_http.py [--environments DIR] [--without-rivals] [--seconds 10] [--json]
 
 FastAPI and Triton get environments of their own in `--environments`, made once; one that cannot be installed
 or does not start is left out, and stderr says why. Client and servers share the cores; the client is a plain socket,
-the same for all. Latency: one request at a time over one open connection, contenders take turns within each round.
-Throughput: 32 connections, each with one request under way. Ratios come from the same rounds. A batch of 1024 is
-measured twice: bytes on a socket, and arrays in and out of Triton's stock client. Triton runs the model in Python, as
-its wheel has no backend for ONNX.
+the same for all. Latency: one request at a time over one open connection, contenders take turns. Throughput: 32
+connections, each with one request under way. A batch of 1024 is measured twice: bytes on a socket, and arrays in and
+out of Triton's stock client. Triton runs the model in Python, as its wheel has no backend for ONNX.
 """
 
 import argparse
 import json
-import select
+import selectors
 import signal
 import socket
 import subprocess
@@ -28,9 +27,10 @@ from typing import IO, Any
 
 import numpy as np
 import tritonclient.http
-from shared import options, print_results, rows, take_turns
+from shared import in_turns, options, print_results
 
 from isocharge.serve import find_model, load_model
+from isocharge.serve.benchmark import Contender
 from isocharge.serve.model.session import OUTPUTS
 
 HERE = Path(__file__).parent
@@ -185,10 +185,12 @@ def start(stack: ExitStack, model: str, environments: Path | None) -> Contenders
     stack.enter_context(running([*ours, "--port", str(tcp[1])], tcp))
     stack.enter_context(running([*ours, "--uds", uds], uds))
     contenders: Contenders = {"isocharge": (tcp, path), "isocharge, Unix socket": (uds, path)}
-    for name, start_rival in RIVALS.items() if environments else ():
+    for name, (environment, words) in RIVALS.items() if environments else ():
+        address = _local_address()
         try:
-            python = python_of("triton" if name == "Triton" else "fastapi", environments)
-            contenders[name] = start_rival(stack, python, folder / "model.onnx"), path
+            python = python_of(environment, environments)
+            stack.enter_context(running([python, *words(str(address[1]), folder / "model.onnx")], address))
+            contenders[name] = address, path
         except NotStarted as error:
             print(f"left out: {name}: {error}", file=sys.stderr)
     return contenders
@@ -198,64 +200,28 @@ def _local_address() -> tuple[str, int]:
     return "127.0.0.1", free_port()
 
 
-def _start_script(script: str, stack: ExitStack, python: Path, model: Path) -> Address:
-    """Start a server of the folder `rivals`, which takes a port and a model file."""
-    address = _local_address()
-    stack.enter_context(running([python, HERE / "rivals" / script, str(address[1]), model], address))
-    return address
-
-
-def _start_triton(stack: ExitStack, python: Path, model: Path) -> Address:
-    """Start Triton on the models as they stand."""
-    address = _local_address()
-    command = [python, DEPLOY / "triton/start.py", model.parents[2], "--port", str(address[1])]
-    stack.enter_context(running(command, address))
-    return address
-
-
 RIVALS = {
-    "bare route": partial(_start_script, "bare_app.py"),
-    "FastAPI": partial(_start_script, "fastapi_app.py"),
-    "Triton": _start_triton,
+    "bare route": ("fastapi", lambda port, model: [HERE / "rivals/bare_app.py", port, model]),
+    "FastAPI": ("fastapi", lambda port, model: [HERE / "rivals/fastapi_app.py", port, model]),
+    "Triton": ("triton", lambda port, model: [DEPLOY / "triton/start.py", model.parents[2], "--port", port]),
 }
+"""Environment, and the words of the program that serves a model file."""
 
 
 def throughput(address: Address, request: bytes, seconds: float) -> float:
-    """Answers per second over 32 connections, each with one request under way.
-
-    The client shares the cores, so it does as little as it can: the same request has an answer of the same length.
-    """
-    opened = [Connection(address).socket for _ in range(CONNECTIONS)]
-    connections = {connection.fileno(): connection for connection in opened}
-    size = _answer_size(address, request)
-    with select.epoll() as waiting:
-        for number, connection in connections.items():
-            waiting.register(number, select.EPOLLIN)
-            connection.sendall(request)
-        begin, answers, missing = time.perf_counter(), 0, dict.fromkeys(connections, size)
+    """Answers per second over 32 connections, each with one request under way."""
+    with ExitStack() as stack, selectors.DefaultSelector() as waiting:
+        for _ in range(CONNECTIONS):
+            connection = stack.enter_context(closing(Connection(address)))
+            waiting.register(connection.socket, selectors.EVENT_READ, connection)
+            connection.socket.sendall(request)
+        begin, answers = time.perf_counter(), 0
         while (now := time.perf_counter()) < begin + seconds:
-            for number, _ in waiting.poll(1.0):
-                connection = connections[number]
-                missing[number] -= len(connection.recv(size))
-                if not missing[number]:
-                    missing[number] = size
-                    connection.send(request)
-                    answers += 1
-    for connection in opened:
-        connection.close()
+            for key, _ in waiting.select(1.0):
+                key.data.receive()
+                key.data.socket.sendall(request)
+                answers += 1
     return answers / (now - begin)
-
-
-def _answer_size(address: Address, request: bytes) -> int:
-    """Bytes of a good answer, its headers included."""
-    connection = Connection(address)
-    connection.socket.sendall(request)
-    time.sleep(0.2)
-    data = connection.socket.recv(1 << 20)
-    connection.close()
-    if not data.startswith(b"HTTP/1.1 200"):
-        raise RuntimeError(f"expected an answer 200, got {data[:300]!r}")
-    return len(data)
 
 
 def asking(stack: ExitStack, address: Address, request: bytes) -> Callable[[], bytes]:
@@ -282,17 +248,18 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
         address, path = servers["isocharge"]
         client = stack.enter_context(tritonclient.http.InferenceServerClient("{}:{}".format(*address)))
         stock = partial(stock_infer, client, path.split("/")[3], charges)
-        single = {name: asking(stack, *target) for name, target in one.items()}
-        batch = {name: asking(stack, address, make(path, charges)) for name, make in CODINGS.items()}
-        arrays = {name: partial(stock, binary=name == "binary") for name in CODINGS}
         tables = {
-            "one press, one request at a time": (single, asked.requests, "isocharge"),
-            "1024 presses, plain socket": (batch, asked.requests // 10, "JSON"),
-            "1024 presses, arrays in and out of the stock client": (arrays, asked.requests // 40, "JSON"),
+            "one press, one request at a time": {name: asking(stack, *target) for name, target in one.items()},
+            "1024 presses, plain socket": {
+                name: asking(stack, address, make(path, charges)) for name, make in CODINGS.items()
+            },
+            "1024 presses, arrays in and out of the stock client": {
+                name: partial(stock, binary=name == "binary") for name in CODINGS
+            },
         }
         results = {
-            title: list(rows(take_turns(calls, asked.rounds, number), against))
-            for title, (calls, number, against) in tables.items()
+            title: in_turns([Contender(name, 1, call) for name, call in calls.items()], asked.seconds)
+            for title, calls in tables.items()
         }
         counts = {name: np.mean([throughput(*target, asked.seconds) for _ in range(2)]) for name, target in one.items()}
     results["32 connections"] = [
@@ -303,14 +270,7 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
 
 
 def main() -> None:
-    asked = options(
-        __doc__,
-        environments=Path("build/bench-environments"),
-        without_rivals=False,
-        rounds=12,
-        requests=400,
-        seconds=4.0,
-    )
+    asked = options(__doc__, environments=Path("build/bench-environments"), without_rivals=False, seconds=10.0)
     print_results("http", asked, measure(asked))
 
 

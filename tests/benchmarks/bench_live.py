@@ -12,7 +12,6 @@ pictures are and how many a second it draws.
 import asyncio
 import json
 import multiprocessing
-import os
 import re
 import struct
 import subprocess
@@ -20,11 +19,12 @@ import sys
 import tempfile
 import time
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 
 import bench_stream
 import numpy as np
-from shared import arguments, percentiles
+from shared import arguments, percentiles, print_results
 from websockets.asyncio.client import connect
 
 from isocharge.serve import Predictor, Recording, Script, wander
@@ -46,26 +46,28 @@ def presses(rate_Hz):
     return Script(*columns, rate_Hz)
 
 
-def watch(url, electrodes, stalls, seconds, results):
-    """A viewer by the stock client, in a process of its own: ages of the newest sample, s."""
-    results.send(asyncio.run(_watch(url, SampleFormat(electrodes), stalls, seconds)))
+def watch(url, electrodes, viewers, seconds, results):
+    """Viewers by the stock client, in a process of their own: ages of the newest sample, s. The first one stalls."""
+    results.send(asyncio.run(_watch_all(url, SampleFormat(electrodes), viewers, seconds)))
+
+
+async def _watch_all(url, form, viewers, seconds):
+    ages = await asyncio.gather(*(_watch(url, form, number == 0, seconds) for number in range(viewers)))
+    return [age for viewer in ages for age in viewer]
 
 
 async def _watch(url, form, stalls, seconds):
-    ages = []
+    ages, end = [], time.monotonic() + seconds
     async with connect(url.replace("http", "ws", 1) + "/live") as client:
         if stalls:
             client.transport.pause_reading()
             await asyncio.sleep(seconds)
             client.transport.abort()  # a stalled client would not take part in closing, either
-            return ages
-        end = time.monotonic() + seconds
         while time.monotonic() < end:
             data = await client.recv()
             if isinstance(data, bytes):
                 rows = np.frombuffer(data, form.dtype, offset=HEADER.size)
-                if len(rows):
-                    ages.append(time.time() - float(rows["timestamp"][-1]))
+                ages += [time.time() - stamp for stamp in rows["timestamp"][-1:]]
                 await asyncio.sleep(1 / 60)  # a picture
                 await client.send(struct.pack("<I", HEADER.unpack_from(data)[3]))
     return ages
@@ -107,30 +109,17 @@ def following(port, folder, name, *words):
         process.wait(30)
 
 
-@contextmanager
-def watched(url, viewers, seconds):
-    """Viewers for a while, the first of which stalls; the list has the ages of what the others saw after the block."""
-    ages, electrodes, watching = [], Predictor(MODEL).metadata.electrodes, []
-    for k in range(viewers):
-        ours, theirs = multiprocessing.Pipe(duplex=False)
-        process = multiprocessing.Process(target=watch, args=(url, electrodes, k == 0, seconds, theirs))
-        process.start()
-        watching.append((process, ours))
-    yield ages
-    for process, result in watching:
-        ages += result.recv() if result.poll(20) else []
-        process.join()
-
-
 def one_round(port, viewers, seconds, folder, name, in_browser):
     """Follow the port for a while: latencies (us), lost frames, ages (s), and what the browser says."""
-    path = folder / f"{name}.rec"
+    path, (ours, theirs) = folder / f"{name}.rec", multiprocessing.Pipe(duplex=False)
     words = ["--live", "127.0.0.1:0"] if viewers else []
-    with (
-        following(port, folder, name, "--record", path, *words) as url,
-        watched(url, viewers - in_browser, seconds) as ages,
-    ):
+    with following(port, folder, name, "--record", path, *words) as url:
+        wanted = url, Predictor(MODEL).metadata.electrodes, viewers - in_browser, seconds, theirs
+        watching = multiprocessing.Process(target=watch, args=wanted)
+        watching.start()
         browsed = browse(url, seconds) if in_browser else time.sleep(seconds)
+        ages = ours.recv()
+        watching.join()
     latencies = np.array([us for event in Recording(path).events() for us in event.latencies_us])
     lines = (json.loads(line) for line in path.open() if line.startswith('{"timestamp"'))
     seq = np.array([line["seq"] for line in lines])
@@ -138,38 +127,31 @@ def one_round(port, viewers, seconds, folder, name, in_browser):
 
 
 def main():
-    options = arguments(__doc__, rounds=4, seconds=10.0, rate_Hz=1000.0, browser=False)
-    context = multiprocessing.get_context("spawn")
-    pipe, far = context.Pipe()
-    board = context.Process(target=bench_stream.board, args=(far, 3, presses(options.rate_Hz), 0), daemon=True)
+    options, results = arguments(__doc__, rounds=4, seconds=10.0, rate_Hz=1000.0, browser=False, json=False), {}
+    pipe, far = multiprocessing.Pipe()
+    board = multiprocessing.get_context("spawn").Process(
+        target=bench_stream.board, args=(far, 3, presses(options.rate_Hz), 0), daemon=True
+    )
     board.start()
     port, p99 = pipe.recv(), {0: [], 3: []}
-    print(
-        f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {options.rate_Hz:g} Hz, {options.seconds:g} s a round"
-    )
-    with tempfile.TemporaryDirectory() as name:
-        for number in range(options.rounds):
-            for viewers in (0, 3) if number % 2 == 0 else (3, 0):
-                in_browser = options.browser and viewers > 0
-                latencies, lost, ages, browsed = one_round(
-                    port, viewers, options.seconds, Path(name), f"{number}-{viewers}", in_browser
-                )
-                p99[viewers].append(float(np.percentile(latencies, 99)))
-                print(
-                    f"round {number}, {viewers} viewers: latency us {percentiles(latencies, SHARES)}; "
-                    f"{len(latencies)} records, {lost} lost; age ms {percentiles(1e3 * np.array(ages), SHARES)}"
-                )
-                if browsed is not None:
-                    print(
-                        f"  Chromium: age of a picture ms {percentiles(browsed[0], SHARES)}, {browsed[1]:.1f} a second"
-                    )
-    ratios = np.array(p99[3]) / np.array(p99[0])
-    spread = f"median {np.median(ratios):.2f}, {ratios.min():.2f} to {ratios.max():.2f}"
-    print(f"p99 with three viewers over without: {spread}")
+    with tempfile.TemporaryDirectory() as folder:
+        for number, viewers in product(range(options.rounds), (0, 3)):
+            in_browser, name = options.browser and viewers > 0, f"round {number}, {viewers} viewers"
+            latencies, lost, ages, browsed = one_round(port, viewers, options.seconds, Path(folder), name, in_browser)
+            p99[viewers].append(float(np.percentile(latencies, 99)))
+            results[name] = {
+                "latency_us": percentiles(latencies, SHARES),
+                "records, lost": (len(latencies), lost),
+                "age_ms": percentiles(1e3 * np.array(ages), SHARES),
+            }
+            if browsed:
+                results[name] |= {"picture_age_ms": percentiles(browsed[0], SHARES), "pictures_per_s": browsed[1]}
+    ratios = np.array(p99[3]) / p99[0]
+    results["p99 with three viewers over without, by round"] = ratios.round(2).tolist()
     pipe.send("enough")
-    played = pipe.recv()
-    print(f"board: {played['sent']} frames sent, {played['withheld']} withheld while nobody followed")
+    results["board"] = pipe.recv()
     board.join()
+    print_results("live", options, results)
 
 
 if __name__ == "__main__":

@@ -1,26 +1,24 @@
 """Released models against the Bayes limit, their intervals and their misfit: the tables of train/docs/accuracy.md.
 
-    python tests/benchmarks/bench_model.py [MODEL ...] [--presses 6000] [--draws 40000] [--seed 1] [--json]
+    python tests/benchmarks/bench_model.py [--models NAME,...] [--presses 6000] [--draws 40000] [--seed 1] [--json]
 
 Presses of a circle of 1 mm from solves of their own, none of them in the training data; `reference` noise, forces of
 the model. A minute for a thousand presses against the limit, kept in the cache folder afterwards.
 """
 
-import argparse
-import json
 from typing import Any
 
 import numpy as np
+from shared import arguments, print_results
 
 from isocharge.serve import Predictor
-from isocharge.serve.benchmark import machine
 from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.train.bayes.limit import BayesLimit, BayesProblem, bayes_estimate
 from isocharge.train.model_release.evaluate import alarm_threshold
 from isocharge.train.report.measures import coverage
 
-RELEASED = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial")
+RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
 BEYOND = ((0.5, 1.0), (1.0, 2.0))
 """Rings outside the working area, mm."""
 APART = 8.0
@@ -112,25 +110,13 @@ def faults(bench: Bench, count: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("models", nargs="*", default=RELEASED, metavar="MODEL")
-    parser.add_argument("--presses", type=int, default=6000, help="against the limit")
-    parser.add_argument("--draws", type=int, default=40000, help="for intervals and faults, at most 40000")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--json", action="store_true")
-    asked = parser.parse_args()
-    results = {}
-    for model in asked.models:
+    asked, results = arguments(__doc__, models=RELEASED, presses=6000, draws=40000, seed=1, json=False), {}
+    for model in asked.models.split(","):
         bench = Bench(model, asked.seed)
-        results[model] = (
+        results[f"{model}, within {bench.radius:.2f} mm"] = (
             against_limit(bench, asked.presses) | intervals(bench, asked.draws) | faults(bench, asked.draws)
         )
-        if not asked.json:
-            print(f"{model}, within {bench.radius:.2f} mm")
-            for name, value in results[model].items():
-                print(f"  {name:<42} {np.array2string(np.asarray(value), precision=4)}")
-    if asked.json:
-        print(json.dumps({"machine": machine(), "seed": asked.seed, "models": results}, indent=1))
+    print_results("model", asked, results)
 
 
 if __name__ == "__main__":

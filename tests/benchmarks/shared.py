@@ -2,16 +2,13 @@
 
 import argparse
 import json
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from isocharge.serve.benchmark import machine
-
-Calls = dict[str, Callable[[], object]]
+from isocharge.serve.benchmark import Contender, machine, take_turns
 
 
 def options(page: str, model: str = "three-25um-biaxial", **more: Any) -> argparse.Namespace:
@@ -31,17 +28,15 @@ def arguments(page: str, **defaults: Any) -> argparse.Namespace:
 
 
 def print_results(name: str, asked: argparse.Namespace, results: dict[str, Any]) -> None:
-    """Results, a value or a list of rows by title, with the machine: for people, or as one JSON object."""
+    """Results by title, a value, rows or values by name, with the machine: for people, or as one JSON object."""
     if asked.json:
         about = {"benchmark": name, **vars(asked), "machine": machine()}
         print(json.dumps(about | {"results": results}, default=str))
         return
     print(", ".join(f"{key} {value}" for key, value in machine().items()))
     for title, value in results.items():
-        if isinstance(value, list):
-            print(title, *value, sep="\n    ")
-        else:
-            print(f"{title}: {value}")
+        lines = [f"{name}: {item}" for name, item in value.items()] if isinstance(value, dict) else value
+        print(*([title, *lines] if isinstance(lines, list) else [f"{title}: {lines}"]), sep="\n    ")
 
 
 def percentiles(values: Any, shares: tuple[float, ...], digits: int = 1) -> dict[str, float]:
@@ -49,32 +44,16 @@ def percentiles(values: Any, shares: tuple[float, ...], digits: int = 1) -> dict
     return {f"p{share:g}": round(float(np.percentile(values, share)), digits) for share in shares if len(values)}
 
 
-def take_turns(calls: Calls, rounds: int, number: int) -> dict[str, np.ndarray]:
-    """Durations, shape (rounds, number), us, of calls that take turns; a first round warms up and is thrown away."""
-    durations: dict[str, list[np.ndarray]] = {name: [] for name in calls}
-    for _ in range(rounds + 1):
-        for name, call in calls.items():
-            durations[name].append(_microseconds(call, number))
-    return {name: np.array(of_name[1:]) for name, of_name in durations.items()}
-
-
-def _microseconds(call: Callable[[], object], number: int) -> np.ndarray:
-    clock, durations = time.perf_counter_ns, np.empty(number)
-    for i in range(number):
-        begin = clock()
-        call()
-        durations[i] = clock() - begin
-    return durations / 1e3
-
-
-def rows(durations: dict[str, np.ndarray], against: str) -> Iterator[dict[str, Any]]:
-    """A row for each call: percentiles, and its p50 over the p50 of `against`, median over rounds and its range."""
-    base = np.median(durations[against], axis=1)
-    for name, of_name in durations.items():
-        ratio = np.median(of_name, axis=1) / base
-        yield {
-            "call": name,
-            "us": percentiles(of_name, (50, 99), 2),
-            "ratio_p50": round(float(np.median(ratio)), 3),
-            "ratio_range": [round(float(ratio.min()), 3), round(float(ratio.max()), 3)],
+def in_turns(contenders: Sequence[Contender], seconds: float) -> list[dict[str, Any]]:
+    """A row for each: percentiles of the time for a press, and its median over that of the first."""
+    timings = take_turns(contenders, seconds)
+    first = timings[0].p50_us / timings[0].presses
+    return [
+        {
+            "call": timing.name,
+            "p50_us": round(timing.p50_us / timing.presses, 3),
+            "p99_us": round(timing.p99_us / timing.presses, 3),
+            "ratio_p50": round(timing.p50_us / timing.presses / first, 3),
         }
+        for timing in timings
+    ]
