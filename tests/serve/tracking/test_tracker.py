@@ -2,13 +2,16 @@
 
 import json
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from isocharge.serve import Chunk, Contact, Device, Frame, TouchStream, encode_frame
 from isocharge.serve.live.device import device_from_table, with_section
-from isocharge.serve.tracking.modes import Modes, Movement, Unit, step
+from isocharge.serve.tracking.modes import CALMEST, Modes, Movement, step
+from isocharge.serve.tracking.noise import Scatter, Unit
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
 
 STD, TRACK = 0.06, {"track": {}}
@@ -26,8 +29,13 @@ def contacts(path, std=STD, correlation=0.6, force=1.0):
 
 def followed(path, rate_Hz=1000.0, **options):
     """What a tracker says of a path, and the events with their frames."""
+    return followed_all(contacts(path, **options), rate_Hz)
+
+
+def followed_all(answers, rate_Hz=1000.0):
+    """The same of answers."""
     tracker = Tracker(TrackRule(lasting=0.0))
-    answers = [tracker.update(one, k / rate_Hz) for k, one in enumerate(contacts(path, **options))]
+    answers = [tracker.update(one, k / rate_Hz) for k, one in enumerate(answers)]
     return np.array([one for one, _ in answers]), [(k, event) for k, (_, event) in enumerate(answers) if event]
 
 
@@ -39,7 +47,7 @@ def slide(speed, rate_Hz=1000.0, turn=0.7):
 
 def test_the_moving_mode_alone_is_the_kalman_filter_of_the_textbook():
     """Constant velocity with white acceleration (Bar-Shalom, Li, Kirubarajan 2001, 6.2.2), in matrices."""
-    dt, q, speed, std, movement = 0.01, 50.0, 400.0, 0.1, Movement(0.0, 400.0, 50.0)
+    dt, q, speed, std, movement = 0.01, 50.0 * CALMEST, 400.0, 0.1, Movement(0.0, 400.0, 50.0)
     unit, measured = Unit.of_force(std), RNG.standard_normal(30) * 0.2 + np.linspace(0.0, 1.0, 30)
     modes = Modes.start(complex(measured[0]), unit, 1.0, movement)._replace(moving=1.0 - 1e-9)
     transition, noise = np.array([[1.0, dt], [0.0, 1.0]]), q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
@@ -48,10 +56,39 @@ def test_the_moving_mode_alone_is_the_kalman_filter_of_the_textbook():
         mean, cov = transition @ mean, transition @ cov @ transition.T + noise
         gain = cov[:, 0] / (cov[0, 0] + std**2)
         mean, cov = mean + gain * (value - mean[0]), cov - np.outer(gain, cov[0])
-        modes, _, _ = step(modes._replace(moving=1.0 - 1e-9), complex(value), dt, unit, 1.0, movement)
+        as_stated = modes._replace(moving=1.0 - 1e-9, scatter=Scatter.start(0j))
+        modes, _, _ = step(as_stated, complex(value), dt, unit, 1.0, movement)
         assert (modes.place.real, modes.velocity.real) == pytest.approx(tuple(mean), rel=0.02, abs=0.01)
         got = [modes.variance, modes.covariance, modes.velocity_variance]
         assert np.array(got) * std**2 == pytest.approx([cov[0, 0], cov[0, 1], cov[1, 1]], rel=0.05, abs=1e-4)
+
+
+@pytest.mark.parametrize(("louder", "left"), [(0.2, 0.0), (1.0, 0.0), (3.0, 0.0), (1.0, 0.5)])
+def test_the_scatter_of_frames_is_learned_while_the_contact_slides(louder, left):
+    """Noise of known size, of which `left` is left after 1 ms, on a slide of 50 mm/s, at uneven times."""
+    unit, learned = Unit.of_place(STD, STD, 0.6), []
+    for _ in range(10):
+        white = [complex(one.x_mm, one.y_mm) for one in contacts(np.zeros(1500), std=louder * STD)]
+        places = lfilter([math.sqrt(1.0 - left**2)], [1.0, -left], white) + 0.05 * np.arange(1500)
+        at_ms = np.cumsum(RNG.choice([1, 2, 5], 500))
+        scatter = Scatter.start(places[at_ms[0]])
+        for before, ms in pairwise(at_ms[at_ms < 1500]):
+            scatter = scatter.after(places[ms], 1e-3 * (ms - before), unit, 1.0)
+        learned.append(scatter.variance)
+    assert np.mean(learned) == pytest.approx(louder**2, rel=0.15, abs=0.02)
+
+
+def test_a_board_quieter_or_louder_than_the_model_says_is_followed_accordingly():
+    """A slide of 10 mm/s: errors and deviations go with the noise."""
+    path, _ = slide(10.0)
+    for louder in (0.2, 4.0):
+        errors, said = [], []
+        for _ in range(10):
+            noisy = contacts(path, std=louder * STD)
+            found, _ = followed_all(one._replace(x_std_mm=STD, y_std_mm=STD) for one in noisy)
+            errors.append(abs(found[100:, 0] + 1j * found[100:, 1] - path[100:]) ** 2)
+            said.append(found[100:, 3] ** 2 + found[100:, 4] ** 2)
+        assert 0.5 < np.mean(errors) / np.mean(said) < 1.5
 
 
 def test_a_held_contact_is_quiet_and_its_deviations_hold():

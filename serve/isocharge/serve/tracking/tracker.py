@@ -12,13 +12,14 @@ from typing import NamedTuple
 from isocharge.serve.flags import BEYOND, INVALID, MISFIT, SATURATED
 from isocharge.serve.prediction.contact import Contact
 from isocharge.serve.signal_chain.rule import Rule, Share
-from isocharge.serve.tracking.modes import Modes, Movement, Step, Unit, step
+from isocharge.serve.tracking.modes import Modes, Movement, Step, step
+from isocharge.serve.tracking.noise import Unit
 
-PLACE = Movement(creep=1e-3, speed=40.0**2, change=1e3)
-"""A finger: 0.03 mm in a second while it holds still, speeds of 40 mm/s, 32 mm/s more or less after a second."""
+PLACE = Movement(creep=5e-4, speed=30.0**2, change=800.0)
+"""A finger: 0.02 mm in a second while it holds still, speeds of 30 mm/s, 28 mm/s more or less after a second."""
 
-FORCE = Movement(creep=1e-3, speed=10.0**2, change=1e3)
-"""A held force wanders by 3 % in a second; one that changes becomes e times as large in a tenth of a second."""
+FORCE = Movement(creep=5e-4, speed=10.0**2, change=1e3)
+"""A held force wanders by 2 % in a second; one that changes becomes e times as large in a tenth of a second."""
 
 DOUBTS = {SATURATED: 100.0, BEYOND: 100.0, MISFIT: 10.0}
 """Flags of frames that count for less, with the factor on their variance."""
