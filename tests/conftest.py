@@ -58,6 +58,18 @@ def command(monkeypatch, capsys):
 
 
 @pytest.fixture
+def refused(command):
+    """Run `isocharge ...`, which must refuse: an exit code, nothing on stdout, and the reason, lines joined."""
+
+    def run(*words, said, code=2):
+        got, out, err = command(*words)
+        assert (got, out, "Traceback" in err) == (code, "", False), err
+        assert said in " ".join(err.split())
+
+    return run
+
+
+@pytest.fixture
 def start_command():
     """Start `isocharge ...` in a process of its own, which ends with the test."""
     started = []

@@ -63,20 +63,3 @@ def test_an_error_beyond_the_disk_is_a_fold():
     found = SimpleNamespace(case=SimpleNamespace(radius=12.0), sensor=load_sensor("three-25um-biaxial"))
     *_, before, after = design_command._table(SimpleNamespace(before=None, after=errors, **vars(found))).splitlines()
     assert (before.split()[-2:], after.split()[-2:]) == (["folds", "folds"], ["2.000", "1.581"])
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("2", "--radius", "8"), "three unknowns"),
-        (("8", "--radius", "8", "--side", "30"), "do not fit"),
-        (("3", "--radius", "8", "--goal", "best"), "expected 'worst', 'rms' or a CSV file"),
-        (("3", "--radius", "8", "--keep", "Q"), "no electrode 'Q'"),
-        (("3", "--radius", "8", "--probe", "triangle:3"), "round probes"),
-    ],
-)
-def test_bad_input_is_refused_before_the_search(command, tmp_path, words, message):
-    code, _, err = command(*DESIGN, *words, "-o", tmp_path / "mine")
-    assert code == 2
-    assert message in " ".join(err.split())
-    assert list(tmp_path.iterdir()) == []

@@ -44,10 +44,3 @@ def test_a_student_serves(command, tmp_path, monkeypatch):
     code, out, _ = command("serve", "predict", str(folder), str(tmp_path / "charges.csv"), "--json")
     assert code == 0
     assert json.loads(out)["model"] == "small/1"
-
-
-def test_a_form_stands_in_one_place(command, tmp_path):
-    words = ["four-25um-biaxial", "-o", str(tmp_path / "small"), "--int8", "--config", "quick.toml"]
-    code, _, err = command("train", "distil", *words)
-    assert code == 2
-    assert "--int8: expected no --config beside it" in err

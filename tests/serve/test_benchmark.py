@@ -79,10 +79,3 @@ def test_the_command_prints_a_table_and_json(command):
     assert report["model"] == "four-25um-biaxial/1"
     assert [timing["presses"] for timing in report["timings"]] == [1, 1, 16, 256, 4096]
     assert all(0 < timing["p50_us"] <= timing["p99_us"] for timing in report["timings"])
-
-
-@pytest.mark.parametrize(("words", "said"), [(("nowhere",), "ModelError: "), (("--seconds", "inf"), "--seconds")])
-def test_what_cannot_be_measured(command, words, said):
-    code, out, err = command("serve", "bench", *words)
-    assert (code, out) == (2, "")
-    assert said in err

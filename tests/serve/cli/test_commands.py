@@ -110,12 +110,10 @@ def test_check_of_many_presses_shows_the_worst(measured, models, command):
         ("force_N,A,B,C\n1,2,3,4\n", ["--position-std", "nan"], "position_std_mm: expected"),
     ],
 )
-def test_check_refuses_with_the_reason(tmp_path, models, command, text, words, said):
+def test_check_refuses_with_the_reason(tmp_path, models, refused, text, words, said):
     path = tmp_path / "measured.csv"
     path.write_text(text)
-    code, out, err = command("serve", "check", "linear", path, "--models", models, *words)
-    assert (code, out) == (2, "")
-    assert re.match(f"PressError: .*{said}", err)
+    refused("serve", "check", "linear", path, "--models", models, *words, said=said)
 
 
 def test_stream_follows_a_port(board, models, run):

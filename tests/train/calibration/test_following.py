@@ -238,16 +238,3 @@ def test_a_file_that_cannot_be_used(mine, tmp_path, change):
         path.write_bytes(replace(known, weights=weights).to_bytes())
     with pytest.raises(ModelError, match=r"pretensions\.npz.*calibrate"):
         FilmFollower(Predictor(folder))
-
-
-@pytest.mark.parametrize(
-    ("model", "words"),
-    [
-        ("three-25um-biaxial", "its film cannot be followed: 3 charges"),
-        ("four-25um-biaxial", "a film is followed from a model that `isocharge train calibrate` made"),
-    ],
-)
-def test_models_that_cannot_follow(command, model, words):
-    code, out, err = command("serve", "stream", model, "--port", "-", "--follow")
-    assert (code, out) == (2, "")
-    assert words in " ".join(err.split())

@@ -135,6 +135,6 @@ def test_what_a_report_cannot_judge_is_refused(dataset, tmp_path):
         write_report(tmp_path, [(dataset, model)], SMALL)
 
 
-def test_as_many_models_as_datasets(tmp_path, command):
-    code, _, err = command("train", "report", tmp_path, "-o", tmp_path / "out", "--model", NAME, "--model", NAME)
-    assert (code, "expected one model for each of 1 datasets, got 2" in err) == (2, True)
+def test_as_many_models_as_datasets(tmp_path, refused):
+    words = "train", "report", tmp_path, "-o", tmp_path / "out", "--model", NAME, "--model", NAME
+    refused(*words, said="expected one model for each of 1 datasets, got 2")
