@@ -1,5 +1,7 @@
 """Scripts stay in their area and their range of forces, and are smooth."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -34,21 +36,6 @@ def test_wander_depends_on_the_seed_alone():
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [
-        {"force_range_N": (0.0, 2.0)},
-        {"force_range_N": (2.0, 1.0)},
-        {"radius_mm": 0.0},
-        {"rate_Hz": 0.0},
-        {"seconds": 0.0},
-    ],
-)
-def test_wander_refuses_impossible_scripts(wrong):
-    with pytest.raises(SceneError, match="wander: expected 0 < smallest"):
-        wander(seed=0, **wrong)
-
-
-@pytest.mark.parametrize(
     ("t_s", "is_silent"), [(0.0, False), (0.5, False), (2.0, True), (2.4, True), (2.5, False), (4.1, True)]
 )
 def test_faults_recur_and_the_first_comes_after_one_period(t_s, is_silent):
@@ -58,11 +45,26 @@ def test_faults_recur_and_the_first_comes_after_one_period(t_s, is_silent):
     assert not Faults().is_silent(t_s)
 
 
-def test_script_arrays_agree():
-    with pytest.raises(SceneError, match="three arrays of one length"):
-        Script(np.zeros(2), np.zeros(2), np.zeros(3), 200.0)
-    with pytest.raises(SceneError, match=r"a positive rate, got 0.0 Hz"):
-        Script(np.zeros(2), np.zeros(2), np.zeros(2), 0.0)
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        *(
+            (partial(wander, seed=0, **wrong), "wander: expected 0 < smallest")
+            for wrong in (
+                {"force_range_N": (0.0, 2.0)},
+                {"force_range_N": (2.0, 1.0)},
+                {"radius_mm": 0.0},
+                {"rate_Hz": 0.0},
+                {"seconds": 0.0},
+            )
+        ),
+        (partial(Script, np.zeros(2), np.zeros(2), np.zeros(3), 200.0), "three arrays of one length"),
+        (partial(Script, np.zeros(2), np.zeros(2), np.zeros(2), 0.0), r"a positive rate, got 0.0 Hz"),
+    ],
+)
+def test_impossible_scripts(make, message):
+    with pytest.raises(SceneError, match=message):
+        make()
 
 
 PRESSES = "presses = [[0, 1, 2, 0], [1, 1, 2, 0], [1.1, 1, 2, 0.5], [2.1, 3, 2, 0.5], [2.2, 3, 2, 0]]\n"

@@ -71,11 +71,14 @@ def test_what_has_no_answer_has_a_status(layout):
     assert np.isnan([too_large.contact[0, :2], apart.contact[0, :2]]).all()
 
 
-def test_wrong_input_is_refused(layout):
-    _, curves = layout
-    with pytest.raises(ChargeError, match=rf"charges of shape \(n, {len(curves)}\) for \(.+\), got shape \(1, 2\)"):
-        DrawnTriangulation(curves).locate(np.ones((1, 2)))
-    with pytest.raises(ChargeError, match="charge of 'A' in press 0: expected a finite number, got nan"):
-        DrawnTriangulation(curves).locate(np.full((1, len(curves)), np.nan))
-    with pytest.raises(SensorError, match="at least three electrodes"):
-        DrawnTriangulation(curves[:2])
+@pytest.mark.parametrize(
+    ("electrodes", "charge", "error", "message"),
+    [
+        (4, np.ones((1, 2)), ChargeError, r"charges of shape \(n, [34]\) for \(.+\), got shape \(1, 2\)"),
+        (3, np.full((1, 3), np.nan), ChargeError, "charge of 'A' in press 0: expected a finite number, got nan"),
+        (2, np.ones((1, 2)), SensorError, "at least three electrodes"),
+    ],
+)
+def test_wrong_input_is_refused(layout, electrodes, charge, error, message):
+    with pytest.raises(error, match=message):
+        DrawnTriangulation(layout[1][:electrodes]).locate(charge)

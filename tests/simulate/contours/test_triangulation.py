@@ -166,11 +166,16 @@ def test_wrong_input_is_shown(charge, force, error, message):
         Triangulation(round_map(CENTRES["three"])).locate(charge, force)
 
 
-def test_impossible_triangulations_are_refused():
-    with pytest.raises(SensorError, match=r"at least three electrodes, got \('A', 'B'\)"):
-        Triangulation(round_map(CENTRES["three"][:2]))
-    with pytest.raises(SceneError, match="tolerance: expected a positive length"):
-        Triangulation(round_map(CENTRES["three"]), tolerance=0.0)
+@pytest.mark.parametrize(
+    ("count", "tolerance", "error", "message"),
+    [
+        (2, 1.0, SensorError, r"at least three electrodes, got \('A', 'B'\)"),
+        (3, 0.0, SceneError, "tolerance: expected a positive length"),
+    ],
+)
+def test_impossible_triangulations_are_refused(count, tolerance, error, message):
+    with pytest.raises(error, match=message):
+        Triangulation(round_map(CENTRES["three"][:count]), tolerance=tolerance)
 
 
 def test_no_presses_give_no_fixes():

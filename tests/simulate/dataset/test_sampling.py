@@ -118,15 +118,10 @@ def test_a_lattice_has_one_spacing_and_as_many_points_as_fit():
         ({"force_range": (2.0, 1.0)}, "force: expected 0 < smallest <= largest force"),
         ({"force_range": (1.0, np.inf)}, "force: expected 0 < smallest <= largest force"),
         ({"force_range": (np.nan, 1.0)}, "force: expected 0 < smallest <= largest force"),
+        ({"samples": 2, "sampling": "grid"}, "samples: expected at least one for each of 3 probes, got 2"),
+        ({}, "probes: expected at least one, got none"),
     ],
 )
 def test_impossible_sweeps_are_refused(settings, message):
     with pytest.raises(SceneError, match=message):
-        Sweep(**settings)
-
-
-def test_probes_are_needed():
-    with pytest.raises(SceneError, match="probes: expected at least one, got none"):
-        Sweep().over(())
-    with pytest.raises(SceneError, match="samples: expected at least one for each of 3 probes, got 2"):
-        Sweep(samples=2, sampling="grid").over(PROBES)
+        Sweep(**settings).over(PROBES if settings else ())

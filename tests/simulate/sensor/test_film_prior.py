@@ -46,12 +46,6 @@ def test_a_virtual_film_is_drawn_by_its_seed():
     assert first == again != other
 
 
-def test_an_electrode_that_some_films_have_over_the_rim_is_refused():
-    at_the_rim = Electrode.of_square("A", (43.0, 0.0), 3.0)
-    with pytest.raises(SensorError, match=r"'A' reaches 44.53 mm .* expected 43.94 mm at most"):
-        FilmPrior(replace(PRIOR.sensor, electrodes=(at_the_rim,)), Circle(1.0))
-
-
 @pytest.mark.parametrize(
     ("sensor", "reason"),
     [
@@ -67,6 +61,19 @@ def test_a_sensor_that_differs_otherwise_is_refused(sensor, reason):
         PRIOR.parameters_of(sensor, PRIOR.probe)
 
 
-def test_an_impossible_spread_is_refused():
-    with pytest.raises(SceneError, match=r"spread of young: expected a positive number, got -0\.1"):
-        FilmSpread(young=-0.1)
+AT_THE_RIM = Electrode.of_square("A", (43.0, 0.0), 3.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: FilmPrior(replace(PRIOR.sensor, electrodes=(AT_THE_RIM,)), Circle(1.0)),
+            r"'A' reaches 44.53 mm .* expected 43.94 mm at most",
+        ),
+        (lambda: FilmSpread(young=-0.1), r"spread of young: expected a positive number, got -0\.1"),
+    ],
+)
+def test_an_impossible_prior_is_refused(make, message):
+    with pytest.raises((SensorError, SceneError), match=message):
+        make()

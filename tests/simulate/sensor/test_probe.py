@@ -83,57 +83,35 @@ def test_any_text_is_a_probe_or_a_scene_error(text):
         assert parse_probe(text).reach > 0.0
 
 
-@pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
-def test_impossible_sizes(size):
-    with pytest.raises(SceneError, match=f"probe radius: expected at least 0.02 mm, got {size:g} mm"):
-        Circle(size)
-    with pytest.raises(SceneError, match=f"probe height: expected at least 0.001 mm, got {size:g} mm"):
-        Polygon.rectangle(1.0, size)
-
-
-def test_sizes_in_metres_are_refused():
-    with pytest.raises(SceneError, match=r"probe radius: expected at least 0\.02 mm, got 0\.001 mm; 0\.001 m are 1 mm"):
-        Circle(1e-3)
-    with pytest.raises(SceneError, match=r"probe reach: expected at least 0\.02 mm, got 0\.0025 mm; .* are 2\.5 mm"):
-        Polygon.rectangle(4e-3, 3e-3)
+CORNERS = "expected 3 to 64 corners"
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("make", "given", "message"),
     [
-        ("circle:-1", "^probe radius: expected at least 0.02 mm, got -1 mm$"),
-        ("rectangle:4x-1", "^probe height: expected at least 0.001 mm, got -1 mm"),
-        ("triangle:1e999", "^probe side: expected at least 0.001 mm, got inf mm"),
-        ("polygon:0,0;0,0;0,0", "convex polygon"),
-        ("polygon:0,0;1e999,0;0,1", "expected 3 to 64 corners"),
+        *((Circle, size, f"radius: expected at least 0.02 mm, got {size:g} mm") for size in (0.0, np.nan, np.inf)),
+        *((Polygon.triangle, size, "side: expected at least 0.001 mm, got") for size in (0.0, -1.0, np.nan, np.inf)),
+        (Circle, 1e-3, r"radius: expected at least 0\.02 mm, got 0\.001 mm; 0\.001 m are 1 mm"),
+        (Polygon.triangle, 3e-3, r"reach: expected at least 0\.02 mm, got 0\.0017.* mm; .* are 1\.7.* mm"),
+        (parse_probe, "circle:-1", "^probe radius: expected at least 0.02 mm, got -1 mm$"),
+        (parse_probe, "rectangle:4x-1", "^probe height: expected at least 0.001 mm, got -1 mm"),
+        (parse_probe, "triangle:1e999", "^probe side: expected at least 0.001 mm, got inf mm"),
+        (parse_probe, "polygon:0,0;0,0;0,0", "convex polygon"),
+        (parse_probe, "polygon:0,0;1e999,0;0,1", CORNERS),
+        (Polygon.of, HOUSE[::-1], r"convex polygon with its corners anticlockwise, got \[\["),
+        (Polygon.of, np.array([(0, 0), (2, 0), (0.5, 0.5), (0, 2)]), "convex polygon"),
+        (Polygon.of, np.array([(0, 0), (1, 0), (2, 0), (0, 1)]), "convex polygon"),
+        (Polygon.of, HOUSE[:2], CORNERS),
+        (Polygon.of, np.array([(0, 0), (1, 0), (np.nan, 1)]), CORNERS),
+        (Polygon.of, np.stack([np.cos(np.arange(65) / 11), np.sin(np.arange(65) / 11)], axis=1), CORNERS),
+        (Polygon, tuple(map(tuple, HOUSE.tolist())), r"corners relative to their centroid, got .*; use Polygon\.of"),
+        (Polygon.triangle(1.0).rotated, np.nan, "probe angle: expected a finite number, got nan"),
     ],
 )
-def test_impossible_size_in_the_notation(text, message):
+def test_impossible_probes(make, given, message):
+    """Sizes in metres among them: the message names the likely value."""
     with pytest.raises(SceneError, match=message):
-        parse_probe(text)
-
-
-@pytest.mark.parametrize(
-    ("corners", "message"),
-    [
-        (HOUSE[::-1], r"convex polygon with its corners anticlockwise, got \[\["),
-        (np.array([(0, 0), (2, 0), (0.5, 0.5), (0, 2)]), "convex polygon"),
-        (np.array([(0, 0), (1, 0), (2, 0), (0, 1)]), "convex polygon"),
-        (HOUSE[:2], "expected 3 to 64 corners"),
-        (np.array([(0, 0), (1, 0), (np.nan, 1)]), "expected 3 to 64 corners"),
-        (np.stack([np.cos(np.arange(65) / 11), np.sin(np.arange(65) / 11)], axis=1), "expected 3 to 64 corners"),
-    ],
-)
-def test_impossible_polygons(corners, message):
-    with pytest.raises(SceneError, match=message):
-        Polygon.of(corners)
-
-
-def test_corners_are_about_the_centroid_and_angles_finite():
-    with pytest.raises(SceneError, match=r"expected corners relative to their centroid, got .*; use Polygon\.of"):
-        Polygon(tuple((float(x), float(y)) for x, y in HOUSE))
-    with pytest.raises(SceneError, match="probe angle: expected a finite number, got nan"):
-        Polygon.triangle(1.0, np.nan)
+        make(given)
 
 
 @pytest.mark.parametrize(
