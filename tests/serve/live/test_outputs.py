@@ -22,10 +22,9 @@ def test_csv_has_the_fields_of_a_record(contract, record):
     (row,) = csv.DictReader(table)
     flat = [name for name in contract if not name.endswith("_pC")]
     assert [name for name in row if "." not in name] == flat
-    assert (row["seq"], row["x_mm"], row["y_mm"], row["contact"]) == ("7", "1.234568", "", "true")
-    assert (row["charge_pC.A"], row["charge_pC.B"]) == ("800.062500", "")
-    assert (row["tare_pC.A"], row["tare_pC.B"], row["charge_raw_pC.A"]) == ("1.000000", "-2.500000", "")
-    assert row["flags"] == "gap outside"
+    expected = {"seq": "7", "x_mm": "1.234568", "y_mm": "", "contact": "true", "flags": "gap outside"}
+    expected |= {"charge_pC.A": "800.062500", "charge_pC.B": "", "tare_pC.A": "1.000000", "tare_pC.B": "-2.500000"}
+    assert (expected | {"charge_raw_pC.A": ""}).items() <= row.items()
 
 
 @pytest.mark.parametrize("name", ["mine, left hand", 'the "good" one', "two\nlines", "cr\rlf", " blank "])

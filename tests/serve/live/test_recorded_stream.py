@@ -24,7 +24,7 @@ from isocharge.serve import (
     load_model,
 )
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
-from isocharge.serve.port.recording import Marker
+from isocharge.serve.port.recording import Marker, NewModel
 
 DEVICE = {"tare": {"frames": 10}, "leak": {"tau_s": 10.0}, "hum": {"frequency_Hz": 50.0}}
 
@@ -144,7 +144,8 @@ def test_replay_in_real_time_waits_as_long_as_it_took(tmp_path, film, predictor,
     assert now[0] - 5e9 == pytest.approx(0.0063 * (count - 1) if real_time else 0.0, abs=1e-5)
 
 
-def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, tmp_path):
+@pytest.mark.parametrize(("asked_for", "taken_since"), [("linear/1", []), ("linear/0", [NewModel("linear/1")])])
+def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, tmp_path, asked_for, taken_since):
     """Begun and ended on request, with a marker: its replay gives its records, and the totals go on."""
     path, device = tmp_path / "later.rec", device_from_table(DEVICE, "test")
     stream, pieces = TouchStream(predictor, device), chunks(film)
@@ -154,7 +155,7 @@ def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, t
         for number, chunk in enumerate(pieces):
             if number == 20:
                 for name in ("never.rec", "later.rec"):  # what is asked for anew takes the place of what waits
-                    live.request_recording(Recorder(tmp_path / name, predictor.metadata.label, "every", DEVICE))
+                    live.request_recording(Recorder(tmp_path / name, asked_for, "every", DEVICE))
             if number == 30:
                 live.request_marker(Marker(1e9, "now"))
             if number == 60:
@@ -168,10 +169,10 @@ def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, t
     assert stream.totals().frames == 78  # outage and beginning cut a frame in two each
     clock, markers = RecordedClock(), []
     again = TouchStream(predictor, device, now_ns=clock)
-    replayed = [line for _, line in replay(Recording(path), again, clock, on_marker=markers.append)]
-    assert replayed == lines
-    assert markers == [Marker(1e9, "now")]
-    assert [*tmp_path.iterdir()] == [path]
+    events = replay(Recording(path), again, clock, on_marker=markers.append, load=lambda _: predictor)
+    replayed = [line for _, line in events]
+    assert [event for event in Recording(path).events() if isinstance(event, NewModel)] == taken_since
+    assert (replayed, markers, [*tmp_path.iterdir()]) == (lines, [Marker(1e9, "now")], [path])
 
 
 @pytest.mark.parametrize("marker", ['["x", "y"]', "[1.0]", "[1.0, 2]", '[1e300, "y"]', "1", f'[1.0, "{"x" * 2000}"]'])

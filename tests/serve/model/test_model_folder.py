@@ -136,29 +136,24 @@ def test_not_a_model_is_chained_from_its_cause(own_model, spoilt):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("spoil", "said"),
     [
-        (None, "missing; a model comes with"),
-        ("{", "expected JSON, got"),
-        ("{}", "key 'sha256' is missing; the file is damaged"),
-        ("[]", "expected a table"),
+        (lambda _: "{", "golden.json: expected JSON, got"),
+        (lambda _: "{}", "golden.json: key 'sha256' is missing; the file is damaged"),
+        (lambda _: "[]", "golden.json: expected a table"),
+        (lambda table: json.dumps(table | {"inputs": {"charge_pC": [[1.0, 2.0]]}}), r"charges of shape \(n, 3\)"),
     ],
 )
-def test_missing_or_damaged_golden(own_model, text, said):
+def test_damaged_golden(own_model, spoil, said):
     golden = own_model / "golden.json"
-    golden.unlink()
-    if text is not None:
-        golden.write_text(text)
-    with pytest.raises(ModelError, match=f"golden.json: {said}"):
+    golden.write_text(spoil(json.loads(golden.read_text())))
+    with pytest.raises(ModelError, match=said):
         load_model(own_model)
 
 
-def test_golden_of_another_width(own_model):
-    golden = own_model / "golden.json"
-    content = json.loads(golden.read_text())
-    content["inputs"]["charge_pC"] = [[1.0, 2.0]]
-    golden.write_text(json.dumps(content))
-    with pytest.raises(ModelError, match=r"expected charges of shape \(n, 3\)"):
+def test_missing_golden(own_model):
+    (own_model / "golden.json").unlink()
+    with pytest.raises(ModelError, match=r"golden\.json: missing; a model comes with"):
         load_model(own_model)
 
 
@@ -232,19 +227,13 @@ def test_path_beside_us_is_found_when_no_model_has_the_name(roots):
     folder = put(roots["current"].parent, "mine")
     assert find_model("mine").resolve() == folder
     shadow = put(roots["current"], "mine")
-    assert find_model("mine").resolve() == shadow
-    assert find_model("./mine").resolve() == folder
-    assert find_model(Path("mine")).resolve() == folder
+    assert [find_model(to).resolve() for to in ("mine", "./mine", Path("mine"))] == [shadow, folder, folder]
 
 
 def test_missing_name_says_where_and_what(roots):
     put(roots["given"], "three")
-    with pytest.raises(ModelError) as caught:
+    with pytest.raises(ModelError, match=r"no model 'four'.*/given \(three\).*/variable \(no models\)"):
         find_model("four", roots["given"])
-    message = str(caught.value)
-    assert "no model 'four'" in message
-    assert f"{roots['given']} (three)" in message
-    assert f"{roots['variable']} (no models)" in message
 
 
 def test_missing_path_says_what_was_expected(roots):
@@ -261,23 +250,15 @@ def test_repository_that_was_named_must_be_there(roots):
 WHERE = "models/linear/1/model.onnx"
 
 
-def test_props_round_trip(film):
-    metadata = film.metadata()
-    assert ModelMetadata.from_props(metadata.to_props(), WHERE) == metadata
-
-
-def test_foreign_props_are_left_alone(film):
+def test_props_round_trip_and_foreign_ones_are_left_alone(film):
     props = film.metadata().to_props() | {"author": "not JSON"}
     assert ModelMetadata.from_props(props, WHERE) == film.metadata()
 
 
 def test_other_format_version(film):
-    props = film.metadata().to_props() | {"format_version": "2"}
-    with pytest.raises(ModelError) as caught:
-        ModelMetadata.from_props(props, WHERE)
-    assert str(caught.value) == (
-        f"{WHERE}: metadata format 2 is not supported (this version reads 1); export it again or upgrade isocharge"
-    )
+    said = r"^.*: metadata format 2 is not supported \(this version reads 1\); export it again or upgrade isocharge$"
+    with pytest.raises(ModelError, match=said):
+        ModelMetadata.from_props(film.metadata().to_props() | {"format_version": "2"}, WHERE)
 
 
 @pytest.mark.parametrize(

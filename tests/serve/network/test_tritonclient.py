@@ -89,8 +89,7 @@ def test_index_unload_load(client, module, film):
     assert index() == [(*version, "READY") for version in both]
     client.unload_model("linear")
     assert index() == [(*version, "UNAVAILABLE") for version in both]
-    assert not client.is_model_ready("linear")
-    assert not client.is_server_ready()
+    assert (client.is_model_ready("linear"), client.is_server_ready()) == (False, False)
     with pytest.raises(InferenceServerException, match="model 'linear' is not found"):
         client.infer("linear", [tensor(module, charges(film))])
     client.load_model("linear")

@@ -43,8 +43,7 @@ def test_clock_of_a_device_that_restarts():
     t_us = np.concatenate([np.arange(1000) * 1000, np.arange(1000) * 1000])
     arrived_s = START_S + np.arange(2000) * 1e-3
     clock, times = follow(t_us, arrived_s)
-    assert clock.restarts == 1
-    assert times[1000].step_s == 0.0
+    assert (clock.restarts, times[1000].step_s) == (1, 0.0)
     assert np.abs(np.array([time.host_s for time in times]) - arrived_s).max() < 1e-3
 
 

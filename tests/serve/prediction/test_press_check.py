@@ -90,8 +90,7 @@ def test_a_scatter_that_is_hardly_larger_is_accepted_however_sure(predictor, mea
 
 def test_a_scale_of_the_force_is_recognised(predictor, measure):
     check = check_presses(predictor, measure(20, force_scale=1.05))
-    assert check.fits is False
-    assert check.verdict.startswith("does not fit: ")
+    assert (check.fits, check.verdict[:14]) == (False, "does not fit: ")
     assert check.agreement.force.mean == pytest.approx(0.05, abs=4 * check.agreement.force.std)
     assert check.force_percent.beyond == pytest.approx(5.0, abs=0.5)
     assert check.position_mm.beyond < 0.05

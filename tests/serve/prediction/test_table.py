@@ -135,11 +135,8 @@ def test_record_is_one_line_of_plain_values(record):
     text = record().to_json()
     assert "\n" not in text
     got = strictly(text)
-    assert got["x_mm"] == 1.234568
-    assert got["y_mm"] is None
-    assert got["charge_pC"] == {"A": 800.0625, "B": None}
-    assert got["flags"] == ["gap"]
-    assert got["timestamp"] == 1763600000.123457
+    expected = {"x_mm": 1.234568, "y_mm": None, "charge_pC": {"A": 800.0625, "B": None}, "flags": ["gap"]}
+    assert (expected | {"timestamp": 1763600000.123457}).items() <= got.items()
 
 
 def test_record_never_holds_nan(record):

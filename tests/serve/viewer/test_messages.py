@@ -211,10 +211,10 @@ def test_the_page_reads_what_the_server_writes(record):
     assert broken == [None, None, None]
     assert (whole["number"], whole["sent_s"], whole["missed"], whole["beginsAnew"]) == (77, 123.5, 4, True)
     first, second = whole["samples"]
-    assert first["charges"] == [1.5, None, -3.0]
-    assert (first["contact"], first["y"], first["t"], first["latency"]) == (True, 2.5, 1763600000.1234567, 9.0)
-    assert (second["contact"], second["x"], second["bits"]) == (False, None, 0)
+    expected = {"charges": [1.5, None, -3.0], "contact": True, "y": 2.5, "t": 1763600000.1234567, "latency": 9.0}
+    assert expected.items() <= first.items()
     assert bin(first["bits"]).count("1") == 2
+    assert {"contact": False, "x": None, "bits": 0}.items() <= second.items()
 
 
 def test_the_page_interpolates_the_deflection():

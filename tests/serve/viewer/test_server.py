@@ -102,9 +102,8 @@ def test_states_reach_the_viewer(page, viewer):
                 return state
 
     state = viewer(page, talk)
-    assert state["counters"] == {"frames": 7}
-    assert state["recording"] == "x.rec"
-    assert state["markers"] == [[1.0, ""], [2.0, "b"]]
+    expected = {"counters": {"frames": 7}, "recording": "x.rec", "markers": [[1.0, ""], [2.0, "b"]]}
+    assert expected.items() <= state.items()
 
 
 @pytest.mark.parametrize(
@@ -193,10 +192,8 @@ def test_a_flood_of_any_frame_ends_the_connection(page, record, viewer, kind):
 
 def test_the_budget_comes_back():
     budget = Budget(10.0, 5.0, 0.0)
-    assert [budget.spend(5, 0.0) for _ in range(3)] == [True, True, False]
-    assert budget.spend(4, 2.0)
-    assert Budget(10.0, 5.0, 0.0).spend(10, 100.0)
-    assert not Budget(10.0, 5.0, 0.0).spend(11, 100.0)
+    spends = [budget.spend(size, at_s) for size, at_s in ((5, 0), (5, 0), (5, 0), (4, 2), (11, 100), (10, 100))]
+    assert spends == [True, True, False, True, False, True]
 
 
 def test_viewers_are_bounded(page, viewer):

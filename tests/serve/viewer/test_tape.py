@@ -45,10 +45,8 @@ def test_a_recorded_tape_keeps_all(recorded):
     assert tape.span() == (0.0, 0.0)
     for first in range(0, 3000, 1000):
         tape.append(samples(1e9 + 0.01 * np.arange(first, first + 1000)))
-    assert tape.total == 3000
-    assert tape.span() == (1e9, 1e9 + 29.99)
+    assert (tape.total, len(tape.samples(0, 3000)), tape.span()) == (3000, 3000, (1e9, 1e9 + 29.99))
     assert tape.index(1e9 + 15.001) == 1501
-    assert len(tape.samples(0, 3000)) == 3000
 
 
 def test_times_never_go_back(recorded):

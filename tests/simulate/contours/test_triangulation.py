@@ -129,8 +129,7 @@ def test_charges_that_no_contour_reaches_or_that_do_not_meet(triangle_map, on_fi
     charge = triangle_map.charges(np.array([[1.0, 1.0, 1.0]]))
     fix = on_film.locate(np.concatenate([[[9e3, 9e3, 9e3], [1.0, 800.0, 800.0]], 1.3 * charge]), 1.0)
     assert fix.status.tolist() == [Meeting.no_contour, Meeting.no_contour, Meeting.apart]
-    assert np.isnan(fix.contact[:, :2]).all()
-    assert np.isnan(fix.spread).all()
+    assert np.isnan(np.column_stack([fix.contact[:, :2], fix.spread])).all()
     assert "do not meet" in Meeting(fix.status[2]).summary
 
 

@@ -30,8 +30,7 @@ def test_new_squares_are_named_anticlockwise_by_free_letters(sensor):
     assert [e.centre for e in made.electrodes] == [(9.0, 1.0), (0.0, 5.0), (-9.0, 1.0), (0.0, -5.0)]
     assert made.calibration == Calibration()
     kept = DesignCase(sensor, 4, 8.0, keep=("B", "D")).layout(np.array([[-20.0, 0.0], [20.0, 0.0]]))
-    assert kept.electrode_names == ("A", "B", "C", "D")
-    assert kept.electrodes[1] == sensor.electrodes[1]
+    assert (kept.electrode_names, kept.electrodes[1]) == (("A", "B", "C", "D"), sensor.electrodes[1])
     assert kept.electrodes[0].centre == pytest.approx((20.0, 0.0))
 
 

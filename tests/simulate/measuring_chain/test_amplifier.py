@@ -108,9 +108,8 @@ def test_converter_clips_and_has_steps_of_16_bits():
 
 def test_mismatch_is_drawn_once_for_each_channel():
     process = load_amplifier("bench").start(20_000, RATE, np.random.default_rng(0))
-    assert process.gain.std() == pytest.approx(0.01, rel=0.03)
-    assert process.tau.std() == pytest.approx(0.5, rel=0.03)
-    assert process.offset.std() == pytest.approx(2.0, rel=0.03)
+    stds = [values.std() for values in (process.gain, process.tau, process.offset)]
+    assert stds == pytest.approx([0.01, 0.5, 2.0], rel=0.03)
     assert set(np.abs(process.bias)) == {0.5}
 
 

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from isocharge.simulate import Resolution
+from isocharge.simulate import Film, Polygon, Resolution
+from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.refinement import RefinedTemplate
 from isocharge.simulate.mesh.template import Template, template
 
+FILM = Film(45.0, 0.025, 3000.0, 0.34)
 RESOLUTIONS = (Resolution(2, 8, 1), Resolution(4, 16, 3, 2))
 CORNERS = (0, 3, 5)
 
@@ -37,6 +39,14 @@ def test_euler_characteristic_of_a_disk(built):
     """Vertices - edges + faces = 1, counted from the numbers that the corners of the elements got."""
     edges = set(edges_of(built))
     assert len(set().union(*edges)) - len(edges) + built.n_element == 1
+
+
+def test_a_rotation_by_a_corner_puts_elements_in_the_place_of_others(resolution):
+    """Of a triangle in the middle of the film: their nodes lie a third of a turn on."""
+    mesh = place(FILM, Polygon.triangle(4.0), (0.0, 0.0), resolution, 0.1)
+    for fold in range(3):
+        there = mesh.points[mesh.template.rotated(fold, 3)] * np.exp(-2j * np.pi * fold / 3)
+        np.testing.assert_allclose(there, mesh.points, atol=1e-12)
 
 
 def test_points_lie_in_the_parts_of_a_split_element():

@@ -42,6 +42,5 @@ def test_cubics_are_exact_everywhere():
     polynomial = np.polynomial.Polynomial([1.0, -2.0, 0.3, 0.05])
     at = np.array([-0.5, 0.0, 0.2, 1.7, 3.0, 5.9, 7.0, 7.4])
     number, weights = cubic_weights(at, 8)
-    assert number.min() == 0
-    assert number.max() == 7
+    assert (number.min(), number.max()) == (0, 7)
     assert (weights * polynomial(number)).sum(axis=1) == pytest.approx(polynomial(at))

@@ -35,10 +35,8 @@ def test_a_parameter_changes_what_its_name_says():
     for name, value in (("young", np.log(1.1)), ("gain C", np.log(0.9)), ("shift_y", 0.2), ("probe_radius", 0.1)):
         parameters[PRIOR.names.index(name)] = value
     sensor, probe = PRIOR.film(parameters)
-    assert sensor.film.young == pytest.approx(3300.0)
-    assert sensor.gains == pytest.approx([1.0, 1.0, 0.9, 1.0])
-    assert sensor.calibration.shift == (0.0, 0.2)
-    assert probe == Circle(1.1)
+    assert (sensor.film.young, *sensor.gains) == pytest.approx((3300.0, 1.0, 1.0, 0.9, 1.0))
+    assert (sensor.calibration.shift, probe) == ((0.0, 0.2), Circle(1.1))
 
 
 def test_a_virtual_film_is_drawn_by_its_seed():

@@ -57,10 +57,9 @@ def test_round_trip(width, height, angle):
 
 
 def test_notation_is_in_mm():
-    assert Circle(0.3).notation == "circle:0.3"
-    assert Polygon.rectangle(4.0, 2.0, 1.0).notation == "rectangle:4.0x2.0"
-    assert Polygon.triangle(4.0).notation == "triangle:4.0"
-    assert parse_probe("polygon:0,0;3,0;0,3").notation == "polygon:-1.0,-1.0;2.0,-1.0;-1.0,2.0"
+    probes = Circle(0.3), Polygon.rectangle(4.0, 2.0, 1.0), Polygon.triangle(4.0), parse_probe("polygon:0,0;3,0;0,3")
+    three = "polygon:-1.0,-1.0;2.0,-1.0;-1.0,2.0"
+    assert [probe.notation for probe in probes] == ["circle:0.3", "rectangle:4.0x2.0", "triangle:4.0", three]
 
 
 @pytest.mark.parametrize(

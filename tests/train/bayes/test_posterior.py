@@ -129,8 +129,7 @@ def test_deviations_are_as_large_as_errors(spline):
 def test_charges_of_nothing_still_give_an_answer(spline):
     """What no press gives: the nearest that the prior knows, finite."""
     mean, std = Posterior(spline, REFERENCE, spline.domain.radius).mean_and_std(np.array([[0.0, -5.0, 1e6]]))
-    assert np.isfinite(mean).all()
-    assert np.isfinite(std).all()
+    assert np.isfinite([mean, std]).all()
     assert np.hypot(*mean[0, :2]) <= spline.domain.radius * (1.0 + 1e-12)
 
 
@@ -160,11 +159,9 @@ def test_the_limit_is_what_the_estimates_give(problem, spline):
 def test_errors_by_hand():
     truth = np.array([[0.0, 0.0, 1.0], [1.0, 1.0, 2.0]])
     limit = BayesLimit.of(truth + np.array([[0.3, 0.4, 0.01], [0.0, 0.0, 0.0]]), truth)
-    assert limit.position_rms_mm == pytest.approx(0.5 / np.sqrt(2.0))
-    assert limit.position_median_mm == pytest.approx(0.25)
-    assert limit.force_rms_percent == pytest.approx(1.0 / np.sqrt(2.0))
-    assert limit.position_p95_mm == pytest.approx(0.475)
-    assert limit.force_median_percent == pytest.approx(0.5)
+    position = limit.position_rms_mm, limit.position_median_mm, limit.position_p95_mm
+    assert position == pytest.approx((0.5 / np.sqrt(2.0), 0.25, 0.475))
+    assert (limit.force_rms_percent, limit.force_median_percent) == pytest.approx((1.0 / np.sqrt(2.0), 0.5))
 
 
 def test_a_map_of_other_forces_is_refused(sensor, spline):

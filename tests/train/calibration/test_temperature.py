@@ -14,6 +14,7 @@ from isocharge.simulate import Circle, load_sensor, press, touch_charge
 from isocharge.train import calibrate, read_earlier, write_calibration
 from isocharge.train.calibration.contacts import temperatures
 from isocharge.train.calibration.folder import read_moved, result_table
+from isocharge.train.calibration.problem import DRIFT, THERMOMETER
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
 
@@ -80,6 +81,16 @@ def test_there_and_back_is_the_same_film(day, tmp_path, problem):
     back = read_moved(written(there, tmp_path), problem, 21.5).posterior
     np.testing.assert_allclose(back.covariance, day.posterior.covariance, atol=2e-5)  # correlations have six digits
     assert back.parameters == pytest.approx(day.posterior.parameters)
+
+
+def test_a_pretension_drifts_less_where_both_temperatures_are_known(day, problem):
+    """By the thermometer's error alone, and by a degree or two unless what a kelvin does is known, too."""
+    before, unknown = day.posterior, replace(day.posterior, warming=None)
+    after = [
+        estimate.drifted(problem.prior, knows_temperature=knows) for estimate in (before, unknown) for knows in (1, 0)
+    ]
+    wider = [float(estimate.covariance[0, 0] - before.covariance[0, 0]) for estimate in after]
+    assert wider == pytest.approx([THERMOMETER**2, *[DRIFT["pretension"] ** 2] * 3])
 
 
 @pytest.mark.parametrize(

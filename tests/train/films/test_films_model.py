@@ -134,8 +134,7 @@ def test_a_film_becomes_a_served_model(films, random_films, drawn, tmp_path):
     check_golden(model)
     served = np.stack(Predictor(folder).predict_batch(fitted.test.charge), axis=1)
     np.testing.assert_allclose(served[:, :3], fitted.predict(fitted.test.charge)[0], rtol=1e-4, atol=1e-4)
-    assert model.metadata.made_with["command"] == "test"
-    assert model.metadata.dataset_sha256 == films.sha256
+    assert (model.metadata.made_with["command"], model.metadata.dataset_sha256) == ("test", films.sha256)
     assert model.metadata.sensor["film"]["pretension_MPa"] == pytest.approx(drawn[0][0])
     assert (folder / "card.md").read_text().endswith("\n# mine\n")
     assert (folder / "presses.csv").read_bytes() == b"x_mm\n"

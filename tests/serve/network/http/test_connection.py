@@ -145,9 +145,7 @@ def test_blank_lines_are_no_requests(connect, blank):
 def test_trailers_are_no_headers(connect):
     """Of a request that is answered, and of the next one."""
     sent, _ = answers(connect, [TRAILED + b"0\r\nHost: y\r\nA: b\r\n\r\n", INNER])
-    assert sent.count(b"HTTP/1.1 200") == 2
-    assert b"b'y'" not in sent
-    assert b"b'a'" not in sent
+    assert [sent.count(part) for part in (b"HTTP/1.1 200", b"b'y'", b"b'a'")] == [2, 0, 0]
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ schemathesis makes requests from the OpenAPI document, good ones and bad ones, a
 import base64
 import gzip
 import hashlib
+import re
 import tracemalloc
 import zlib
 
@@ -292,17 +293,15 @@ BAD = {
 def test_bad_bodies_are_refused_with_the_reason(ask, case):
     body, status, said = BAD[case]
     got, error = refusal(ask("POST", INFER, body))
-    assert got == status
-    with pytest.raises(InputError, match=said):
-        raise InputError(error)
+    assert (got, bool(re.search(said, error))) == (status, True), error
 
 
 @pytest.mark.parametrize("length", ["", "-1", "+5", "1_0", "1e3", "9999", "9" * 5000, "0x10", " 5", "٣"])
 def test_bad_header_lengths(handler, length):
     body, _ = binary_request(np.float32(PRESS))
     response = handler.answer("POST", INFER, [(b"inference-header-content-length", length.encode())], body)
-    assert response.status == 400
-    assert b"Inference-Header-Content-Length: expected a whole number up to" in response.body
+    said = b"Inference-Header-Content-Length: expected a whole number up to"
+    assert (response.status, said in response.body) == (400, True)
 
 
 @pytest.mark.parametrize(
@@ -320,8 +319,7 @@ def test_bad_header_lengths(handler, length):
 def test_binary_data_that_do_not_fit(ask, changes, cut, said):
     body, length = binary_request(np.float32(PRESS), **changes)
     status, error = refusal(ask("POST", INFER, body[:cut], inference_header_content_length=str(length)))
-    assert status == 400
-    assert said in error
+    assert (status, said in error) == (400, True), error
 
 
 def test_what_is_not_finite_is_null(ask, bare):
@@ -384,9 +382,8 @@ def test_metadata_say_what_the_file_says(ask, store):
 def test_the_page_lists_models_with_their_cards(ask, store, tmp_path):
     (tmp_path / "models/linear/2/card.md").write_text("# Card\n\n<script>x</script>\n")
     page = ask("GET", "/")[2].decode()
-    assert page.count("<article>") == 2
-    assert "<pre># The linear film" in page
-    assert "&lt;script&gt;x&lt;/script&gt;" in page
+    parts = "<article>", "<pre># The linear film", "&lt;script&gt;x&lt;/script&gt;"
+    assert [page.count(part) for part in parts] == [2, 1, 1]
     store.unload("linear")
     assert "No model is loaded" in ask("GET", "/")[2].decode()
 
@@ -406,8 +403,7 @@ def test_the_page_may_run_and_load_nothing(ask):
     assert policy.pop("style-src") == f"'sha256-{digest}'"
     assert policy == dict.fromkeys(("default-src", "base-uri", "form-action", "frame-ancestors"), "'none'")
     assert (headers["x-content-type-options"], headers["x-frame-options"]) == ("nosniff", "DENY")
-    assert " style=" not in page.decode()
-    assert "<script" not in page.decode()
+    assert (b" style=" in page, b"<script" in page) == (False, False)
 
 
 CHECKS = [
