@@ -106,10 +106,12 @@ def test_what_does_not_fit_is_named(board, message):
 
 
 def test_the_table_itself_is_named_without_a_path():
-    with pytest.raises(SensorError, match=r"^mine\.toml: key 'board' is missing$"):
-        convert({}, File, "mine.toml", SensorError)
-    with pytest.raises(SensorError, match=r"^expected a table, got 3$"):
-        convert(3, File, "", SensorError)
+    for table, where, said in (
+        ({}, "mine.toml", "mine.toml: key 'board' is missing"),
+        (3, "", "expected a table, got 3"),
+    ):
+        with pytest.raises(SensorError, match=f"^{said}$"):
+            convert(table, File, where, SensorError)
 
 
 def test_messages_stay_short():

@@ -135,7 +135,7 @@ def covered(job: tuple[str, int]) -> tuple[int, int]:
 
 
 def summary(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """Medians over films, and the largest ratio to the limit."""
+    """Errors over films, mm and %, and how much of the limit is left."""
     table: dict[str, Any] = {
         "films": len(records),
         "noise_mm": rms([record["noise"][0] for record in records]),
@@ -143,58 +143,46 @@ def summary(records: list[dict[str, Any]]) -> dict[str, Any]:
     }
     for count in COUNTS:
         rows = [record["by_count"][count] for record in records]
-        ratio, force = np.array([row["left"] for row in rows]).T / np.array([row["limit"] for row in rows]).T
-        entry = {
-            "left_mm": rms([row["left"][0] for row in rows]),
-            "left_percent": rms([row["left"][1] for row in rows]),
-            "limit_mm": rms([row["limit"][0] for row in rows]),
-            "limit_percent": rms([row["limit"][1] for row in rows]),
-            "ratio_median": float(np.median(ratio)),
-            "ratio_max": float(ratio.max()),
-            "force_ratio_median": float(np.median(force)),
-            "force_ratio_max": float(force.max()),
-            "error_mm": rms([row["error"][0] for row in rows]),
-            "error_percent": rms([row["error"][1] for row in rows]),
+        entry: dict[str, Any] = {
+            key: [rms([row[key][axis] for row in rows if key in row]) for axis in (0, 1)] if key in rows[0] else None
+            for key in ("left", "limit", "error", "gains_only", "gauss_newton")
+        }
+        ratio = np.array([row["left"] for row in rows]) / np.array([row["limit"] for row in rows])
+        table[str(count)] = entry | {
+            "over_limit_median": np.median(ratio, axis=0).tolist(),
+            "over_limit_max": ratio.max(axis=0).tolist(),
             "bad": sum(row["bad"] for row in rows),
             "seconds_median": float(np.median([row["seconds"] for row in rows])),
         }
-        for method in ("gains_only", "gauss_newton"):
-            values = [row[method] for row in rows if method in row]
-            entry[method] = [rms([value[axis] for value in values]) for axis in (0, 1)] if values else None
-        table[str(count)] = entry
     return table
+
+
+LINES = {
+    "gains only": ("gains_only", {"marker": "s", "color": "#c07a2c", "lw": 1.0}),
+    "Gauss-Newton on the calibrated map, some films": ("gauss_newton", {"marker": "x", "color": "#5a9a5a", "lw": 1.0}),
+    "calibrated network": ("error", {"marker": "o", "color": "#24476b", "lw": 2.0}),
+    "of it by not knowing the film": ("left", {"marker": "o", "ls": "", "mfc": "white", "color": "#24476b"}),
+    "its linearised limit": ("limit", {"ls": ":", "color": "k"}),
+}
 
 
 def picture(tables: dict[str, dict[str, Any]], path: Path) -> None:
     """Position error and force error against the number of presses, a column for each sensor."""
     figure = new_figure(4.6 * len(tables), 7.6)
     rows = figure.subplots(2, len(tables), sharex=True, squeeze=False)
-    styles = {
-        "gains only": ("gains_only", "#c07a2c", "s"),
-        "Gauss-Newton on the calibrated map, some films": ("gauss_newton", "#5a9a5a", "x"),
-    }
-    for column, (sensor, table) in enumerate(tables.items()):
-        for axis, (axes, unit) in enumerate(zip(rows[:, column], ("mm", "percent"), strict=True)):
+    for axis, label in enumerate(("position error (rms), mm", "force error (rms), %")):
+        rows[axis, 0].set(ylabel=label)
+        for axes, (sensor, table) in zip(rows[axis], tables.items(), strict=True):
             axes.axhline(table["uncalibrated"][axis], color="#b03a3a", ls="--", label="no calibration")
-            for label, (key, colour, marker) in styles.items():
-                values = [table[str(n)][key][axis] if table[str(n)][key] else np.nan for n in COUNTS]
-                axes.plot(COUNTS, values, marker=marker, color=colour, lw=1.0, label=label)
-            values = [table[str(n)][f"error_{unit}"] for n in COUNTS]
-            axes.plot(COUNTS, values, "o-", color="#24476b", lw=2.0, label="calibrated network")
-            values = [table[str(n)][f"left_{unit}"] for n in COUNTS]
-            axes.plot(COUNTS, values, "o", mfc="white", color="#24476b", label="of it by not knowing the film")
-            axes.plot(COUNTS, [table[str(n)][f"limit_{unit}"] for n in COUNTS], "k:", label="its linearised limit")
-            axes.set(xscale="log", yscale="log", xticks=COUNTS)
+            for name, (key, style) in LINES.items():
+                values = [(table[str(count)][key] or (np.nan, np.nan))[axis] for count in COUNTS]
+                axes.plot(COUNTS, values, label=name, **style)
+            axes.set(xscale="log", yscale="log", xticks=COUNTS, title=sensor, xlabel="presses")
             axes.xaxis.set_major_formatter(ScalarFormatter())
             axes.xaxis.set_minor_formatter(NullFormatter())
             axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
             axes.grid(alpha=0.3)
-        rows[0, column].set(title=sensor)
-        rows[1, column].set(xlabel="presses")
-    rows[0, 0].set(ylabel="position error (rms), mm")
-    rows[1, 0].set(ylabel="force error (rms), %")
-    handles, labels = rows[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(tables), fontsize=8)
+    figure.legend(*rows[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(tables), fontsize=8)
     figure.savefig(path, dpi=100)
 
 

@@ -34,16 +34,14 @@ SHARES = (50, 95, 100)
 RATE_HZ, REST_S, PRESS_S, PAUSE_S, RAMP_S = 200.0, 4.0, 1.5, 1.5, 0.1
 
 
-def script_of(places_mm, force_N=1.0, press_s=PRESS_S):
-    """Presses at places x + 1j y, straight up and down, after a rest."""
-    period, n = press_s + PAUSE_S, len(places_mm)
-    t = np.arange(round((REST_S + n * period) * RATE_HZ)) / RATE_HZ
-    number = np.floor((t - REST_S) / period).astype(int).clip(0, n - 1)
-    since = np.where(t >= REST_S, (t - REST_S) % period, -1.0)
-    rise = np.clip(np.minimum(since, press_s - since) / RAMP_S, 0.0, 1.0)
-    force = np.where(rise > 0, np.maximum(force_N * rise, 0.05), 0.0)
-    place = np.where(force > 0, np.asarray(places_mm)[number], np.nan)
-    return Script(place.real, place.imag, force, RATE_HZ)
+def script_of(presses, end_s, force_N=1.0):
+    """Presses (place x + 1j y, begin, end), straight up and down, mm and s."""
+    t = np.arange(round(end_s * RATE_HZ)) / RATE_HZ
+    place, rise = np.full(t.size, complex(np.nan, np.nan)), np.zeros(t.size)
+    for at, begin, end in presses:
+        ramp = np.clip(np.minimum(t - begin, end - t) / RAMP_S, 0.0, 1.0)
+        place[ramp > 0], rise = at, rise + ramp
+    return Script(place.real, place.imag, np.where(rise > 0, np.maximum(force_N * rise, 0.05), 0.0), RATE_HZ)
 
 
 def charges(film, script):
@@ -103,7 +101,9 @@ def accuracy(predictor, film, part, presses, gain_error, seed):
     """Errors on the plateaus of presses, delay of the first reading."""
     rng = np.random.default_rng(seed)
     phase = 2j * np.pi * rng.uniform(size=presses)
-    script = script_of(film.domain.radius * np.sqrt(rng.uniform(size=presses)) * np.exp(phase))
+    places = film.domain.radius * np.sqrt(rng.uniform(size=presses)) * np.exp(phase)
+    begin_s = REST_S + (PRESS_S + PAUSE_S) * np.arange(presses + 1)
+    script = script_of(zip(places, begin_s, begin_s + PRESS_S, strict=False), begin_s[-1])
     records = feel(predictor, charges(film, script), part, gain_error, seed)
     plateau = np.flatnonzero(script.force_N >= 1.0)
     felt = [k for k in plateau if records[k].contact]
@@ -134,7 +134,8 @@ def warming(predictor, film, part, seed):
     for radius_mm in (0.5, 2.0, 4.0, 6.0, 7.5):
         moved, flags = {True: [], False: []}, []
         for k in range(6):
-            pressed = charges(film, script_of([radius_mm * np.exp(2j * np.pi * rng.uniform())], 0.5, 14.0))
+            place = radius_mm * np.exp(2j * np.pi * rng.uniform())
+            pressed = charges(film, script_of([(place, REST_S, REST_S + 14.0)], REST_S + 15.5, 0.5))
             for warm, changes in moved.items():
                 records = feel(predictor, pressed, part, 0.002, seed + k, {"common_mode": {}} if warm else None)
                 force = [np.mean([r.force_N for r in records[at - 100 : at]]) for at in (before, after)]
@@ -160,13 +161,7 @@ KNOWN = {"no memory": None} | {
 def memory(predictor, film, level, seed):
     """Presses of 60 s and, after a release, of 10 s: largest errors of the force; and a hand 2 K warmer for 10 s."""
     part = replace(load_amplifier(level), creep=0.08, thermoelastic=0.06, film_time=2.5, limit=3000.0)
-    t, out = np.arange(round(118.0 * RATE_HZ)) / RATE_HZ, {}
-
-    def scene(place, *presses):
-        rise = sum(np.clip(np.minimum(t - a, b - t) / RAMP_S, 0.0, 1.0) for a, b in presses) + 0.0 * t
-        force = np.where(rise > 0, np.maximum(rise, 0.05), 0.0)
-        where = np.where(force > 0, place, np.nan)
-        return Script(where.real, where.imag, force, RATE_HZ)
+    out = {}
 
     def errors(script, records, begin, end):
         at = range(round((begin + 0.12) * RATE_HZ), round((end - 0.12) * RATE_HZ), 20)
@@ -181,7 +176,7 @@ def memory(predictor, film, level, seed):
     def false(script, records):
         return sum(record.contact for record, touches in zip(records, script.touching, strict=True) if not touches)
 
-    held = scene(2.0 - 1.0j, (30.0, 90.0), (100.0, 110.0))
+    held = script_of([(2.0 - 1.0j, 30.0, 90.0), (2.0 - 1.0j, 100.0, 110.0)], 118.0)
     for name, sections in KNOWN.items():
         records = feel(predictor, charges(film, held), part, 0.002, seed, sections)
         first, second = errors(held, records, 30.0, 90.0), errors(held, records, 100.0, 110.0)
@@ -194,7 +189,7 @@ def memory(predictor, film, level, seed):
             "it comes": (27.0, 37.0),
             "it goes": (35.0, 47.0),
         }.items():
-            script = scene(place, *[press] if press else [])
+            script = script_of([(place, *press)] if press else [], 118.0)
             records = feel(predictor, charges(film, script), warm, 0.002, seed, KNOWN["creep +0%, step +0%"])
             blind = sum("blind" in record.flags for record in records)
             found = errors(script, records, *press) if press else {}

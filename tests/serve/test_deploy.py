@@ -8,7 +8,6 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -26,17 +25,6 @@ DEPLOY = ROOT / "serve/deploy"
 UNIT = DEPLOY / "systemd/isocharge.service"
 ENVIRONMENTS = Path(os.environ.get("ISOCHARGE_BENCH_ENVIRONMENTS", ROOT / "build/bench-environments"))
 MODELS = find_model("three-25um-biaxial").parents[1]
-
-
-@contextmanager
-def running(words, **options):
-    """A server process that prints its address."""
-    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
-    try:
-        yield process, process.stdout.readline().strip()
-    finally:
-        process.terminate()
-        process.communicate(timeout=30)
 
 
 def status_of(url, token=None):

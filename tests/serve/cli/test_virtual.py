@@ -134,19 +134,19 @@ def test_a_seed_is_one_draw(run, asked):
     assert films[3] == virtual_film(*described, 4) != films[1]
 
 
-def test_what_is_refused(run, asked, tmp_path):
-    taken = tmp_path / "film"
-    taken.write_text("mine")
-    with pytest.raises(OutputExists, match="film is already there"):
-        run("virtual", SENSOR, "--link", taken, "--seconds", 0)
-    assert taken.read_text() == "mine"
-    with pytest.raises(InputError, match="the link cannot be made"):
-        run("virtual", SENSOR, "--link", tmp_path / "no" / "film", "--seconds", 0)
-    with pytest.raises(SensorError):
-        run("virtual", "five-25um-biaxial")
-    with pytest.raises(InputError, match=r"--film: expected a round --probe like circle:1\.0.*got 'triangle:4'"):
-        run("virtual", SENSOR, "--film", 1, "--probe", "triangle:4")
-    (tmp_path / "plain.toml").write_text("")
-    with pytest.raises(InputError, match="expected a file with described frames"):
-        run("virtual", SENSOR, "--device", tmp_path / "plain.toml")
-    assert len(asked) <= 1
+@pytest.mark.parametrize(
+    ("words", "error", "said"),
+    [
+        (f"{SENSOR} --seconds 0 --link TMP/film", OutputExists, "film is already there"),
+        (f"{SENSOR} --seconds 0 --link TMP/no/film", InputError, "the link cannot be made"),
+        ("five-25um-biaxial", SensorError, "no sensor 'five-25um-biaxial'"),
+        (f"{SENSOR} --film 1 --probe triangle:4", InputError, r"--film: expected a round --probe .*got 'triangle:4'"),
+        (f"{SENSOR} --device TMP/plain.toml", InputError, "expected a file with described frames"),
+    ],
+)
+def test_what_is_refused(run, asked, tmp_path, words, error, said):
+    (tmp_path / "film").write_text("mine")
+    (tmp_path / "plain.toml").touch()
+    with pytest.raises(error, match=said):
+        run("virtual", *words.replace("TMP", str(tmp_path)).split())
+    assert (len(asked) <= 1, (tmp_path / "film").read_text()) == (True, "mine")

@@ -133,16 +133,18 @@ def test_charges_of_nothing_still_give_an_answer(spline):
     assert np.hypot(*mean[0, :2]) <= spline.domain.radius * (1.0 + 1e-12)
 
 
-def test_bad_input_is_refused(spline):
-    posterior = Posterior(spline, REFERENCE, spline.domain.radius)
-    with pytest.raises(ChargeError, match=r"shape \(n, 3\), n at least 1, got shape \(2, 4\)"):
-        posterior.mean_and_std(np.ones((2, 4)))
-    with pytest.raises(ChargeError, match="finite"):
-        posterior.mean_and_std(np.array([[np.nan, 1.0, 1.0]]))
-    with pytest.raises(InputError, match="white noise"):
-        replace(posterior, noise=noise_model("clean"))
-    with pytest.raises(InputError, match="up to 8 mm"):
-        replace(posterior, radius=9.0)
+@pytest.mark.parametrize(
+    ("changes", "charge", "message"),
+    [
+        ({}, np.ones((2, 4)), r"shape \(n, 3\), n at least 1, got shape \(2, 4\)"),
+        ({}, np.array([[np.nan, 1.0, 1.0]]), "finite"),
+        ({"noise": noise_model("clean")}, np.ones((2, 3)), "white noise"),
+        ({"radius": 9.0}, np.ones((2, 3)), "up to 8 mm"),
+    ],
+)
+def test_bad_input_is_refused(spline, changes, charge, message):
+    with pytest.raises((ChargeError, InputError), match=message):
+        replace(Posterior(spline, REFERENCE, spline.domain.radius), **changes).mean_and_std(charge)
 
 
 @pytest.fixture
