@@ -17,8 +17,8 @@ from isocharge.train.baselines.networks import OnnxContact, ReleasedModel, conta
 from isocharge.train.baselines.paper import Triangulate
 from isocharge.train.baselines.rivals import polynomial_ridge, rivals
 from isocharge.train.data.presses import LabelledPresses, position_error
-from isocharge.train.training.folding import contact_alone
-from isocharge.train.training.network import Features, InverseNetwork
+from isocharge.train.training.features import Features
+from isocharge.train.training.network import InverseNetwork, contact_alone
 
 ALLOWED = {
     "polynomial ridge": 0.1,

@@ -16,8 +16,8 @@ from isocharge.simulate import load_sensor, noise_model
 from isocharge.train.data.presses import draw_contacts
 from isocharge.train.export_c.network import read_network
 from isocharge.train.model_release.export import export_onnx
+from isocharge.train.training.features import SignedCharges
 from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, PlainPerceptron
-from isocharge.train.training.network import SignedCharges
 
 FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0, 5.0, 5.0, 5.0])
 """mm and N, and larger ones for the misfit, which golden vectors have, too, and the correlations."""

@@ -8,8 +8,10 @@ import torch
 
 from isocharge.simulate import Domain, FilmPrior, noise_model
 from isocharge.train import FilmsModel, read_films
-from isocharge.train.films.conditional_network import ConditionalPerceptron, ConditionalWeights, FilmInputs, FilmScaling
+from isocharge.train.films.conditional_network import ConditionalPerceptron, FilmInputs
+from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.films.films_data import draw_film_presses
+from isocharge.train.films.films_model import ConditionalWeights
 
 MODELS = Path(__file__).parents[3] / "models"
 

@@ -12,8 +12,8 @@ from isocharge.common.errors import InputError, ModelError, SceneError
 from isocharge.serve import Predictor, check_golden, load_model
 from isocharge.simulate import Calibration, load_sensor, press, touch_charge
 from isocharge.train import Provenance, evaluate, release
-from isocharge.train.films.conditional_network import FilmScaling
-from isocharge.train.training.network import MISFIT_UNIT
+from isocharge.train.films.film_scaling import FilmScaling
+from isocharge.train.training.features import MISFIT_UNIT
 
 AT, FORCE = (3.0, -4.0), 0.3
 

@@ -13,7 +13,7 @@ from isocharge.simulate import noise_model
 from isocharge.train.model_release.export import check_graph, export_onnx
 from isocharge.train.training import correlation
 from isocharge.train.training.correlation import with_correlation
-from isocharge.train.training.folding import fold_network
+from isocharge.train.training.network import fold_network
 
 REFERENCE = noise_model("reference")
 ABSURD = {

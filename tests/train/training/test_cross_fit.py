@@ -13,7 +13,7 @@ from isocharge.train.data.channel_noise import ChannelNoise
 from isocharge.train.data.measured_sensor import PressedArea, outline
 from isocharge.train.data.presses import folds_by_place, held_out
 from isocharge.train.training.cross_fit import deviation_factors, usable_presses
-from isocharge.train.training.network import Features
+from isocharge.train.training.features import Features
 from kept import ROOT, kept
 
 QUICK = FitConfig(

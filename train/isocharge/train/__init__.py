@@ -10,6 +10,7 @@
 Each of the three works alone.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from isocharge.common.extras import require
@@ -25,16 +26,10 @@ with require("train"):
     from isocharge.train.data.presses import LabelledPresses
     from isocharge.train.films.films_file import read_films
     from isocharge.train.films.films_model import FilmsModel
-    from isocharge.train.films.fit import FilmsConfig, fit_films
-    from isocharge.train.films.release import release_films
     from isocharge.train.model_release.evaluate import evaluate
     from isocharge.train.model_release.release import Release, release
-    from isocharge.train.model_release.student import StudentCase, student_config, student_data
-    from isocharge.train.rig.rig_data import Rig, rig_data
     from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig, load_config
-    from isocharge.train.training.cross_fit import fit_presses
-    from isocharge.train.training.fit import Fitted, fit
-    from isocharge.train.training.source import Provenance, Teacher, TrainingData
+    from isocharge.train.training.fitted import Fitted, Provenance
 
 __all__ = [
     "BayesLimit",
@@ -77,6 +72,37 @@ __all__ = [
 ]
 
 __version__: str
-if not TYPE_CHECKING:  # a type checker would take every misspelt name for a text
-    __getattr__ = version_attribute(__name__)
+
+if TYPE_CHECKING:
+    from isocharge.train.films.fit import FilmsConfig, fit_films
+    from isocharge.train.films.release import release_films
+    from isocharge.train.model_release.student import StudentCase, student_config, student_data
+    from isocharge.train.rig.rig_data import Rig, rig_data
+    from isocharge.train.training.cross_fit import fit_presses
+    from isocharge.train.training.fit import fit
+    from isocharge.train.training.source import Teacher, TrainingData
+else:  # a type checker would take every misspelt name for a text
+    _LATE = {  # with torch, which takes a second
+        "FilmsConfig": "films.fit",
+        "fit_films": "films.fit",
+        "release_films": "films.release",
+        "StudentCase": "model_release.student",
+        "student_config": "model_release.student",
+        "student_data": "model_release.student",
+        "Rig": "rig.rig_data",
+        "rig_data": "rig.rig_data",
+        "fit_presses": "training.cross_fit",
+        "fit": "training.fit",
+        "Teacher": "training.source",
+        "TrainingData": "training.source",
+    }
+    _other = version_attribute(__name__)
+
+    def __getattr__(name):
+        if name not in _LATE:
+            return _other(name)
+        with require("train"):
+            globals()[name] = getattr(import_module(f"{__name__}.{_LATE[name]}"), name)
+        return globals()[name]
+
     del TYPE_CHECKING

@@ -23,7 +23,8 @@ from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.model_release.export import GraphBuilder, add_inputs, add_layers, make_model
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.training.fit import train_network
-from isocharge.train.training.folding import FoldedNetwork, contact_alone
+from isocharge.train.training.folding import FoldedNetwork
+from isocharge.train.training.network import contact_alone
 from isocharge.train.training.source import TrainingData
 
 RELEASED = "released network"

@@ -20,7 +20,7 @@ from isocharge.train.calibration.discrepancy import Hypothesis
 from isocharge.train.calibration.film_fit import MISTAKEN, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity, quantities, summarise
-from isocharge.train.training.fit import Fitted
+from isocharge.train.training.fitted import Fitted
 
 UNEXPLAINED = 1e-6
 """Chance of residuals as large as these, below which no film explains the presses..."""
@@ -118,10 +118,11 @@ class CalibrationResult:
         known: dict[bytes, Array] = {}
 
         def factor(contact: Array) -> Array:
-            key = contact.tobytes()
-            if key not in known:
-                known[key] = self.problem.charges.factor(self.posterior.unknowns, contact)
-            return known[key]
+            keys = [row.tobytes() for row in contact]
+            if new := [number for number, key in enumerate(keys) if key not in known]:
+                factors = self.problem.charges.factor(self.posterior.unknowns, contact[new])
+                known.update(zip([keys[number] for number in new], factors, strict=True))
+            return np.stack([known[key] for key in keys])
 
         return factor
 

@@ -48,7 +48,7 @@ from isocharge.train.calibration.following import pretensions_of
 from isocharge.train.calibration.picture import calibration_picture
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate, Warming
 from isocharge.train.model_release.release import release
-from isocharge.train.training.source import Provenance
+from isocharge.train.training.fitted import Provenance
 
 RESULT, SENSOR, PRESSES, PICTURE, CARD = "calibration.json", "sensor.toml", "presses.csv", "calibration.png", "card.md"
 """Names of the files."""

@@ -17,8 +17,8 @@ from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.calibrate import CalibrationResult
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, draw_contacts
 from isocharge.train.model_release.export import export_onnx
+from isocharge.train.training.features import MISFIT_UNIT
 from isocharge.train.training.folding import KNOWN, FoldedNetwork
-from isocharge.train.training.network import MISFIT_UNIT
 
 NODES = 6
 """Pretensions at which weights are given."""

@@ -20,7 +20,7 @@ from isocharge.train.calibration.discrepancy import Hypothesis
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.films.films_file import FILE, read_films
 from isocharge.train.films.films_model import FilmsModel
-from isocharge.train.training.fit import Fitted
+from isocharge.train.training.fitted import Fitted
 
 DRIFT = {"pretension": 0.4, "d31": 0.05, "d32": 0.05, "gain": 0.1}
 """Standard deviations of what may have changed since an earlier calibration, over those of the prior: creep of the

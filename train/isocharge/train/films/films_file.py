@@ -31,8 +31,8 @@ from isocharge.simulate import Circle, Domain, NoiseModel
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
-from isocharge.train.films.conditional_network import ConditionalWeights, FilmScaling
-from isocharge.train.films.films_model import FilmsModel
+from isocharge.train.films.film_scaling import FilmScaling
+from isocharge.train.films.films_model import ConditionalWeights, FilmsModel
 
 FILE = "films.npz"
 """Name of the file in a version folder."""

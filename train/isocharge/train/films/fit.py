@@ -18,7 +18,8 @@ from isocharge.simulate.forward.film_modes import FilmModes
 from isocharge.simulate.sensor.film_prior import REACH, SHARED, FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.misfit_charges import misfit_noise
-from isocharge.train.films.conditional_network import ConditionalPerceptron, ConditionalWeights, FilmInputs, FilmScaling
+from isocharge.train.films.conditional_network import ConditionalPerceptron, FilmInputs
+from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.films.films_data import (
     D31,
     D32,
@@ -31,7 +32,7 @@ from isocharge.train.films.films_data import (
     gains_of,
     part_factors,
 )
-from isocharge.train.films.films_model import FilmsModel
+from isocharge.train.films.films_model import ConditionalWeights, FilmsModel
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fit import (
     WARM_UP,

@@ -14,8 +14,7 @@ from isocharge.train.films.films_file import FILE, films_bytes, films_from_bytes
 from isocharge.train.films.films_model import FilmsModel
 from isocharge.train.model_release.evaluate import ONLY_SIMULATED, contact_errors, rounded
 from isocharge.train.model_release.release import Release, release, yield_words
-from isocharge.train.training.fit import Fitted
-from isocharge.train.training.source import Provenance
+from isocharge.train.training.fitted import Fitted, Provenance
 
 FILMS, PRESSES = 64, 256
 """Fresh films that errors are measured on, and presses of each."""

@@ -9,7 +9,7 @@ from isocharge.simulate import Dataset, NoiseModel
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.presses import LabelledPresses, position_error
-from isocharge.train.training.fit import Fitted
+from isocharge.train.training.fitted import Fitted
 
 Predict = Callable[[Array], tuple[Array, Array, Array]]
 """Charges (n, n_electrode), pC, to contact (n, 3), mm and N, standard deviations (n, 3) and misfit (n, 1)."""

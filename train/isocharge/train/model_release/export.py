@@ -19,8 +19,8 @@ from isocharge.serve.model.session import CORRELATION, OUTPUTS, open_session, ru
 from isocharge.serve.prediction.table import LARGEST
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
+from isocharge.train.training.features import MISFIT_UNIT
 from isocharge.train.training.folding import COSINES, FoldedLayers, FoldedNetwork
-from isocharge.train.training.network import MISFIT_UNIT
 
 Exact = Callable[[Array], tuple[Array, ...]]
 

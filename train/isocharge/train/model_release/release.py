@@ -26,7 +26,7 @@ from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
 from isocharge.train.model_release.evaluate import evaluate
 from isocharge.train.model_release.export import check_graph, export_onnx
 from isocharge.train.model_release.measured_card import measured_card, measured_errors
-from isocharge.train.training.fit import Fitted
+from isocharge.train.training.fitted import Fitted
 
 CORNERS = 64
 """Corners of the polygon that stands for a round working area."""

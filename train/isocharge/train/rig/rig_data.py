@@ -26,7 +26,8 @@ from isocharge.train.data.presses import (
     presses_sha256,
 )
 from isocharge.train.rig.rig_film import RigFilm, calibrated_film, corrected_film
-from isocharge.train.training.source import Provenance, TrainingData
+from isocharge.train.training.fitted import Provenance
+from isocharge.train.training.source import TrainingData
 
 _log = logging.getLogger(__name__)
 

@@ -18,16 +18,14 @@ import logging
 from dataclasses import replace
 
 import numpy as np
-import torch
 from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
-from torch import Tensor
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Singles
 from isocharge.simulate import NoiseModel
 from isocharge.train.data.presses import LabelledPresses
+from isocharge.train.training.features import whitening
 from isocharge.train.training.folding import KNOWN, FoldedNetwork
-from isocharge.train.training.network import whitening
 
 _log = logging.getLogger(__name__)
 
@@ -48,8 +46,11 @@ SMALL_GRADIENT = 2e-3
 """Largest derivative of the loss at its minimum."""
 
 STARTS, STEPS, REMEMBERED = 5, 90, 20
-"""How often the search may begin anew, as a line search may find no step where two unit vectors nearly meet; the steps
-of each (more change the coverage by less than 0.005), and those that its idea of the curvature is made of."""
+"""How often the search may begin anew, as a line search may find no step where two unit vectors nearly meet; its steps
+(more change the coverage by less than 0.005), and those that its idea of the curvature is made of."""
+
+FIRST_STEP = 0.125
+"""Length of a search's first step: a longer one leads to where unit vectors meet."""
 
 FARTHEST = 5.0
 """Deviations up to which an error counts: beyond it is none of a Gaussian."""
@@ -93,36 +94,52 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
 def _fit_angles(features: Array, deviation: Array) -> tuple[Array, Array]:
     """Slopes (k, 3) and shift (3,) of the angles, from features (n, k) and errors over their deviations (n, 3)."""
     mean, matrix = whitening(features[::SPARSE], LEAST_SPREAD)
-    inputs = torch.from_numpy((features - mean) @ matrix)
-    targets = torch.from_numpy(np.clip(deviation, -FARTHEST, FARTHEST))
+    inputs = np.ascontiguousarray((features - mean) @ matrix, dtype=np.float32)
+    targets = np.ascontiguousarray(np.clip(deviation, -FARTHEST, FARTHEST).T, dtype=np.float32)
 
-    def loss(values: Array) -> tuple[float, Array]:
-        head = torch.tensor(values.reshape(-1, 3), requires_grad=True)
-        angles = inputs @ head[1:] + head[0]
-        total = correlation_loss(angles, targets) + RIDGE * torch.sum(head[1:] ** 2)
-        total.backward()  # type: ignore[no-untyped-call]
-        return total.item(), np.asarray(head.grad).ravel()
+    def loss(steps: Array) -> tuple[float, Array]:
+        head = FIRST_STEP * steps.reshape(-1, 3)
+        slopes = head[1:].astype(np.float32)
+        angles = slopes.T @ inputs.T + head[0].astype(np.float32)[:, None]
+        total, by_angle = correlation_loss(angles, targets)
+        gradient = np.vstack([by_angle.sum(axis=1, dtype=float), inputs.T @ by_angle.T + 2.0 * RIDGE * slopes])
+        return total + RIDGE * float((head[1:] ** 2).sum()), FIRST_STEP * gradient.ravel()
 
     start = np.zeros((1 + features.shape[1], 3))
-    start[0] = 0.5 * np.pi  # no correlation
-    found, options = start.ravel(), {"ftol": 0.0, "gtol": SMALL_GRADIENT, "maxiter": STEPS, "maxcor": REMEMBERED}
+    start[0] = 0.5 * np.pi / FIRST_STEP  # no correlation
+    found, options = start.ravel(), {"ftol": 0.0, "gtol": FIRST_STEP * SMALL_GRADIENT, "maxcor": REMEMBERED}
+    left = STEPS
     for _ in range(STARTS):
-        result = minimize(loss, found, jac=True, method="L-BFGS-B", options=options)
-        found = result.x
-        if result.status < 2:  # at its minimum or after its steps
+        result = minimize(loss, found, jac=True, method="L-BFGS-B", options=options | {"maxiter": left})
+        found, left = result.x, left - result.nit
+        if left <= 0 or np.abs(result.jac).max() <= options["gtol"]:
             break
     else:
-        _log.warning("the correlations are not learned to the end: the gradient is %.1g", np.abs(result.jac).max())
+        largest = np.abs(result.jac).max() / FIRST_STEP
+        _log.warning("the correlations are not learned to the end: the gradient is %.1g", largest)
+    found *= FIRST_STEP
     found = found.reshape(start.shape)
     slopes = matrix @ found[1:]
     return slopes, found[0] - mean @ slopes
 
 
-def correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:
-    """Negative logarithm of a Gaussian likelihood with unit variances, but for a constant; shapes (n, 3)."""
-    (sin_a, sin_b, sin_c), (cos_a, cos_b, cos_c) = angles.sin().T, angles.cos().T
-    first, second, third = deviation.T
+def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tuple[float, Array | Singles]:
+    """Negative logarithm of a Gaussian likelihood with unit variances, but for a constant, mean over n errors.
+
+    Args:
+        angles: Shape (3, n).
+        deviation: Errors over their deviations, shape (3, n).
+
+    Returns:
+        The loss, and its derivatives by the angles, shape (3, n).
+    """
+    (sin_a, sin_b, sin_c), (cos_a, cos_b, cos_c) = np.sin(angles), np.cos(angles)
+    first, second, third = deviation
     second = (second - cos_a * first) / sin_a
     third = (third - cos_b * first - sin_b * cos_c * second) / (sin_b * sin_c)
-    loss: Tensor = torch.log(torch.abs(sin_a * sin_b * sin_c)) + 0.5 * (second**2 + third**2)
-    return loss.mean()
+    loss = np.log(np.abs(sin_a * sin_b * sin_c)) + 0.5 * (second**2 + third**2)
+    cot_a, cot_b, cot_c = (cos / sin for cos, sin in ((cos_a, sin_a), (cos_b, sin_b), (cos_c, sin_c)))
+    by_a = cot_a + (second - third * cot_c) * (first - cot_a * second)
+    by_b = cot_b + third * ((first - cot_b * cos_c * second) / sin_c - cot_b * third)
+    by_c = cot_c + third * (second - cot_c * third)
+    return float(loss.mean(dtype=float)), np.stack([by_a, by_b, by_c]) / np.float32(angles.shape[1])

@@ -36,17 +36,10 @@ from isocharge.train.data.presses import (
 )
 from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.fit import (
-    Fitted,
-    contact_stage,
-    misfit_stage,
-    teaching_loss,
-    threads_and_seed,
-    train_part,
-)
-from isocharge.train.training.folding import fold_network
-from isocharge.train.training.network import Features, InverseNetwork, as_tensor
-from isocharge.train.training.source import Provenance
+from isocharge.train.training.features import Features
+from isocharge.train.training.fit import contact_stage, misfit_stage, teaching_loss, threads_and_seed, train_part
+from isocharge.train.training.fitted import Fitted, Provenance
+from isocharge.train.training.network import InverseNetwork, as_tensor, fold_network
 
 _log = logging.getLogger(__name__)
 

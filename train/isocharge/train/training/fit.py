@@ -21,20 +21,20 @@ from torch import Tensor
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ConfigError
 from isocharge.common.resumable_run import ResumableRun
-from isocharge.simulate import ChargeMap, Dataset, Domain, NoiseModel, Sensor
+from isocharge.simulate import ChargeMap, Dataset, Domain, NoiseModel
 from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.channel_noise import ChannelNoise, Noise
 from isocharge.train.data.charge_field import ChargeField, invertible_domain
-from isocharge.train.data.measured_sensor import MeasuredSensor
 from isocharge.train.data.misfit_charges import draw_misfit_examples, misfit_noise
 from isocharge.train.data.presses import LabelledPresses, held_out, split_by_position
 from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.folding import FoldedNetwork, fold_network
-from isocharge.train.training.network import Features, InverseNetwork, Perceptron, as_tensor, compress_length
-from isocharge.train.training.source import Provenance, Teacher, TrainingData
+from isocharge.train.training.features import Features
+from isocharge.train.training.fitted import Fitted
+from isocharge.train.training.network import InverseNetwork, Perceptron, as_tensor, compress_length, fold_network
+from isocharge.train.training.source import Teacher, TrainingData
 
 _log = logging.getLogger(__name__)
 
@@ -51,49 +51,6 @@ WATCHED = 0.5
 SHARPER = 0.1
 """Size from which features of any sign are logarithmic, over that from which noise grows with the charge. Measured: 1
 comes to 1.08 of the Bayes limit of the position on a taut uniaxial film, 0.1 to 1.05."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fitted:
-    """A fitted network, and what it is for.
-
-    Attributes:
-        network: The network as plain layers in NumPy.
-        sensor: The sensor whose charges it takes.
-        probes: Notations of the probes.
-        domain: The contacts that it knows.
-        noise: Noise that it was trained for.
-        test: Presses that it is judged by; it did not learn from them, or see `judged`.
-        good: Presses of which 1 % may have a misfit above the alarm's.
-        sha256: Checksum of what it was fitted to.
-        provenance: For the release.
-        asked: The domain that was asked for; larger than the network's where the map folds.
-        cautions: What users of the network should know, a sentence each.
-        judged: Contacts and standard deviations, mm and N, shapes (n, 3), and misfits, shape (n, 1), of `test` without
-            what was learned from a press's own place; None where this network did not see `test`.
-    """
-
-    network: FoldedNetwork
-    sensor: Sensor | MeasuredSensor
-    probes: tuple[str, ...]
-    domain: Domain
-    noise: Noise
-    test: LabelledPresses
-    good: LabelledPresses
-    sha256: str
-    provenance: Provenance
-    asked: Domain
-    cautions: tuple[str, ...] = ()
-    judged: tuple[Array, Array, Array] | None = None
-
-    @property
-    def misfit_noise(self) -> Noise:
-        """The unit of the misfit."""
-        return misfit_noise(self.noise) if isinstance(self.noise, NoiseModel) else self.noise
-
-    def predict(self, charge: Array) -> tuple[Array, Array, Array]:
-        """Charges (n, n_electrode), pC, to contact (n, 3), mm and N, standard deviations (n, 3), and misfit (n, 1)."""
-        return self.network.predict(charge)
 
 
 def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run: ResumableRun | None = None) -> Fitted:

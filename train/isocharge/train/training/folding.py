@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
-from torch import nn
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.train.training.network import MISFIT_UNIT, InverseNetwork, Perceptron, SignedCharges, bent
+from isocharge.train.training.features import MISFIT_UNIT, SignedCharges, bent
 
 Layer = tuple[Array, Array]
 """Weights (inputs, outputs) and bias."""
@@ -33,12 +32,6 @@ class PlainPerceptron:
 
     layers: tuple[Layer, ...]
     skip: Array
-
-    @classmethod
-    def of(cls, perceptron: Perceptron) -> "PlainPerceptron":
-        """The weights of a torch module, in double precision."""
-        layers = tuple((_matrix(layer), layer.bias.detach().double().numpy()) for layer in perceptron.layers())
-        return cls(layers, _matrix(perceptron.skip))
 
 
 @dataclass(frozen=True)
@@ -194,15 +187,6 @@ class FoldedNetwork:
         return replace(self, layers=self.layers.taught(self.inputs(charge), wanted))
 
 
-def fold_network(network: InverseNetwork) -> FoldedNetwork:
-    """Both perceptrons, from ln(Q / typical) or what stands for it."""
-    features, n_electrode = network.features, network.features.typical.size
-    perceptrons = [PlainPerceptron.of(part) for part in (network.contact, network.misfit_vector)]
-    whitening, mean = network.whitening.double().numpy(), network.logs_mean.double().numpy()
-    units = answer_units(network.domain, np.eye(3), np.zeros(3), n_electrode)
-    return FoldedNetwork(FoldedLayers.of(perceptrons, whitening, mean, units), features.typical, features.signed)
-
-
 def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer:
     """Matrix and shift from outputs of the perceptrons to answers.
 
@@ -223,14 +207,6 @@ def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: in
     return matrix, shift
 
 
-def contact_alone(network: InverseNetwork) -> FoldedNetwork:
-    """The contact network without standard deviations: its layers give (x_mm, y_mm, ln F) alone."""
-    matrix = np.vstack([np.diag(network.domain.scale), np.zeros((3, 3))])
-    features, contact = network.features, PlainPerceptron.of(network.contact)
-    layers = FoldedLayers.of((contact,), features.matrix, features.mean, (matrix, network.domain.centre))
-    return FoldedNetwork(layers, features.typical, features.signed)
-
-
 def _side_by_side(perceptrons: Sequence[PlainPerceptron]) -> tuple[list[Layer], Layer]:
     """Layers that tanh follows, and the last; the first shares its inputs, the others are block-diagonal."""
     stages = zip(*(perceptron.layers for perceptron in perceptrons), strict=True)
@@ -242,8 +218,3 @@ def _side_by_side(perceptrons: Sequence[PlainPerceptron]) -> tuple[list[Layer], 
         for number, stage in enumerate(stages)
     ]
     return layers[:-1], layers[-1]
-
-
-def _matrix(layer: nn.Linear) -> Array:
-    """Weights of a layer, shape (inputs, outputs)."""
-    return np.asarray(layer.weight.detach().double().numpy().T)

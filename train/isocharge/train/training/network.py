@@ -12,7 +12,6 @@ the image of the forward map. Lengths from a tenth to thousands are brought into
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -22,88 +21,11 @@ from torch import Tensor, nn
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
-
-MISFIT_UNIT = 5.0
-"""Standard deviations up to which the misfit is learned about linearly; beyond, its logarithm is."""
+from isocharge.train.training.features import MISFIT_UNIT, Features
+from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, PlainPerceptron, answer_units
 
 LARGEST_INT8 = 127
 """A rounded weight is a whole number from minus this to this, times the scale of its output."""
-
-
-WIDER = 1.0
-"""How far signed charges may lie beyond those of presses, over the width of these, in asinh: farther ones count as just
-so far. What is absurd still gives a finite answer."""
-
-
-@dataclass(frozen=True)
-class SignedCharges:
-    """Charges of any sign: asinh(clip(Q) / typical) - mean stands for the logarithm.
-
-    Attributes:
-        low, high: Charges are brought between these, shape (n_electrode,), pC.
-        mean: Shape (n_electrode,): numbers about 0 keep the digits of a float32.
-    """
-
-    low: Array
-    high: Array
-    mean: Array
-
-    @classmethod
-    def of(cls, charge: Array, typical: Array) -> "SignedCharges":
-        """From charges of presses, shape (n, n_electrode), and the typical ones, pC."""
-        levels = np.arcsinh(charge / typical)
-        low, high = levels.min(axis=0), levels.max(axis=0)
-        beyond = WIDER * (high - low)
-        return cls(np.sinh(low - beyond) * typical, np.sinh(high + beyond) * typical, levels.mean(axis=0))
-
-
-@dataclass(frozen=True)
-class Features:
-    """Whitened logarithms of the charges: x = (ln(clip(Q) / typical) - mean) @ matrix.
-
-    Attributes:
-        typical: The power of two nearest to each charge's geometric mean, shape (n_electrode,), pC: dividing by it
-            costs a float32 no digit, and the logarithms are small enough to keep theirs. For signed charges the size
-            from which noise grows with the charge.
-        mean: Of the logarithms, shape (n_electrode,).
-        matrix: Shape (n_electrode, n_electrode).
-        signed: What stands for the logarithm if charges may have any sign.
-    """
-
-    typical: Array
-    mean: Array
-    matrix: Array
-    signed: SignedCharges | None = None
-
-    @classmethod
-    def fit(cls, charge: Array) -> "Features":
-        """From clean positive charges, shape (n, n_electrode): zero mean, unit covariance along the principal axes."""
-        within = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
-        typical = 2.0 ** np.round(np.log2(within).mean(axis=0))
-        return cls(typical, *whitening(np.log(within / typical)))
-
-    @classmethod
-    def of_signed(cls, charge: Array, typical: Array) -> "Features":
-        """From charges of any sign, shape (n, n_electrode), and the size from which noise grows with them, pC."""
-        signed = SignedCharges.of(charge, typical)
-        return cls(typical, *whitening(bent(charge, typical, signed)), signed)
-
-
-def bent(charge: Array, typical: Array, signed: SignedCharges | None) -> Array:
-    """What features are linear in, shape (n, n_electrode): ln(Q / typical), or what stands for it."""
-    if signed:
-        return np.asarray(np.arcsinh(np.clip(charge, signed.low, signed.high) / typical) - signed.mean)
-    return np.asarray(np.log(np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE) / typical))
-
-
-def whitening(values: Array, least: float = 0.0) -> tuple[Array, Array]:
-    """Mean and matrix M of values (n, k): (values - mean) @ M has unit covariance along its principal axes.
-
-    Where the deviation along an axis is less than `least` of the largest, it stays below 1.
-    """
-    mean = values.mean(axis=0)
-    _, singular, axes = np.linalg.svd(values - mean, full_matrices=False)
-    return mean, axes.T * (np.sqrt(len(values)) / np.maximum(singular, max(1e-12, least * singular[0])))
 
 
 class Trainable(nn.Module, ABC):
@@ -139,6 +61,11 @@ class Perceptron(Trainable):
     def layers(self) -> list[nn.Linear]:
         """The linear layers between which tanh stands, first to last."""
         return [layer for layer in self.mlp if isinstance(layer, nn.Linear)]
+
+    def plain(self) -> PlainPerceptron:
+        """The same in NumPy, in double precision."""
+        layers = tuple((_matrix(layer), layer.bias.detach().double().numpy()) for layer in self.layers())
+        return PlainPerceptron(layers, _matrix(self.skip))
 
     def hidden_matrices(self) -> list[Tensor]:
         """Weights from one hidden layer to the next."""
@@ -209,3 +136,25 @@ def compress_length(residual: Tensor) -> Tensor:
 def as_tensor(values: Array) -> Tensor:
     """In single precision."""
     return torch.tensor(values).float()
+
+
+def fold_network(network: InverseNetwork) -> FoldedNetwork:
+    """Both perceptrons, from ln(Q / typical) or what stands for it."""
+    features, n_electrode = network.features, network.features.typical.size
+    perceptrons = [part.plain() for part in (network.contact, network.misfit_vector)]
+    whitening, mean = network.whitening.double().numpy(), network.logs_mean.double().numpy()
+    units = answer_units(network.domain, np.eye(3), np.zeros(3), n_electrode)
+    return FoldedNetwork(FoldedLayers.of(perceptrons, whitening, mean, units), features.typical, features.signed)
+
+
+def contact_alone(network: InverseNetwork) -> FoldedNetwork:
+    """The contact network without standard deviations: its layers give (x_mm, y_mm, ln F) alone."""
+    matrix = np.vstack([np.diag(network.domain.scale), np.zeros((3, 3))])
+    features, contact = network.features, network.contact.plain()
+    layers = FoldedLayers.of((contact,), features.matrix, features.mean, (matrix, network.domain.centre))
+    return FoldedNetwork(layers, features.typical, features.signed)
+
+
+def _matrix(layer: nn.Linear) -> Array:
+    """Weights of a layer, shape (inputs, outputs)."""
+    return np.asarray(layer.weight.detach().double().numpy().T)

@@ -1,6 +1,6 @@
 """What a network is fitted to: simulated presses, measured ones, or the answers of another model."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,6 +9,7 @@ from torch import Tensor
 from isocharge.common.arrays import Array
 from isocharge.simulate import Dataset, Domain, Sensor
 from isocharge.train.data.presses import LabelledPresses, domain_of, presses_of
+from isocharge.train.training.fitted import Provenance
 from isocharge.train.training.network import as_tensor
 
 
@@ -36,21 +37,6 @@ class Teacher:
         return as_tensor(domain.to_unit(contact)), as_tensor(np.log(relative))
 
 
-@dataclass(frozen=True)
-class Provenance:
-    """What a released model says about its origin, beside what every model says.
-
-    Attributes:
-        card: A section for the card, in Markdown.
-        made_with: Entries for the metadata.
-        files: More files for the version folder, by name.
-    """
-
-    card: str = ""
-    made_with: Mapping[str, object] = field(default_factory=dict)
-    files: Mapping[str, bytes] = field(default_factory=dict)
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrainingData:
     """What one network is fitted to, and what it is judged by.
@@ -74,7 +60,7 @@ class TrainingData:
     sha256: str
     test: LabelledPresses | None = None
     teacher: Teacher | None = None
-    provenance: Provenance = Provenance()
+    provenance: Provenance = field(default_factory=Provenance)
 
     @classmethod
     def of(cls, dataset: Dataset) -> "TrainingData":
