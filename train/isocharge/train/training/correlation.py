@@ -55,6 +55,9 @@ FIRST_STEP = 0.125
 FARTHEST = 5.0
 """Deviations up to which an error counts: beyond it is none of a Gaussian."""
 
+LEAST_SINE = 1e-4
+"""Sines of angles count as no smaller: the squares of what is divided by three of them are numbers of a float32."""
+
 ANGLE_SUMS = np.array([[1, 0, 1, 1, 1, 1, 1, 1], [0, 1, -1, 1, -1, -1, 1, 1], [0, 0, 0, 0, -1, 1, -1, 1]], dtype=float)
 """From the angles (a, b, c) to the arguments of the cosines."""
 
@@ -133,7 +136,8 @@ def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tup
     Returns:
         The loss, and its derivatives by the angles, shape (3, n).
     """
-    (sin_a, sin_b, sin_c), (cos_a, cos_b, cos_c) = np.sin(angles), np.cos(angles)
+    sine, (cos_a, cos_b, cos_c) = np.sin(angles), np.cos(angles)
+    sin_a, sin_b, sin_c = np.copysign(np.maximum(np.abs(sine), LEAST_SINE), sine)
     first, second, third = deviation
     second = (second - cos_a * first) / sin_a
     third = (third - cos_b * first - sin_b * cos_c * second) / (sin_b * sin_c)
