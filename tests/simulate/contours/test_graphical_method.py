@@ -49,6 +49,16 @@ def test_lines_that_do_not_reach_the_charge_give_no_contour():
     assert draw_contour(curves_of(LAYOUTS["three"], "A"), 5e3) is None
 
 
+def test_two_contours_cross_where_their_circles_do():
+    """In the press and in its mirror image in the line through both electrodes, once each."""
+    sensor, z = LAYOUTS["three"], 1.0 + 2.0j
+    charges = zip("AB", charges_of(sensor, np.array([z.real]), np.array([z.imag]))[0], strict=False)
+    one, other = (draw_contour(curves_of(sensor, name), float(charge), degree=3) for name, charge in charges)
+    a, b = (complex(*electrode.centre) for electrode in sensor.electrodes[:2])
+    mirrored = a + np.conj((z - a) / (b - a)) * (b - a)
+    np.testing.assert_allclose(np.sort_complex(one.crossings(other) @ [1.0, 1.0j]), [z, mirrored], atol=0.01)
+
+
 def test_presses_are_found(layout):
     sensor, curves = layout
     rng = np.random.default_rng(1)

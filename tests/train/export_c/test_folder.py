@@ -48,6 +48,7 @@ def test_command_writes_the_folder_once(command, refused, tmp_path):
     code, out, err = command(*words)
     assert (code, out, "isocharge_model.c" in err) == (0, "", True)
     assert "#define ISOCHARGE_LEAK_TAU_S {10.0, 10.0, 10.0}" in (tmp_path / "c" / "isocharge_device.h").read_text()
+    assert "Written by `isocharge train export-c three-25um-biaxial --" in (tmp_path / "c" / "README.md").read_text()
     refused(*words, said="is already there and is not overwritten", code=1)
 
 

@@ -47,7 +47,7 @@ def test_the_derivatives_of_the_loss_are_its_differences():
     np.testing.assert_allclose(by_angle(angles).ravel(), approx_fprime(angles, found), atol=1e-6)
 
 
-def test_planted_correlations_are_found_and_other_answers_stay(trained):
+def test_planted_correlations_are_found_and_other_answers_stay(trained, caplog):
     """Truths drawn about the network's own answers, with correlations that depend on the charges."""
     network, charge = fold_network(trained.network), trained.split.train.charge
     still = replace(noise_model("reference"), white=0.0, gain=0.0)
@@ -58,6 +58,7 @@ def test_planted_correlations_are_found_and_other_answers_stay(trained):
     truth = np.column_stack([contact[:, :2] + drawn[:, :2], contact[:, 2] * np.exp(drawn[:, 2] / contact[:, 2])])
     turned = with_correlation(network, LabelledPresses(truth, charge), still, seed=0)
     *same, found, misfit = turned.outputs(charge)
+    assert caplog.messages == []  # the search has ended
     assert np.sqrt(np.mean((found - planted) ** 2)) < 0.2 * np.sqrt(np.mean(planted**2))
     for mine, theirs in zip((*same, misfit), network.outputs(charge), strict=True):
         np.testing.assert_array_equal(mine, theirs)
