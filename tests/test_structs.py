@@ -2,6 +2,7 @@
 
 import math
 import re
+from functools import partial
 from typing import Annotated, Literal
 
 import msgspec
@@ -124,22 +125,27 @@ def test_messages_stay_short():
         assert len(str(caught.value)) < 3 * LONGEST_VALUE
 
 
-def test_files_that_are_none(tmp_path):
-    path = tmp_path / "board.toml"
-    for content, message in (
-        (b"a = x", "not a TOML file: .*line 1"),
-        (b"\xff", "not a TOML file: not text in UTF-8"),
-        (b"#" * (MOST_TOML_BYTES + 1), r"cannot be read \(larger than 262144 bytes\); expected a device file in TOML"),
-        (b"a = " + b"[" * 100_000, "not a TOML file"),
-        (b"a." * 100_000 + b"a = 1", "not a TOML file: a key of more than 32 parts"),
-        (b"'a b' . " * 30_000 + b"a = 1", "not a TOML file: a key of more than 32 parts"),
-    ):
-        path.write_bytes(content)
-        with pytest.raises(DeviceError, match=rf"^{path}: {message}"):
-            read_toml(path, "a device file", DeviceError, dict)
-    with pytest.raises(DeviceError, match=r"cannot be read \(.*\); expected a device file in TOML"):
-        read_toml(tmp_path, "a device file", DeviceError, dict)
-    for content in (b"{", b"[" * 100_000, b"NaN", b"\xef", b"1" * 5000):
-        path.write_bytes(content)
-        with pytest.raises(DeviceError, match=rf"^{path}: (expected JSON, got|not a JSON file)"):
-            read_json(path, "a list", DeviceError, list)
+TOML = partial(read_toml, what="a device file", error=DeviceError, kind=dict)
+JSON = partial(read_json, what="a list", error=DeviceError, kind=list)
+
+
+@pytest.mark.parametrize(
+    ("read", "content", "message"),
+    [
+        (TOML, b"a = x", "not a TOML file: .*line 1"),
+        (TOML, b"\xff", "not a TOML file: not text in UTF-8"),
+        (TOML, b"#" * (MOST_TOML_BYTES + 1), r"cannot be read \(larger than 262144 bytes\); expected a device file in"),
+        (TOML, b"a = " + b"[" * 100_000, "not a TOML file"),
+        (TOML, b"a." * 100_000 + b"a = 1", "not a TOML file: a key of more than 32 parts"),
+        (TOML, b"'a b' . " * 30_000 + b"a = 1", "not a TOML file: a key of more than 32 parts"),
+        *(
+            (JSON, data, "(expected JSON, got|not a JSON file)")
+            for data in (b"{", b"[" * 100_000, b"NaN", b"\xef", b"1" * 5000)
+        ),
+    ],
+)
+def test_files_that_are_none(tmp_path, read, content, message):
+    (tmp_path / "board").write_bytes(content)
+    for path, said in ((tmp_path / "board", message), (tmp_path, "cannot be read")):
+        with pytest.raises(DeviceError, match=rf"^{path}: {said}"):
+            read(path)

@@ -1,6 +1,6 @@
 """One press: CPU time against error, for several meshes, without and with bending.
 
-    python tests/benchmarks/bench_solve.py [--positions 20] [--seed 1] [--plot FILE.png]       (ten minutes)
+    python tests/benchmarks/bench_solve.py [--positions 20] [--seed 1] [--plot FILE.png] [--json]       (ten minutes)
 
 Time is the process CPU time of `press` (mesh, Newton) and `touch_charge` (readout) with imports, templates and symbolic
 work done, from flat ("cold") and from a press 0.5 mm away with a tenth more force ("warm"). Errors are of each charge,
@@ -8,16 +8,14 @@ relative to itself, over the built-in sensors, against a solve of the same theor
 are read with 60 x 60 points; so they contain mesh and readout, but not what a theory leaves out.
 """
 
-import json
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from shared import arguments
+from shared import arguments, print_results
 
-from isocharge.serve.benchmark import machine
 from isocharge.simulate import (
     Circle,
     Equilibrium,
@@ -118,9 +116,6 @@ def record(positions: int, seed: int) -> dict:
         for number, contact in enumerate(group)
     }
     return {
-        "machine": machine(),
-        "positions": positions,
-        "seed": seed,
         "meshes": [measure(theory, mesh, groups, exact) for theory, meshes in MESHES.items() for mesh in meshes],
         "chosen": [chosen(theory, probe, groups["away"][:3]) for probe in PROBES for theory in MESHES],
     }
@@ -144,13 +139,11 @@ def plot(result: dict, path: Path) -> None:
 
 
 def main() -> None:
-    asked = arguments(__doc__, positions=20, seed=1, plot=None)
+    asked = arguments(__doc__, positions=20, seed=1, plot=None, json=False)
     result = record(asked.positions, asked.seed)
     if asked.plot:
         plot(result, asked.plot)
-    for row in result.pop("meshes") + result.pop("chosen"):
-        print(json.dumps(row))
-    print(json.dumps(result))
+    print_results("solve", asked, result)
 
 
 if __name__ == "__main__":

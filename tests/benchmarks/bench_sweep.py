@@ -1,6 +1,6 @@
-"""100,000 labelled presses: wall time, memory, and the error of the charges against direct solves, as JSON.
+"""100,000 labelled presses: wall time, memory, and the error of the charges against direct solves.
 
-    python tests/benchmarks/bench_sweep.py [--samples 100000] [--workers 2] [--checks 60] [--seed 0]
+    python tests/benchmarks/bench_sweep.py [--samples 100000] [--workers 2] [--checks 60] [--seed 0] [--json]
 
 Three probes within 10 mm of the centre, 0.05 to 2 N, turned at random, as `isocharge simulate sweep` makes them, from
 the call to the finished dataset: start of the workers, solves, evaluation, checksums. Memory is the peak of the parent
@@ -8,7 +8,6 @@ and of the largest worker, added up. Then some of the presses, as many of each p
 mesh, and every charge is compared relative to itself.
 """
 
-import json
 import resource
 import tempfile
 import time
@@ -16,10 +15,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from shared import arguments
+from shared import arguments, print_results
 
 from isocharge.common.progress import listening
-from isocharge.serve.benchmark import machine
 from isocharge.simulate import (
     Dataset,
     Resolution,
@@ -49,7 +47,7 @@ def relative_error(dataset: Dataset, row: int) -> np.ndarray:
 
 
 def main() -> None:
-    options = arguments(__doc__, sensor="four-25um-biaxial", samples=100_000, workers=2, checks=60, seed=0)
+    options = arguments(__doc__, sensor="four-25um-biaxial", samples=100_000, workers=2, checks=60, seed=0, json=False)
     sensor, sweep = load_sensor(options.sensor), Sweep(10.0, (0.05, 2.0), options.samples, options.seed, "random")
     began, solved_at = time.perf_counter(), []
 
@@ -68,7 +66,7 @@ def main() -> None:
             rows = rng.permutation(np.flatnonzero(dataset.samples.probe == name))[: options.checks // len(PROBES)]
             errors[name] = np.array([*in_order(executor, partial(relative_error, dataset), rows.tolist())])
     every = np.concatenate([*errors.values()])
-    result = vars(options) | {
+    result = {
         "seconds": seconds,
         "solve_seconds": solved_at[0] - began,
         "cpu_seconds": sum(used.ru_utime + used.ru_stime for used in (parent, worker)),
@@ -77,9 +75,8 @@ def main() -> None:
         **{key: dataset.manifest["solver"][key] for key in ("solves", "interpolation_error")},
         "share_within_0.1_percent": float((every < 1e-3).mean()),
         "worst_percent": {name: 100.0 * float(error.max()) for name, error in errors.items()},
-        "machine": machine(),
     }
-    print(json.dumps(result, indent=1))
+    print_results("sweep", options, result)
 
 
 if __name__ == "__main__":

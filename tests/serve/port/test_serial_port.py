@@ -56,6 +56,10 @@ def test_chunk_has_the_bytes_unchanged_and_the_time_of_arrival(board):
         ("/etc/hostname", r"cannot be opened at 115200 baud .*check the cable"),
         ("socket://127.0.0.1:1", r"cannot be opened \(.*refused\); check host and number"),
         ("telepathy://x", r"cannot be opened \(invalid URL"),
+        *(
+            (f"udp://{place}", "cannot be opened")
+            for place in ("127.0.0.1", "127.0.0.1:99999", "127.0.0.1:9/x", "300.0.0.1:9")
+        ),
     ],
 )
 def test_port_that_cannot_be_opened(url, said):
@@ -196,18 +200,20 @@ def received(address, *datagrams):
         return [next(chunks).data for datagram in datagrams if datagram]
 
 
-def test_each_datagram_is_a_chunk(address):
-    sent = [b"\x00\xff" * 20, b"\x01", b"\x02\n" * 700]
-    assert received(address, *sent) == sent
+TEXT, BYTES = (b'{"A": 1}', b"A:1\tB:2", "1 µC".encode()), (b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f")
 
 
-def test_lines_without_an_end_get_one(address):
-    text, bytes_ = [b'{"A": 1}', b"A:1\tB:2", "1 µC".encode()], [b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f"]
-    assert received(address, *text, *bytes_) == [*(line + b"\n" for line in text), *bytes_]
-
-
-def test_a_board_that_ends_its_lines_gets_no_more_ends(address):
-    assert received(address, b"1,2\n", b"3,", b"4\n") == [b"1,2\n", b"3,", b"4\n"]
+@pytest.mark.parametrize(
+    ("sent", "chunks"),
+    [
+        ((b"\x00\xff" * 20, b"\x01", b"\x02\n" * 700), (b"\x00\xff" * 20, b"\x01", b"\x02\n" * 700)),
+        ((*TEXT, *BYTES), (*(line + b"\n" for line in TEXT), *BYTES)),
+        ((b"1,2\n", b"3,", b"4\n"), (b"1,2\n", b"3,", b"4\n")),
+    ],
+    ids=["each is a chunk", "lines without an end get one", "a board ends its lines itself"],
+)
+def test_datagrams_are_chunks(address, sent, chunks):
+    assert received(address, *sent) == [*chunks]
 
 
 def test_an_empty_datagram_is_no_silence(address):
@@ -215,14 +221,6 @@ def test_an_empty_datagram_is_no_silence(address):
     with Port(f"udp://127.0.0.1:{address[1]}", silence_s=0.05) as port, socket.socket(type=socket.SOCK_DGRAM) as board:
         board.sendto(b"", address)
         assert port.read(0.01) is None
-
-
-@pytest.mark.parametrize(
-    "url", ["udp://127.0.0.1", "udp://127.0.0.1:99999", "udp://127.0.0.1:9/x", "udp://300.0.0.1:9"]
-)
-def test_addresses_that_are_none(url):
-    with pytest.raises(PortError, match=f"{url}: cannot be opened"), Port(url):
-        pass
 
 
 def test_an_address_that_is_taken(address):

@@ -52,8 +52,7 @@ def replace_shard(folder: Path, **columns) -> None:
     with np.load(path) as old:
         arrays = {name: old[name] for name in old} | columns
     np.savez(path, allow_pickle=True, **{name: array for name, array in arrays.items() if array is not None})
-    checksum = hashlib.sha256(path.read_bytes()).hexdigest()
-    edit(folder, lambda manifest: manifest["shards"][0].update(sha256=checksum))
+    write_shard(folder, path.read_bytes())
 
 
 # Round trip
@@ -99,50 +98,6 @@ def test_not_a_dataset(tmp_path):
             read_dataset(path)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "[]",
-        "{}",
-        "\xff",
-        "[" * 100_000,
-        '{"format_version": 1' + "0" * 5000,
-    ],
-)
-def test_broken_manifest(dataset, text):
-    (dataset / "manifest.json").write_text(text, encoding="latin-1")
-    with pytest.raises(DatasetError, match=r"manifest\.json: not a manifest of a dataset"):
-        read_dataset(dataset)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            lambda manifest: manifest.update(format_version=2),
-            "format version 2 is not supported",
-        ),
-        (lambda manifest: manifest.pop("sensor"), "key 'sensor' is missing"),
-        (lambda manifest: manifest.pop("shards"), "key 'shards' is missing"),
-        (lambda manifest: manifest.update(shards=[]), "lists no shards"),
-        (lambda manifest: manifest["sensor"]["film"].update(colour="red"), r"unknown key 'film\.colour'"),
-        (
-            lambda manifest: manifest.update(electrodes=["B", "A", "C"]),  # else read as each other's charges
-            r"expected the sensor's electrodes in its order, \['A', 'B', 'C'\], got \['B'",
-        ),
-        *(
-            (lambda manifest, value=value: manifest.update(shards=value), "shards")
-            for value in (None, [3], [{"file": 3, "sha256": ""}])
-        ),
-    ],
-)
-def test_manifest_with_a_wrong_entry(dataset, change, message):
-    edit(dataset, change)
-    with pytest.raises(DatasetError, match=rf"manifest\.json: .*{message}"):
-        read_dataset(dataset)
-
-
 def test_another_sensor_where_one_is_expected(dataset):
     assert read_dataset(dataset, SENSOR).sensor == SENSOR
     message = r"manifest\.json: expected the sensor 'four-25um-biaxial', got 'three-25um-biaxial'; use its own"
@@ -153,45 +108,113 @@ def test_another_sensor_where_one_is_expected(dataset):
         read_dataset(dataset, thicker)
 
 
-def test_missing_shard(dataset):
-    (dataset / "shard-00001.npz").unlink()
-    with pytest.raises(DatasetError, match=r"shard-00001\.npz: the manifest lists this shard, but the file is missing"):
-        read_dataset(dataset)
+def packed(data: bytes) -> bytes:
+    """An npz file whose columns are these bytes."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
+        for name in COLUMNS:
+            file.writestr(f"{name}.npy", data)
+    return buffer.getvalue()
 
 
-def test_one_damaged_byte(dataset):
-    path = dataset / "shard-00000.npz"
-    data = bytearray(path.read_bytes())
-    data[100] ^= 1
-    path.write_bytes(bytes(data))
-    with pytest.raises(DatasetError, match=r"shard-00000\.npz is damaged: expected sha256 [0-9a-f]{12}\.\.\., got"):
-        read_dataset(dataset)
+def npy(shape: str, dtype: str = "<f8", data: bytes = b"") -> bytes:
+    head = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + data
 
 
-def test_shard_outside_the_folder_is_not_read(dataset, tmp_path):
-    """A manifest cannot point elsewhere."""
-    shutil.move(dataset / "shard-00000.npz", tmp_path / "shard-00000.npz")
-    edit(dataset, lambda manifest: manifest["shards"][0].update(file="../shard-00000.npz"))
-    with pytest.raises(DatasetError, match="the file is missing"):
-        read_dataset(dataset)
+def write_shard(folder: Path, data: bytes) -> None:
+    """Other bytes for the first shard, with a checksum that fits."""
+    (folder / "shard-00000.npz").write_bytes(data)
+    edit(folder, lambda manifest: manifest["shards"][0].update(sha256=hashlib.sha256(data).hexdigest()))
 
 
-WRONG_COLUMNS = {
-    "missing": ({"force_N": None}, "not a shard with the columns x_mm, y_mm"),
-    "too long": ({"x_mm": np.zeros(6)}, r"expected columns of shapes .* got .*'x_mm': \(6,\)"),
-    "too many electrodes": ({"charge_pC": np.zeros((5, 4))}, r"got .*'charge_pC': \(5, 4\)"),
-    "no samples": ({n: np.zeros((0, 3) if n == "charge_pC" else 0) for n in COLUMNS}, "at least one sample"),
-    "NaN": ({"x_mm": np.array([0, 1, np.nan, 3, 4])}, "column x_mm holds nan in row 2; every number must be finite"),
-    "text": ({"x_mm": np.array(list("abcde"))}, "column x_mm: expected numbers, got <U1"),
-    "objects": ({"x_mm": np.array([None] * 5)}, "not a shard"),
-    "probe of numbers": ({"probe": np.zeros(5)}, "column probe: expected text, got float64"),
+def flip(path: Path) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[:100] + bytes([data[100] ^ 1]) + data[101:])
+
+
+def manifest_of(text: str):
+    return lambda folder: (folder / "manifest.json").write_text(text, encoding="latin-1")
+
+
+def entry(change):
+    return lambda folder: edit(folder, change)
+
+
+def shard(**columns):
+    return lambda folder: replace_shard(folder, **columns)
+
+
+NO_MANIFEST, NO_SHARD = (
+    r"manifest\.json: not a manifest of a dataset",
+    r"shard-00000\.npz: (not a shard|expected columns)",
+)
+DAMAGE = {
+    "manifest: empty": (manifest_of(""), NO_MANIFEST),
+    "manifest: a list": (manifest_of("[]"), NO_MANIFEST),
+    "manifest: empty table": (manifest_of("{}"), NO_MANIFEST),
+    "manifest: no text": (manifest_of("\xff"), NO_MANIFEST),
+    "manifest: deep": (manifest_of("[" * 100_000), NO_MANIFEST),
+    "manifest: a long number": (manifest_of('{"format_version": 1' + "0" * 5000), NO_MANIFEST),
+    "version": (entry(lambda table: table.update(format_version=2)), "format version 2 is not supported"),
+    "no sensor": (entry(lambda table: table.pop("sensor")), "key 'sensor' is missing"),
+    "no key of shards": (entry(lambda table: table.pop("shards")), "key 'shards' is missing"),
+    "no shards": (entry(lambda table: table.update(shards=[])), "lists no shards"),
+    "film": (entry(lambda table: table["sensor"]["film"].update(colour="red")), r"unknown key 'film\.colour'"),
+    "electrodes": (  # else read as each other's charges
+        entry(lambda table: table.update(electrodes=["B", "A", "C"])),
+        r"expected the sensor's electrodes in its order, \['A', 'B', 'C'\], got \['B'",
+    ),
+    **{
+        f"shards {value}": (entry(lambda table, value=value: table.update(shards=value)), r"manifest\.json: .*shards")
+        for value in (None, [3], [{"file": 3, "sha256": ""}])
+    },
+    "a shard is missing": (
+        lambda folder: (folder / "shard-00001.npz").unlink(),
+        r"shard-00001\.npz: the manifest lists this shard, but the file is missing",
+    ),
+    "one byte": (
+        lambda folder: flip(folder / "shard-00000.npz"),
+        r"shard-00000\.npz is damaged: expected sha256 [0-9a-f]{12}\.\.\., got",
+    ),
+    "a shard outside the folder": (
+        lambda folder: (
+            shutil.move(folder / "shard-00000.npz", folder.parent),
+            edit(folder, lambda table: table["shards"][0].update(file="../shard-00000.npz")),
+        ),
+        "the file is missing",
+    ),
+    "a column is missing": (shard(force_N=None), "not a shard with the columns x_mm, y_mm"),
+    "too long": (shard(x_mm=np.zeros(6)), r"expected columns of shapes .* got .*'x_mm': \(6,\)"),
+    "too many electrodes": (shard(charge_pC=np.zeros((5, 4))), r"got .*'charge_pC': \(5, 4\)"),
+    "no samples": (shard(**{n: np.zeros((0, 3) if n == "charge_pC" else 0) for n in COLUMNS}), "at least one sample"),
+    "NaN": (shard(x_mm=np.array([0, 1, np.nan, 3, 4])), "column x_mm holds nan in row 2; every number must be finite"),
+    "text": (shard(x_mm=np.array(list("abcde"))), "column x_mm: expected numbers, got <U1"),
+    "objects": (shard(x_mm=np.array([None] * 5)), "not a shard"),
+    "probe of numbers": (shard(probe=np.zeros(5)), "column probe: expected text, got float64"),
+    **{
+        f"shard: {name}": (lambda folder, make=make: write_shard(folder, make()), NO_SHARD)
+        for name, make in {
+            "empty": lambda: b"",
+            "garbage": lambda: b"garbage",
+            "end of a zip": lambda: packed(b"")[-22:],
+            "no arrays": lambda: packed(b""),
+            "one number": lambda: packed(npy("()", data=bytes(8))),
+            "a trillion numbers": lambda: packed(npy("(1000000000000,)")),
+            "numbers without width": lambda: packed(npy("(99999999999999999999,)", "|V0")),
+            "zeros for ever": lambda: packed(npy("(8750000,)", data=bytes(70_000_000))),
+            "an object": lambda: packed(npy("(1,)", "|O", b"cos\nsystem\n(S'true'\ntR.")),
+        }.items()
+    },
 }
 
 
-@pytest.mark.parametrize(("columns", "message"), WRONG_COLUMNS.values(), ids=WRONG_COLUMNS.keys())
-def test_wrong_columns(dataset, columns, message):
-    replace_shard(dataset, **columns)
-    with pytest.raises(DatasetError, match=rf"shard-00000\.npz: .*{message}"):
+@pytest.mark.parametrize("what", DAMAGE)
+def test_damage_is_told(dataset, what):
+    """A manifest cannot point elsewhere, and nothing in a shard is run."""
+    spoil, message = DAMAGE[what]
+    spoil(dataset)
+    with pytest.raises(DatasetError, match=message):
         read_dataset(dataset)
 
 
@@ -225,39 +248,3 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
         with pytest.raises(OutputError, match="presses cannot be written: No space left on device"):
             write_dataset(tmp_path / "new" / "presses", SENSOR, [samples(), samples()], ABOUT)
         assert list(tmp_path.iterdir()) == []
-
-
-def packed(data: bytes) -> bytes:
-    """An npz file whose columns are these bytes."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
-        for name in COLUMNS:
-            file.writestr(f"{name}.npy", data)
-    return buffer.getvalue()
-
-
-def npy(shape: str, dtype: str = "<f8", data: bytes = b"") -> bytes:
-    head = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
-    return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + data
-
-
-SHARDS = {
-    "empty": lambda: b"",
-    "garbage": lambda: b"garbage",
-    "end of a zip": lambda: packed(b"")[-22:],
-    "no arrays": lambda: packed(b""),
-    "one number": lambda: packed(npy("()", data=bytes(8))),
-    "a trillion numbers": lambda: packed(npy("(1000000000000,)")),
-    "numbers without width": lambda: packed(npy("(99999999999999999999,)", "|V0")),
-    "zeros for ever": lambda: packed(npy("(8750000,)", data=bytes(70_000_000))),
-    "an object": lambda: packed(npy("(1,)", "|O", b"cos\nsystem\n(S'true'\ntR.")),
-}
-
-
-@pytest.mark.parametrize("how", SHARDS)
-def test_anything_in_a_shard_whose_checksum_fits(dataset, how):
-    data = SHARDS[how]()
-    (dataset / "shard-00000.npz").write_bytes(data)
-    edit(dataset, lambda manifest: manifest["shards"][0].update(sha256=hashlib.sha256(data).hexdigest()))
-    with pytest.raises(DatasetError, match=r"shard-00000\.npz: (not a shard with the columns|expected columns)"):
-        read_dataset(dataset)

@@ -26,8 +26,7 @@ def test_a_design_is_drawn_with_its_worst_place(nuisances, before, known):
     figure = error_maps_picture(Design(case, SENSOR, 1.0, "", 0, errors if before else None, errors))
     maps = figure.axes[:-1]
     assert figure.get_size_inches().tolist() == [13.8 if before else 7.4, 6.0]
-    assert len(maps) == 1 + before
-    assert known in figure.get_suptitle()
+    assert (len(maps), known in figure.get_suptitle()) == (1 + before, True)
     for axes in maps:
         assert [line.get_xydata().tolist() for line in axes.lines] == [[[2.0, 4.0]]]
         assert "worst 3 mm (cross), rms 1.35 mm" in axes.get_title()
