@@ -230,6 +230,7 @@ BAD = [
         2,
         "--int8: expected no --config beside it",
     ),
+    (("train", "distil", SENSOR, "-o", "OUT", "--config", "none.toml"), 2, "ConfigError: none.toml: cannot be"),
     (("simulate", "identify", SENSOR, "--noise", "clean"), 2, "expected white noise"),
     (("simulate", "identify", SENSOR, "--noise", "loud"), 2, "noise level: expected one of"),
     (("simulate", "identify", SENSOR, "--error", "nan"), 2, "--error: expected a positive number"),

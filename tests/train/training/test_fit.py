@@ -14,7 +14,7 @@ from isocharge.simulate import Dataset, Domain, NoiseModel, Samples
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config
 from isocharge.train.training import descent
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.fit import Split, fit_identity, teaching_loss, train_network
+from isocharge.train.training.fit import Split, fit_identity, start_loss, teaching_loss, train_network
 from isocharge.train.training.network import LARGEST_INT8, Perceptron
 
 REPORT_EVERY = 20
@@ -158,6 +158,16 @@ def test_coverage_where_the_truth_is_known(sensor):
     deviation = np.abs(found - good.contact) / std
     assert np.mean(deviation < 1.0, axis=0) == pytest.approx([0.68] * 3, abs=0.08)
     assert np.mean(deviation < 1.96, axis=0) == pytest.approx([0.95] * 3, abs=0.04)
+
+
+def test_the_first_loss_is_least_squares_and_deviations_follow_without_pulling():
+    """The slope by a mean is that of least squares, and by a deviation none where it is as large as the error."""
+    mean, unit = torch.randn((2, 20, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    mean.requires_grad_()
+    log_std = torch.log(torch.abs(mean - unit)).detach().requires_grad_()
+    start_loss(mean, log_std, unit).backward()
+    np.testing.assert_allclose(mean.grad, 60.0 / 20 * (mean - unit).detach(), rtol=1e-9)
+    np.testing.assert_allclose(log_std.grad, 0.0, atol=1e-12)
 
 
 def test_the_loss_of_a_student_is_the_divergence_of_gaussians():
