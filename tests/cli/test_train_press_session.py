@@ -130,8 +130,7 @@ def test_what_is_typed_is_done(events, taken, said, capsys):
 
 def test_a_press_that_is_refused_is_asked_for_again(capsys):
     session, script, _ = dialogue(refused("it moves"), refused(AWAY), STEADY, "", "q")
-    assert session.taken == [FIRST]
-    assert script.armed == 4
+    assert (session.taken, script.armed) == ([FIRST], 4)
     assert "not taken: it moves; press again" in capsys.readouterr().err
 
 

@@ -129,8 +129,7 @@ def test_the_channels_of_most_similar_noise_are_chosen():
 def test_channels_that_a_file_leaves_out_are_ignored():
     board = {"channels": {"A": "ch1", "B": "3", "C": "4"}, "gain": {"pC_per_unit": 0.5, "offset": 300}}
     report = findings(heard(row), device=device_from_table(board, "test"))
-    assert [channel.name for channel in report.channels] == ["1", "3", "4"]
-    assert report.unused == ("2", "5", "6")
+    assert ([channel.name for channel in report.channels], report.unused) == (["1", "3", "4"], ("2", "5", "6"))
     assert all(abs(channel.offset_pC) < 10 for channel in report.channels)
 
 

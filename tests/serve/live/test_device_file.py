@@ -180,8 +180,7 @@ def test_offset_limit_changes_in_the_rule_and_in_the_table(device):
     board = with_offset_limit(device(FULL), 250.0)
     assert (board.tare.frames, board.tare.offset_limit_pC) == (50, 250.0)
     assert board.table["tare"] == {"frames": 50, "offset_limit_pC": 250.0}
-    assert with_offset_limit(ANY_BOARD, 250.0).tare.offset_limit_pC == 250.0
-    assert ANY_BOARD.table == {}
+    assert (with_offset_limit(ANY_BOARD, 250.0).tare.offset_limit_pC, ANY_BOARD.table) == (250.0, {})
     with pytest.raises(DeviceError, match=r"device\.toml: tare\.offset_limit_pC: expected a number from 0"):
         with_offset_limit(board, -1.0)
 

@@ -33,8 +33,7 @@ def read(tmp_path):
 
 def test_every_column_arrives(read):
     presses = read(f"{HEADER},position_std_mm,force_std\n1,-2,0.5,10,20,30,0.05,0.003\n")
-    assert presses.contact.tolist() == [[1.0, -2.0, 0.5]]
-    assert presses.charge_pC.tolist() == [[10.0, 20.0, 30.0]]
+    assert (presses.contact.tolist(), presses.charge_pC.tolist()) == ([[1.0, -2.0, 0.5]], [[10.0, 20.0, 30.0]])
     assert (presses.position_std_mm.tolist(), presses.force_std.tolist()) == ([0.05], [0.003])
     assert (presses.electrodes, presses.lines, presses.ignored, len(presses)) == (NAMES, (2,), (), 1)
 
@@ -118,8 +117,7 @@ def test_rows(read):
     assert (len(last), last.lines, last.contact[0, 2], last.ignored) == (1, (4,), 3.0, ("d",))
     assert presses[-1] == last
     assert presses[1:] == presses[[1, 2]] == presses[np.array([False, True, True])] != presses
-    assert [press.lines for press in presses] == [(2,), (3,), (4,)]
-    assert len(presses[:0]) == 0
+    assert ([press.lines for press in presses], len(presses[:0])) == ([(2,), (3,), (4,)], 0)
 
 
 @pytest.mark.parametrize(

@@ -66,8 +66,7 @@ def test_a_press_is_on_the_page_where_it_is_and_the_stream_goes_on_without_it(bo
     process, url = start("stream", "linear", "--port", board.url, "--output", "none")
     rows, state = follow(url, lambda rows, state: touched(rows, state) and state.get("rate_Hz"))
     contacts = rows[(rows["flags"] & CONTACT_BIT) != 0]
-    assert np.median(contacts["x_mm"]) == pytest.approx(3.0, abs=0.01)
-    assert np.median(contacts["force_N"]) == pytest.approx(1.0, abs=0.01)
+    assert [np.median(contacts[name]) for name in ("x_mm", "force_N")] == pytest.approx([3.0, 1.0], abs=0.01)
     assert state["counters"]["lost"] == 0
     assert 1000.0 < state["rate_Hz"] < 3000.0 or os.getloadavg()[0] > 2.0
     assert json.load(urllib.request.urlopen(url + "/session.json"))["film"]["model"] == "linear/1"

@@ -80,9 +80,8 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, whole, phase, count):
     with listening(lambda title, done, _total, _note: reports.append(done) if title == "pressing" else None):
         sweep_to(target, executor=second)
     expected, jobs = whole
-    assert files(target) == expected
+    assert (files(target), [path.name for path in tmp_path.iterdir()]) == (expected, ["presses"])
     assert first.jobs + second.jobs == jobs  # nothing twice
-    assert [path.name for path in tmp_path.iterdir()] == ["presses"]
     assert reports[0] == (count if phase == "pressing" else 0)
 
 
