@@ -144,5 +144,6 @@ def test_a_port_that_vanishes_comes_back_under_the_same_name(film):
         with Port(sensor.url, reconnect=True) as port:
             outages_s = list(islice((chunk.outage_s for chunk in port if chunk.outage_s > 0.0), 2))
         assert sensor.unplugged >= 2
+        assert sensor.sent < 0.7 * (sensor.sent + sensor.withheld + sensor.lost)  # away for three eighths of the time
     assert min(outages_s) > 0.1
     assert port.outages == 2
