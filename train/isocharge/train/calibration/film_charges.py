@@ -56,6 +56,9 @@ SLACKENING = 1.75
 NEGLIGIBLE = 1e-3
 """Largest coefficient of the modes that counts as none: it changes charges by some 3e-5, and they take long."""
 
+LITTLE = 0.1
+"""Largest coefficient of the modes below which what they do is taken for the same on neighbouring films."""
+
 LEAST_TENSION = 1e-3
 """Least pretension over which the uneven part is taken, MPa."""
 
@@ -67,7 +70,7 @@ EDGE = 1.0 - 1e-6
 
 
 class _Modes(NamedTuple):
-    """The modes of the last film, their charges under the last presses, and what an uneven tension adds to ln Q."""
+    """The modes of one of the last films, their charges under the last presses, and what an uneven tension adds to ln Q."""
 
     modes: ModeMap | None
     sensor: Sensor
@@ -175,7 +178,8 @@ class FilmCharges:
             falls = -parameters[0] * self._by_step("pretension", parameters, contact, charge) / charge
             of_uneven = falls * (1.0 - np.clip(1.0 - 0.5 * falls, 0.0, 1.0) ** SLACKENING)
             last = _Modes(known, sensor, contact, by_mode * [MODE_STDS[name] for name in self.modes], of_uneven)
-            self._last_modes.clear()
+            if key not in self._last_modes and len(self._last_modes) > 1:
+                del self._last_modes[next(iter(self._last_modes))]
             self._last_modes[key] = last
         return last
 
@@ -216,7 +220,7 @@ class FilmCharges:
 
         Returns:
             Shape (n, n_electrode, n_parameter) or (n, n_electrode, n_parameter + n_coefficient), pC. The modes are
-            taken for the same share of the charges on neighbouring films.
+            taken for the same share of the charges where electrodes, coefficients and probe differ a little.
         """
         parameters, coefficients = np.split(unknowns, [len(self.prior.names)])
         film, by_force = self.forward_map(parameters), by_contact[:, :, 2]
@@ -237,11 +241,31 @@ class FilmCharges:
         if not coefficients.size:
             return np.asarray(of_film)
         factor = self.factor(unknowns, contact, charge)[:, :, None]
+        of_film[:, :, :3] += charge[:, :, None] * self._by_load(unknowns, contact) * self.prior.std[:3]
+        of_film *= factor
         modes = self._by_mode(parameters, contact, charge)
         by_uneven = self._unevenness(parameters[0], coefficients[: len(self.modes)])[1]
+        of_tension = np.isin(self.modes, UNEVEN)  # as the pretension, they count over E
         of_modes = modes.by_mode + factor * (charge * modes.of_uneven)[:, :, None] * by_uneven
+        of_film[:, :, 1] -= of_modes @ (coefficients[: len(self.modes)] * of_tension) * self.prior.std[1]
         of_terms = (factor * own)[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
-        return np.asarray(np.concatenate([factor * of_film, of_modes, of_terms.reshape(*charge.shape, -1)], axis=2))
+        return np.asarray(np.concatenate([of_film, of_modes, of_terms.reshape(*charge.shape, -1)], axis=2))
+
+    def _by_load(self, unknowns: Array, contact: Array) -> Array:
+        """Derivatives of ln Q of what the modes do by pretension, ln E and ln h, shape (n, n_electrode, 3).
+
+        They are functions of F / (E h a) and T / E, as the charges are.
+        """
+        film = np.where(np.arange(unknowns.size) < len(self.prior.names) + len(self.modes), unknowns, 0.0)
+        if np.abs(film[len(self.prior.names) :]).max() < LITTLE:
+            return np.zeros((len(contact), len(self.prior.sensor.electrodes), 3))
+        change = (-STEP if film[0] > self.prior.mean[0] else STEP) * self.prior.std[0]
+        factor = self.factor(film, contact)
+        stronger = self.factor(film, contact * [1.0, 1.0, np.exp(CONTACT_STEPS[2])])
+        tauter = self.factor(np.append(film[0] + change, film[1:]), contact)
+        by_force, by_tension = (stronger - factor) / CONTACT_STEPS[2], (tauter - factor) / change
+        columns = [by_tension, -by_force - film[0] * by_tension, -by_force]
+        return np.asarray(np.stack(columns, axis=2) / np.maximum(factor, LEAST_FACTOR)[:, :, None])
 
     def _by_step(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
         """Derivative by one parameter; by the thickness at one load F / (E h a), which is bending's part alone."""
