@@ -48,6 +48,20 @@ def test_derivatives_are_those_of_the_charges(layout):
     np.testing.assert_allclose(by_contact / size[:, :, None], by_map / size[:, :, None], atol=2e-3)
 
 
+@pytest.mark.parametrize("name", ["pretension", "young", "thickness"])
+def test_derivatives_contain_what_a_parameter_does_to_the_modes(problem, name):
+    charges, rng = problem.charges, np.random.default_rng(4)
+    names = [*charges.prior.names, *charges.modes]
+    film, at = problem.before.parameters, draw_contacts(rng, problem.domain.within(7.0), 6)
+    unknowns = np.pad(np.append(film, [1.5, -1.0, 1.5]), (0, charges.n_coefficient - 3))
+    step = 0.01 * np.eye(unknowns.size)[names.index(name)]
+    change = step * np.pad(charges.prior.std, (0, charges.n_coefficient), constant_values=1.0)
+    size = charges.charges(unknowns, at)
+    expected = (charges.charges(unknowns + change, at) - charges.charges(unknowns - change, at)) / 0.02
+    found = charges.by_parameter(unknowns, at, charges.by_contact(unknowns, at))[:, :, names.index(name)]
+    np.testing.assert_allclose(found / size, expected / size, atol=1e-3)
+
+
 def test_it_is_the_minimum_of_the_joint_problem(problem, monkeypatch):
     """SciPy over parameters and contacts together, with differences for derivatives, finds the same film."""
     monkeypatch.setattr(discrepancy, "hypotheses", lambda: [discrepancy.Hypothesis()])

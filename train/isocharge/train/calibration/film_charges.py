@@ -70,7 +70,7 @@ EDGE = 1.0 - 1e-6
 
 
 class _Modes(NamedTuple):
-    """The modes of one of the last films, their charges under the last presses, and what an uneven tension adds to ln Q."""
+    """The modes of a film, their charges under the last presses, and what an uneven tension adds to ln Q."""
 
     modes: ModeMap | None
     sensor: Sensor
