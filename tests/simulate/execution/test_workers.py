@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import pytest
 
@@ -71,6 +72,12 @@ def test_results_come_in_order_and_tasks_are_drawn_as_they_are_needed():
         assert next(results) == 0.0
         assert len(drawn) <= 5
         assert [0.0, *results] == [0.002 * (number % 3) for number in range(20)]
+
+
+def test_tasks_run_beside_each_other():
+    both = Barrier(2)
+    with ThreadPoolExecutor(2) as pool:
+        assert sorted(in_order(pool, lambda _: both.wait(timeout=5.0), range(4))) == [0, 0, 1, 1]
 
 
 def waited(seconds: float) -> float:
