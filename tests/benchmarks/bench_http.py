@@ -21,7 +21,7 @@ import time
 import venv
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -225,8 +225,9 @@ def throughput(address: Address, request: bytes, seconds: float) -> float:
 
 
 def asking(stack: ExitStack, address: Address, request: bytes) -> Callable[[], bytes]:
-    """A call that sends a request over an open connection and waits for its answer."""
-    return partial(stack.enter_context(closing(Connection(address))).ask, request)
+    """A call that sends a request over an open connection and waits for its answer; the first one opens it."""
+    connection = cache(lambda: stack.enter_context(closing(Connection(address))))
+    return lambda: connection().ask(request)
 
 
 def stock_infer(client: Any, name: str, charges: np.ndarray, *, binary: bool) -> None:
