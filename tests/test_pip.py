@@ -76,5 +76,6 @@ def test_a_missing_extra_says_so_in_python_too(base, tmp_path, stage):
 )
 def test_a_missing_extra_says_how_to_get_it(base, tmp_path, words, extra):
     done = run(base, "isocharge", *words.split(), cwd=tmp_path)
-    said = f"pip install 'isocharge[{extra}]'" in done.stderr, "Traceback" in done.stderr
-    assert (done.returncode, *said) == (1, True, False), done.stderr
+    assert done.returncode == 1
+    assert f"pip install 'isocharge[{extra}]'" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -234,8 +234,9 @@ def test_a_board_that_is_plugged_in(command, tmp_path):
         path = tmp_path / "board.toml"
         doctor = ("serve", "doctor", "--port", port.url, "--seconds", "0.8")
         code, out, err = command(*doctor, "--model", FOUR)
-        told = "3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')", f"models of 3 electrodes: {THREE}"
-        assert (code, told[0] in out, told[1] in err) == (0, True, True)
+        assert code == 0
+        assert "3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')" in out
+        assert f"models of 3 electrodes: {THREE}" in err
         code, _, err = command(*doctor, "--model", THREE, "--write", path)
         assert (code, "models of" in err) == (0, False)
         code, _, err = command(*doctor, "--model", THREE, "--write", path)

@@ -256,7 +256,9 @@ def test_props_round_trip_and_foreign_ones_are_left_alone(film):
 
 
 def test_other_format_version(film):
-    said = r"^.*: metadata format 2 is not supported \(this version reads 1\); export it again or upgrade isocharge$"
+    said = (
+        rf"^{WHERE}: metadata format 2 is not supported \(this version reads 1\); export it again or upgrade isocharge$"
+    )
     with pytest.raises(ModelError, match=said):
         ModelMetadata.from_props(film.metadata().to_props() | {"format_version": "2"}, WHERE)
 

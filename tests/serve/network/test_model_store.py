@@ -169,7 +169,9 @@ def test_names_that_no_model_has(film, tmp_path):
     next(prop for prop in model.metadata_props if prop.key == "name").value = json.dumps(name)
     put_in_place(folder, model.SerializeToString())
     store = open_model_store(tmp_path)
-    assert (labels(store), "<svg" in page(store), "&lt;svg" in page(store)) == (["linear/1"], False, True)
+    assert labels(store) == ["linear/1"]
+    assert "<svg" not in page(store)
+    assert "&lt;svg" in page(store)
 
 
 SECRET = 'open "sesame"'
@@ -268,7 +270,8 @@ def test_messages_of_loggers_are_lines_too(lines):
     assert (warning["level"], warning["logger"]) == ("warning", "isocharge.test")
     assert warning["message"] == f"two\nlines ? {FORGED}[secret]"
     assert (failure["level"], failure["message"]) == ("error", "a request failed")
-    assert all(word in failure["traceback"] for word in ("Traceback", "ValueError"))
+    assert "Traceback" in failure["traceback"]
+    assert "ValueError" in failure["traceback"]
     assert len(failure["traceback"]) < LONGEST_TEXT + 20
     assert not any("sesame" in line for line in lines)
 

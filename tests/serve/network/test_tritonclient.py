@@ -89,7 +89,8 @@ def test_index_unload_load(client, module, film):
     assert index() == [(*version, "READY") for version in both]
     client.unload_model("linear")
     assert index() == [(*version, "UNAVAILABLE") for version in both]
-    assert (client.is_model_ready("linear"), client.is_server_ready()) == (False, False)
+    assert not client.is_model_ready("linear")
+    assert not client.is_server_ready()
     with pytest.raises(InferenceServerException, match="model 'linear' is not found"):
         client.infer("linear", [tensor(module, charges(film))])
     client.load_model("linear")

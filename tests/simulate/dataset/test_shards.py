@@ -133,41 +133,57 @@ def flip(path: Path) -> None:
     path.write_bytes(data[:100] + bytes([data[100] ^ 1]) + data[101:])
 
 
-def manifest_of(text: str):
-    return lambda folder: (folder / "manifest.json").write_text(text, encoding="latin-1")
-
-
-def entry(change):
-    return lambda folder: edit(folder, change)
-
-
 def shard(**columns):
     return lambda folder: replace_shard(folder, **columns)
 
 
-NO_MANIFEST, NO_SHARD = (
-    r"manifest\.json: not a manifest of a dataset",
-    r"shard-00000\.npz: (not a shard|expected columns)",
-)
-DAMAGE = {
-    "manifest: empty": (manifest_of(""), NO_MANIFEST),
-    "manifest: a list": (manifest_of("[]"), NO_MANIFEST),
-    "manifest: empty table": (manifest_of("{}"), NO_MANIFEST),
-    "manifest: no text": (manifest_of("\xff"), NO_MANIFEST),
-    "manifest: deep": (manifest_of("[" * 100_000), NO_MANIFEST),
-    "manifest: a long number": (manifest_of('{"format_version": 1' + "0" * 5000), NO_MANIFEST),
-    "version": (entry(lambda table: table.update(format_version=2)), "format version 2 is not supported"),
-    "no sensor": (entry(lambda table: table.pop("sensor")), "key 'sensor' is missing"),
-    "no key of shards": (entry(lambda table: table.pop("shards")), "key 'shards' is missing"),
-    "no shards": (entry(lambda table: table.update(shards=[])), "lists no shards"),
-    "film": (entry(lambda table: table["sensor"]["film"].update(colour="red")), r"unknown key 'film\.colour'"),
+MANIFESTS = {
+    "a version to come": (lambda table: table.update(format_version=2), "format version 2 is not supported"),
+    "no sensor": (lambda table: table.pop("sensor"), "key 'sensor' is missing"),
+    "no key of shards": (lambda table: table.pop("shards"), "key 'shards' is missing"),
+    "no shards": (lambda table: table.update(shards=[]), "lists no shards"),
+    "film": (lambda table: table["sensor"]["film"].update(colour="red"), r"unknown key 'film\.colour'"),
     "electrodes": (  # else read as each other's charges
-        entry(lambda table: table.update(electrodes=["B", "A", "C"])),
+        lambda table: table.update(electrodes=["B", "A", "C"]),
         r"expected the sensor's electrodes in its order, \['A', 'B', 'C'\], got \['B'",
     ),
     **{
-        f"shards {value}": (entry(lambda table, value=value: table.update(shards=value)), r"manifest\.json: .*shards")
+        f"shards {value}": (lambda table, value=value: table.update(shards=value), "shards")
         for value in (None, [3], [{"file": 3, "sha256": ""}])
+    },
+}
+COLUMNS_OF = {
+    "a column is missing": (shard(force_N=None), "not a shard with the columns x_mm, y_mm"),
+    "too long": (shard(x_mm=np.zeros(6)), r"expected columns of shapes .* got .*'x_mm': \(6,\)"),
+    "too many electrodes": (shard(charge_pC=np.zeros((5, 4))), r"got .*'charge_pC': \(5, 4\)"),
+    "no samples": (shard(**{n: np.zeros((0, 3) if n == "charge_pC" else 0) for n in COLUMNS}), "at least one sample"),
+    "NaN": (shard(x_mm=np.array([0, 1, np.nan, 3, 4])), "column x_mm holds nan in row 2; every number must be finite"),
+    "text": (shard(x_mm=np.array(list("abcde"))), "column x_mm: expected numbers, got <U1"),
+    "objects": (shard(x_mm=np.array([None] * 5)), "not a shard"),
+    "probe of numbers": (shard(probe=np.zeros(5)), "column probe: expected text, got float64"),
+}
+FILES = {
+    "empty": lambda: b"",
+    "garbage": lambda: b"garbage",
+    "end of a zip": lambda: packed(b"")[-22:],
+    "no arrays": lambda: packed(b""),
+    "one number": lambda: packed(npy("()", data=bytes(8))),
+    "a trillion numbers": lambda: packed(npy("(1000000000000,)")),
+    "numbers without width": lambda: packed(npy("(99999999999999999999,)", "|V0")),
+    "zeros for ever": lambda: packed(npy("(8750000,)", data=bytes(70_000_000))),
+    "an object": lambda: packed(npy("(1,)", "|O", b"cos\nsystem\n(S'true'\ntR.")),
+}
+DAMAGE = {
+    **{
+        f"manifest: {text[:20]}": (
+            lambda folder, text=text: (folder / "manifest.json").write_text(text, encoding="latin-1"),
+            r"manifest\.json: not a manifest of a dataset",
+        )
+        for text in ("", "[]", "{}", "\xff", "[" * 100_000, '{"format_version": 1' + "0" * 5000)
+    },
+    **{
+        name: (lambda folder, change=change: edit(folder, change), rf"manifest\.json: .*{said}")
+        for name, (change, said) in MANIFESTS.items()
     },
     "a shard is missing": (
         lambda folder: (folder / "shard-00001.npz").unlink(),
@@ -184,27 +200,13 @@ DAMAGE = {
         ),
         "the file is missing",
     ),
-    "a column is missing": (shard(force_N=None), "not a shard with the columns x_mm, y_mm"),
-    "too long": (shard(x_mm=np.zeros(6)), r"expected columns of shapes .* got .*'x_mm': \(6,\)"),
-    "too many electrodes": (shard(charge_pC=np.zeros((5, 4))), r"got .*'charge_pC': \(5, 4\)"),
-    "no samples": (shard(**{n: np.zeros((0, 3) if n == "charge_pC" else 0) for n in COLUMNS}), "at least one sample"),
-    "NaN": (shard(x_mm=np.array([0, 1, np.nan, 3, 4])), "column x_mm holds nan in row 2; every number must be finite"),
-    "text": (shard(x_mm=np.array(list("abcde"))), "column x_mm: expected numbers, got <U1"),
-    "objects": (shard(x_mm=np.array([None] * 5)), "not a shard"),
-    "probe of numbers": (shard(probe=np.zeros(5)), "column probe: expected text, got float64"),
+    **{name: (spoil, rf"shard-00000\.npz: .*{said}") for name, (spoil, said) in COLUMNS_OF.items()},
     **{
-        f"shard: {name}": (lambda folder, make=make: write_shard(folder, make()), NO_SHARD)
-        for name, make in {
-            "empty": lambda: b"",
-            "garbage": lambda: b"garbage",
-            "end of a zip": lambda: packed(b"")[-22:],
-            "no arrays": lambda: packed(b""),
-            "one number": lambda: packed(npy("()", data=bytes(8))),
-            "a trillion numbers": lambda: packed(npy("(1000000000000,)")),
-            "numbers without width": lambda: packed(npy("(99999999999999999999,)", "|V0")),
-            "zeros for ever": lambda: packed(npy("(8750000,)", data=bytes(70_000_000))),
-            "an object": lambda: packed(npy("(1,)", "|O", b"cos\nsystem\n(S'true'\ntR.")),
-        }.items()
+        f"shard: {name}": (
+            lambda folder, make=make: write_shard(folder, make()),
+            r"shard-00000\.npz: (not a shard with the columns|expected columns)",
+        )
+        for name, make in FILES.items()
     },
 }
 

@@ -121,8 +121,9 @@ def test_the_folder_is_complete_and_says_what_it_holds(released, dataset, sensor
     middle = 0.5 * (corners + np.roll(corners, -1, axis=0))
     assert np.hypot(*middle.T).min() == pytest.approx(RADIUS, abs=1e-3)
     card = (released.folder / "card.md").read_text()
-    stressed = f"beyond {metadata.yield_force_N:g} N the film is stressed to more than 45 MPa"
-    assert all(said in card for said in (f"{metadata.errors['position_median_mm']:g} mm", stressed, "make it"))
+    assert f"{metadata.errors['position_median_mm']:g} mm" in card
+    assert f"beyond {metadata.yield_force_N:g} N the film is stressed to more than 45 MPa" in card
+    assert "make it" in card
     _, block, _ = card.split("---\n", 2)
     [index] = yaml.safe_load(block)["model-index"]
     [result] = index["results"]

@@ -293,15 +293,16 @@ BAD = {
 def test_bad_bodies_are_refused_with_the_reason(ask, case):
     body, status, said = BAD[case]
     got, error = refusal(ask("POST", INFER, body))
-    assert (got, bool(re.search(said, error))) == (status, True), error
+    assert got == status
+    assert re.search(said, error)
 
 
 @pytest.mark.parametrize("length", ["", "-1", "+5", "1_0", "1e3", "9999", "9" * 5000, "0x10", " 5", "٣"])
 def test_bad_header_lengths(handler, length):
     body, _ = binary_request(np.float32(PRESS))
     response = handler.answer("POST", INFER, [(b"inference-header-content-length", length.encode())], body)
-    said = b"Inference-Header-Content-Length: expected a whole number up to"
-    assert (response.status, said in response.body) == (400, True)
+    assert response.status == 400
+    assert b"Inference-Header-Content-Length: expected a whole number up to" in response.body
 
 
 @pytest.mark.parametrize(
@@ -319,7 +320,8 @@ def test_bad_header_lengths(handler, length):
 def test_binary_data_that_do_not_fit(ask, changes, cut, said):
     body, length = binary_request(np.float32(PRESS), **changes)
     status, error = refusal(ask("POST", INFER, body[:cut], inference_header_content_length=str(length)))
-    assert (status, said in error) == (400, True), error
+    assert status == 400
+    assert said in error
 
 
 def test_what_is_not_finite_is_null(ask, bare):
@@ -403,7 +405,8 @@ def test_the_page_may_run_and_load_nothing(ask):
     assert policy.pop("style-src") == f"'sha256-{digest}'"
     assert policy == dict.fromkeys(("default-src", "base-uri", "form-action", "frame-ancestors"), "'none'")
     assert (headers["x-content-type-options"], headers["x-frame-options"]) == ("nosniff", "DENY")
-    assert (b" style=" in page, b"<script" in page) == (False, False)
+    assert b" style=" not in page
+    assert b"<script" not in page
 
 
 CHECKS = [
