@@ -287,6 +287,7 @@ BAD = [
     (("serve", "predict", SENSOR, "x.csv", "--models", "nope"), 2, "ModelError: nope: expected a folder of models"),
     (("serve", "predict", "no-such-model", "x.csv"), 2, "ModelError"),
     (("serve", "predict", SENSOR, "none.csv"), 2, "InputError: none.csv: cannot be read"),
+    (("serve", "predict", SENSOR, "-"), 2, "stdin"),
     (("serve", "stream", SENSOR, "--port", "/dev/none"), 1, "PortError"),
 ]
 

@@ -3,12 +3,13 @@
 import csv
 import io
 import socket
+import time
 from contextlib import closing
 
 import pytest
 
 from isocharge.common.errors import InputError
-from isocharge.serve.live.outputs import UdpSink, csv_header, csv_line
+from isocharge.serve.live.outputs import LineQueue, UdpSink, csv_header, csv_line
 from isocharge.serve.prediction.record import FIELDS, OF_FILM, OF_TRACKING
 from isocharge.serve.tracking.film_follower import FollowedFilm
 from isocharge.serve.tracking.tracker import Tracked
@@ -55,6 +56,15 @@ def test_contacts_and_films_that_are_followed_are_the_last_columns(record):
     untouched = record(follows=True, film=film)
     (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_line(untouched, ELECTRODES) + "\n"), strict=True)
     assert (row["tracked.x_mm"], row["event"], row["film.pretension_std_MPa"]) == ("", "", "0.050000")
+
+
+def test_the_end_waits_for_a_consumer_that_takes_its_time():
+    """It takes longer for all lines than it may take for one."""
+    written = []
+    with LineQueue(lambda line: written.append(time.sleep(0.4) or line)) as queue:
+        for line in "abcd":
+            queue.put(line)
+    assert (written, queue.lost) == (list("abcd"), 0)
 
 
 def test_datagrams_to_nobody_are_dropped():

@@ -4,6 +4,7 @@ import json
 import math
 
 import numpy as np
+import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from isocharge.serve import Predictor, find_model
@@ -112,6 +113,12 @@ def test_misfit_alarms_are_the_flags_of_records():
         handler.answer("POST", path, [], body(row, **contact_only))  # 50 checked: a press is always computed whole
     handler.answer("POST", path, [], body(charges, **contact_only))  # of a batch, only what is asked for
     samples, of = scrape(handler), {"model": MODEL, "version": "1"}
+    stats = json.loads(handler.answer("GET", f"/v2/models/{MODEL}/stats", [], b"").body)["model_stats"][0][
+        "inference_stats"
+    ]
+    stage_s = value(samples, "inference_stage_seconds_total", stage="compute_infer", **of)
+    assert stage_s == pytest.approx(stats["compute_infer"]["ns"] / 1e9)
+    assert value(samples, "inference_seconds_sum", **of) == pytest.approx(stats["success"]["ns"] / 1e9)
     counts = [value(samples, f"{name}_total", **of) for name in ("presses", "misfit_checked", "misfit_alarms")]
     assert counts == [700, 400, sum(alarms) + 2 * sum(alarms[:50])]
 

@@ -141,6 +141,13 @@ def test_records_say_it(film, predictor):
     assert records[30].force_std_N == pytest.approx(expected, rel=0.1)
     assert expected > 2.0 * plain.force_std_N
     assert records[30].tracked["force_std_N"] > 0.8 * expected
+    assert records[30].x_std_mm == pytest.approx(plain.x_std_mm)  # of this film no place moves
+    assert records[30].y_std_mm == pytest.approx(plain.y_std_mm)
+
+
+def test_charges_of_warming_count_in_their_mean():
+    board = device_from_table({"common_mode": {"pC_per_K": {"A": 2.0, "B": -6.0, "C": 3.0, "D": 1.0}}}, "b")
+    np.testing.assert_allclose(board.chain((*NAMES, "D")).pyro, np.array([2.0, -6.0, 3.0, 1.0]) / 3.0)
 
 
 @pytest.mark.parametrize("per_K", [{"A": 1.0}, {"A": 0.0, "B": 0.0, "C": 0.0, "D": 0.0}])

@@ -83,14 +83,17 @@ def test_a_press_is_on_the_page_where_it_is_and_the_stream_goes_on_without_it(bo
     assert (process.returncode, "Traceback" in err) == (0, False)
 
 
-def test_the_rate_is_that_of_the_board_however_fast_a_recording_is_read(predictor, record, monkeypatch):
+def test_the_rate_is_that_of_the_board_however_fast_a_recording_is_read(predictor, record, monkeypatch, capsys):
+    """Unknown until time has passed between two frames."""
     monkeypatch.setattr(live_page_module, "STATE_S", -1.0)
     told = []
     link = SimpleNamespace(put=id, tell=lambda **state: told.append(state), is_open=True, dropped=0)
     feed = live_page_module.PageFeed(link, TouchStream(predictor))
-    for k in range(50):
+    for k in (0, 0, *range(2, 51)):
         feed.put(record(timestamp=1e9 + 0.005 * k))
+    assert [state["rate_Hz"] for state in told[:2]] == [None, None]
     assert told[-1]["rate_Hz"] == pytest.approx(200.0, rel=1e-3)
+    assert capsys.readouterr().err == ""  # the page is there
 
 
 def test_a_replay_is_sought_and_played_fast(film, models, start, command, tmp_path):
@@ -114,5 +117,14 @@ def test_a_replay_is_sought_and_played_fast(film, models, start, command, tmp_pa
         assert 600 in make_reader(file).get_summary().statistics.channel_message_counts.values()
 
 
-def test_others_are_let_in_on_purpose_only(models, refused):
-    refused("serve", "stream", "linear", "--models", models, "--port", "x", "--live", "[::]:0", said="--token")
+@pytest.mark.parametrize(
+    ("live", "said"),
+    [
+        ("[::]:0", "--token"),  # others are let in on purpose only
+        (":8001", "expected HOST:PORT"),
+        ("127.0.0.1:x", "expected HOST:PORT"),
+        ("127.0.0.1:65536", "expected HOST:PORT"),
+    ],
+)
+def test_addresses_that_no_page_may_have(models, refused, live, said):
+    refused("serve", "stream", "linear", "--models", models, "--port", "x", "--live", live, said=said)

@@ -36,7 +36,7 @@ def parquet_lines(path: Path) -> Iterator[str]:
                 writer.writerows(map(_cells, zip(*columns, strict=True)))
                 yield from _taken(text)
     except OSError as error:
-        raise PressError(f"{path}: cannot be read ({error.strerror or cut(str(error))})") from error
+        raise PressError(f"{path}: cannot be read ({cut(str(error))})") from error
     except ArrowException as error:
         raise PressError(f"{path}: not a Parquet file ({cut(str(error))}); write it again, or as CSV") from error
     yield from _taken(text)

@@ -333,6 +333,19 @@ def test_what_is_not_finite_is_null(ask, bare):
     jsonschema_rs.Draft202012Validator(schema).validate(orjson.loads(body))
 
 
+def test_the_document_says_how_a_route_is_asked_and_what_it_answers(ask):
+    document = orjson.loads(ask("GET", "/openapi.json")[2])
+    for path, item in sorted(document["paths"].items(), key=lambda row: row[0].endswith("unload")):
+        (method,) = item.keys() - {"parameters"}
+        (kind,) = item[method]["responses"]["200"]["content"]
+        body = orjson.dumps(request(PRESS)) if path.endswith("/infer") else b""
+        status, headers, _ = ask(method.upper(), path.format(model="linear", version=1), body)
+        assert (status, headers["content-type"].partition(";")[0]) == (200, kind), path
+        assert item[method].get("requestBody", {}).get("required", False) == bool(body), path
+    names = {name: of["schema"]["enum"] for name, of in document["components"]["parameters"].items()}
+    assert names == {"model": ["linear"], "version": ["1", "2"]}
+
+
 def test_binary_nan_is_refused_by_name(ask):
     body, length = binary_request(np.float32([[1.0, np.nan, 3.0]]))
     status, error = refusal(ask("POST", INFER, body, inference_header_content_length=str(length)))
