@@ -102,7 +102,8 @@ def test_check_of_many_presses_shows_the_worst(measured, models, command):
     per_degree = values["chi_squared_per_degree"]
     assert per_degree == pytest.approx(values["chi_squared"] / 100)
     assert f"per degree of freedom {per_degree:.3g} (100)" in out
-    assert "scale of the force 1.0309 +- " in out
+    assert values["force_scale"] == pytest.approx(1.0 / 0.97, rel=1e-4)
+    assert f"scale of the force {values['force_scale']:.4f} +- " in out
     assert "position, mm" not in out
 
 

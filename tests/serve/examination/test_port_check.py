@@ -74,7 +74,7 @@ def test_check_of_a_channel_without_a_number():
     assert report.channels[0].unusable == report.good == 400
     assert "charges on channel A" in missing(report)
     assert "life on channel B: every value is 1.5" in missing(report)
-    assert "?" in "\n".join(report_lines(report))
+    assert {("A", "?"), ("B", "1.50")} <= {tuple(line.split()[:2]) for line in report_lines(report)}
     json.dumps(asdict(report), allow_nan=False)
 
 
@@ -87,7 +87,7 @@ def test_check_of_a_channel_without_a_number():
         (charges(offset=(0.0, 120.0, 0.0)), "rest near zero on channel 2: 120 pC, a tare takes 100"),
         (charges(noise=8.0), "quiet on channel 1: "),
         (lambda k: charges()(3 * k), "798 frames lost"),
-        (lambda k: charges()(k) + b"\x07\0" * (k % 4 == 0), "of the bytes are no good frames"),
+        (lambda k: charges()(k) + b"\x07\0" * (k % 4 == 0), "2.3% of the bytes are no good frames"),
         (lambda _: b"", "not one byte came"),
         (lambda _: b"\xf8\x80\xfe\xff" * 5, "bytes come, but no frames: another baud rate"),
         (lambda k: f"{1e-3 * (k % 7):.4f};{1.65 + 1e-3 * (k % 5):.4f}\n".encode(), "feedback capacitance"),

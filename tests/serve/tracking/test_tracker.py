@@ -9,6 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from isocharge.serve import Chunk, Contact, Device, Frame, TouchStream, encode_frame
+from isocharge.serve.flags import INVALID
 from isocharge.serve.live.device import device_from_table, with_section
 from isocharge.serve.tracking.modes import CALMEST, Modes, Movement, step
 from isocharge.serve.tracking.noise import Scatter, Unit
@@ -147,9 +148,13 @@ def test_what_the_touch_does():
     said = [tracker.update(one, k / 1000.0) for k, one in enumerate(contacts(path))]
     moving = np.mean([(one.vx_mm_s, one.vy_mm_s) for one, _ in said[400:590]], axis=0)
     assert (np.hypot(*moving), np.degrees(np.arctan2(*moving[::-1]))) == pytest.approx((50.0, 40.0), rel=0.03)
+    assert tracker.update(None, 0.85, (INVALID,)) == (said[-1][0], None)
     assert tracker.update(None, 0.9) == (None, "release")
+    assert tracker.update(None, 0.95) == (None, None)
     tap = [tracker.update(one, 1.0 + k / 1000.0)[1] for k, one in enumerate(contacts(np.zeros(100)))]
     assert [*filter(None, tap), tracker.update(None, 1.1)[1]] == ["press", "tap"]
+    swipe = [tracker.update(one, 2.0 + k / 1000.0)[1] for k, one in enumerate(contacts(0.1 * np.arange(100)))]
+    assert [*filter(None, swipe), tracker.update(None, 2.1)[1]] == ["press", "slide", "release"]
 
 
 def test_a_saturated_frame_counts_for_less():

@@ -126,10 +126,10 @@ def test_electrodes_are_drawn_where_they_lie(film):
     assert "more_mm" not in described
     trace = {"more_mm": [[[2, 0], [2, -9], [3, -9]]], "back_mm": [[[2, 0], [3, 0], [2, 1]]]}
     electrodes = {name: {"polygon_mm": [[2, 0], [3, 0], [2, 1]]} | trace for name in "ABC"}
-    turned = {"name": "mine", "electrodes": electrodes, "calibration": {"rotation_deg": 90.0, "shift_mm": [0.5, 0.0]}}
+    turned = {"name": "mine", "electrodes": electrodes, "calibration": {"rotation_deg": 90.0, "shift_mm": [0.5, 0.25]}}
     described = describe_film("left", film.metadata(sensor=turned), None)
-    np.testing.assert_allclose(described["outlines_mm"]["C"], [[0.5, 2.0], [0.5, 3.0], [-0.5, 2.0]], atol=1e-12)
-    np.testing.assert_allclose(described["more_mm"]["C"], [[[0.5, 2.0], [9.5, 2.0], [9.5, 3.0]]], atol=1e-12)
+    np.testing.assert_allclose(described["outlines_mm"]["C"], [[0.5, 2.25], [0.5, 3.25], [-0.5, 2.25]], atol=1e-12)
+    np.testing.assert_allclose(described["more_mm"]["C"], [[[0.5, 2.25], [9.5, 2.25], [9.5, 3.25]]], atol=1e-12)
 
 
 def test_every_flag_has_a_bit_of_its_own():
