@@ -87,7 +87,7 @@ def test_check_of_a_channel_without_a_number():
         (charges(offset=(0.0, 120.0, 0.0)), "rest near zero on channel 2: 120 pC, a tare takes 100"),
         (charges(noise=8.0), "quiet on channel 1: "),
         (lambda k: charges()(3 * k), "798 frames lost"),
-        (lambda k: charges()(k) + b"\x07\0" * (k % 4 == 0), "2.3% of the bytes are no good frames"),
+        (lambda k: charges()(k) + b"\x07\0" * (k % 4 == 0), "2.0% of the bytes are no good frames"),
         (lambda _: b"", "not one byte came"),
         (lambda _: b"\xf8\x80\xfe\xff" * 5, "bytes come, but no frames: another baud rate"),
         (lambda k: f"{1e-3 * (k % 7):.4f};{1.65 + 1e-3 * (k % 5):.4f}\n".encode(), "feedback capacitance"),
