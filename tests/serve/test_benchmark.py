@@ -47,6 +47,8 @@ def test_durations_are_those_of_the_clock():
     assert (steady.name, steady.p50_us, steady.p99_us, steady.calls) == ("steady", 7.0, 7.0, 9 * LEAST_CALLS)
     assert steady.presses_per_s == pytest.approx(1e6 / 7.0)
     assert batch.presses_per_s == pytest.approx(100 * 1e6 / 50.0)
+    (timed,) = take_turns([Contender("steady", 1, clock.takes(7))], 0.07, clock=clock)
+    assert timed.calls == 9 * 1000  # nine of ten rounds, 7 ms each
 
 
 def test_ways_predict_what_the_model_does():

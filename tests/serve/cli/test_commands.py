@@ -87,6 +87,9 @@ def test_check_takes_the_rig_s_uncertainty(measured, models, command):
     values = json.loads(command(*words, "--position-std", "0.4", "--force-std", "0.05")[1])
     assert (values["position_mm"]["rig"], values["force_percent"]["rig"]) == pytest.approx((0.4 * 2**0.5, 5.0))
     assert values["force_percent"]["rms"] == pytest.approx(100 * (1 / 0.97 - 1), rel=1e-3)
+    row = values["each"][0]
+    shares = row["noise_std_percent"], row["force_std_percent"]
+    assert shares == pytest.approx((100 * row["force_std_N"] / (0.97 * row["force_N"]), 5.0))
     assert values["model"] == "linear/1"
 
 

@@ -4,14 +4,16 @@ import re
 import threading
 import time
 from contextlib import suppress
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from boards import interrupt
+from isocharge.cli.shared import virtual_sensor
 from isocharge.common.errors import InputError, OutputExists, SceneError, SensorError
 from isocharge.serve import Port, device_from_table, load_device
-from isocharge.simulate import Circle, ForwardMap, load_sensor, virtual_film
+from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor, virtual_film
 from kept import kept
 
 SENSOR = "three-25um-biaxial"
@@ -121,6 +123,13 @@ def test_a_film_is_solved_as_far_as_it_is_pressed(tmp_path, run, asked):
         with suppress(SceneError):  # the small map does not reach so far
             run("virtual", "four-25um-biaxial-15mm", "--seconds", 0, *words)
     assert [round(radius, 3) for _, _, radius, _ in asked] == [8.0, 15.0, 13.0]
+
+
+def test_below_the_map_charges_are_those_of_a_membrane():
+    """An eighth of its smallest force is a quarter of the charge: force to the 2/3."""
+    linear = SimpleNamespace(domain=Domain(3.0, (0.2, 1.0)), charges=lambda contact: 100.0 * contact[:, 2:])
+    charges, _ = virtual_sensor.played(linear, 1, 200.0)
+    assert charges(np.array([[1.0, 2.0, 0.025], [1.0, 2.0, 0.5]])) == pytest.approx(np.array([[5.0], [50.0]]))
 
 
 def test_a_seed_is_one_draw(run, asked):

@@ -107,6 +107,7 @@ def test_volts_on_a_feedback_capacitance(device):
     """1 V on 1 nF is 1 nC."""
     text = "[gain]\nV_per_unit = -0.001\noffset = 1650\nfeedback_pF = {A = 1000, B = 1000, C = 500}\n"
     np.testing.assert_allclose(device(text).chain(ELECTRODES).raw(np.full(3, 1651.0)), [-1.0, -1.0, -0.5])
+    assert device(text).gain.charge_pC("C", np.array([1651.0])) == pytest.approx(-0.5)
 
 
 def test_other_names_of_number_and_clock(device):

@@ -88,6 +88,7 @@ def test_charges_of_a_header_alone():
         ("A,B,C\n1,2,1e39\n", "line 2, column 'C': .* got '1e39'"),
         ("A,B,C\n1,1_0,3\n", "line 2, column 'B': .* got '1_0'"),
         ('A,B,C\n1,"2,5",3\n', "line 2, column 'B': .* got '2,5'; write a decimal point"),
+        ('A,B,C\n1,"x,y",3\n', "line 2, column 'B': .* got 'x,y'$"),
         ("A,B,C\n1,2\n", "line 2: expected 3 cells as in the header, got 2"),
         ("A,B,C\n1,2,3,4\n", "line 2: expected 3 cells as in the header, got 4"),
     ],
