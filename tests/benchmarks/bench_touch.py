@@ -1,12 +1,11 @@
 """What a real measuring chain costs: accuracy of the live path behind the simulator's amplifier.
 
-    python tests/benchmarks/bench_touch.py [--model NAME|PATH] [--presses 100] [--warm] [--unplug 20] [--json]
+    python tests/benchmarks/bench_touch.py [--model NAME|PATH] [--presses 100] [--memory] [--json]
 
 The model's sensor is pressed with a circle of 1 mm and 1 N at random places of its working area; the frames of the
 amplifier `bench` go through the whole path, bytes to records, without a port. The device file knows tau to 0.5 % and
-the gains to 0.2 % (and once not at all). `--warm` adds a temperature step of 0.5 K of the air while 0.5 N press, for a
-model of four electrodes, and says where temperature can be told from force; `--memory` holds presses on a film that
-creeps, and lays a hand over it; `--unplug N` pulls a terminal N times.
+the gains to 0.2 % (and once not at all). `--memory` holds presses on a film that creeps, and lays a hand over it, and
+says where its warmth can be told from force.
 """
 
 import time
@@ -15,18 +14,7 @@ from dataclasses import replace
 import numpy as np
 from shared import options, percentiles, print_results
 
-from isocharge.serve import (
-    Chunk,
-    Faults,
-    Frame,
-    Port,
-    Predictor,
-    Script,
-    TouchStream,
-    VirtualSensor,
-    device_from_table,
-    encode_frame,
-)
+from isocharge.serve import Chunk, Frame, Predictor, Script, TouchStream, device_from_table, encode_frame
 from isocharge.simulate import Circle, ForwardMap, load_amplifier
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
@@ -127,28 +115,6 @@ def nothing(predictor, film, part, seed):
     return {"false_contacts": sum(record.contact for record in feel(predictor, charge, part, 0.002, seed))}
 
 
-def warming(predictor, film, part, seed):
-    """A step of 0.5 K of the air in a press of 14 s: how far the force moves, and where warming cannot be told."""
-    part, rng, out = replace(part, step=0.5, step_at=REST_S + 3.0), np.random.default_rng(seed), {}
-    before, after = (round((REST_S + t) * RATE_HZ) for t in (2.5, 12.0))
-    for radius_mm in (0.5, 2.0, 4.0, 6.0, 7.5):
-        moved, flags = {True: [], False: []}, []
-        for k in range(6):
-            place = radius_mm * np.exp(2j * np.pi * rng.uniform())
-            pressed = charges(film, script_of([(place, REST_S, REST_S + 14.0)], REST_S + 15.5, 0.5))
-            for warm, changes in moved.items():
-                records = feel(predictor, pressed, part, 0.002, seed + k, {"common_mode": {}} if warm else None)
-                force = [np.mean([r.force_N for r in records[at - 100 : at]]) for at in (before, after)]
-                changes.append(round(100 * abs(float(force[1] / force[0]) - 1), 1))
-                flags += records[after].flags if warm else ()
-        counts = {word: flags.count(word) for word in ("thermal", "blind", "saturated")}
-        out[f"{radius_mm} mm"] = {
-            "force_moves_percent": moved[True],
-            "without_the_stage_percent": moved[False],
-        } | counts
-    return out
-
-
 KNOWN = {"no memory": None} | {
     f"creep {creep:+.0%}, step {step:+.0%}": {
         "memory": {"creep": 0.08 + 0.08 * creep, "thermoelastic": 0.06 + 0.06 * step}
@@ -197,30 +163,8 @@ def memory(predictor, film, level, seed):
     return out
 
 
-def unplugging(predictor, times):
-    """Pull a pseudo-terminal for 1 s: how long after it is there again the first record and the new tare come."""
-    every_s, away_s, n = 4.0, 1.0, len(predictor.metadata.electrodes)
-    script = Script(np.zeros(200), np.zeros(200), np.r_[np.zeros(199), 1e-9], RATE_HZ)
-    faults, path, back, tared = Faults(unplug_every_s=every_s, unplug_s=away_s), TouchStream(predictor), [], []
-    sensor = VirtualSensor(lambda contact: np.zeros((len(contact), n)), script, faults=faults)
-    with sensor, Port(sensor.url, reconnect=True) as port:
-        records = (record for chunk in port for record in path.feed(chunk))
-        while len(tared) < times:
-            record = next(records)
-            since_s = record.seq / RATE_HZ % every_s - away_s
-            if "reconnected" in record.flags:
-                back.append(since_s)
-            if len(back) > len(tared) and record.tare_pC is not None:
-                tared.append(since_s)
-    return {
-        "outages": path.counts.outages,
-        "back_s": percentiles(back, SHARES, 3),
-        "tared_s": percentiles(tared, SHARES, 3),
-    }
-
-
 def main():
-    asked = options(__doc__, presses=100, warm=False, memory=False, unplug=0)
+    asked = options(__doc__, presses=100, memory=False)
     predictor, part = Predictor(asked.model), load_amplifier("bench")
     corners = np.array(predictor.metadata.working_area_mm) @ [1.0, 1j]
     radius_mm = float(np.abs(0.5 * (corners + np.roll(corners, 1))).min())
@@ -235,10 +179,6 @@ def main():
         "nothing for 600 s": nothing(predictor, film, part, asked.seed),
         "held": held_presses(predictor, part, asked.seed),
     }
-    if asked.warm:
-        result["warming"] = warming(predictor, film, part, asked.seed)
-    if asked.unplug:
-        result["unplugging"] = unplugging(predictor, asked.unplug)
     print_results("touch", asked, result)
 
 
