@@ -81,7 +81,7 @@ class Modes:
     def start(cls, measured: complex, white: float, movement: Movement) -> "Modes":
         """At a first frame."""
         scatter = Scatter.start(measured)
-        return cls(movement, 0.5, measured, white, measured, 0.0 * measured, white, 0.0, movement.speed, scatter)
+        return cls(movement, 0.5, measured, white, measured, measured - measured, white, 0.0, movement.speed, scatter)
 
     def step(self, measured: complex, dt_s: float, shape: Shape, white: float) -> Estimate | None:
         """Take the next frame in.

@@ -74,8 +74,10 @@ class Tracked(NamedTuple):
 
     def widened(self, shift: tuple[float, float, float]) -> "Tracked":
         """With an error more, which moves x and y, mm, and force, N, by so much, and is the same in every frame."""
-        stds = (math.hypot(std, by) for std, by in zip(self[3:6], shift, strict=True))
-        return self._replace(**dict(zip(self._fields[3:6], stds, strict=True)))
+        x, y, force, x_std, y_std, force_std, *motion = self
+        by_x, by_y, by_F = shift
+        stds = math.hypot(x_std, by_x), math.hypot(y_std, by_y), math.hypot(force_std, by_F)
+        return Tracked(x, y, force, *stds, *motion)
 
 
 class Tracker:
