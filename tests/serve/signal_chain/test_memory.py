@@ -49,9 +49,9 @@ def pressed(t, begin, end):
 
 @pytest.mark.parametrize("tau_s", [None, 10.0])
 def test_its_own_series_is_undone_exactly(tau_s):
-    """Filters of scipy make what the film and then a leaky amplifier show of a charge that varies while it is held."""
+    """Filters of scipy make what film and leaky amplifier show of a charge that varies and is let go for a moment."""
     t = times(30.0)
-    touch = pressed(t, 5.0, 25.0) * (1.0 + 0.3 * np.sin(t))
+    touch = (pressed(t, 5.0, 20.0) | pressed(t, 20.05, 25.0)) * (1.0 + 0.3 * np.sin(t))
     steps, crept = np.diff(touch, prepend=0.0), CREEP * np.exp(-1.0 / DECADES_S).sum()
     film = (1.0 - crept) * touch
     for lag, weight in zip([*DECADES_S, WARMTH_S], [CREEP] * len(DECADES_S) + [STEP], strict=True):

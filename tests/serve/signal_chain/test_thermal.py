@@ -58,11 +58,12 @@ def test_warming_of_a_quiet_film_stays_small():
 
 
 def test_charge_and_slope_are_estimated_by_a_kalman_filter():
-    """Of a slope that decays and walks at random, in matrices; the misfit weighs the sum of its direction's parts."""
+    """Of a slope that decays and walks at random, so that the charge changes by `wander_pC` in a second, in matrices;
+    the misfit weighs the sum of its direction's parts."""
     rule, t, warmth_s, off_pC = ThermalRule(), 0.4, 1e3, 4.0
     before, known = ThermalDrift(3.0, 40.0, covariance=5.0, rate_variance=20.0), np.array([[40.0, 5.0], [5.0, 20.0]])
     flow = expm(t * np.array([[0.0, 1.0], [0.0, -1.0 / warmth_s]]))
-    walk = rule.wander_pC**2 * np.array([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]])
+    walk = 3.0 * rule.wander_pC**2 * np.array([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]])
     predicted = flow @ known @ flow.T + walk
     across = np.linalg.svd(UNIAXIAL)[0][:, 3]
     gain = predicted[:, 0] / (predicted[0, 0] + (rule.noise * 2.0 / across.sum()) ** 2)

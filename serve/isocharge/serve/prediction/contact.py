@@ -46,12 +46,13 @@ class Contact(NamedTuple):
 
     def widened(self, shift: tuple[float, float, float]) -> "Contact":
         """With an error more, a standard deviation of which moves x and y, mm, and force, N, by so much together."""
-        x_std, y_std, force_std = stds = [math.hypot(std, by) for std, by in zip(self[3:6], shift, strict=True)]
-        xy, xF, yF = (
-            (correlation * self[3 + i] * self[3 + j] + shift[i] * shift[j]) / (stds[i] * stds[j])
-            for correlation, (i, j) in zip(self[SEVEN:], ((0, 1), (0, 2), (1, 2)), strict=True)
-        )
-        return Contact(self.x_mm, self.y_mm, self.force_N, x_std, y_std, force_std, self.misfit, xy, xF, yF)
+        by_x, by_y, by_F = shift
+        x, y, force, of_x, of_y, of_F, misfit, xy, xF, yF = self
+        x_std, y_std, F_std = math.hypot(of_x, by_x), math.hypot(of_y, by_y), math.hypot(of_F, by_F)
+        xy = (xy * of_x * of_y + by_x * by_y) / (x_std * y_std)
+        xF = (xF * of_x * of_F + by_x * by_F) / (x_std * F_std)
+        yF = (yF * of_y * of_F + by_y * by_F) / (y_std * F_std)
+        return Contact(x, y, force, x_std, y_std, F_std, misfit, xy, xF, yF)
 
     def fields(self) -> dict[str, Any]:
         """As fields of a record: correlations that the model does not give are None."""

@@ -95,10 +95,10 @@ def undo_leak(
     if contact:
         trusted = leak.trusted_pC_per_s
         return Leak(charge_pC, output_pC, trusted, trusted, trusted, 0.0, leak.learned_s, rule.hold_off_s)
-    charge_pC = charge_pC * math.exp(-dt_s / rule.relax_s)
+    leak = Leak(charge_pC * math.exp(-dt_s / rule.relax_s), output_pC, *leak[2:])
     if leak.hold_s > 0.0 or not rule.learn:
-        return leak._replace(charge_pC=charge_pC, output_pC=output_pC, hold_s=leak.hold_s - dt_s)
-    return learn_inflow(rule, leak, surplus_pC, noise_pC, dt_s)._replace(charge_pC=charge_pC, output_pC=output_pC)
+        return leak._replace(hold_s=leak.hold_s - dt_s)
+    return learn_inflow(rule, leak, surplus_pC, noise_pC, dt_s)
 
 
 def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array, dt_s: float) -> Leak:
@@ -107,6 +107,7 @@ def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array,
     clipped_pC = np.minimum(np.maximum(surplus_pC, -limit_pC), limit_pC)
     learned_s, age_s = leak.learned_s + dt_s, leak.candidate_age_s + dt_s
     inflow = leak.inflow_pC_per_s + clipped_pC / max(min(rule.settle_s, learned_s), dt_s)  # at most the whole surplus
-    if age_s < rule.look_back_s:
-        return leak._replace(inflow_pC_per_s=inflow, candidate_age_s=age_s, learned_s=learned_s)
-    return Leak(leak.charge_pC, leak.output_pC, inflow, leak.candidate_pC_per_s, inflow, 0.0, learned_s)
+    trusted, candidate = leak.trusted_pC_per_s, leak.candidate_pC_per_s
+    if age_s >= rule.look_back_s:
+        trusted, candidate, age_s = candidate, inflow, 0.0
+    return Leak(leak.charge_pC, leak.output_pC, inflow, trusted, candidate, age_s, learned_s)

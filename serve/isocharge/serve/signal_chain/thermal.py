@@ -117,9 +117,9 @@ def _predicted(
     rule: ThermalRule, state: ThermalDrift, waited_s: float, warmth_s: float | None
 ) -> tuple[float, float, float]:
     """Variance of p, its covariance with its slope, and that one's variance, after a while."""
-    walk = rule.wander_pC**2 * waited_s
     if warmth_s is None:
-        return state.variance_pC2 + walk, 0.0, 0.0
+        return state.variance_pC2 + rule.wander_pC**2 * waited_s, 0.0, 0.0
+    walk = 3.0 * rule.wander_pC**2 * waited_s  # of the slope: p's is as large after a second
     left = math.exp(-waited_s / warmth_s)
     reach_s, both, rate = warmth_s * (1.0 - left), state.covariance, state.rate_variance
     variance_pC2 = state.variance_pC2 + reach_s * (2.0 * both + reach_s * rate) + walk * waited_s**2 / 3.0

@@ -185,8 +185,8 @@ class FilmFollower:
         if self._beside is None:
             return contact
         other, share = self._beside.predict(charge_pC), self._answered_std / BESIDE_MPa
-        x, y, force = (share * (moved - own) for moved, own in zip(other[:3], contact[:3], strict=True))
-        return contact.widened((x, y, force))
+        x, y, force = other.x_mm - contact.x_mm, other.y_mm - contact.y_mm, other.force_N - contact.force_N
+        return contact.widened((share * x, share * y, share * force))
 
     def take(self, charge_pC: Array, clock_s: float) -> None:
         """Take in a touch, charges of shape (n_electrode,), pC."""

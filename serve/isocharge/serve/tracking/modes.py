@@ -5,15 +5,15 @@ mixed as the contact may change from one to the other, and each frame's innovati
 knows no velocity; the moving one has a constant velocity with white acceleration, and takes an unknown one when a
 movement begins.
 
-A place is a complex number x + iy, a logarithm of a force a complex number without imaginary part. Variances are
-multiples of the covariance R of a frame: noise of the process is given its shape, so that one number stands for a
-matrix and a step takes microseconds.
+A place is a complex number x + iy, a logarithm of a force a real one. Covariances have the shape of a frame's: noise of
+the process is given that shape, so that one number stands for a matrix and a step takes microseconds.
 """
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
-from isocharge.serve.tracking.noise import Scatter, Unit
+from isocharge.serve.tracking.noise import FRESH_S, Scatter, Shape
 
 
 class Movement(NamedTuple):
@@ -40,20 +40,32 @@ CALMEST = 0.2
 FARTHEST = 30.0
 """Squared innovation, in deviations, beyond which a frame is none of this contact."""
 
+LARGEST_LEAD = 60.0
+"""Largest logarithm of what a frame says for one mode over the other: by then the probability is at its limit."""
 
-class Modes(NamedTuple):
-    """The state of the filter; variances in units of R.
+LEAST, MOST = 1e-6, 1.0 - 1e-6
+"""Limits of the probability of a mode."""
+
+Estimate = tuple[complex, float]
+"""A place or a logarithm, and its variance."""
+
+
+@dataclass(slots=True)
+class Modes:
+    """The filter and its state; variances in mm^2, or squares of ln N.
 
     Attributes:
+        movement: How the contact moves.
         moving: Probability of the moving mode.
         held: Estimate of the held mode.
         held_variance: Its variance.
         place, velocity: Estimates of the moving mode.
         variance, covariance, velocity_variance: Their variances.
-        unit: R's `variance` at the frame before.
         scatter: Of the frames up to now.
+        waited_s: Time since the last frame that told it, s.
     """
 
+    movement: Movement
     moving: float
     held: complex
     held_variance: float
@@ -62,80 +74,85 @@ class Modes(NamedTuple):
     variance: float
     covariance: float
     velocity_variance: float
-    unit: float
     scatter: Scatter
+    waited_s: float = 0.0
 
     @classmethod
-    def start(cls, measured: complex, unit: Unit, white: float, movement: Movement) -> "Modes":
+    def start(cls, measured: complex, white: float, movement: Movement) -> "Modes":
         """At a first frame."""
-        fast = movement.speed / unit.variance
-        return cls(0.5, measured, white, measured, 0j, white, 0.0, fast, unit.variance, Scatter.start(measured))
+        scatter = Scatter.start(measured)
+        return cls(movement, 0.5, measured, white, measured, measured - measured, white, 0.0, movement.speed, scatter)
 
+    def step(self, measured: complex, dt_s: float, shape: Shape, white: float) -> Estimate | None:
+        """Take the next frame in.
 
-Step = tuple[Modes, complex, float]
-"""The state after a frame, the estimate, and its variance in units of R."""
+        Calls of `min`, `max` and `Shape.square` would take a third of its time.
 
+        Args:
+            measured: What the frame says.
+            dt_s: Since the frame before, s, positive.
+            shape: Of its covariance.
+            white: Variance of what is independent from frame to frame, as stated; larger for a frame that counts for
+                less.
 
-def step(modes: Modes, measured: complex, dt_s: float, unit: Unit, white: float, movement: Movement) -> Step | None:
-    """Take the next frame in.
-
-    Args:
-        modes: After the frame before.
-        measured: What the frame says.
-        dt_s: Since the frame before, s, positive.
-        unit: R of the frame.
-        white: Part of R that is independent from frame to frame, as stated; larger than 1 for a frame that counts for
-            less.
-        movement: How the contact moves.
-
-    Returns:
-        The state, the estimate and its variance; None if the frame is none of this contact.
-    """
-    xx, yy, xy, scale, dimensions = unit
-    square = unit.square
-    moving, held, held_variance, place, velocity, a, b, c, before, scatter = modes
-    white, stated = white * scatter.variance, white
-    rescale = before / scale
-    begins, ends = (1.0 - moving) * min(dt_s / HELD_S, 0.5), moving * min(dt_s / MOVING_S, 0.5)
-    moving += begins - ends
-    share, back = begins / moving, ends / (1.0 - moving)
-    gap = place - held
-    apart = square(gap) / dimensions
-    x, y, vx, vy = gap.real, gap.imag, velocity.real, velocity.imag
-    across = ((xx * x + xy * y) * vx + (yy * y + xy * x) * vy) / dimensions
-    fast = square(velocity) / dimensions
-    stay = share * (1.0 - share)
-    held_variance, a, b, c = held_variance * rescale, a * rescale, b * rescale, c * rescale
-    first = held_variance + back * (a - held_variance) + back * (1.0 - back) * apart + movement.creep * dt_s / scale
-    held += back * gap
-    a += share * (held_variance - a) + stay * apart
-    b += stay * across - share * b
-    c += share * (movement.speed / scale - c) + stay * fast
-    place -= share * gap
-    velocity *= 1.0 - share
-    speed_square = velocity.real * velocity.real + velocity.imag * velocity.imag
-    change = movement.change * max(speed_square / movement.speed, CALMEST) * dt_s / scale
-    place += velocity * dt_s
-    a += dt_s * (2.0 * b + dt_s * (c + change / 3.0))
-    b += dt_s * (c + 0.5 * change)
-    c += change
-    by_held, by_moving = measured - held, measured - place
-    in_held, in_moving = 1.0 / (first + white), 1.0 / (a + white)
-    from_held, from_moving = square(by_held) * in_held, square(by_moving) * in_moving
-    if from_held > FARTHEST and from_moving > FARTHEST:
-        return None
-    weight = in_moving / in_held if dimensions == 2 else math.sqrt(in_moving / in_held)
-    odds = moving / (1.0 - moving) * weight * math.exp(min(max(0.5 * (from_held - from_moving), -60.0), 60.0))
-    moving = min(max(odds / (1.0 + odds), 1e-6), 1.0 - 1e-6)
-    gain = first * in_held
-    held += gain * by_held
-    first = gain * white
-    gain, turn = a * in_moving, b * in_moving
-    place += gain * by_moving
-    velocity += turn * by_moving
-    a, b, c = gain * white, turn * white, c - turn * b
-    gap = place - held
-    apart = square(gap) / dimensions
-    spread = first + moving * (a - first) + moving * (1.0 - moving) * apart
-    scatter = scatter.after(measured, dt_s, unit, stated)
-    return Modes(moving, held, first, place, velocity, a, b, c, scale, scatter), held + moving * gap, spread
+        Returns:
+            The estimate and its variance; None, and nothing changes, if the frame is none of this contact.
+        """
+        xx, yy, xy, dimensions = shape
+        creep, speed, density = self.movement
+        moving, held, first, place, velocity = self.moving, self.held, self.held_variance, self.place, self.velocity
+        a, b, c, scatter = self.variance, self.covariance, self.velocity_variance, self.scatter
+        noise = white * scatter.variance
+        begins = (1.0 - moving) * (dt_s / HELD_S if dt_s < 0.5 * HELD_S else 0.5)
+        ends = moving * (dt_s / MOVING_S if dt_s < 0.5 * MOVING_S else 0.5)
+        moving += begins - ends
+        share, back = begins / moving, ends / (1.0 - moving)
+        gap = place - held
+        x, y, vx, vy = gap.real, gap.imag, velocity.real, velocity.imag
+        dual_x, dual_y = xx * x + xy * y, xy * x + yy * y
+        apart, across = dual_x * x + dual_y * y, dual_x * vx + dual_y * vy
+        fast = (xx * vx + 2.0 * xy * vy) * vx + yy * vy * vy
+        stay = 1.0 - share
+        held += back * gap
+        first, a = (
+            first + back * (a - first + (1.0 - back) * apart) + creep * dt_s,
+            a + share * (first - a + stay * apart),
+        )
+        b += share * (stay * across - b)
+        c += share * (speed - c + stay * fast)
+        velocity *= stay
+        calm = stay * stay * (vx * vx + vy * vy) / speed
+        change = density * (calm if calm > CALMEST else CALMEST) * dt_s
+        place += velocity * dt_s - share * gap
+        a += dt_s * (2.0 * b + dt_s * (c + change / 3.0))
+        b += dt_s * (c + 0.5 * change)
+        c += change
+        by_held, by_moving = measured - held, measured - place
+        in_held, in_moving = 1.0 / (first + noise), 1.0 / (a + noise)
+        x, y, dx, dy = by_held.real, by_held.imag, by_moving.real, by_moving.imag
+        from_held = dimensions * in_held * ((xx * x + 2.0 * xy * y) * x + yy * y * y)
+        from_moving = dimensions * in_moving * ((xx * dx + 2.0 * xy * dy) * dx + yy * dy * dy)
+        if from_held > FARTHEST and from_moving > FARTHEST:
+            return None
+        weight = in_moving / in_held if dimensions == 2 else math.sqrt(in_moving / in_held)
+        lead = 0.5 * (from_held - from_moving)
+        odds = moving / (1.0 - moving) * weight * math.exp(lead if lead < LARGEST_LEAD else LARGEST_LEAD)
+        moving = odds / (1.0 + odds)
+        moving = LEAST if moving < LEAST else MOST if moving > MOST else moving
+        gain = first * in_held
+        held += gain * by_held
+        first = gain * noise
+        gain, turn = a * in_moving, b * in_moving
+        place += gain * by_moving
+        velocity += turn * by_moving
+        a, b, c = gain * noise, turn * noise, c - turn * b
+        gap = place - held
+        x, y = gap.real, gap.imag
+        apart = (xx * x + 2.0 * xy * y) * x + yy * y * y
+        spread = first + moving * (a - first + (1.0 - moving) * apart)
+        self.moving, self.held, self.held_variance, self.place, self.velocity = moving, held, first, place, velocity
+        self.variance, self.covariance, self.velocity_variance = a, b, c
+        self.waited_s += dt_s
+        if self.waited_s >= FRESH_S:
+            self.scatter, self.waited_s = scatter.after(measured, self.waited_s, shape, white), 0.0
+        return held + moving * gap, spread

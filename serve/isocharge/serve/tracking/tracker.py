@@ -12,11 +12,12 @@ from typing import NamedTuple
 from isocharge.serve.flags import BEYOND, INVALID, MISFIT, SATURATED
 from isocharge.serve.prediction.contact import Contact
 from isocharge.serve.signal_chain.rule import Rule, Share
-from isocharge.serve.tracking.modes import Modes, Movement, Step, step
-from isocharge.serve.tracking.noise import Unit
+from isocharge.serve.tracking.modes import Modes, Movement
+from isocharge.serve.tracking.noise import LINE, Shape
 
 PLACE = Movement(creep=5e-4, speed=30.0**2, change=800.0)
-"""A finger: 0.02 mm in a second while it holds still, speeds of 30 mm/s, 28 mm/s more or less after a second."""
+"""A finger: 0.02 mm in a second while it holds still, speeds of 30 mm/s; what moves so fast is 28 mm/s faster or slower
+after a second, others in proportion to their speed, and 13 mm/s at least."""
 
 FORCE = Movement(creep=5e-4, speed=10.0**2, change=1e3)
 """A held force wanders by 2 % in a second; one that changes becomes e times as large in a tenth of a second."""
@@ -73,8 +74,10 @@ class Tracked(NamedTuple):
 
     def widened(self, shift: tuple[float, float, float]) -> "Tracked":
         """With an error more, which moves x and y, mm, and force, N, by so much, and is the same in every frame."""
-        stds = (math.hypot(std, by) for std, by in zip(self[3:6], shift, strict=True))
-        return self._replace(**dict(zip(self._fields[3:6], stds, strict=True)))
+        x, y, force, x_std, y_std, force_std, *motion = self
+        by_x, by_y, by_F = shift
+        stds = math.hypot(x_std, by_x), math.hypot(y_std, by_y), math.hypot(force_std, by_F)
+        return Tracked(x, y, force, *stds, *motion)
 
 
 class Tracker:
@@ -87,7 +90,7 @@ class Tracker:
 
     def forget(self) -> None:
         """Forget the contact, as after an outage or a new tare."""
-        self._modes: tuple[Modes, Modes] | None = None
+        self._of_place, self._of_force = Modes.start(0j, 1.0, PLACE), Modes.start(0.0, 1.0, FORCE)
         self._last: Tracked | None = None
         self._far, self._t_s = 0, 0.0
         self._began_s = self._rest_s = 0.0
@@ -123,57 +126,45 @@ class Tracker:
 
     def _advance(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> Tracked:
         x, y, force, x_std, y_std, force_std, _, correlation, _, _ = contact
-        force = max(force, 1e-6)
-        place, log_force = complex(x, y), complex(math.log(force))
-        relative = force_std / force
+        place, force = complex(x, y), force if force > 1e-6 else 1e-6
+        log_force, relative = math.log(force), force_std / force
         correlation = correlation if correlation == correlation else 0.0  # a model may give none
-        units = Unit.of_place(x_std, y_std, correlation), Unit.of_force(relative)
+        shape, variance = Shape.of_place(x_std, y_std, correlation)
         white = 1.0 - self._lasting
         for flag in flags:
             white *= DOUBTS.get(flag, 1.0)
-        dt_s, steps = t_s - self._t_s, None
-        if self._modes is not None and 0.0 < dt_s <= LONGEST_STEP_S:
-            steps = self._steps(self._modes, place, log_force, dt_s, units, white)
-            if self._last is not None:
+        place_white, force_white = white * variance, white * relative * relative
+        of_place, of_force, by_place, by_force = self._of_place, self._of_force, None, None
+        dt_s = t_s - self._t_s
+        if self._last is not None and 0.0 < dt_s <= LONGEST_STEP_S:
+            by_place = of_place.step(place, dt_s, shape, place_white)
+            if by_place is not None:
+                by_force = of_force.step(log_force, dt_s, LINE, force_white)
+            else:
                 way_mm = abs(place - complex(self._last.x_mm, self._last.y_mm))
-                self._far = 0 if steps or way_mm < FASTEST_MM_S * dt_s else self._far + 1
+                self._far = 0 if way_mm < FASTEST_MM_S * dt_s else self._far + 1
                 if 0 < self._far < FAR_FRAMES:
                     return self._last
-        if steps is None:
-            start = Modes.start(place, units[0], white, PLACE), Modes.start(log_force, units[1], white, FORCE)
-            steps = (start[0], place, white), (start[1], log_force, white)
+        if by_place is None:
+            self._of_place = of_place = Modes.start(place, place_white, PLACE)
+            by_place = place, place_white
+        if by_force is None:  # a force that jumps begins anew alone
+            self._of_force, by_force = Modes.start(log_force, force_white, FORCE), (log_force, force_white)
         self._far, self._t_s = 0, t_s
-        (modes, place, spread), (force_modes, log_force, force_spread) = steps
-        self._modes = modes, force_modes
-        of_place, force = math.sqrt(spread + self._lasting), math.exp(log_force.real)
-        velocity = modes.moving * modes.velocity
+        (place, spread), (mean, force_spread) = by_place, by_force
+        share, force = math.sqrt(spread / variance + self._lasting), math.exp(mean.real)
+        velocity = of_place.moving * of_place.velocity
         return Tracked(
             place.real,
             place.imag,
             force,
-            x_std * of_place,
-            y_std * of_place,
-            force * relative * math.sqrt(force_spread + self._lasting),
+            x_std * share,
+            y_std * share,
+            force * math.sqrt(force_spread + relative * relative * self._lasting),
             velocity.real,
             velocity.imag,
-            modes.moving,
+            of_place.moving,
         )
-
-    @staticmethod
-    def _steps(
-        modes: tuple[Modes, Modes],
-        place: complex,
-        log_force: complex,
-        dt_s: float,
-        units: tuple[Unit, Unit],
-        white: float,
-    ) -> tuple[Step, Step] | None:
-        """Both filters by a frame; None if its place is none of this contact. A force that jumps begins anew alone."""
-        by_place = step(modes[0], place, dt_s, units[0], white, PLACE)
-        if by_place is None:
-            return None
-        by_force = step(modes[1], log_force, dt_s, units[1], white, FORCE)
-        return by_place, by_force or (Modes.start(log_force, units[1], white, FORCE), log_force, white)
 
     def _event(self, tracked: Tracked, t_s: float, *, began: bool) -> str | None:
         """What begins with this frame."""
