@@ -229,7 +229,9 @@ def test_presses_of_a_machine_calibrate_a_film(command, desk, film, places):
     code, out, err = command(*CALIBRATE, "--port", "rest.bin", "--press-list", "list.csv", "--json")
     assert (code, "going on with 2 presses" in err) == (0, True)
     *lines, end = map(json.loads, out.splitlines())
-    assert [(line["press"], line["next"]) for line in lines] == [(3, None)]  # a machine asks for none
+    assert [(line["press"], line["problem"], line["next"]) for line in lines] == [
+        (3, None, None)
+    ]  # a machine asks for none
     clean = film.charges(places)
     taken = read_presses(desk / "film/1/presses.csv", NAMES)
     assert [[line["charge_pC"][name] for name in NAMES] for line in lines] == taken.charge_pC[2:].tolist()
