@@ -98,7 +98,7 @@ def test_enter_takes_a_press_as_proposed(capsys):
     assert np.isnan(session.taken[2][:2]).all()
     assert taken == [1, 2, 3]
     said = capsys.readouterr().err
-    assert "1. Press 1.00 N at (0.0, 0.0) mm and hold." in said
+    assert "\n1. Press 1.00 N at (0.0, 0.0) mm and hold." in said
     assert "hold it, 0.3 s: A 400.0, B 400.0, C 400.0, D 400.0 pC" in said
     assert ("0.8 s" in said, "hold it, 1.4 s" in said) == (False, True)  # one line a second
     assert "steady after 0.7 s: A 500.0" in said
