@@ -227,8 +227,7 @@ def write_model(
         ModelError: If the graph cannot be loaded as a reader loads it, or disagrees with `metadata`. After any error
             no file of the version is left.
     """
-    target = folder / str(metadata.version)
-    check_target(folder, metadata.version, metadata.electrodes)
+    target = check_target(folder, metadata.version, metadata.electrodes)
     if folder.resolve().name != metadata.name:
         raise ModelError(f"{folder}: expected a folder named {metadata.name!r}, as the metadata names the model")
     where = f"the new model {metadata.label}"
