@@ -55,7 +55,7 @@ SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1"]
 """A sweep of a small family."""
 
 
-def test_a_sweep_as_a_table_for_other_programs(command, refused, tmp_path):
+def test_a_sweep_as_a_table_for_other_programs(command, refused, tmp_path, monkeypatch):
     """Read by pyarrow, against the dataset beside it."""
     assert command(*SMALL, "--samples", "5", "--workers", "1", "-o", tmp_path / "a.parquet")[0] == 0
     samples, columns = read_dataset(tmp_path / "a").samples, read_table(tmp_path / "a.parquet").to_pydict()
@@ -65,6 +65,9 @@ def test_a_sweep_as_a_table_for_other_programs(command, refused, tmp_path):
     refused(*SMALL, *two, "-o", tmp_path / "c.csv", said="a table of presses has one probe")
     refused(*SMALL, "-o", tmp_path / "a.csv", said="the dataset that belongs beside", code=1)
     refused(*SMALL, "-o", ".", said="is already there", code=1)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    refused(*SMALL, "-o", tmp_path / "b.parquet", said="pip install 'isocharge[parquet]'", code=1)
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "a.parquet"}  # said before anything is pressed
 
 
 def test_a_stopped_sweep_says_how_to_go_on_and_leaves_no_process(tmp_path):
@@ -96,15 +99,12 @@ def ends(is_so) -> bool:
     return False
 
 
-def test_an_unfinished_sweep_of_other_settings_is_kept_unless_fresh(command, tmp_path):
+def test_fresh_throws_an_unfinished_sweep_of_other_settings_away(command, tmp_path):
     part = tmp_path / "presses.part"
     for folder in ("parts", "data"):
         (part / folder).mkdir(parents=True)
     (part / "lock").touch()
     (part / "run.json").write_text('{"sweep": {"samples": 7}}')
-    _, _, err = command(*SMALL, "-o", tmp_path / "presses")
-    assert re.search("OutputExists.*presses.part holds the unfinished run of other settings.*--fresh", err, re.DOTALL)
-    assert part.exists()
     words = ["--samples", 300, "--sampling", "grid", "--orientation", "random", "--workers", 1, "--fresh"]
     code, _, err = command(*SMALL, *words, "-o", tmp_path / "presses")
     assert code == 0
@@ -188,7 +188,7 @@ def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
 
 
 BAD = [
-    (("simulate", "point", "no-such-sensor"), 2, "SensorError: no sensor 'no-such-sensor'"),
+    (("simulate", "point", "no-such-sensor"), 2, "SensorError: no sensor 'no-such-sensor': it is neither a built-in"),
     (("simulate", "point", SENSOR, "--force", "-1"), 2, "SceneError: force: expected a positive number of newtons"),
     (("simulate", "point", SENSOR, "--force", "nan"), 2, "SceneError: force"),
     (("simulate", "point", SENSOR, "--at", "44.5,0"), 2, "SceneError: probe off the film: centre (44.5, 0) mm"),
@@ -234,9 +234,12 @@ BAD = [
         "--int8: expected no --config beside it",
     ),
     (("train", "distil", SENSOR, "-o", "OUT", "--config", "none.toml"), 2, "ConfigError: none.toml: cannot be"),
-    (("simulate", "identify", SENSOR, "--noise", "clean"), 2, "expected white noise"),
+    (("simulate", "identify", SENSOR, "--noise", "clean"), 2, "expected white noise above 0 pC, got that of 'clean'"),
     (("simulate", "identify", SENSOR, "--noise", "loud"), 2, "noise level: expected one of"),
-    (("simulate", "identify", SENSOR, "--error", "nan"), 2, "--error: expected a positive number"),
+    *(
+        (("simulate", "identify", SENSOR, "--error", error), 2, "--error: expected a positive number")
+        for error in ("nan", "0", "inf")
+    ),
     (("simulate", "identify", SENSOR, "--radius", "44.5"), 2, "leave the film of radius 45 mm"),
     (
         ("simulate", "sweep", SENSOR, "--radius", "all", "-o", "OUT"),
@@ -260,6 +263,15 @@ BAD = [
         ("serve", "stream", "four-25um-biaxial", "--port", "-", "--follow"),
         2,
         "a film is followed from a model that `isocharge train calibrate` made",
+    ),
+    *(
+        (("train", "fit", *words.split(), "-o", "OUT"), 2, said)
+        for words, said in [
+            (f"{__file__} --radius 5", "--radius: belongs to --sensor"),
+            (f"{__file__} --sensor {SENSOR} --radius auto", "--radius: expected a number of mm with measured presses"),
+            (f"{__file__} --sensor {SENSOR} --probe circle:1 --probe circle:2", "--probe: expected the one that made"),
+            (f"none.csv --sensor {SENSOR}", "none.csv: expected a dataset folder, or a CSV file"),
+        ]
     ),
     (("train", "fit", ".", "-o", "OUT"), 2, "DatasetError: . is not a dataset: it has no manifest.json"),
     (

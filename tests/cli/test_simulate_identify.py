@@ -16,7 +16,7 @@ def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_pa
     area = numbers["working_area"]
     assert max(1.5, area["radius_mm"]) < area["fold_radius_mm"] < 5.0
     assert numbers["folds_mm"]
-    assert "no method can tell them apart by one reading" in err
+    assert "on both sides of the fold give the same charges, and no method can tell them apart by one reading" in err
     assert f"on {100.0 * area['determined_share']:.0f} % of the 3.5 mm searched" in err
     assert picture.shape[0] > 400
     assert picture.std() > 0.1

@@ -98,7 +98,7 @@ def test_enter_takes_a_press_as_proposed(capsys):
     assert np.isnan(session.taken[2][:2]).all()
     assert taken == [1, 2, 3]
     said = capsys.readouterr().err
-    assert "1. Press 1.00 N at (0.0, 0.0) mm and hold." in said
+    assert "\n1. Press 1.00 N at (0.0, 0.0) mm and hold." in said
     assert "hold it, 0.3 s: A 400.0, B 400.0, C 400.0, D 400.0 pC" in said
     assert ("0.8 s" in said, "hold it, 1.4 s" in said) == (False, True)  # one line a second
     assert "steady after 0.7 s: A 500.0" in said
@@ -229,7 +229,9 @@ def test_presses_of_a_machine_calibrate_a_film(command, desk, film, places):
     code, out, err = command(*CALIBRATE, "--port", "rest.bin", "--press-list", "list.csv", "--json")
     assert (code, "going on with 2 presses" in err) == (0, True)
     *lines, end = map(json.loads, out.splitlines())
-    assert [(line["press"], line["next"]) for line in lines] == [(3, None)]  # a machine asks for none
+    assert [(line["press"], line["problem"], line["next"]) for line in lines] == [
+        (3, None, None)
+    ]  # a machine asks for none
     clean = film.charges(places)
     taken = read_presses(desk / "film/1/presses.csv", NAMES)
     assert [[line["charge_pC"][name] for name in NAMES] for line in lines] == taken.charge_pC[2:].tolist()

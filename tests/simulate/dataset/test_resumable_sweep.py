@@ -95,7 +95,9 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, whole, phase, count):
 )  # fmt: skip
 def test_a_draft_of_other_settings_is_left_alone(stopped, whole, changes, message):
     before = sorted(draft_of(stopped).rglob("*"))
-    with pytest.raises(OutputExists, match=rf"presses\.part holds the unfinished run of other settings: {message}"):
+    with pytest.raises(
+        OutputExists, match=rf"presses\.part holds the unfinished run of other settings: {message}.*--fresh"
+    ):
         sweep_to(stopped, **changes)
     assert sorted(draft_of(stopped).rglob("*")) == before
     assert files(sweep_to(stopped)) == whole[0]

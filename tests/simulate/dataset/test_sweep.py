@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.common.errors import OutputError, SceneError
+from isocharge.common.errors import OutputError
 from isocharge.common.progress import listening
 from isocharge.simulate import (
     Circle,
@@ -130,12 +130,6 @@ def test_shards_and_tasks_keep_the_order(tmp_path):
 
 
 # Refused, and failed
-
-
-def test_a_sweep_that_leaves_the_film_leaves_nothing(tmp_path):
-    with pytest.raises(SceneError, match="leave the film of radius 45 mm"):
-        run_sweep(tmp_path / "new" / "presses", SENSOR, (Circle(1.0),), Sweep(radius=44.5))
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_cannot_be_written(tmp_path):

@@ -196,7 +196,7 @@ def test_orientations_are_spread_evenly_and_solved_once_each(folds, rotations):
     assert family.solved_rotations.size * folds == rotations
 
 
-@pytest.mark.parametrize("period", [2 * np.pi, 2 * np.pi / 3])
+@pytest.mark.parametrize("period", [2 * np.pi, np.pi, 2 * np.pi / 3])
 def test_nodes_interpolate_what_charges_look_like(period):
     """A power of the force, a smooth function of the distance, the first harmonics of the orientation."""
     rng = np.random.default_rng(9)

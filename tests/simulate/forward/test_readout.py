@@ -202,6 +202,7 @@ def with_d33(d33: float = -30.0, **changes) -> Sensor:
         (Circle(1.0), (5.0, 0.0), 0.0),
         (Polygon.rectangle(2.0, 1.0, np.pi / 2), (8.5, 1.5), 0.5),
         (Polygon.rectangle(2.0, 2.0, np.pi / 4), (8.5, 0.0), 2.0),
+        (Polygon.triangle(1.0), (10.0, 1.5), 5 / 9 * np.sqrt(3.0) / 4),  # all below the centroid
     ],
 )
 def test_contact_pressure_counts_where_it_lies_on_the_electrode(probe, at, covered):

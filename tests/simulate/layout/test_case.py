@@ -78,6 +78,8 @@ def test_a_map_of_what_matters(tmp_path):
     goal = read_goal(str(path))
     assert goal.weigh(np.array([[0.0, 0.0], [5.0, 0.0], [20.0, 0.0]])) == pytest.approx([1.0, 0.5, 0.0])
     assert goal.name == "map.csv"
+    line = WeightMap("line", np.array([[1.0, 0.0, 2.0], [1.0, 10.0, 3.0]]))
+    assert line.weigh(np.array([[5.0, 4.0], [1.0, 6.0]])).tolist() == [2.0, 3.0]  # nothing lies between them
 
 
 @pytest.mark.parametrize(

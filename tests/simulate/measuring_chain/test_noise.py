@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from isocharge.common.errors import InputError
-from isocharge.simulate import NoiseModel, load_amplifier, noise_model, read_dataset
+from isocharge.simulate import NoiseModel, load_amplifier, noise_model
 from isocharge.simulate.measuring_chain.noise_file import AMPLIFIER_LEVELS
 
 
@@ -15,14 +15,6 @@ def test_sigma_of_the_reference_level(charge, sigma):
     model, charges = noise_model("reference"), np.array([charge, -charge])
     np.testing.assert_allclose(model.sigma(charges), sigma, rtol=1e-7)
     np.testing.assert_allclose(model.variance(charges), sigma**2, rtol=1e-7)
-
-
-def test_noise_speaks_the_unit_of_a_datasets_charges(small_dataset):
-    """1.00 pC for small charges; it answered 0.04 when one spoke C and the other pC."""
-    charge = read_dataset(small_dataset).samples.charge_pC
-    sigma = noise_model("reference").sigma(charge)
-    assert sigma.min() == pytest.approx(1.0, abs=0.05)
-    np.testing.assert_allclose(sigma**2, 1.0 + (0.002 * charge) ** 2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("charge", [0.0, 848.0, -2000.0])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from isocharge.simulate import Calibration, Domain, Electrode, FunctionMap, load_sensor
-from isocharge.simulate.plots.film import draw_charge_map, draw_electrodes
+from isocharge.simulate import Calibration, Circle, Domain, Electrode, FunctionMap, Polygon, load_sensor, press
+from isocharge.simulate.plots.film import draw_charge_map, draw_electrodes, draw_probe, draw_section
 
 
 def test_all_metal_is_drawn_where_it_lies():
@@ -29,3 +29,22 @@ def test_the_whole_film_is_shaded():
     axes = Figure().subplots()
     draw_charge_map(axes, charge_map, 0)
     assert axes.dataLim.extents == pytest.approx([-8.0, -8.0, 8.0, 8.0], abs=0.02)
+
+
+def test_a_footprint_lies_where_it_presses():
+    axes, triangle = Figure().subplots(), Polygon.triangle(3.0, 0.3)
+    draw_probe(axes, triangle, (2.0, -1.0))
+    np.testing.assert_allclose(axes.patches[0].get_xy()[:-1] @ [1.0, 1.0j], 2.0 - 1.0j + triangle.outline)
+
+
+@pytest.mark.parametrize(("at", "distance"), [((3.0, -4.0), 5.0), ((0.0, 0.0), 0.0)])
+def test_a_section_goes_through_the_probe(at, distance):
+    """From rim to rim, deepest under the probe, below its mark."""
+    axes = Figure().subplots()
+    draw_section(axes, press(load_sensor("three-25um-biaxial").film, Circle(1.0), at, 1.0))
+    film, mark = axes.lines
+    along, height = film.get_data()
+    assert [*mark.get_xdata(), *along[[0, -1]]] == pytest.approx(
+        [distance - 1.0, distance + 1.0, -45.0, 45.0], rel=1e-5
+    )
+    assert along[height.argmin()] == pytest.approx(distance, abs=0.5)

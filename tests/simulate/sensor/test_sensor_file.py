@@ -250,11 +250,6 @@ def test_file_that_is_not_toml(tmp_path, data, message):
         load_sensor(path)
 
 
-def test_no_such_sensor():
-    with pytest.raises(SensorError, match=r"no sensor 'five': it is neither a built-in name .* nor a file"):
-        load_sensor("five")
-
-
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("count", [65, 200_000])
 def test_too_many_electrodes_are_refused_at_once(tmp_path, count):

@@ -13,6 +13,7 @@ from isocharge.serve import find_model
 from isocharge.simulate import Domain, FunctionMap, noise_model
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines.gauss_newton import GaussNewton
+from isocharge.train.baselines.learned import Logarithms
 from isocharge.train.baselines.networks import OnnxContact, ReleasedModel, contact_graph
 from isocharge.train.baselines.paper import Triangulate
 from isocharge.train.baselines.rivals import polynomial_ridge, rivals
@@ -65,6 +66,11 @@ def test_force_follows(name, limit, fitted, test_presses):
 def test_a_polynomial_does_not_explode_outside_of_what_it_saw(fitted, task):
     absurd = np.array([[0.0], [-5.0], [1e9]]) * np.ones(task.train.charge.shape[1])
     assert np.isfinite(fitted["polynomial ridge"].regressor.predict(absurd)).all()
+
+
+def test_logarithms_of_charges_of_both_signs_are_asinh_of_twice_their_share_of_the_usual_size():
+    charge = 300.0 * np.array([[1.0, -1.0], [-1.0, 1.0], [-1.0, -5.0]])
+    np.testing.assert_allclose(Logarithms().fit_transform(charge), np.arcsinh(charge / 150.0))
 
 
 @pytest.mark.parametrize(("electrodes", "degrees"), [(3, [10, 12]), (5, [4, 6]), (8, [4]), (40, [1])])

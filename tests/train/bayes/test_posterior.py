@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from isocharge.common.errors import ChargeError, InputError
-from isocharge.simulate import Circle, Domain, NoiseModel, noise_model
+from isocharge.simulate import Circle, Domain, ForwardMap, NoiseModel, noise_model
 from isocharge.train import BayesLimit, BayesProblem, bayes_estimate, bayes_limit
 from isocharge.train.bayes.posterior import Cells, Posterior
 from isocharge.train.data.presses import draw_contacts
@@ -152,7 +152,8 @@ def problem(sensor):
     return BayesProblem(sensor, Circle(1.0))
 
 
-def test_the_limit_is_what_the_estimates_give(problem, spline):
+def test_the_limit_is_what_the_estimates_give(problem, spline, monkeypatch):
+    monkeypatch.setattr(ForwardMap, "build", None)  # the map is given
     limit = bayes_limit(problem, 40, seed=5, charge_map=spline)
     assert 0.05 < limit.position_median_mm < limit.position_rms_mm < 0.4
     assert limit.presses == 40

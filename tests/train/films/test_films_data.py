@@ -2,15 +2,26 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from isocharge.common.errors import DatasetError
-from isocharge.simulate import FilmPrior, Piezo, load_sensor
+from isocharge.simulate import FilmPrior, NoiseModel, Piezo, load_sensor
 from isocharge.simulate.identifiability.nearest_contact import search
+from isocharge.train import FilmsConfig
 from isocharge.train.films import films_data
-from isocharge.train.films.films_data import FilmsSource, draw_film_presses, draw_misfit_films, draw_near_films
+from isocharge.train.films.films_data import (
+    DrawnFilms,
+    FilmsSource,
+    draw_film_presses,
+    draw_misfit_films,
+    draw_near_films,
+)
+from isocharge.train.films.fit import misfit_stage
+from isocharge.train.training.network import compress_length
 
 
 def charges(prior, family, parameters, contact):
@@ -67,6 +78,28 @@ def test_what_no_contact_explains_is_perpendicular_to_the_derivatives(source):
         np.testing.assert_allclose(across @ slopes, 0.0, atol=0.02)
         np.testing.assert_allclose(across @ across, across, atol=1e-9)
         np.testing.assert_allclose(np.trace(across, axis1=1, axis2=2), 1.0)  # four charges, three unknowns
+
+
+def test_good_presses_are_off_by_up_to_eight_times_the_noise_and_count_ten_times():
+    """Charges of 400 pC with 5 pC of noise, all of which no contact explains; answers that are wrong by 1 each.
+
+    Factors are 1 + 7 u^3 with u uniform; their mean square is 1 + 14 / 4 + 49 / 7.
+    """
+    clean, off = np.full((50, 8, 4), 400.0), []
+    examples = DrawnFilms(np.zeros((50, 1)), clean, 0.0 * clean)
+    near = replace(examples, aim=np.broadcast_to(np.eye(4), (50, 8, 4, 4)))
+    inputs = SimpleNamespace(values=lambda charge, _: (charge - 400.0) / 5.0, context=torch.tensor)
+
+    def wrong_by_one(deviation, _):
+        off.append(deviation)
+        return compress_length(deviation) + 1.0
+
+    config = FilmsConfig(batch_films=256)
+    stage = misfit_stage(wrong_by_one, inputs, examples, near, NoiseModel("mine", 3.0, 0.01), config)
+    losses = stage.loss(0, torch.Generator().manual_seed(0)).item(), stage.score()[0]
+    assert losses == pytest.approx((10.0 * 4.0 + 4.0, 10.0 * 4.0 + 4.0), rel=1e-5)
+    assert [len(films) for films in off] == [128, 128, 3, 50]  # 6 % of the examples are watched
+    assert torch.mean(off[1] ** 2).item() == pytest.approx(11.5, rel=0.12)
 
 
 def test_charges_that_are_not_positive_are_refused(films):

@@ -95,31 +95,14 @@ def test_the_graph_answers_as_the_network_does_on_odd_charges(trained, held, ses
     assert case not in ABSURD or found[2].min() > 50.0
 
 
-def steep(network):
-    """Off the presses it runs off the numbers."""
-    network.contact.skip.weight *= 1e3
-
-
-def another(network):
-    """Its answers are not those of the file."""
-    network.contact.skip.weight += 0.1
-
-
-@pytest.mark.parametrize(
-    ("change", "exported", "message"),
-    [
-        (steep, True, r"answers contact = .* expected finite numbers for any charges"),
-        (another, False, "the exported graph disagrees with the network on contact"),
-    ],
-)
-def test_a_wrong_graph_is_not_released(trained, held, graph, change, exported, message, monkeypatch):
+def test_a_network_that_runs_off_the_numbers_is_not_released(trained, held, monkeypatch):
     monkeypatch.setattr(correlation, "EXAMPLES", 1_000)  # errors that are nonsense have no correlations to find
     network = copy.deepcopy(trained.network)
     with torch.no_grad():
-        change(network)
+        network.contact.skip.weight *= 1e3
     exact = turned(network, trained)
-    with pytest.raises(TrainingError, match=message):
-        check_graph(export_onnx(exact, {}) if exported else graph, exact.outputs, held, REFERENCE)
+    with pytest.raises(TrainingError, match=r"answers contact = .* expected finite numbers for any charges"):
+        check_graph(export_onnx(exact, {}), exact.outputs, held, REFERENCE)
 
 
 def test_file_and_network_may_differ_by_a_thousandth_of_what_charges_tell(trained, held, graph):
@@ -133,7 +116,9 @@ def test_file_and_network_may_differ_by_a_thousandth_of_what_charges_tell(traine
         return outputs
 
     check_graph(graph, beside(8e-4), held, REFERENCE)
-    with pytest.raises(TrainingError, match="disagrees with the network on contact"):
+    with pytest.raises(
+        TrainingError, match=r"on contact: expected at most 1e-05 for 99\.9% of the charges and 0\.0001 for all"
+    ):
         check_graph(graph, beside(2e-3), held, REFERENCE)
 
 

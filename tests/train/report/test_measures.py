@@ -128,3 +128,5 @@ def test_a_case_has_the_dataset_s_probes_and_as_many_presses_of_each(dataset):
         assert (len(case.probes), case.presses, case.rotated) == (probes, presses, chosen is turned)
         assert case.probes[1] == parse_probe("rectangle:4x2").rotated(np.deg2rad(30.0))
         assert case.probes[2:] == (parse_probe("triangle:4.0"),) * (probes - 2)
+    twice = case.sweep(2.0)
+    assert (twice.radius, *twice.force_range) == pytest.approx((16.0, 0.025, 4.0))

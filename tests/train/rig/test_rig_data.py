@@ -49,7 +49,7 @@ def test_the_errors_are_what_serve_check_says_of_presses_that_nobody_trained_on(
 def test_card_and_metadata_say_that_it_was_fitted_to_measurements(model):
     card, errors = (model.folder / "card.md").read_text("utf-8"), model.metadata.errors
     assert f"## Errors on {errors['measured_presses']:.0f} measured presses that training never saw" in card
-    assert "The film was not calibrated" in card
+    assert "places to 0.05 mm and forces to 0.5 %, as given.\n- The film was not calibrated" in card
     measurement = model.metadata.made_with["measured"]
     assert measurement["trained_on"] + measurement["held_out"] == 300
 

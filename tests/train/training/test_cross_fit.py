@@ -1,14 +1,17 @@
 """Models of measured presses alone, of a sensor whose least error is known in closed form."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from isocharge.cli.train import fit as fit_command
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, Predictor, read_presses
+from isocharge.serve.prediction.measured_presses import write_presses
 from isocharge.serve.prediction.press_check import check_presses
-from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit_presses, release
+from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit_presses
 from isocharge.train.data.channel_noise import ChannelNoise
 from isocharge.train.data.measured_sensor import PressedArea, outline
 from isocharge.train.data.presses import folds_by_place, held_out
@@ -92,18 +95,25 @@ def test_charges_of_no_press_have_a_large_misfit(alone, fresh):
     assert np.mean(alone.predict(off)[2] > limit) > 0.97
 
 
-def test_the_released_model_is_served_and_checked(alone, fresh, tmp_path):
-    folder = release(alone, tmp_path / "pad", command="make it").folder
+def test_the_released_model_is_served_and_checked(alone, fresh, tmp_path, command, monkeypatch):
+    """By the command, from a file of presses."""
+    monkeypatch.setattr(fit_command, "fit_presses", lambda *_, probes, **__: replace(alone, probes=probes))
+    write_presses(tmp_path / "pad.csv", l_shaped())
+    assert command("train", "fit", tmp_path / "pad.csv", "-o", tmp_path / "pad")[0] == 0
+    folder = tmp_path / "pad" / "1"
     predictor, presses = Predictor(folder), measured(fresh.contact[:200], fresh.charge[:200])
     np.testing.assert_allclose(predictor.predict(fresh.charge[0])[:3], alone.predict(fresh.charge[:1])[0][0], rtol=1e-3)
     assert check_presses(predictor, presses).fits
     assert predictor.metadata.sensor == {"name": "pad", "electrodes": ["Q1", "Q2", "Q3", "Q4"]}
     assert read_presses(folder / "presses.csv") == l_shaped()
     card, errors = (folder / "card.md").read_text(), predictor.metadata.errors
-    assert "1200 presses at 1200 places" in card
-    for share in ("68", "95"):
-        (percent,) = re.findall(rf"coverage of the {share} % intervals \| (\S+) %", card)
-        assert float(percent) == pytest.approx(100.0 * errors[f"coverage_{share}"], rel=1e-2)
+    assert f"```bash\n{predictor.metadata.made_with['command']}\n```" in card
+    assert {"| fitted to | 1200 presses at 1200 places, in `presses.csv` |", "| probes | unknown |"} <= {
+        *card.splitlines()
+    }
+    said = re.findall(r"(?:\| \S+ and|intervals \|) (\S+) %", card)
+    expected = [*alone.noise.gain, errors["coverage_68"], errors["coverage_95"]]
+    np.testing.assert_allclose(np.array(said, float), 100.0 * np.array(expected), rtol=1e-2)
 
 
 def test_the_outline_is_that_of_the_area():
@@ -123,6 +133,7 @@ def test_one_force_and_channels_that_are_mostly_zero():
     charge = np.where(np.random.default_rng(7).random((600, 4)) < 0.6, 0.0, charges(contact, 8))
     noise = ChannelNoise.of(charge, PressedArea.of(contact).to_unit(contact))
     np.testing.assert_allclose(noise.charge(noise.level(charge)), charge, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(noise.bend(np.abs(charge)), noise.bend(-np.abs(charge)))
     assert np.isfinite(Features.of_signed(charge, noise.bend(charge)).matrix).all()
 
 

@@ -227,8 +227,7 @@ def write_model(
         ModelError: If the graph cannot be loaded as a reader loads it, or disagrees with `metadata`. After any error
             no file of the version is left.
     """
-    target = folder / str(metadata.version)
-    check_target(folder, metadata.version, metadata.electrodes)
+    target = check_target(folder, metadata.version, metadata.electrodes)
     if folder.resolve().name != metadata.name:
         raise ModelError(f"{folder}: expected a folder named {metadata.name!r}, as the metadata names the model")
     where = f"the new model {metadata.label}"
@@ -250,8 +249,8 @@ def write_model(
     return target
 
 
-def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> None:
-    """Refuse a folder in which a model version cannot be written; training checks it before it starts.
+def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Path:
+    """The version folder; refused where a model version cannot be written. Training checks it before it starts.
 
     Args:
         folder: The model's folder, named as the model.
@@ -262,7 +261,8 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Non
         OutputExists: If the version exists already, or a file has the folder's name.
         ModelError: If the folder's name is no model name, or the folder holds a model with other electrodes.
     """
-    refuse_existing(folder / str(version))
+    target = folder / str(version)
+    refuse_existing(target)
     if folder.exists() and not folder.is_dir():
         raise OutputExists(f"{folder}: expected a folder or nothing, got a file; choose another place")
     name = folder.resolve().name
@@ -280,6 +280,7 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Non
         raise ModelError(
             f"{config}: describes a model other than one with the electrodes {electrodes}; use another model name"
         )
+    return target
 
 
 def _check_draft(draft: Path, metadata: ModelMetadata) -> None:

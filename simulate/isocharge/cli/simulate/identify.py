@@ -1,7 +1,7 @@
 """`isocharge simulate identify`: what the charges of a sensor determine about a press."""
 
 import json as json_module
-from math import isfinite
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -52,7 +52,7 @@ def identify_command(
     """
     if output is not None:
         refuse_existing(output)
-    if not (isfinite(error) and error > 0.0):
+    if not 0.0 < error < inf:
         raise InputError(f"--error: expected a positive number of mm, got {error}")
     with shown_progress():
         identified = identify(

@@ -78,7 +78,7 @@ def _table(report: dict[str, Any]) -> str:
             f"deflection        {report['deflection_mm']:10.4f} mm",
             f"theory            {report['theory']}, estimated error {_percent(report['estimated_error'])}",
             f"solver            {report['status']} in {report['iterations']} steps, residual "
-            f"{report['residual']:.1e}, {report['seconds'] * 1e3:.0f} ms CPU",
+            f"{report['residual']:.1e}, {report['seconds']:.3f} s CPU",
         ]
     )
 

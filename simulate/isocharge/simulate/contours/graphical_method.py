@@ -14,7 +14,7 @@ from itertools import combinations, product
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.contours.charge_curves import Curves
 from isocharge.simulate.contours.fix import AMBIGUOUS, APART, TOLERANCE, Fix, Meeting, check_triangulation
 from isocharge.simulate.forward.charge_map import as_charges
@@ -61,12 +61,10 @@ class DrawnContour:
 
     def crossings(self, other: "DrawnContour") -> Array:
         """Positions where two contours cross, shape (n, 2), mm."""
-        starts = _chord_crossings(self.points, other.points)
-        mine, theirs = self._parameters, other._parameters
         crossings = []
-        for i, s, j, t in starts:
-            at = np.array([mine[i] + s * (mine[i + 1] - mine[i]), theirs[j] + t * (theirs[j + 1] - theirs[j])])
-            for _ in range(4):  # Newton's method on the splines; the chords are within a few um
+        for mine, theirs in _chord_crossings(self.points, other.points):
+            at = np.array([self._parameters[mine], other._parameters[theirs]])
+            for _ in range(4):  # Newton's method on the splines, from where the chords begin
                 gap = self._spline(at[0]) - other._spline(at[1])
                 matrix = np.stack([self._spline(at[0], 1), -other._spline(at[1], 1)], axis=1)
                 at = at - np.linalg.lstsq(matrix, gap, rcond=None)[0]
@@ -74,16 +72,15 @@ class DrawnContour:
         return np.array(crossings).reshape(-1, 2)
 
 
-def _chord_crossings(first: Array, second: Array) -> list[tuple[int, float, int, float]]:
-    """Chords of two polylines that cross: index and share along the first, index and share along the second."""
+def _chord_crossings(first: Array, second: Array) -> Integers:
+    """Chords of two polylines that cross: index along the first, index along the second, shape (n, 2)."""
     a, b = np.diff(first, axis=0)[:, None], np.diff(second, axis=0)[None]
     between = second[None, :-1] - first[:-1, None]
     with np.errstate(divide="ignore", invalid="ignore"):  # parallel chords do not cross
         area = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
         s = (between[..., 0] * b[..., 1] - between[..., 1] * b[..., 0]) / area
         t = (between[..., 0] * a[..., 1] - between[..., 1] * a[..., 0]) / area
-        rows, columns = np.nonzero((s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0))
-    return [(int(i), float(s[i, j]), int(j), float(t[i, j])) for i, j in zip(rows, columns, strict=True)]
+        return np.argwhere((s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0))
 
 
 def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnContour | None:

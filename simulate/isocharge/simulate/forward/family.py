@@ -75,12 +75,11 @@ class Family:
 
     def _by_rotation(self, rotation: Array) -> Array:
         """Trigonometric interpolation on an even spread: each weight is a Dirichlet kernel, shape (n, n_rotation)."""
-        harmonics = np.arange(1, (self.rotation.size - 1) // 2 + 1)
+        count = self.rotation.size
+        harmonics = np.arange(1, count // 2 + 1)
+        factor = np.where(2 * harmonics == count, 1.0, 2.0)  # an even spread does not see the highest one's sine
         phase = (rotation[:, None] - self.rotation)[..., None] * harmonics
-        kernel = 1.0 + 2.0 * np.cos(phase).sum(axis=-1)
-        if self.rotation.size % 2 == 0:
-            kernel = kernel + np.cos(0.5 * self.rotation.size * (rotation[:, None] - self.rotation))
-        return np.asarray(kernel / self.rotation.size)
+        return np.asarray((1.0 + np.cos(phase) @ factor) / count)
 
     def solve(self, sensor: Sensor, probe: Probe, settings: SolveSettings, executor: Executor | None) -> Array:
         """Scaled stress at the nodes, as `unfold` takes it: (n_distance, n_solved_rotation, n_force, ...).

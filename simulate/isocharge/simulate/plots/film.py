@@ -1,5 +1,6 @@
 """The film to scale: electrodes, probe, working area, charge map, deflection."""
 
+from math import atan2, cos, hypot, sin
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from matplotlib.patheffects import withStroke
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.plots.figure import FELT, INK
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
@@ -34,14 +36,11 @@ def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool 
 
 def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "", colour: str = FELT) -> None:
     """The footprint of a press at (x, y), mm."""
-    style: dict[str, Any] = {"fill": True, "fc": colour, "ec": colour, "alpha": 0.35, "zorder": 2}
-    style["label"] = label or None
-    x, y = at
+    style: dict[str, Any] = {"fill": True, "fc": colour, "ec": colour, "alpha": 0.35, "zorder": 2, "label": label}
     if isinstance(probe, Circle):
         axes.add_patch(Disk(at, probe.radius, **style))
     else:
-        corners = probe.outline
-        axes.add_patch(Patch(np.stack([x + corners.real, y + corners.imag], axis=1), **style))
+        axes.add_patch(Patch(to_corners(complex(*at) + probe.outline), **style))
 
 
 def draw_circle(axes: Any, radius: float, **style: Any) -> None:
@@ -51,7 +50,7 @@ def draw_circle(axes: Any, radius: float, **style: Any) -> None:
 
 def draw_working_area(axes: Any, radius: float, label: str = "") -> None:
     """A dotted circle of `radius` (mm) about the centre."""
-    draw_circle(axes, radius, ls=":", color=INK, label=label or None)
+    draw_circle(axes, radius, ls=":", color=INK, label=label)
 
 
 def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> None:
@@ -87,10 +86,9 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
 def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     """Deflection on a cut through the probe and the centre of the film, not to scale."""
     along = np.linspace(-INNER, INNER, 801) * equilibrium.film.radius
-    at = np.array(equilibrium.at)
-    distance = float(np.linalg.norm(at))
-    direction = at / distance if distance > 0.0 else np.array([1.0, 0.0])
-    depth = deflection(equilibrium, along[:, None] * direction)
+    x, y = equilibrium.at
+    distance, angle = hypot(x, y), atan2(y, x)
+    depth = deflection(equilibrium, np.outer(along, [cos(angle), sin(angle)]))
     axes.plot(along, -depth, color=INK, lw=1.5)
     half = equilibrium.probe.reach
     axes.plot([distance - half, distance + half], [0.25, 0.25], color=FELT, lw=5, solid_capstyle="butt")

@@ -108,10 +108,11 @@ class Film:
         check_stress("film pretension", self.pretension, -MOST_SLACK, MOST_PRETENSION, SensorError)
         if not 0.0 <= self.poisson < 0.5:
             raise SensorError(f"film poisson: expected 0 <= poisson < 0.5, got {self.poisson}")
-        if self.coat is not None and not 0.0 < self.coat.stiffness <= MOST_COAT * self.young * self.thickness:
+        stiffest = MOST_COAT * self.young * self.thickness
+        if self.coat is not None and not 0.0 < self.coat.stiffness <= stiffest:
             raise SensorError(
                 f"film coat: expected Young's modulus times thickness up to {MOST_COAT:g} times the film's, "
-                f"{self.young * self.thickness:.4g} N/mm, got {self.coat.stiffness:.4g} N/mm"
+                f"{stiffest:.4g} N/mm, got {self.coat.stiffness:.4g} N/mm"
             )
         for name, value in zip(("(T11 - T22) / 2", "T12"), self.deviator, strict=True):
             check_stress(f"film pretension, {name}", value, -MOST_PRETENSION, MOST_PRETENSION, SensorError)

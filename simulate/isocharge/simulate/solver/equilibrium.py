@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_stress
@@ -114,8 +114,7 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     if surface != "middle":
         strained += _bent_strain(equilibrium, surface, gradient @ node_slope(equilibrium)[element, :, :, 2])
     if mesh.coat is not None:
-        turned = (points @ [1.0, 1j]) * np.exp(-1j * np.arctan2(equilibrium.at[1], equilibrium.at[0]))
-        strained = mesh.coat.of_film(turned / equilibrium.film.radius, strained)
+        strained = mesh.coat.of_film(_rotated(equilibrium, points), strained)
     local = equilibrium.film.young * groups.amplitude2 * scaled_stress(strained, groups)
     local[mirrored, 2] *= -1.0
     return rotate_stress(local, np.arctan2(equilibrium.at[1], equilibrium.at[0]))
@@ -166,12 +165,17 @@ def _bent_strain(equilibrium: Equilibrium, surface: Surface, hessian: Array) -> 
 
 def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, Array, Booleans]:
     """Element, xi, eta of each point and whether it was mirrored into a half template; SceneError off the film."""
-    points, radius, (x, y) = np.asarray(points, dtype=float), equilibrium.film.radius, equilibrium.at
+    points, radius = np.asarray(points, dtype=float), equilibrium.film.radius
     alpha, oval = equilibrium.film.oval_axis, equilibrium.film.oval
     rim = radius * (1.0 + oval * np.cos(2.0 * (np.arctan2(points[:, 1], points[:, 0]) - alpha))) if oval else radius
     off = ~(np.hypot(points[:, 0], points[:, 1]) <= rim * (1.0 + 1e-9))
     if off.any():
         first = points[np.argmax(off)]
         raise SceneError(f"point ({first[0]:.4g}, {first[1]:.4g}) mm is off the film of radius {radius:.4g} mm")
-    rotated = (points[:, 0] + 1j * points[:, 1]) * np.exp(-1j * np.arctan2(y, x))
-    return equilibrium.mesh.locate(rotated / radius)
+    return equilibrium.mesh.locate(_rotated(equilibrium, points))
+
+
+def _rotated(equilibrium: Equilibrium, points: Array) -> Complexes:
+    """Points (x, y), mm, as x + iy in film radii, the press rotated onto the x axis."""
+    z = (points[:, 0] + 1j * points[:, 1]) / equilibrium.film.radius
+    return np.asarray(z * np.exp(-1j * np.arctan2(equilibrium.at[1], equilibrium.at[0])))

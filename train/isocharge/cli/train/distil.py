@@ -44,7 +44,7 @@ def distil_command(
     folder = find_model(model, models)
     settings = load_config(config) if config else student_config("int8" if int8 else "float32")
     case = StudentCase.of(load_model(folder).metadata)
-    check_target(output, version, case.sensor.electrode_names)
+    target = check_target(output, version, case.sensor.electrode_names)
     with shown_progress():
         presses = simulated_presses(case.sensor, case.probes, case.domain.radius, case.domain.force_range)
     data = student_data(folder, presses)
@@ -52,4 +52,4 @@ def distil_command(
     def train(run: ResumableRun) -> Release:
         return release(fit(data, settings, run=run), output, version=version, command=this_command())
 
-    release_resumably(train, fit_identity(data, settings), output / str(version), fresh=fresh, json=json)
+    release_resumably(train, fit_identity(data, settings), target, fresh=fresh, json=json)

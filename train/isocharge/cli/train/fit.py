@@ -120,10 +120,10 @@ def fit_command(
 
     Example: isocharge train fit presses.csv -o models/pad
     """
-    probes, target = probe or ["circle:1.0"], output / str(version)
+    probes = probe or ["circle:1.0"]
     if films:
         prior, sizes = _films(dataset, sensor, probes, radius, config)
-        check_target(output, version, prior.sensor.electrode_names)
+        target = check_target(output, version, prior.sensor.electrode_names)
         caution_of_stress(prior.sensor.film, [prior.probe], sizes.force_range[1])
 
         def train_films(run: ResumableRun) -> Release:
@@ -138,7 +138,7 @@ def fit_command(
     settings = load_config(config) if config else FitConfig()
     if dataset and dataset.is_file() and not sensor:
         presses = _measured(dataset, radius, (position_std_mm, force_std))
-        check_target(output, version, presses.electrodes)
+        target = check_target(output, version, presses.electrodes)
 
         def train_alone(run: ResumableRun) -> Release:
             name = output.resolve().name
@@ -153,7 +153,7 @@ def fit_command(
             data = rig_data(rig, rig.problem(models), seed=settings.training.seed)
         else:
             data = _presses(dataset, sensor, probes, radius)
-    check_target(output, version, data.sensor.electrode_names)
+    target = check_target(output, version, data.sensor.electrode_names)
     caution_of_stress(data.sensor.film, map(parse_probe, data.probes), data.domain.force_range[1])
 
     def train(run: ResumableRun) -> Release:

@@ -218,6 +218,6 @@ def _good_presses(source: FilmsSource, presses: int, seed: int, job: tuple[int, 
     number, parameters = job
     contact = draw_contacts(np.random.default_rng([seed, 5, number]), source.domain, presses)
     charge, slopes = linearised(source.charge_map(parameters), contact)
-    basis = np.linalg.qr(slopes * source.domain.scale / source.noise.sigma(charge)[:, :, None])[0]
+    basis = np.linalg.qr(slopes / source.noise.sigma(charge)[:, :, None])[0]
     across = np.eye(charge.shape[1]) - basis @ basis.transpose(0, 2, 1)
     return np.concatenate([charge[:, :, None], across], axis=2)

@@ -29,8 +29,6 @@ from isocharge.train.films.films_data import (
     draw_film_presses,
     draw_misfit_films,
     draw_near_films,
-    gains_of,
-    part_factors,
 )
 from isocharge.train.films.films_model import ConditionalWeights, FilmsModel
 from isocharge.train.training.descent import Descent, TrainingStage
@@ -207,13 +205,12 @@ def contact_stage(
         of: np.ndarray, rows: np.ndarray, parameters: Array, random: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, log standard deviation and truth in unit coordinates, each (n, 3), of noisy charges."""
-        parts = torch.from_numpy(presses.response[of[:, None], rows])
-        factors = as_tensor(part_factors(parameters))[:, None, :, None]
-        clean = (parts @ factors)[..., 0] * as_tensor(gains_of(parameters))[:, None]
-        out = part(inputs.values(with_fresh_noise(clean, noise, random), parameters), inputs.context(parameters))
+        drawn = FilmPresses(parameters, presses.contact[of[:, None], rows], presses.response[of[:, None], rows])
+        noisy = with_fresh_noise(as_tensor(drawn.charge()), noise, random)
+        out = part(inputs.values(noisy, parameters), inputs.context(parameters))
         rotation, offset = as_tensor(scaling.rotation(parameters)), as_tensor(scaling.offset(parameters))
         mean = torch.baddbmm(offset[:, None], out[..., :3], rotation.transpose(1, 2))
-        unit = as_tensor(scaling.domain.to_unit(presses.contact[of[:, None], rows].reshape(-1, 3)))
+        unit = as_tensor(scaling.domain.to_unit(drawn.contact.reshape(-1, 3).astype(float)))
         return mean.reshape(-1, 3), out[..., 3:].reshape(-1, 3), unit
 
     def loss(step: int, random: torch.Generator) -> Tensor:

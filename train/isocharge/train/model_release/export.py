@@ -205,12 +205,11 @@ def _compare(
     answers = exact(charge.astype(float))
     least = np.maximum(floors, OF_STD * answers[1])
     for mine, (name, theirs) in zip(answers, run(session, charge).items(), strict=True):
-        unit, limit = least if name in ("contact", "contact_std") else 1.0, AGREEMENT[name]
+        unit = least if name in ("contact", "contact_std") else 1.0
         apart = np.max(np.abs(mine - theirs) / np.maximum(np.abs(mine), unit), axis=1)
-        nearly_all, all_of_them = float(np.quantile(apart, NEARLY_ALL)), float(apart.max())
-        if not (nearly_all <= slack * limit and all_of_them <= ABSURD * limit):
+        got, allowed = np.quantile(apart, [NEARLY_ALL, 1.0]), np.array([slack, ABSURD]) * AGREEMENT[name]
+        if not (got <= allowed).all():
             raise TrainingError(
-                f"the exported graph disagrees with the network on {name}: expected at most {slack * limit:g} for "
-                f"{NEARLY_ALL:.1%} of the charges and {ABSURD * limit:g} for all, got {nearly_all:.3g} and "
-                f"{all_of_them:.3g}"
+                f"the exported graph disagrees with the network on {name}: expected at most {allowed[0]:g} for "
+                f"{NEARLY_ALL:.1%} of the charges and {allowed[1]:g} for all, got {got[0]:.3g} and {got[1]:.3g}"
             )

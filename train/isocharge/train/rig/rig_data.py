@@ -14,7 +14,6 @@ from isocharge.common.files import sha256_of
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text
 from isocharge.simulate import Dataset, Domain, ForwardMap, Probe, Samples, Sensor, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
-from isocharge.train.calibration.film_charges import CONTACT_STEPS
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.presses import (
     SOLVER,
@@ -105,11 +104,7 @@ def rig_data(rig: Rig, problem: CalibrationProblem | None, *, drawn: int = DRAWN
 def _domain(rig: Rig, problem: CalibrationProblem | None) -> Domain:
     if problem is None:
         return Domain(rig.radius, DEFAULT_FORCE_RANGE)
-    of_network, of_films, (step, _, log_step) = problem.domain, problem.charges.domain, CONTACT_STEPS
-    radius = min(rig.radius, of_network.radius, of_films.radius - step)
-    low = max(of_network.force_range[0], of_films.force_range[0] * float(np.exp(log_step)))
-    high = min(of_network.force_range[1], of_films.force_range[1] / float(np.exp(log_step)))
-    return Domain(float(f"{radius:.6g}"), (low, high))
+    return Domain(min(rig.radius, problem.domain.radius), problem.domain.force_range)
 
 
 def _usable(rig: Rig, domain: Domain) -> MeasuredPresses:

@@ -208,13 +208,13 @@ def _train_members(
 
     start = {name: weight.clone() for name, weight in members[0].contact.state_dict().items()}
     best = descend(0, steps)
-    while 2 * steps <= config.steps:
+    while (doubled := 2 * steps) <= config.steps:
         members[0].contact.load_state_dict(start)
-        longer = descend(0, 2 * steps)
+        longer = descend(0, doubled)
         if longer.best >= best.best:
             members[0].contact.load_state_dict(best.best_weights)
             break
-        best, steps = longer, 2 * steps
+        best, steps = longer, doubled
     for number in range(1, len(members)):
         descend(number, steps)
     return steps
