@@ -14,8 +14,7 @@ from isocharge.common.number_text import number_of
 def test_a_file_is_read_whole(tmp_path):
     path = tmp_path / "file"
     path.write_bytes(b"12345")
-    assert read_whole(path) == b"12345"
-    assert read_whole(path, 5) == b"12345"
+    assert read_whole(path) == read_whole(path, 5) == b"12345"
     with pytest.raises(OSError, match="larger than 4 bytes"):
         read_whole(path, 4)
 

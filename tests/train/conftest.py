@@ -4,7 +4,7 @@ import pytest
 
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Sweep, load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
-from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, TrainingData, fit
+from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, TrainingData, fit
 from isocharge.train.training import fit as fit_module
 from isocharge.train.training.fit import train_network
 from kept import kept
@@ -49,3 +49,9 @@ def fitted(dataset, trained):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "train_network", lambda *_, **__: trained)
         return fit(dataset, QUICK)
+
+
+@pytest.fixture(scope="session")
+def problem():
+    """What a calibration of the four-electrode sensor knows before its presses."""
+    return CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))

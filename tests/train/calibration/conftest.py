@@ -26,11 +26,6 @@ def layout(request) -> CalibrationProblem:
     return CalibrationProblem.of(load_sensor(request.param), Circle(1.0))
 
 
-@pytest.fixture(scope="session")
-def problem() -> CalibrationProblem:
-    return CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
-
-
 def rig(problem, count, seed, position_std_mm=0.1, force_std=0.01) -> tuple[np.ndarray, MeasuredPresses]:
     """A film drawn from the prior, and presses on it: noisy charges, and places and forces as a rig reads them."""
     rng = np.random.default_rng(seed)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from isocharge.serve import MeasuredPresses
-from isocharge.simulate import Circle, Domain, load_sensor
-from isocharge.train import CalibrationProblem
+from isocharge.simulate import Domain
 from isocharge.train.data.presses import draw_contacts
 
 DOMAIN = Domain(7.5, (0.06, 1.9))
@@ -27,11 +26,6 @@ def measured(truth, count, share=1.0, seed=3):
     contact[:, 2] *= np.exp(0.005 * rng.standard_normal(count))
     stds = np.full(count, 0.05), np.full(count, 0.005)
     return MeasuredPresses(contact, charge, *stds, truth.electrodes, tuple(range(2, count + 2)))
-
-
-@pytest.fixture(scope="session")
-def problem():
-    return CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
 
 
 @pytest.fixture(scope="session")
