@@ -9,8 +9,9 @@ whose coefficients have mean zero and the standard deviation s FADING^(i + j + m
 electrodes share, COMMON times as large: where a film is stiffer than its parameters say, all charges are smaller. The
 size s is not known. Neither is whether the whole session had a common offset of the charges (a bad tare), charges that
 drifted, or charges and forces that were not read together (a leak between them, a load cell that lags). Every
-combination is a hypothesis; the presses weigh them by how well each predicts them (the evidence of a linear Gaussian
-model, MacKay 1992), and what is known is the mixture.
+combination is a hypothesis, and so are traces that are not described, in a session without any of these; the presses
+weigh them by how well each predicts them (the evidence of a linear Gaussian model, MacKay 1992), and what is known is
+the mixture.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
