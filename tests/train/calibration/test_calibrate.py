@@ -12,6 +12,8 @@ from tests.train.calibration.conftest import presses_of, rig
 
 from isocharge.common.errors import ModelError, PressError, SceneError
 from isocharge.simulate import Circle, Polygon, load_sensor, press, touch_charge
+from isocharge.simulate.forward.film_modes import MODES
+from isocharge.simulate.sensor.film_prior import SHARED
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.simulate.solver.stress_limit import largest_stress
 from isocharge.train import CalibrationProblem, calibrate, next_presses
@@ -48,18 +50,20 @@ def test_derivatives_are_those_of_the_charges(layout):
     np.testing.assert_allclose(by_contact / size[:, :, None], by_map / size[:, :, None], atol=2e-3)
 
 
-@pytest.mark.parametrize("name", ["pretension", "young", "thickness"])
-def test_derivatives_contain_what_a_parameter_does_to_the_modes(problem, name):
+@pytest.mark.parametrize(
+    ("names", "besides"),
+    [(("pretension", "young", "thickness"), [1.5, -1.0, 1.5]), (SHARED, [0.0] * len(MODES) + [0.2, 0.9, -0.1] * 4)],
+    ids=["modes", "traces"],
+)
+def test_derivatives_contain_what_a_parameter_does_to_the_rest(problem, names, besides):
     charges, rng = problem.charges, np.random.default_rng(4)
-    names = [*charges.prior.names, *charges.modes]
     film, at = problem.before.parameters, draw_contacts(rng, problem.domain.within(7.0), 6)
-    unknowns = np.pad(np.append(film, [1.5, -1.0, 1.5]), (0, charges.n_coefficient - 3))
-    step = 0.01 * np.eye(unknowns.size)[names.index(name)]
-    change = step * np.pad(charges.prior.std, (0, charges.n_coefficient), constant_values=1.0)
-    size = charges.charges(unknowns, at)
-    expected = (charges.charges(unknowns + change, at) - charges.charges(unknowns - change, at)) / 0.02
-    found = charges.by_parameter(unknowns, at, charges.by_contact(unknowns, at))[:, :, names.index(name)]
-    np.testing.assert_allclose(found / size, expected / size, atol=1e-3)
+    unknowns = np.pad(np.append(film, besides), (0, charges.n_coefficient - len(besides)))
+    size, found = charges.charges(unknowns, at), charges.by_parameter(unknowns, at, charges.by_contact(unknowns, at))
+    for number, name in enumerate(names):
+        change = np.pad(0.01 * np.diag(charges.prior.std)[number], (0, charges.n_coefficient))
+        expected = (charges.charges(unknowns + change, at) - charges.charges(unknowns - change, at)) / 0.02
+        np.testing.assert_allclose(found[:, :, number] / size, expected / size, atol=1e-3, err_msg=name)
 
 
 def test_it_is_the_minimum_of_the_joint_problem(problem, monkeypatch):
@@ -378,11 +382,11 @@ def test_what_no_film_explains_is_refused(problem):
 def test_proposed_presses_tell_more_than_random_ones(problem):
     """Of a film that may be imperfect, beyond those of the prior."""
     proposed, film = next_presses(problem, 8), problem.expected
-    sensitivity, before = ContactSensitivity.at(problem, film.unknowns), np.linalg.inv(film.joint)
+    sensitivity, nothing = ContactSensitivity.at(problem, film.unknowns), np.eye(len(film.joint))
 
     def left(at):
-        information = before + information_of(problem, film.unknowns, at).sum(axis=0)
-        return sensitivity.left(np.linalg.inv(information)).position_mm
+        told = information_of(problem, film.unknowns, at).sum(axis=0) @ film.joint
+        return sensitivity.left(film.joint @ np.linalg.inv(nothing + told)).position_mm
 
     expected = [press.position_mm for press in proposed]
     assert expected == sorted(expected, reverse=True)
@@ -479,3 +483,21 @@ def test_electrodes_with_traces_are_read_by_the_network_of_their_pads(problem):
     off = fitted.predict(np.array(charge))[0] - contact[:10]
     assert fitted.sensor.electrodes == sensor.electrodes
     assert np.hypot(off[:, 0], off[:, 1]).mean() < 0.1  # of the pads alone 0.9
+
+
+@pytest.mark.slow
+def test_traces_that_are_not_described_are_found_by_their_charge(problem):
+    """Of 0.5 and 0.3 mm, askew, by direct solves of a film that has them."""
+    rng = np.random.default_rng(5)
+    (sensor, probe), at = problem.prior.film(problem.prior.draw(rng, 1)[0]), draw_contacts(rng, problem.domain, 22)
+    a, b, c, d = sensor.electrodes
+    a, c = a.with_trace((a.centre, (38.0, 14.0)), 0.5), c.with_trace((c.centre, (-40.0, -2.0)), 0.3)
+    film = replace(sensor, electrodes=(a, b, c, d))
+    charge = np.array([touch_charge(film, press(film.film, probe, (x, y), force)) for x, y, force in at])
+    result = calibrate(presses_of(problem, at[:16], problem.noise.add(charge[:16], rng)), problem)
+    found = problem.charges.trace_widths(result.posterior.unknowns, result.posterior.joint)
+    for (width, std), true in zip(found.values(), (0.5, 0.0, 0.3, 0.0), strict=True):
+        assert abs(width - true) < min(3.0 * std, 0.2)
+    off = problem.charges.charges(result.posterior.unknowns, at[16:]) / charge[16:] - 1.0
+    assert np.sqrt(np.mean(off**2)) < 0.02
+    assert re.search(r"traces to the rim of this width would: A 0\.\d+ mm, C 0\.\d+ mm\.", " ".join(result.summary))

@@ -187,7 +187,7 @@ class ForwardMap:
                 charge[chunk] = self._charges(at[chunk], contact[chunk, 2], orientation[chunk])
         return charge
 
-    def by_field(self, contact: Array, odd: Booleans) -> Array:
+    def by_field(self, contact: Array, odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
         """Charges of several fields of stress in one table, each at its nodes in turn, under a round probe.
 
         These are corrections: the coarse rule is used everywhere, and neither pressure on electrodes nor crosstalk is
@@ -196,38 +196,45 @@ class ForwardMap:
         Args:
             contact: Presses of the domain, shape (n, 3), mm and N.
             odd: Which fields are odd about the direction of the press, shape (n_field,).
+            readout: What collects; the electrodes if absent.
 
         Returns:
             Shape (n, n_electrode, n_field), pC.
         """
-        at = contact[:, 0] + 1j * contact[:, 1]
-        near = np.zeros((at.size, len(self.electrodes)), dtype=bool)
+        at, readout = contact[:, 0] + 1j * contact[:, 1], readout or self._readouts[1]
+        every = np.ones((at.size, len(readout.count)), dtype=bool)
         with single_threaded_blas():
             parts = [
-                self._by_field(at[chunk], contact[chunk, 2], np.zeros(1), odd, near[chunk])
+                self._by_field(at[chunk], contact[chunk, 2], np.zeros(1), odd, ((readout, every[chunk]),))
                 for chunk in (slice(start, start + CHUNK) for start in range(0, at.size, CHUNK))
             ]
         return np.concatenate(parts)
 
     def _charges(self, at: Complexes, force: Array, orientation: Array) -> Array:
         """Charges of one chunk of presses, shape (n, n_electrode)."""
-        near = self._near(at)
-        charge: Array = self._by_field(at, force, orientation, EVEN, near)[..., 0]
+        near, (fine, coarse) = self._near(at), self._readouts
+        charge: Array = self._by_field(at, force, orientation, EVEN, ((fine, near), (coarse, ~near)))[..., 0]
         if self.sensor.piezo.d33 != 0.0:
             for i in np.flatnonzero(near.any(axis=1)):
                 probe = self.probe.rotated(float(orientation[i]))
                 charge[i] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])
         return self.sensor.calibration.read(charge)
 
-    def _by_field(self, at: Complexes, force: Array, orientation: Array, odd: Booleans, near: Booleans) -> Array:
-        """Charges of the fields of one chunk of presses, (n, n_electrode, n_field); the fine rule where `near`."""
+    def _by_field(
+        self,
+        at: Complexes,
+        force: Array,
+        orientation: Array,
+        odd: Booleans,
+        rules: tuple[tuple[ReadoutPoints, Booleans], ...],
+    ) -> Array:
+        """Charges of the fields of one chunk of presses, (n, n_electrode, n_field); each rule where it is chosen."""
         rotation = orientation - np.angle(at)
         field = self.family.weights(np.abs(at), force, rotation) @ self.table
         mesh = template_for(self.probe, self.resolution)
         placement = Placement.of(mesh, self.probe, np.abs(at), self.sensor.film.radius, self.layer, rotation)
-        charge = np.empty((at.size, len(self.sensor.electrodes), odd.size))
-        fine, coarse = self._readouts
-        for readout, chosen in ((fine, near), (coarse, ~near)):
+        charge = np.empty((*rules[0][1].shape, odd.size))
+        for readout, chosen in rules:
             for count in np.unique(readout.count):
                 press_index, electrode = np.nonzero(chosen & (readout.count == count))
                 charge[press_index, electrode] = self._read(

@@ -34,6 +34,9 @@ DIRECT, FINE, COARSE = 20, 12, 4
 The stress has a kink on the footprint's edge; where that crosses an electrode 20 points leave 1e-5, 12 leave 8e-5.
 """
 
+ALONG = 8
+"""Gauss points along a line."""
+
 NEAR = 3.0
 """Distance from the probe's edge to an electrode below which the fine rule is used, mm."""
 
@@ -64,6 +67,25 @@ class ReadoutPoints:
         per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
         weights = (sensor.gains * areas)[:, None, None] * shares * per_stress
         return cls(sensor.calibration.place(points), weights, count)
+
+    @classmethod
+    def along(cls, sensor: Sensor, lines: Array) -> "ReadoutPoints":
+        """Points along straight lines of metal that belong to the electrodes, each read by itself.
+
+        Args:
+            sensor: Its coefficients and calibration are used.
+            lines: Ends on the layout, shape (n_electrode, n_line, 2, 2), mm.
+
+        Returns:
+            For n_electrode * n_line lines, those of an electrode in turn; weights are per mm of width, pC/(MPa mm).
+        """
+        at, share = gauss_line(ALONG)
+        start, step = lines[:, :, :1], lines[:, :, 1:] - lines[:, :, :1]
+        points = start + at[:, None] * step
+        weights = sensor.gains[:, None, None] * np.linalg.norm(step, axis=3) * share
+        per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
+        placed = sensor.calibration.place(points.reshape(-1, ALONG, 2))
+        return cls(placed, weights.reshape(-1, ALONG, 1) * per_stress, np.full(len(placed), ALONG))
 
     def charge(self, stress: Array) -> Array:
         """Charges (..., n_electrode), pC, from stress at the points, shape (..., n_electrode, n_point, 3), MPa."""

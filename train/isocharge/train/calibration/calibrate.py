@@ -49,6 +49,9 @@ EDGE = 0.1
 MORE = 30
 """Presses of which it is said what they would reach, where a film has what no parameter describes."""
 
+SEEN = 2.0
+"""Standard deviations of a trace's width from which on it is named."""
+
 CLOSE_MM = 1.0
 """Presses that all lie within this distance of each other do not identify places: said."""
 
@@ -182,6 +185,13 @@ class CalibrationResult:
             f"smoothly over the film: {self.left.position_mm:.2g} mm are left now. {MORE} more presses would reach "
             f"{more[-1].position_mm:.2g} mm, the first of them {places}; --next lists more."
         )
+        if self.posterior.probability("traces") > PROBABLE:
+            widths = self.problem.charges.trace_widths(self.posterior.unknowns, self.posterior.joint)
+            seen = [f"{name} {width:.2g} mm" for name, (width, std) in widths.items() if width > SEEN * std]
+            yield (
+                f"Most of it is that electrodes collect beyond their pads, as traces to the rim of this width would: "
+                f"{', '.join(seen)}. Described in the sensor file, they leave less."
+            )
 
 
 def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:

@@ -9,8 +9,9 @@ whose coefficients have mean zero and the standard deviation s FADING^(i + j + m
 electrodes share, COMMON times as large: where a film is stiffer than its parameters say, all charges are smaller. The
 size s is not known. Neither is whether the whole session had a common offset of the charges (a bad tare), charges that
 drifted, or charges and forces that were not read together (a leak between them, a load cell that lags). Every
-combination is a hypothesis; the presses weigh them by how well each predicts them (the evidence of a linear Gaussian
-model, MacKay 1992), and what is known is the mixture.
+combination is a hypothesis, and so are traces that are not described, in a session without any of these; the presses
+weigh them by how well each predicts them (the evidence of a linear Gaussian model, MacKay 1992), and what is known is
+the mixture.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -43,6 +44,13 @@ IMPERFECT = {0.0: 0.5, 1.0: 0.5}
 
 SIZES = {0.0: 0.5, 0.003: 0.1, 0.01: 0.15, 0.03: 0.15, 0.1: 0.1}
 """Sizes s that are weighed, dimensionless, with what each is believed to beforehand."""
+
+TRACED = 0.01
+"""Probability beforehand of traces that collect and are not described."""
+
+TRACE_ANGLES = (-45.0, 0.0, 45.0)
+"""Directions of the lines along which the trace of an electrode may lie, degrees from the outward one: for presses
+within the working area a trace in between is a sum of these, to half of the noise."""
 
 OFFSETS_PC = {0.0: 0.9, 30.0: 0.1}
 """The same for the standard deviation of a common offset of all charges, pC."""
@@ -92,6 +100,7 @@ class Hypothesis:
         drift: Standard deviation of a drift of the charges, a share.
         scatter: Standard deviation of stated forces besides what they are said to have, a share.
         belief: Probability before the presses.
+        traces: Size of the traces that are not described over what films have, dimensionless.
     """
 
     modes: float = 0.0
@@ -100,13 +109,15 @@ class Hypothesis:
     drift: float = 0.0
     scatter: float = 0.0
     belief: float = 1.0
+    traces: float = 0.0
 
     def covariance(self, n_parameter: int, n_mode: int, n_electrode: int) -> Array:
         """What it adds to the covariance of parameters, coefficients and `NUISANCES`, (n_unknown, n_unknown)."""
         together = np.eye(n_electrode) + COMMON**2
         of_terms = self.size**2 * np.kron(np.eye(term_count()), together)
         known, of_modes = np.zeros((n_parameter, n_parameter)), self.modes**2 * np.eye(n_mode)
-        return np.asarray(block_diag(known, of_modes, of_terms, 0.0, self.offset**2, self.drift**2))
+        of_traces = self.traces**2 * np.eye(n_electrode * len(TRACE_ANGLES))
+        return np.asarray(block_diag(known, of_modes, of_traces, of_terms, 0.0, self.offset**2, self.drift**2))
 
 
 def hypotheses() -> Iterator[Hypothesis]:
@@ -116,6 +127,9 @@ def hypotheses() -> Iterator[Hypothesis]:
     ):
         if modes == 0.0 or size > 0.0:  # to first order modes are never the whole
             yield Hypothesis(modes, size, offset, drift, scatter, a * b * c * d * e)
+    for size, belief in SIZES.items():
+        if size > 0.0:
+            yield Hypothesis(modes=1.0, size=size, belief=TRACED * belief, traces=1.0)
 
 
 class Linearised(NamedTuple):
@@ -156,14 +170,14 @@ class Linearised(NamedTuple):
     def given(self, covariance: Array) -> tuple[float, Array, Array]:
         """Logarithm of the evidence, mean and covariance of the unknowns, for a covariance before the presses."""
         active = np.diag(covariance) > 0.0
-        root, wide = np.zeros_like(covariance), np.ix_(active, active)
-        root[wide] = np.linalg.cholesky(covariance[wide])
-        inner = np.eye(len(root)) + root.T @ self.normal @ root
-        factor = np.linalg.cholesky(inner)
-        pull = root.T @ self.moment
+        wide = np.ix_(active, active)
+        root, mean, after = np.linalg.cholesky(covariance[wide]), np.zeros(len(active)), np.zeros_like(covariance)
+        factor = np.linalg.cholesky(np.eye(len(root)) + root.T @ self.normal[wide] @ root)
+        pull = root.T @ self.moment[active]
         step = cho_solve((factor, True), pull)
         evidence = -0.5 * (self.square - pull @ step) - np.log(np.diag(factor)).sum()
-        return float(evidence), -root @ step, root @ cho_solve((factor, True), root.T)
+        mean[active], after[wide] = -root @ step, root @ cho_solve((factor, True), root.T)
+        return float(evidence), mean, after
 
 
 class Mixture(NamedTuple):

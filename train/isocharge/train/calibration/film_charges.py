@@ -15,9 +15,12 @@ from isocharge.simulate import Circle, Film, ForwardMap, Probe, Sensor
 from isocharge.simulate.forward.charge_map import Domain, FunctionMap, differences
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.forward.film_modes import MODES, ModeMap
+from isocharge.simulate.forward.forward_map import EVEN
+from isocharge.simulate.forward.readout import ReadoutPoints
 from isocharge.simulate.numerics.disk import onto_disk
+from isocharge.simulate.numerics.polygon import area_of
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
-from isocharge.train.calibration.discrepancy import term_count, terms
+from isocharge.train.calibration.discrepancy import TRACE_ANGLES, term_count, terms
 
 STEP = 0.005
 """Step of the differences by a parameter, in standard deviations of its prior: the map is smooth on that scale."""
@@ -44,6 +47,12 @@ MODE_STDS = {
     "stiffening": 0.3,
 }
 """Standard deviations of the modes over films that have imperfections, in their units."""
+
+TRACE_STD_MM = 0.5
+"""Standard deviation of the width of a trace that is not described, mm."""
+
+TRACE_END = 0.93
+"""Distance from the centre at which such traces end, over the film's radius: four millimetres matter little."""
 
 UNEVEN, MOST_UNEVEN = ("tension_difference", "tension_shear"), 0.9
 """Modes that act on all charges alike to second order, and the largest square of theirs over that of the mean tension:
@@ -112,7 +121,44 @@ class FilmCharges:
     @property
     def n_coefficient(self) -> int:
         """Number of coefficients after the parameters."""
-        return len(self.modes) + term_count() * len(self.prior.sensor.electrodes)
+        return self.n_mode + term_count() * len(self.prior.sensor.electrodes)
+
+    @property
+    def n_mode(self) -> int:
+        """Number of modes and of lines of traces, the first of the coefficients."""
+        return len(self.modes) + len(TRACE_ANGLES) * len(self.prior.sensor.electrodes)
+
+    @cached_property
+    def _lines(self) -> Array:
+        """Ends of the lines along which traces may lie, shape (n_electrode, n_line, 2, 2), mm."""
+        electrodes, end = self.prior.sensor.electrodes, TRACE_END * self.prior.sensor.film.radius
+        centre = np.array([complex(*e.centre) for e in electrodes])[:, None]
+        reach = np.sqrt([area_of(np.array(e.corners)) / np.pi for e in electrodes])[:, None]
+        direction = np.exp(1j * (np.angle(centre) + np.deg2rad(TRACE_ANGLES)))
+        along = (centre.conj() * direction).real
+        to_rim = np.sqrt(along**2 + end**2 - np.abs(centre) ** 2) - along
+        ends = centre[:, :, None] + np.stack([reach * direction, to_rim * direction], axis=2)
+        return np.stack([ends.real, ends.imag], axis=3)
+
+    def _by_trace(self, forward_map: ForwardMap, contact: Array) -> Array:
+        """Charges of the lines, `TRACE_STD_MM` wide, shape (n, n_electrode, n_electrode * n_line), pC."""
+        n, count = len(contact), len(self.prior.sensor.electrodes)
+        of_width = forward_map.by_field(contact, EVEN, ReadoutPoints.along(forward_map.sensor, self._lines))
+        own = TRACE_STD_MM * of_width.reshape(n, count, 1, -1) * np.eye(count)[:, :, None]
+        return np.asarray(own.reshape(n, count, -1))
+
+    def trace_widths(self, unknowns: Array, covariance: Array) -> dict[str, tuple[float, float]]:
+        """Width of the trace of each electrode beyond what is described of it, and its standard deviation, mm.
+
+        Args:
+            unknowns: Of a film, shape (n_parameter + n_coefficient,).
+            covariance: Of them, parameters over their prior standard deviations.
+        """
+        n, names = len(self.prior.names), self.prior.sensor.electrode_names
+        lines = slice(n + len(self.modes), n + self.n_mode)
+        of_each = TRACE_STD_MM * np.eye(len(names)).repeat(len(TRACE_ANGLES), axis=1)
+        std = np.sqrt(np.diag(of_each @ covariance[lines, lines] @ of_each.T))
+        return dict(zip(names, zip((of_each @ unknowns[lines]).tolist(), std.tolist(), strict=True), strict=True))
 
     def forward_map(self, parameters: Array) -> ForwardMap:
         """The forward map of one film without a discrepancy, parameters of shape (n_parameter,).
@@ -142,7 +188,7 @@ class FilmCharges:
         return FunctionMap(charges, forward_map.electrodes, self.domain)
 
     def factor(self, unknowns: Array, contact: Array, charge: Array | None = None) -> Array:
-        """Factors of modes and discrepancy on a film's charges, shape (n, n_electrode).
+        """Factors of modes, traces and discrepancy on a film's charges, shape (n, n_electrode).
 
         Args:
             unknowns: As `film` takes them.
@@ -150,13 +196,17 @@ class FilmCharges:
             charge: Charges without them, if they are known.
         """
         n = len(self.prior.names)
-        of_modes, shares = np.split(unknowns[n:], [len(self.modes)])
+        of_modes, of_traces, shares = np.split(unknowns[n:], [len(self.modes), self.n_mode])
         factor = np.ones((len(contact), len(self.prior.sensor.electrodes)))
-        if np.abs(of_modes).max(initial=0.0) > NEGLIGIBLE:
-            charge = self.forward_map(unknowns[:n]).charges(contact) if charge is None else charge
-            modes = self._by_mode(unknowns[:n], contact, charge)
-            factor += modes.by_mode @ of_modes / charge
-            factor *= np.exp(self._unevenness(unknowns[0], of_modes)[0] * modes.of_uneven)
+        if np.abs(unknowns[n : n + self.n_mode]).max(initial=0.0) > NEGLIGIBLE:
+            forward_map = self.forward_map(unknowns[:n])
+            charge = forward_map.charges(contact) if charge is None else charge
+            if np.abs(of_traces).max() > NEGLIGIBLE:
+                factor += self._by_trace(forward_map, contact) @ of_traces / charge
+            if np.abs(of_modes).max(initial=0.0) > NEGLIGIBLE:
+                modes = self._by_mode(unknowns[:n], contact, charge)
+                factor += modes.by_mode @ of_modes / charge
+                factor *= np.exp(self._unevenness(unknowns[0], of_modes)[0] * modes.of_uneven)
         if shares.any():
             factor = np.maximum(factor, LEAST_FACTOR) * np.exp(
                 terms(contact, self.domain) @ shares.reshape(term_count(), -1)
@@ -242,21 +292,24 @@ class FilmCharges:
             return np.asarray(of_film)
         factor = self.factor(unknowns, contact, charge)[:, :, None]
         of_film[:, :, :3] += charge[:, :, None] * self._by_load(unknowns, contact) * self.prior.std[:3]
+        if np.abs(coefficients[len(self.modes) : self.n_mode]).max() > LITTLE:
+            of_film[:, :, 3 : len(SHARED)] += charge[:, :, None] * self._by_place(unknowns, contact)
         of_film *= factor
         modes = self._by_mode(parameters, contact, charge)
+        by_trace = self._by_trace(film, contact)
         by_uneven = self._unevenness(parameters[0], coefficients[: len(self.modes)])[1]
         of_tension = np.isin(self.modes, UNEVEN)  # as the pretension, they count over E
         of_modes = modes.by_mode + factor * (charge * modes.of_uneven)[:, :, None] * by_uneven
         of_film[:, :, 1] -= of_modes @ (coefficients[: len(self.modes)] * of_tension) * self.prior.std[1]
         of_terms = (factor * own)[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
-        return np.asarray(np.concatenate([of_film, of_modes, of_terms.reshape(*charge.shape, -1)], axis=2))
+        return np.asarray(np.concatenate([of_film, of_modes, by_trace, of_terms.reshape(*charge.shape, -1)], axis=2))
 
     def _by_load(self, unknowns: Array, contact: Array) -> Array:
         """Derivatives of ln Q of what the modes do by pretension, ln E and ln h, shape (n, n_electrode, 3).
 
         They are functions of F / (E h a) and T / E, as the charges are.
         """
-        film = np.where(np.arange(unknowns.size) < len(self.prior.names) + len(self.modes), unknowns, 0.0)
+        film = np.where(np.arange(unknowns.size) < len(self.prior.names) + self.n_mode, unknowns, 0.0)
         if np.abs(film[len(self.prior.names) :]).max() < LITTLE:
             return np.zeros((len(contact), len(self.prior.sensor.electrodes), 3))
         change = (-STEP if film[0] > self.prior.mean[0] else STEP) * self.prior.std[0]
@@ -265,6 +318,21 @@ class FilmCharges:
         tauter = self.factor(np.append(film[0] + change, film[1:]), contact)
         by_force, by_tension = (stronger - factor) / CONTACT_STEPS[2], (tauter - factor) / change
         columns = [by_tension, -by_force - film[0] * by_tension, -by_force]
+        return np.asarray(np.stack(columns, axis=2) / np.maximum(factor, LEAST_FACTOR)[:, :, None])
+
+    def _by_place(self, unknowns: Array, contact: Array) -> Array:
+        """Derivatives of ln Q of what traces do by the coefficients, place and probe over their prior's deviations.
+
+        Shape (n, n_electrode, 6). A trace is not where its electrode is, so it answers otherwise.
+        """
+        film, n = np.zeros_like(unknowns), len(self.prior.names)
+        film[:n], of_traces = unknowns[:n], slice(n + len(self.modes), n + self.n_mode)
+        film[of_traces] = unknowns[of_traces]
+        factor, columns = self.factor(film, contact), []
+        for number in range(3, len(SHARED)):
+            moved, step = film.copy(), -STEP if film[number] > self.prior.mean[number] else STEP
+            moved[number] += step * self.prior.std[number]
+            columns.append((self.factor(moved, contact) - factor) / step)
         return np.asarray(np.stack(columns, axis=2) / np.maximum(factor, LEAST_FACTOR)[:, :, None])
 
     def _by_step(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:

@@ -208,21 +208,22 @@ class CalibrationProblem:
     ) -> Fitted:
         """The network of a film, arguments as `FilmsModel.film` takes them.
 
-        What the described electrodes have that the network's do not have is one more factor: its mean counts as gains,
-        and the network's last layer is changed for the rest. Only one for `release` learns correlations and is judged.
+        The charges of the film over those of the network's, its factor and what only the described electrodes have,
+        count as gains as far as they are the same everywhere; the network's last layer is changed for the rest. Only
+        one for `release` learns correlations and is judged.
         """
         about: dict[str, Any] = {} if release else {"correlation": False, "fresh": 0}
-        if self.prior is self.films.prior:
-            return self.films.film(parameters, left=left, factor=factor, **about)
         described, own = self.charges.forward_map(parameters), self.films.forward_map(parameters)
-        scaled = parameters.copy()
-        scaled[len(SHARED) :] += np.log(described.charges(left[0]) / own.charges(left[0])).mean(axis=0)
 
-        def over_network(contact: Array) -> Array:
-            of_network = self.films.forward_map(scaled).charges(contact)
-            return np.asarray(factor(contact) * described.charges(contact) / of_network)
+        def over_own(contact: Array) -> Array:
+            if self.prior is self.films.prior:
+                return factor(contact)
+            return np.asarray(factor(contact) * described.charges(contact) / own.charges(contact))
 
-        fitted = self.films.film(scaled, left=left, factor=over_network, **about)
+        alike = bool(self.sensor.calibration.crosstalk)  # which gains of each electrode would change
+        gains, scaled = np.median(over_own(left[0]), axis=None if alike else 0), parameters.copy()
+        scaled[len(SHARED) :] += np.log(gains)
+        fitted = self.films.film(scaled, left=left, factor=lambda contact: over_own(contact) / gains, **about)
         return replace(fitted, sensor=described.sensor)
 
     @property
