@@ -88,8 +88,8 @@ def test_check_takes_the_rig_s_uncertainty(measured, models, command):
     assert (values["position_mm"]["rig"], values["force_percent"]["rig"]) == pytest.approx((0.4 * 2**0.5, 5.0))
     assert values["force_percent"]["rms"] == pytest.approx(100 * (1 / 0.97 - 1), rel=1e-3)
     row = values["each"][0]
-    shares = row["noise_std_percent"], row["force_std_percent"]
-    assert shares == pytest.approx((100 * row["force_std_N"] / (0.97 * row["force_N"]), 5.0))
+    noise = 100 * row["force_std_N"] / (0.97 * row["force_N"])
+    assert (row["noise_std_percent"], row["force_std_percent"]) == pytest.approx((noise, 5.0))
     assert values["model"] == "linear/1"
 
 
@@ -97,11 +97,9 @@ def test_check_of_many_presses_shows_the_worst(measured, models, command):
     """Of forces that are off by the same share these are the largest, for their noise is the least share."""
     words = ["serve", "check", "linear", measured(count=100, known="force_N", scale=0.97), "--models", models]
     out, values = command(*words)[1], json.loads(command(*words, "--json")[1])
-    worst = sorted(values["each"], key=lambda row: row["force_N"])[-40:]
-    rows = ["{line} {x_mm:.2f} {y_mm:.2f} {force_N:.3f} - {force_error_percent:.2f}".format(**row) for row in worst]
-    assert [" ".join(line.split()) for line in out.splitlines()[2:42]] == sorted(
-        rows, key=lambda row: int(row.split()[0])
-    )
+    worst = sorted(sorted(values["each"], key=lambda row: row["force_N"])[-40:], key=lambda row: row["line"])
+    form = "{line} {x_mm:.2f} {y_mm:.2f} {force_N:.3f} - {force_error_percent:.2f}"
+    assert [" ".join(line.split()) for line in out.splitlines()[2:42]] == [form.format(**row) for row in worst]
     per_degree = values["chi_squared_per_degree"]
     assert per_degree == pytest.approx(values["chi_squared"] / 100)
     assert f"per degree of freedom {per_degree:.3g} (100)" in out

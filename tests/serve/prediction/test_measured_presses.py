@@ -107,8 +107,7 @@ def test_unknown_values(read):
 
 def test_uncertainty_is_the_caller_s_where_the_file_has_none(read):
     presses = read(f"{HEADER},force_std\n1,2,3,4,5,6,0.003\n1,2,3,4,5,6,\n", position_std_mm=0.3, force_std=0.02)
-    assert presses.position_std_mm.tolist() == [0.3, 0.3]
-    assert presses.force_std.tolist() == [0.003, 0.02]
+    assert (presses.position_std_mm.tolist(), presses.force_std.tolist()) == ([0.3, 0.3], [0.003, 0.02])
     plain = read(f"{HEADER}\n1,2,3,4,5,6\n")
     assert (plain.position_std_mm.tolist(), plain.force_std.tolist()) == ([0.1], [0.01])
 

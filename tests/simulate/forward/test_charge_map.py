@@ -49,8 +49,7 @@ def test_a_map_keeps_the_protocol(charge_map):
     """
     contact = contacts(charge_map.domain, share=0.7)
     charge, slope = charge_map.charges(contact), charge_map.derivatives(contact)
-    assert charge.shape == (60, len(charge_map.electrodes))
-    assert slope.shape == (*charge.shape, 3)
+    assert slope.shape == (*charge.shape, 3) == (60, len(charge_map.electrodes), 3)
     for axis, step in enumerate((0.02, 0.02, 1e-3)):
         ahead, behind = contact.copy(), contact.copy()
         ahead[:, axis] = contact[:, axis] + step if axis < 2 else contact[:, 2] * np.exp(step)

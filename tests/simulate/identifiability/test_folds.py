@@ -216,8 +216,7 @@ def test_the_nearest_contact_is_the_right_one(force, forces):
 
 def test_the_crease_bounds_the_working_area():
     working = working_area(creased(), REFERENCE, error=np.inf)
-    assert working.fold_radius == pytest.approx(CREASE, abs=0.06)
-    assert working.bound == "fold"
+    assert (working.bound, working.fold_radius) == ("fold", pytest.approx(CREASE, abs=0.06))
     assert working.radius == working.unambiguous_radius == pytest.approx(2.9, abs=0.11)
 
 

@@ -64,8 +64,7 @@ def test_theory_has_the_name_of_its_terms_and_is_found_by_it(film, terms, name):
 )
 def test_choose_theory_gives_the_fewest_terms(film, thickness, pretension, force, accuracy, name):
     theory = choose_theory(thick(film, thickness, pretension), PROBE, force, accuracy)
-    assert theory.name == name
-    assert theory.pretensioned == (pretension > 0.0)
+    assert (theory.name, theory.pretensioned) == (name, pretension > 0.0)
 
 
 @given(

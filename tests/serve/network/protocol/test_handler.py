@@ -342,8 +342,11 @@ def test_the_document_says_how_a_route_is_asked_and_what_it_answers(ask):
         status, headers, _ = ask(method.upper(), path.format(model="linear", version=1), body)
         assert (status, headers["content-type"].partition(";")[0]) == (200, kind), path
         assert item[method].get("requestBody", {}).get("required", False) == bool(body), path
-    names = {name: of["schema"]["enum"] for name, of in document["components"]["parameters"].items()}
-    assert names == {"model": ["linear"], "version": ["1", "2"]}
+    parameters = document["components"]["parameters"]
+    assert {name: of["schema"]["enum"] for name, of in parameters.items()} == {
+        "model": ["linear"],
+        "version": ["1", "2"],
+    }
 
 
 def test_binary_nan_is_refused_by_name(ask):
