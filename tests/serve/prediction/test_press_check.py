@@ -209,8 +209,9 @@ def test_common_part_is_the_weighted_mean():
         error = 0.3 + scatter * std * rng.normal(size=500)
         common = Common.of(np.append(error, np.nan), np.append(std, 1.0) ** 2)
         mean, weight = np.average(error, weights=std**-2, returned=True)
-        assert common.mean == pytest.approx(mean)
-        assert common.std == pytest.approx(scatter * weight**-0.5, rel=0.1)
+        widening = max(1.0, np.sum(((error - mean) / std) ** 2) / 499) ** 0.5  # as the Particle Data Group averages
+        assert (common.mean, common.std) == pytest.approx((mean, widening * weight**-0.5))
+        assert widening == pytest.approx(scatter, rel=0.1)
 
 
 def test_summary_of_known_numbers():
