@@ -120,8 +120,8 @@ def test_the_outline_is_that_of_the_area():
     place = np.stack(np.meshgrid(np.arange(11.0), np.arange(11.0)), axis=-1).reshape(-1, 2)
     assert sorted(map(tuple, outline(place))) == [(-0.5, -0.5), (-0.5, 10.5), (10.5, -0.5), (10.5, 10.5)]
     x, y = outline(contacts(2_000, 4)[:, :2]).T
-    area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
-    assert area == pytest.approx(1200.0, rel=0.05)
+    assert 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) == pytest.approx(1200.0, rel=0.05)
+    assert PressedArea.of(np.pad(place, ((0, 0), (0, 1)), constant_values=1.0)).radius == pytest.approx(5.5 * 2**0.5)
     with pytest.raises(PressError, match="expected presses over an area"):
         outline(np.column_stack([np.arange(9.0), np.arange(9.0)]))
 
