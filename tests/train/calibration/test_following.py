@@ -144,7 +144,7 @@ def test_a_film_that_stays_is_left_as_it_is(mine, problem, film):
     _, errors = follow(mine, problem, film, [1.0] * 80)
     _, alone = follow(mine, problem, film, [1.0] * 80, ask=lambda stream, _: stream.back())
     followed, alone = rms(errors), rms(alone)
-    np.testing.assert_array_less(followed, 1.05 * alone + [0.0, 0.4])  # gains may have drifted by 1 %
+    np.testing.assert_array_less(followed, np.hypot(1.05 * alone, [0.0, 0.75]))  # each gain may drift by 1 %; F ~ Q^1.5
 
 
 def test_a_replay_follows_and_goes_back_as_the_stream_did(mine, problem, film, tmp_path):

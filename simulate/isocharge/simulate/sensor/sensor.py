@@ -4,7 +4,7 @@ Frame: origin at the film's centre, x along the drawn direction (1), y transvers
 """
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import combinations
 from typing import Literal, get_args
 
@@ -223,13 +223,11 @@ class Sensor:
         if not set(gains) <= set(names):
             unknown = sorted(set(gains) - set(names))
             raise SensorError(f"calibration gain: no electrode named {shown(unknown)}, have {cut(str(names))}")
+        _check_layout(self.electrodes)
         for electrode in self.electrodes:
-            _check_electrode(electrode, self.film, self.calibration)
+            _check_on_film(electrode, self.film, self.calibration)
             if self.readout == "edge" and not electrode.square:
                 raise SensorError(f"readout 'edge' needs square electrodes, but {electrode.name!r} is a polygon")
-        for first, second in combinations(self.electrodes, 2):
-            if first.overlaps(second):
-                raise SensorError(f"electrodes {first.name!r} and {second.name!r} overlap; move one of them")
 
     @property
     def electrode_names(self) -> tuple[str, ...]:
@@ -290,33 +288,46 @@ def _check_name(name: str) -> None:
         raise SensorError(f"electrode {name!r}: this name means something else in files of charges; choose another one")
 
 
-def _check_electrode(electrode: Electrode, film: Film, calibration: Calibration) -> None:
-    """Refuse an electrode that cannot exist on a film.
+@lru_cache(maxsize=64)
+def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
+    """Refuse electrodes that cannot exist on any film; the many films of one layout are looked at once.
 
     Raises:
-        SensorError: If a polygon crosses itself, nothing collects, it is tiny, a square that is none, or not wholly on
-            the film.
+        SensorError: If a polygon crosses itself, nothing collects, one is tiny, a square is none, or two overlap.
     """
-    name, parts = f"electrode {electrode.name!r}", electrode.uncut
-    if not parts:
-        raise SensorError(f"{name}: its front and its back have no area in common, so nothing collects; move one")
-    corners = np.array(electrode.corners)
-    check_length(name, float(np.ptp(corners, axis=0).max()), LEAST_EXTENT, SensorError)
-    side = float(corners[1, 0] - corners[0, 0])
-    square = Electrode.of_square(electrode.name, electrode.centre, side).corners
-    alone = len(corners) == 4 and not (electrode.more or electrode.back)
-    if electrode.square and not (alone and np.allclose(corners, square, rtol=0.0, atol=1e-9 * side)):
-        raise SensorError(
-            f"{name}: expected the corners of a square along the axes, got {corners.tolist()} mm; make squares with "
-            "Electrode.of_square"
-        )
-    placed = calibration.place(np.concatenate(parts))
+    for electrode in electrodes:
+        name = f"electrode {electrode.name!r}"
+        if not electrode.uncut:
+            raise SensorError(f"{name}: its front and its back have no area in common, so nothing collects; move one")
+        corners = np.array(electrode.corners)
+        check_length(name, float(np.ptp(corners, axis=0).max()), LEAST_EXTENT, SensorError)
+        side = float(corners[1, 0] - corners[0, 0])
+        square = Electrode.of_square(electrode.name, electrode.centre, side).corners
+        alone = len(corners) == 4 and not (electrode.more or electrode.back)
+        if electrode.square and not (alone and np.allclose(corners, square, rtol=0.0, atol=1e-9 * side)):
+            raise SensorError(
+                f"{name}: expected the corners of a square along the axes, got {corners.tolist()} mm; make squares "
+                "with Electrode.of_square"
+            )
+    for first, second in combinations(electrodes, 2):
+        if first.overlaps(second):
+            raise SensorError(f"electrodes {first.name!r} and {second.name!r} overlap; move one of them")
+
+
+def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -> None:
+    """Refuse an electrode that does not lie wholly on a film.
+
+    Raises:
+        SensorError: If a part of it lies beyond the rim.
+    """
+    placed = calibration.place(np.concatenate(electrode.uncut))
     if not np.linalg.norm(placed, axis=1).max() < film.radius:
         x, y = placed.mean(axis=0)
         reach = np.linalg.norm(placed - placed.mean(axis=0), axis=1).max()
-        size = f"half side {_short(0.5 * side)} mm" if electrode.square else f"corners up to {_short(reach)} mm from it"
+        half = 0.5 * (electrode.corners[1][0] - electrode.corners[0][0])
+        size = f"half side {_short(half)} mm" if electrode.square else f"corners up to {_short(reach)} mm from it"
         raise SensorError(
-            f"{name} lies outside the film: centre ({_short(x)}, {_short(y)}) mm, {size}, "
+            f"electrode {electrode.name!r} lies outside the film: centre ({_short(x)}, {_short(y)}) mm, {size}, "
             f"film radius {_short(film.radius)} mm" + "; end its traces before the rim" * bool(electrode.more)
         )
 

@@ -25,7 +25,7 @@ from numpy.polynomial import chebyshev
 from scipy.linalg import block_diag, cho_solve
 from scipy.special import logsumexp
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.simulate.forward.charge_map import Domain
 
 DEGREE, FORCE_DEGREE = 4, 2
@@ -61,6 +61,10 @@ DRIFTS = {0.0: 0.95, 0.15: 0.05}
 SCATTERS = {0.0: 0.95, 0.03: 0.03, 0.1: 0.02}
 """The same for the standard deviation of a press's force about the one that its charges show, a share, over what the
 rig is said to have."""
+
+
+NO_WEIGHT = 1e-7
+"""Largest probability of a hypothesis whose answer does not count."""
 
 
 def terms(contact: Array, domain: Domain) -> Array:
@@ -167,17 +171,27 @@ class Linearised(NamedTuple):
         square = self.square - own.square + float(np.log1p(variance).sum())
         return Linearised(self.normal - own.normal, self.moment - own.moment, square)
 
-    def given(self, covariance: Array) -> tuple[float, Array, Array]:
-        """Logarithm of the evidence, mean and covariance of the unknowns, for a covariance before the presses."""
+    def evidence(self, covariance: Array) -> float:
+        """Logarithm of the evidence for a covariance of the unknowns before the presses."""
+        _, _, factor, (pull, step) = self._solved(covariance)
+        return float(-0.5 * (self.square - pull @ step) - np.log(np.diag(factor)).sum())
+
+    def given(self, covariance: Array) -> tuple[Array, Array]:
+        """Mean and covariance of the unknowns, for a covariance before the presses."""
+        active, root, factor, (_, step) = self._solved(covariance)
+        mean, after = np.zeros(len(active)), np.zeros_like(covariance)
+        mean[active], after[np.ix_(active, active)] = -root @ step, root @ cho_solve((factor, True), root.T)
+        return mean, after
+
+    def _solved(self, covariance: Array) -> tuple[Booleans, Array, Array, tuple[Array, Array]]:
+        """Which unknowns are not known before, the root of their covariance, that of 1 + root' normal root, and the
+        moment as root' moment, before and after a division by this."""
         active = np.diag(covariance) > 0.0
         wide = np.ix_(active, active)
-        root, mean, after = np.linalg.cholesky(covariance[wide]), np.zeros(len(active)), np.zeros_like(covariance)
-        factor = np.linalg.cholesky(np.eye(len(root)) + root.T @ self.normal[wide] @ root)
+        root = np.asarray(np.linalg.cholesky(covariance[wide]), np.float64)
+        factor = np.asarray(np.linalg.cholesky(np.eye(len(root)) + root.T @ self.normal[wide] @ root), np.float64)
         pull = root.T @ self.moment[active]
-        step = cho_solve((factor, True), pull)
-        evidence = -0.5 * (self.square - pull @ step) - np.log(np.diag(factor)).sum()
-        mean[active], after[wide] = -root @ step, root @ cho_solve((factor, True), root.T)
-        return float(evidence), mean, after
+        return active, root, factor, (pull, cho_solve((factor, True), pull))
 
 
 class Mixture(NamedTuple):
@@ -214,13 +228,14 @@ def weigh(
         tried: The hypotheses.
     """
     tried = list(tried or hypotheses())
-    answers = [linearised[each.scatter].given(before(each)) for each in tried]
-    logs = np.array([answer[0] + np.log(each.belief) for answer, each in zip(answers, tried, strict=True)])
+    logs = np.array([linearised[each.scatter].evidence(before(each)) + np.log(each.belief) for each in tried])
     evidence = float(logsumexp(logs))
     weight = np.exp(logs - evidence)
-    mean = np.einsum("h,hp->p", weight, [answer[1] for answer in answers])
+    counting = np.flatnonzero(weight > NO_WEIGHT)
+    answers = [linearised[tried[i].scatter].given(before(tried[i])) for i in counting]
+    mean = np.einsum("h,hp->p", weight[counting], [answer[0] for answer in answers])
     covariance = sum(
         share * (own + np.outer(centre - mean, centre - mean))
-        for share, (_, centre, own) in zip(weight, answers, strict=True)
+        for share, (centre, own) in zip(weight[counting], answers, strict=True)
     )
     return Mixture(mean, np.asarray(covariance), dict(zip(tried, weight.tolist(), strict=True)), evidence)
