@@ -74,7 +74,8 @@ class Assembly:
         if self.follow is not None:
             self.follow = self.follow[:, order]
             return
-        numbered = self._skeleton(np.arange(float(pattern.nnz)))[:, order][order]
+        pattern.data = np.arange(pattern.nnz)
+        numbered = pattern[:, order][order]
         numbered.sort_indices()
         self._place = np.append(np.argsort(numbered.data), numbered.nnz)[self._place]
         self._indices, self._indptr, self.skeleton = numbered.indices, numbered.indptr, self.skeleton[order]
