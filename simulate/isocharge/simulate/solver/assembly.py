@@ -99,7 +99,7 @@ class Assembly:
         data = np.bincount(self._place, schur.ravel(), self._indices.size + 1)[:-1]
         return Factor(self, inverse, coupling, reduced, _factorise(self._skeleton(data), "NATURAL"))
 
-    def _skeleton(self, data: Array) -> csc_matrix:
+    def _skeleton(self, data: np.ndarray) -> csc_matrix:
         """The skeleton matrix of the unknowns that do not hang."""
         matrix = csc_matrix((data, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
         return matrix if self.follow is None else csc_matrix(self.follow.T @ matrix @ self.follow)
