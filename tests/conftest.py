@@ -1,5 +1,6 @@
 """What tests of several stages share."""
 
+import gc
 import os
 import re
 import signal
@@ -22,6 +23,8 @@ LONGEST = ("tests/train", "tests/cli", "tests/test_pages", "tests/test_examples"
 settings.register_profile("patient", deadline=None)  # a busy machine is no fault of an example
 settings.load_profile("patient")
 
+gc.disable()  # what is imported and collected stays: there is nothing to look for until the tests run
+
 signal.signal(
     signal.SIGINT, signal.default_int_handler
 )  # a run in the background ignores it, and so would its commands
@@ -41,6 +44,8 @@ def pytest_collection_modifyitems(items):
             seen[test] += 1
             if seen[test] > marker.args[0]:
                 item.add_marker(pytest.mark.slow)
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ import hashlib
 import inspect
 import pickle
 import shutil
+from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def kept(make, *arguments, **options):
     """
     where = Path(inspect.getsourcefile(make)).relative_to(ROOT).parts
     folder = FOLDER / _code("simulate" if "simulate" in where else "train")
-    wanted = pickle.dumps((inspect.getsource(make), arguments, sorted(options.items())))
+    wanted = pickle.dumps((inspect.getsource(make), *map(_fields, (arguments, tuple(sorted(options.items()))))))
     path = folder / f"{make.__name__}-{hashlib.sha256(wanted).hexdigest()[:16]}.pickle"
     FOLDER.mkdir(parents=True, exist_ok=True)
     with FileLock(FOLDER / f"{path.name}.lock"):
@@ -38,6 +39,13 @@ def kept(make, *arguments, **options):
             part.write_bytes(pickle.dumps(result))
             part.rename(path)
         return pickle.loads(path.read_bytes())
+
+
+def _fields(value):
+    """A value without what a dataclass has cached beside its fields, which would be another key."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value).__name__, [_fields(getattr(value, field.name)) for field in fields(value)]
+    return [*map(_fields, value)] if isinstance(value, tuple) else value
 
 
 @cache

@@ -17,7 +17,7 @@ PAGES = {
 SMALLER = {
     "--samples 100000": "--samples 500",
     "--samples 6000": "--samples 1500",
-    "--seconds 90": "--seconds 900",
+    "--link film --seconds 90": "--link film --seconds 900 --force-max 0.05",
     "train/configs/quick.toml": "quick.toml",
 }
 """What of an example would take a test too long, or be over too early on a busy machine, and what runs in its place."""

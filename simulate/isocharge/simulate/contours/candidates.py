@@ -6,7 +6,7 @@
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.ndimage import minimum_filter
+import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap
@@ -139,7 +139,9 @@ class SeedGrid:
         grid = np.full((len(distance), self.side**2), np.inf)
         grid[:, self.place] = distance
         square = grid.reshape(-1, self.side, self.side)
-        low = (square == minimum_filter(square, (1, 3, 3), mode="constant", cval=np.inf)).reshape(len(distance), -1)
+        low = (square == scipy.ndimage.minimum_filter(square, (1, 3, 3), mode="constant", cval=np.inf)).reshape(
+            len(distance), -1
+        )
         ranked = np.where(low[:, self.place], distance, np.inf)
         node = np.argpartition(ranked, most, axis=1)[:, :most]
         press, column = np.nonzero(np.isfinite(np.take_along_axis(ranked, node, axis=1)))

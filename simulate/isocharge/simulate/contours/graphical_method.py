@@ -12,7 +12,7 @@ from functools import cached_property
 from itertools import combinations, product
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.contours.charge_curves import Curves
@@ -49,9 +49,9 @@ class DrawnContour:
         return np.asarray(self._spline(self._parameters))
 
     @cached_property
-    def _spline(self) -> CubicSpline:
+    def _spline(self) -> "scipy.interpolate.CubicSpline":
         chords = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.knots, axis=0), axis=1))])
-        return CubicSpline(chords, self.knots, bc_type="natural")
+        return scipy.interpolate.CubicSpline(chords, self.knots, bc_type="natural")
 
     @property
     def _parameters(self) -> Array:

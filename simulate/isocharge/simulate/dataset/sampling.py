@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from scipy.stats import qmc
+import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
@@ -128,7 +128,7 @@ class Sweep:
         if self.sampling == "random":
             return rng.random((count, 4))
         bits = int(np.ceil(np.log2(max(count, 2))))
-        return np.asarray(qmc.Sobol(4, rng=rng).random_base2(bits)[:count])
+        return np.asarray(scipy.stats.qmc.Sobol(4, rng=rng).random_base2(bits)[:count])
 
     def _force(self, share: Array) -> Array:
         """Forces (N) at shares of the range in ln F."""

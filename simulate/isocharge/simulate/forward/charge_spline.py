@@ -9,7 +9,7 @@ between forces in the same way, so at its force nodes nothing is lost.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import NdBSpline
+import scipy  # loads a part when it is used
 from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
@@ -62,7 +62,7 @@ class ChargeSpline:
     film: Film
     domain: Domain
     force: Array
-    table: NdBSpline
+    table: "scipy.interpolate.NdBSpline"
     error: float
 
     @classmethod
@@ -166,11 +166,11 @@ def _samples(cells: int) -> Array:
     return np.stack([at.real, at.imag], axis=1)
 
 
-def _least_squares(at: Array, values: Array, radius: float, cells: int) -> NdBSpline:
+def _least_squares(at: Array, values: Array, radius: float, cells: int) -> "scipy.interpolate.NdBSpline":
     """Cubic spline through values, shape (n, ...), at positions (n, 2): least squares with small third differences."""
     knots = np.concatenate([[-radius] * 3, np.linspace(-radius, radius, cells + 1), [radius] * 3])
     count = knots.size - 4
-    entries = NdBSpline.design_matrix(at, (knots, knots), 3)  # only as wide as its last entry
+    entries = scipy.interpolate.NdBSpline.design_matrix(at, (knots, knots), 3)  # only as wide as its last entry
     design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(at), count**2))
     third = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
     smooth = STIFFNESS * vstack([kron(third, eye_array(count)), kron(eye_array(count), third)])
@@ -178,7 +178,7 @@ def _least_squares(at: Array, values: Array, radius: float, cells: int) -> NdBSp
     right = np.ascontiguousarray(design.T @ values.reshape(len(at), -1))
     factors = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     solved = factors.solve(right)  # positive definite: without pivots, some ten times faster
-    return NdBSpline((knots, knots), solved.reshape(count, count, *values.shape[1:]), 3)
+    return scipy.interpolate.NdBSpline((knots, knots), solved.reshape(count, count, *values.shape[1:]), 3)
 
 
 def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:

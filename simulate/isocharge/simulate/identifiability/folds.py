@@ -20,7 +20,7 @@ Even without folds two contacts may have the same charges, see `ambiguous_pairs`
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import minimum_filter
+import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
@@ -144,7 +144,7 @@ class _FoldSearch:
     def weakest_places(self, rings: Rings, scaled: Array) -> Array:
         """Minima of the smallest singular value, followed downhill from those among the positions of the rings."""
         weakest = singular_values(scaled.reshape(-1, *scaled.shape[2:]))[:, -1].reshape(scaled.shape[:2])
-        lowest = weakest == minimum_filter(weakest, 3, mode=("nearest", "wrap"))
+        lowest = weakest == scipy.ndimage.minimum_filter(weakest, 3, mode=("nearest", "wrap"))
         step = np.maximum(rings.distance[0], rings.distance * 2.0 * np.pi / scaled.shape[1])
         ring, _ = np.nonzero(lowest)  # not empty: the lowest value of all is one
         return self._downhill(rings.position[lowest], weakest[lowest], step[ring])

@@ -6,7 +6,7 @@ min over contacts c of the domain of |(Q - Q(c)) / sigma|
 from collections.abc import Callable
 
 import numpy as np
-from scipy.stats import qmc
+import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
@@ -97,7 +97,7 @@ def search(
 
 def _spread(count: int) -> Array:
     """Contacts in unit coordinates, shape (count, 3)."""
-    sobol = qmc.Sobol(3, scramble=False).random(count)
+    sobol = scipy.stats.qmc.Sobol(3, scramble=False).random(count)
     radius, angle = np.sqrt(sobol[:, 0]), 2.0 * np.pi * sobol[:, 1]
     radius[::4] = 1.0
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), 2.0 * sobol[:, 2] - 1.0], axis=1)

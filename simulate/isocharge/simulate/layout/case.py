@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
@@ -77,9 +77,9 @@ class WeightMap:
     def weigh(self, presses: Array) -> Array:
         """Weights of presses, shape (n, 2), mm: linear between the places, beyond them that of the nearest."""
         places, values = self.table[:, :2], self.table[:, 2]
-        weights = NearestNDInterpolator(places, values)(presses)
+        weights = scipy.interpolate.NearestNDInterpolator(places, values)(presses)
         if np.linalg.matrix_rank(places - places[0]) == 2:
-            between = LinearNDInterpolator(places, values)(presses)
+            between = scipy.interpolate.LinearNDInterpolator(places, values)(presses)
             weights = np.where(np.isnan(between), weights, between)
         return np.asarray(weights)
 

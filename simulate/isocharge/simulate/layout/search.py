@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import InputError
@@ -197,7 +197,7 @@ class Search:
             return np.concatenate([variables[-1] - self._logs(moved, active), self.case.spare(moved)])
 
         only_last = np.append(np.zeros(places.size), 1.0)
-        solved = minimize(
+        solved = scipy.optimize.minimize(
             lambda variables: variables[-1],
             np.append(places, self._logs(places, active).max()),
             jac=lambda _: only_last,

@@ -19,7 +19,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
@@ -170,7 +170,7 @@ class Measurement:
         shares = np.append(np.full(CREEP_TIMES.size, 0.5 * part.creep), part.thermoelastic)
         for k, (lag, share) in enumerate(zip(np.append(CREEP_TIMES, part.film_time), shares, strict=True)):
             keep = math.exp(-1.0 / (self.rate * lag))
-            term, self._memory[k] = lfilter([share], [1.0, -keep], steps, axis=0, zi=self._memory[k])
+            term, self._memory[k] = scipy.signal.lfilter([share], [1.0, -keep], steps, axis=0, zi=self._memory[k])
             film = film + term
         return film
 
@@ -185,11 +185,11 @@ class Measurement:
         of_air, of_film = (math.exp(-1.0 / (self.rate * lag)) for lag in (part.temperature_time, part.film_time))
         kick = math.sqrt((1.0 - of_air * of_air) / self._share_of_air) * part.temperature_rms
         kicks = kick * self.rng.standard_normal(time.size)
-        drift = lfilter([1.0], [1.0, -of_air], kicks, zi=[of_air * self._warmth[0]])[0]
+        drift = scipy.signal.lfilter([1.0], [1.0, -of_air], kicks, zi=[of_air * self._warmth[0]])[0]
         since = time - part.step_at
         rise = np.clip(np.minimum(since, part.step_for - since) / part.step_time, 0.0, 1.0)
         air = drift + part.step * rise
-        film: Array = lfilter([1.0 - of_film], [1.0, -of_film], air, zi=[of_film * self._warmth[1]])[0]
+        film: Array = scipy.signal.lfilter([1.0 - of_film], [1.0, -of_film], air, zi=[of_film * self._warmth[1]])[0]
         self._warmth = float(drift[-1]), float(film[-1])
         return film
 
@@ -200,7 +200,7 @@ class Measurement:
         keep = np.exp(-1.0 / (self.rate * self.tau))
         output = np.empty_like(steps)
         for k, share in enumerate(keep):
-            output[:, k] = lfilter([1.0], [1.0, -share], steps[:, k], zi=[share * self._output[k]])[0]
+            output[:, k] = scipy.signal.lfilter([1.0], [1.0, -share], steps[:, k], zi=[share * self._output[k]])[0]
         self._output = output[-1]
         return output
 

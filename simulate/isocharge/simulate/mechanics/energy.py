@@ -148,16 +148,15 @@ class Membrane:
         weighted = _tensor(total * geometry.weights[..., None])
         n_element, _, _, n_local = gradient.shape
         left = np.ascontiguousarray(geometry.stacked.transpose(0, 2, 1))
-        matrix = np.empty((n_element, n_local, 3, n_local, 3))
+        matrix = np.empty((n_element, 3, n_local, 3, n_local))
         for i, j in PAIRS:
             block = self._moduli(stretch, i, j) * geometry.weights[..., None, None]
             if i == j:
                 block += self._scale[i] * weighted
-            right = block[..., 0, None] * gradient[:, :, None, 0] + block[..., 1, None] * gradient[:, :, None, 1]
-            matrix[:, :, i, :, j] = left @ right.reshape(n_element, -1, n_local)
+            matrix[:, i, :, j] = left @ (block @ gradient).reshape(n_element, -1, n_local)
             if i != j:
-                matrix[:, :, j, :, i] = matrix[:, :, i, :, j].transpose(0, 2, 1)
-        return matrix
+                matrix[:, j, :, i] = matrix[:, i, :, j].transpose(0, 2, 1)
+        return matrix.transpose(0, 2, 1, 4, 3)
 
     def _moduli(self, stretch: Array, i: int, j: int) -> Array:
         """Material part of d(traction_ia)/d(slope_jb) for one pair of components, shape (n_element, n_point, 2, 2)."""
@@ -235,7 +234,7 @@ class Bending:
         Shape (n_element, n_local, 4, n_local, 4).
         """
         n_element, n_local = self.geometry.nodes.shape
-        matrix = np.zeros((n_element, n_local, 4, n_local, 4))
+        matrix = np.zeros((n_element, 4, n_local, 4, n_local)).transpose(0, 2, 1, 4, 3)
         matrix[:, :, :3, :, :3] = tangent
         mass = np.eye(n_local) * self.geometry.mass[:, None]
         shifted = np.sqrt(self.stiffness) * (self._laplace - SHIFT * mass)

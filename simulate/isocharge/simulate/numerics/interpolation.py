@@ -72,11 +72,11 @@ def lagrange_values(nodes: Array, weights: Array, at: Array) -> Array:
         Shape (m, n); each row adds up to one.
     """
     difference = at[:, None] - nodes[None, :]
-    hit = np.abs(difference) < 1e-200  # closer, the quotient below would overflow
-    terms = weights / np.where(hit, 1.0, difference)
-    values: Array = terms / terms.sum(axis=1, keepdims=True)
-    on_node = hit.any(axis=1)
-    values[on_node] = hit[on_node]
+    row, node = np.nonzero(np.abs(difference) < 1e-200)  # closer, the quotient below would overflow
+    difference[row, node] = 1.0
+    terms = weights / difference
+    values: Array = terms / (terms @ np.ones(nodes.size))[:, None]
+    values[row] = nodes == nodes[node, None]
     return values
 
 

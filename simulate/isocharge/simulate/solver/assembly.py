@@ -37,8 +37,9 @@ class Assembly:
         shell = (on_edge[:, None] | on_edge[None, :]).ravel()
         self.components = components
         self.free = _free(mesh, components, odd)
-        self._outer, self._inner = self._unknowns(np.flatnonzero(shell)), self._unknowns(np.flatnonzero(~shell))
-        unknown = self._unknowns(mesh.nodes)
+        within = np.arange(components)[:, None]  # an element's unknowns are numbered component by component
+        self._outer, self._inner = ((within * shell.size + np.flatnonzero(part)).ravel() for part in (shell, ~shell))
+        unknown = (components * mesh.nodes[:, None] + within).reshape(len(mesh.nodes), -1)
         self.inner_global = unknown[:, self._inner]
         self.outer_global = unknown[:, self._outer]
         in_skeleton = np.zeros(self.free.size, dtype=bool)
@@ -51,11 +52,7 @@ class Assembly:
         if mesh.constraint is not None:
             each = kron(mesh.constraint, eye_array(components)).tocsr()[self.skeleton][:, self.skeleton]
             self.follow = each[:, each.diagonal() > 0.0].tocsc()
-
-    def _unknowns(self, nodes: Integers) -> Integers:
-        """Numbers of the unknowns of nodes: shape (..., n) to (..., components * n), components fast."""
-        count = self.components
-        return (count * nodes[..., None] + np.arange(count)).reshape(*nodes.shape[:-1], -1)
+        self._reorder()
 
     def _pattern(self, number: Integers) -> None:
         """Compressed columns of the skeleton matrix and where each element entry goes; fixed ones go past the end."""
@@ -69,6 +66,20 @@ class Assembly:
         self._indices = (key % size).astype(np.int32)
         self._indptr = np.concatenate([[0], np.cumsum(np.bincount(key // size, minlength=size))]).astype(np.int32)
 
+    def _reorder(self) -> None:
+        """Number the unknowns so that elimination in turn fills in little: the pattern alone decides, so once."""
+        pattern = self._skeleton(np.ones(self._indices.size))
+        dominant = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
+        order = np.argsort(_factorise(dominant, "MMD_AT_PLUS_A").perm_c)
+        if self.follow is not None:
+            self.follow = self.follow[:, order]
+            return
+        pattern.data = np.arange(pattern.nnz)
+        numbered = pattern[:, order][order]
+        numbered.sort_indices()
+        self._place = np.append(np.argsort(numbered.data), numbered.nnz)[self._place]
+        self._indices, self._indptr, self.skeleton = numbered.indices, numbered.indptr, self.skeleton[order]
+
     def factor(self, matrix: Array) -> "Factor":
         """Factorise K.
 
@@ -80,26 +91,26 @@ class Assembly:
         """
         inner, outer = self._inner, self._outer
         size = matrix.shape[1] * self.components
-        matrix = matrix.reshape(-1, size, size)
-        interior, coupling = matrix[:, inner[:, None], inner], matrix[:, inner[:, None], outer]
-        reduced = np.linalg.solve(interior, coupling).astype(float, copy=False)
+        matrix = matrix.transpose(0, 2, 1, 4, 3).reshape(-1, size, size)
+        coupling = matrix[:, inner[:, None], outer]
+        inverse = np.linalg.inv(matrix[:, inner[:, None], inner]).astype(float, copy=False)
+        reduced = inverse @ coupling
         schur = matrix[:, outer[:, None], outer] - coupling.transpose(0, 2, 1) @ reduced
-        return Factor(self, interior, coupling, reduced, self._factor_skeleton(schur))
-
-    def _factor_skeleton(self, schur: Array) -> SuperLU:
         data = np.bincount(self._place, schur.ravel(), self._indices.size + 1)[:-1]
-        skeleton = csc_matrix((data, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
-        if self.follow is not None:
-            skeleton = csc_matrix(self.follow.T @ skeleton @ self.follow)
-        return splu(skeleton, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        return Factor(self, inverse, coupling, reduced, _factorise(self._skeleton(data), "NATURAL"))
+
+    def _skeleton(self, data: np.ndarray) -> csc_matrix:
+        """The skeleton matrix of the unknowns that do not hang."""
+        matrix = csc_matrix((data, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
+        return matrix if self.follow is None else csc_matrix(self.follow.T @ matrix @ self.follow)
 
 
 class Factor:
     """A factorised K."""
 
-    def __init__(self, assembly: Assembly, interior: Array, coupling: Array, reduced: Array, skeleton: SuperLU) -> None:
+    def __init__(self, assembly: Assembly, inverse: Array, coupling: Array, reduced: Array, skeleton: SuperLU) -> None:
         self._assembly = assembly
-        self._interior, self._coupling, self._reduced, self._skeleton = interior, coupling, reduced, skeleton
+        self._inverse, self._coupling, self._reduced, self._skeleton = inverse, coupling, reduced, skeleton
 
     def solve(self, right: Array) -> Array:
         """Solve for the free unknowns.
@@ -114,7 +125,7 @@ class Factor:
         padded = np.zeros(parts.free.shape)
         padded[:, :3] = right
         flat = padded.ravel()
-        inside = np.linalg.solve(self._interior, flat[parts.inner_global][..., None])
+        inside = self._inverse @ flat[parts.inner_global][..., None]
         carried = self._coupling.transpose(0, 2, 1) @ inside
         shifted = flat - np.bincount(parts.outer_global.ravel(), carried.ravel(), flat.size)
         solution = np.zeros(flat.size)
@@ -126,6 +137,10 @@ class Factor:
         back = self._reduced @ solution[parts.outer_global][..., None]
         solution[parts.inner_global] = (inside - back)[..., 0]
         return solution.reshape(parts.free.shape)[:, :3]
+
+
+def _factorise(matrix: csc_matrix, order: str) -> SuperLU:
+    return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:

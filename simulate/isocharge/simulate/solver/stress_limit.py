@@ -8,7 +8,7 @@ times at 0.93 of the radius. Under a tip it grows a little slower than F^(2/3), 
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import newton
+import scipy  # loads a part when it is used
 
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
@@ -65,5 +65,6 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
     def beyond(log_force: float) -> float:  # nearly straight: the stress grows like a power of the force
         return float(np.log(largest_stress(film, probe, float(np.exp(log_force))) / limit))
 
-    found = newton(beyond, np.log(low), x1=np.log(high), tol=0.01)  # secants: a last step of 1 % is exact to 0.01 %
+    # secants: a last step of 1 % is exact to 0.01 %
+    found = scipy.optimize.newton(beyond, np.log(low), x1=np.log(high), tol=0.01)
     return float(np.exp(found))
