@@ -21,7 +21,7 @@ MOST_STEPS = 30
 """Steps at most; most problems need five."""
 
 CHANGE = 1e-7
-"""The search is over after a step that changes |r|^2 by less than this, relative to 1 + |r|^2."""
+"""Least change of |r|^2 that is worth another step, relative to 1 + |r|^2."""
 
 ROUNDING = 1e-12
 """A step that raises |r|^2 by no more than this, relative to 1 + |r|^2, is taken: it may be the last to the minimum."""
@@ -39,13 +39,14 @@ ON_EDGE = 1e-9
 """Distance from an edge up to which a point counts as on it: rounding."""
 
 
-def minimise(residuals: Residuals, start: Array, steps: int = MOST_STEPS) -> tuple[Array, Array]:
+def minimise(residuals: Residuals, start: Array, steps: int = MOST_STEPS, least: float = CHANGE) -> tuple[Array, Array]:
     """The minimum that descent from a start leads to, for every problem.
 
     Args:
         residuals: The problems.
         start: Shape (n, 3); points outside D start from its nearest point.
         steps: Largest number of steps.
+        least: Least change of |r|^2 that is worth another step, relative to 1 + |r|^2.
 
     Returns:
         Points in D, shape (n, 3), and their residuals, shape (n, k).
@@ -65,7 +66,7 @@ def minimise(residuals: Residuals, start: Array, steps: int = MOST_STEPS) -> tup
         unit[better], residual[better], slopes[better] = trial[lower], new_residual[lower], new_slopes[lower]
         square[better] = new_square[lower]
         damping[active] = np.where(lower, np.maximum(damping[active] * EASIER, LEAST), damping[active] * HARDER)
-        active = active[(np.abs(change) >= CHANGE) & (damping[active] <= MOST)]
+        active = active[(np.abs(change) >= least) & (damping[active] <= MOST)]
     return unit, residual
 
 

@@ -22,9 +22,11 @@ from isocharge.train.calibration.film_charges import CONTACT_STEPS, FilmCharges
 PLACES = 300
 """Places among which the start of a press is chosen whose place is not known."""
 
+LEAST_CHANGE = 1e-5
+"""Least change of a press's chi2 that is worth another step of its contact, relative to 1 + chi2."""
+
 VAGUE_FORCE = 1.5
 """Standard deviation of the logarithm of a force that nobody knows, about the middle of the forces."""
-
 
 NUISANCES = 3
 """What a session has besides a film: change of the pretension with temperature, offset and drift of the charges."""
@@ -195,7 +197,7 @@ def adjust_contacts(charges: FilmCharges, parameters: Array, data: PressData, st
         slopes = presses.slopes(share[:, :, None] * by_contact + charge[:, :, None] * steeper[rows])
         return presses.residual(share * charge, contact), (slopes * domain.scale).swapaxes(1, 2)
 
-    unit, residual = minimise(residuals, (start - domain.centre) / domain.scale)
+    unit, residual = minimise(residuals, (start - domain.centre) / domain.scale, least=LEAST_CHANGE)
     return AdjustedContacts(unit * domain.scale + domain.centre, residual)
 
 

@@ -5,6 +5,7 @@ other units. What then explains them is named; the data are never mended silentl
 """
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -141,7 +142,9 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     placed = presses[presses.placed]
     if not len(placed):
         return []
-    mistakes = [(_misfit(charges, contact, charge), sentence) for sentence, contact, charge in _tried(placed, charges)]
+    sentences, contacts, measured = zip(*_tried(placed, charges), strict=True)
+    expected = np.split(_expected(charges, np.concatenate(contacts)), len(contacts), axis=1)
+    mistakes = [*zip(map(partial(_misfit, charges), contacts, measured, expected), sentences, strict=True)]
     clearer = CLEARER * misfit(presses, charges)
     least = min(tried for tried, _ in mistakes)
     return [sentence for tried, sentence in sorted(mistakes) if tried < clearer and tried <= AS_GOOD * least]
@@ -150,14 +153,16 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
     """How far presses of known place and force are from those of any film, dimensionless: 1 is common, 20 is not."""
     placed = presses[presses.placed]
-    return _misfit(charges, placed.contact, placed.charge_pC) if len(placed) else 0.0
+    if not len(placed):
+        return 0.0
+    return _misfit(charges, placed.contact, placed.charge_pC, _expected(charges, placed.contact))
 
 
-def _misfit(charges: FilmCharges, contact: Array, charge: Array) -> float:
-    """Mean squared logarithm of measured over expected charges, in units of what films differ by."""
+def _misfit(charges: FilmCharges, contact: Array, charge: Array, expected: Array) -> float:
+    """Mean squared logarithm of measured over expected charges, in units of what films differ by; see `_expected`."""
     if (charges.into_domain(contact) != contact).any(axis=1).mean() > 0.2:
         return np.inf
-    logs = np.log(np.maximum(charge, 1e-3)) - np.log(np.maximum(_expected(charges, contact), 1e-3))
+    logs = np.log(np.maximum(charge, 1e-3)) - np.log(np.maximum(expected, 1e-3))
     common = np.nanmedian(logs, axis=(1, 2))
     own = np.nanmean(np.minimum((logs - common[:, None, None]) ** 2, 4.0), axis=(1, 2))
     return float(np.min(own / SCATTER**2 + (common / OFFSET) ** 2))
