@@ -7,6 +7,8 @@ BIN := $(VENV)/bin
 
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 COMPILED_ONCE := PYTHONDONTWRITEBYTECODE=
+# Memory of arrays is used again and not fetched from the kernel, zeroed, each time (glibc).
+ONE_HEAP := MALLOC_TRIM_THRESHOLD_=1073741824 MALLOC_MMAP_THRESHOLD_=33554432
 
 demo: $(VENV)/installed
 	$(BIN)/isocharge demo
@@ -23,7 +25,7 @@ types: $(VENV)/installed
 
 # Some tests wait for a clock or a process, so there is a worker more than the two cores that we count on.
 tests: $(VENV)/installed
-	$(ONE_THREAD) $(COMPILED_ONCE) $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+	$(ONE_THREAD) $(COMPILED_ONCE) $(ONE_HEAP) $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 test-all: docs
 	$(BIN)/python -m pytest -m "slow or not slow"

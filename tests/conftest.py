@@ -95,19 +95,6 @@ def start_command():
         process.communicate()
 
 
-@pytest.fixture
-def shell():
-    """Run lines of a README in bash, this environment's `isocharge` first on the path: what they print."""
-
-    def run(script, cwd=None, timeout=280):
-        environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-        done = _run(["bash", "-ec", script], cwd, environment, timeout)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    return run
-
-
 ABSENT = """
 import os, sys
 

@@ -39,8 +39,10 @@ def shares(name):
 
     predictor, rng = Predictor(name), np.random.default_rng(7)
     reach, names = 0.999 * predictor.validity.reach_mm, predictor.metadata.electrodes
-    film = kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0), radius=WIDEST)
-    forward_map = replace(film, sensor=load_sensor(name))
+    forward_map = replace(
+        kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0), radius=WIDEST),
+        sensor=load_sensor(name),
+    )
     radius, angle = reach * np.sqrt(rng.random(PRESSES)), 2.0 * np.pi * rng.random(PRESSES)
     force = np.exp(rng.uniform(np.log(0.5), np.log(2.0), PRESSES))
     clean = forward_map.charges(np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force]))

@@ -49,8 +49,11 @@ def is_slow(example):
 @pytest.fixture(scope="module")
 def presses(tmp_path_factory):
     """A dataset for the examples that begin with one."""
-    film = kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0))
-    return write_sweep(tmp_path_factory.mktemp("data") / "presses", (film,), Sweep(samples=2000))
+    return write_sweep(
+        tmp_path_factory.mktemp("data") / "presses",
+        (kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0)),),
+        Sweep(samples=2000),
+    )
 
 
 @pytest.fixture(scope="module")

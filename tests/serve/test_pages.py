@@ -57,10 +57,11 @@ def desks(tmp_path_factory):
 
 def test_an_example_does_what_it_says(page_example, desks, installed, start_http, run_example, run_commands):
     """In the order of the page, in the install that it names; Python prints what the comments say."""
-    text = page_example.text.replace(
-        "--link film", "--link film --force-max 0.05"
-    )  # a film of one force: sooner solved
-    folder, environment = desks[page_example.page], installed(*page_example.extras)
+    text, folder, environment = (
+        page_example.text.replace("--link film", "--link film --force-max 0.05"),  # one force: solved sooner
+        desks[page_example.page],
+        installed(*page_example.extras),
+    )
     if page_example.language == "python":
         if "127.0.0.1:8000" in text:
             text = text.replace("127.0.0.1:8000", start_http(Handler(open_model_store())).url.removeprefix("http://"))

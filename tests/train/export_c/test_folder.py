@@ -69,11 +69,13 @@ def test_no_folder_is_left_of_what_cannot_be_written(refused, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["board.toml", "damaged"]
 
 
-def test_the_readme_says_what_works(exports, shell, tmp_path, compile_c):
+def test_the_readme_says_what_works(exports, run_commands, installed, tmp_path, compile_c):
     """Its lines compile, its C compiles, and its table names every file."""
     folder = Path(shutil.copytree(exports[0], tmp_path / "c"))
     text = (folder / "README.md").read_text()
-    printed = "".join(shell(lines, cwd=folder) for lines in re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
+    printed = "".join(
+        run_commands(lines, folder, installed("all")) for lines in re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+    )
     assert "64 golden vectors, 0 wrong numbers" in printed
     assert (folder / "host_example").exists()
     (lines,) = re.findall(r"```c\n(.*?)```", text, re.DOTALL)
