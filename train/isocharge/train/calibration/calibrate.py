@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+import scipy  # loads a part when it is used
 from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array
@@ -230,7 +230,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
         posterior = fit_film(problem.charges, data, problem.before, at_C)
     _refuse_unexplained(presses, problem, posterior)
     chi2, freedom = posterior.total
-    if freedom and chi2_distribution.sf(chi2, freedom) < UNCERTAIN:  # larger errors, by Birge's ratio (1932)
+    if freedom and scipy.stats.chi2.sf(chi2, freedom) < UNCERTAIN:  # larger errors, by Birge's ratio (1932)
         posterior = posterior.scaled(chi2 / freedom)
         cautions.append(
             f"the presses scatter {np.sqrt(chi2 / freedom):.2g} times as much as noise and rig are said to; the errors "
@@ -285,8 +285,8 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
     chi2, freedom = posterior.total
     deviation = (posterior.parameters - problem.before.parameters) / problem.prior.std
     strain = float(deviation @ np.linalg.solve(problem.before.covariance, deviation))
-    unexplained = freedom > 0.0 and chi2 / freedom > FAR_OFF and chi2_distribution.sf(chi2, freedom) < UNEXPLAINED
-    chance = chi2_distribution.sf(strain, deviation.size)
+    unexplained = freedom > 0.0 and chi2 / freedom > FAR_OFF and scipy.stats.chi2.sf(chi2, freedom) < UNEXPLAINED
+    chance = scipy.stats.chi2.sf(strain, deviation.size)
     strange = posterior.imperfect or posterior.bad.any() or chance < ODD
     odd = strange and bool(find_mistakes(presses, problem.charges))  # a few wrong presses may find a strange film
     if unexplained or chance < STRAINED or odd:

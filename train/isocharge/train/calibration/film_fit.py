@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # loads a part when it is used
 from scipy.optimize import least_squares
-from scipy.stats import chi2 as chi2_distribution
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
@@ -189,8 +189,8 @@ def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate, at_C: 
 
 def _suspicious(chi2: Array, freedom: Array) -> bool:
     """Whether a press, or all of them, have larger residuals than noise explains."""
-    alone = chi2_distribution.sf(chi2, np.maximum(freedom, 1.0)).min() * len(chi2)
-    together = chi2_distribution.sf(chi2.sum(), max(freedom.sum(), 1.0))
+    alone = scipy.stats.chi2.sf(chi2, np.maximum(freedom, 1.0)).min() * len(chi2)
+    together = scipy.stats.chi2.sf(chi2.sum(), max(freedom.sum(), 1.0))
     return bool(min(alone, together) < DOUBTFUL)
 
 
@@ -218,8 +218,8 @@ def _good_presses(problem: "_Fit", data: PressData, solved: _Solved, freedom: Ar
             break
         start, adjusted = problem.solve(data, weight, start, Hypothesis())
     freedom = np.maximum(freedom, 1.0)
-    scatter = np.median(adjusted.chi2 / np.maximum(chi2_distribution.median(freedom), 0.1))
-    keep = adjusted.chi2 <= chi2_distribution.isf(BAD / len(data), freedom) * max(1.0, scatter)
+    scatter = np.median(adjusted.chi2 / np.maximum(scipy.stats.chi2.median(freedom), 0.1))
+    keep = adjusted.chi2 <= scipy.stats.chi2.isf(BAD / len(data), freedom) * max(1.0, scatter)
     return (keep if np.mean(~keep) <= LARGEST_BAD_SHARE else np.ones_like(keep)), start
 
 
@@ -358,7 +358,7 @@ class _Fit:
         residual = contacts.residual + rows @ (self.mean + mixture.mean - solved.unit)
         expected = np.eye(rows.shape[1]) + rows @ mixture.covariance @ rows.swapaxes(1, 2)
         chi2 = np.einsum("nk,nk->n", residual, np.linalg.solve(expected, residual[:, :, None])[:, :, 0])
-        return np.asarray(chi2 <= chi2_distribution.isf(BAD / len(data), np.maximum(freedom, 1.0)))
+        return np.asarray(chi2 <= scipy.stats.chi2.isf(BAD / len(data), np.maximum(freedom, 1.0)))
 
     def weigh(self, data: PressData, solved: _Solved) -> Mixture:
         """What the presses say of the unknowns, and of the hypotheses."""

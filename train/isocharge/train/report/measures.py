@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy.stats import norm
+import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array
 from isocharge.serve.benchmark import Timing
@@ -156,7 +156,7 @@ def pareto(cost: Array, error: Array) -> np.ndarray:
 def coverage(contact: Array, std: Array, truth: Array, levels: Array) -> Array:
     """Share of truths within the central interval of each nominal level, Gaussian; shape (n_level, 3) for x, y, F."""
     deviation = np.abs(contact - truth) / std
-    return np.asarray(np.mean(deviation[None] <= norm.ppf(0.5 + 0.5 * levels)[:, None, None], axis=1))
+    return np.asarray(np.mean(deviation[None] <= scipy.stats.norm.ppf(0.5 + 0.5 * levels)[:, None, None], axis=1))
 
 
 WORDS: dict[Plot, str] = {"latency": "single predictions", "throughput": "batches"}

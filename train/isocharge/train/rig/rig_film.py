@@ -9,7 +9,7 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
@@ -198,7 +198,7 @@ def corrected_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Do
     total = residuals.chi2(correction.log_factor(residuals.contact)).sum()
     freedom = max(residuals.log_ratio.size - correction.freedom, 1.0)
     scatter = float(np.sqrt(total / freedom))
-    scattered = scatter > LARGER and chi2_distribution.sf(total, freedom) < SCATTER_CHANCE
+    scattered = scatter > LARGER and scipy.stats.chi2.sf(total, freedom) < SCATTER_CHANCE
     return RigFilm(forward_map, correction, domain, scatter, bool(scattered))
 
 
