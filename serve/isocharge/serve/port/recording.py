@@ -70,7 +70,7 @@ class Recorder:
         failed: Whether writing has stopped because the disk is full. What was written before is whole.
     """
 
-    def __init__(self, path: Path, model: str, policy: str, device: Mapping[str, Any], name: str = "") -> None:
+    def __init__(self, path: Path, model: str, policy: str, device: Mapping[str, Any], name: str | None = None) -> None:
         """Describe a recording; the file is created on entering the context.
 
         Args:
@@ -78,7 +78,7 @@ class Recorder:
             model: The model's label, `name/version`.
             policy: Which frames get a record.
             device: Content of the device file.
-            name: The film's own name in the records; empty for that of the model's sensor.
+            name: The film's own name in the records; None for that of the model's sensor.
         """
         self.path, self.model_label = path, model
         self.failed = False
