@@ -190,8 +190,9 @@ def test_the_nearest_fold_is_that_of_a_grid_of_a_tenth_of_a_millimetre(charges):
     assert np.hypot(*folds[0]) == pytest.approx(np.hypot(x, y)[turned].min(), abs=0.1)
 
 
-def test_ambiguous_pairs_are_mirror_images_in_the_crease():
-    pairs = find_ambiguous_pairs(creased(), REFERENCE, 0.5, places=400)
+@pytest.mark.parametrize("forces", [FORCES, (0.5, 0.5)], ids=["a range", "one force"])
+def test_ambiguous_pairs_are_mirror_images_in_the_crease(forces):
+    pairs = find_ambiguous_pairs(creased(forces=forces), REFERENCE, 0.5, places=400)
     assert len(pairs) > 20
     assert pairs.first[:, 0] + pairs.second[:, 0] == pytest.approx(2.0 * CREASE, abs=0.5)
     assert pairs.first[:, 1] == pytest.approx(pairs.second[:, 1], abs=0.5)

@@ -42,7 +42,7 @@ def serve(store):
         yield start
 
 
-def call(channel, name, metadata=None, **fields):
+def call(channel, name, /, metadata=None, **fields):
     request, response = METHODS[name]
     method = channel.unary_unary(
         f"/{SERVICE}/{name}",
