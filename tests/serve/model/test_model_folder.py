@@ -15,7 +15,7 @@ import pytest
 from isocharge.common.errors import ChargeError, ModelError, OutputExists
 from isocharge.common.files import sha256_of
 from isocharge.serve import ModelMetadata, check_golden, find_model, load_model, write_model
-from isocharge.serve.model.golden import make_golden
+from isocharge.serve.model.golden import contact_floors, make_golden
 
 
 @pytest.fixture
@@ -100,6 +100,18 @@ def test_golden_vectors_are_checked_before_a_version_appears(film, tmp_path, mon
     with pytest.raises(ModelError, match=r"contact\[0, .\] is"):
         write(film, tmp_path / "linear")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_floors_of_golden_answers_grow_with_area_and_force_and_are_no_less_than_the_error(film):
+    usual, wide, noisy = (
+        np.array(contact_floors(film.metadata(working_area_mm=((r, 0.0), (0.0, r), (-r, 0.0)), **changes)))
+        for r, changes in (
+            (20.0, {}),
+            (60.0, {"force_range_N": (0.05, 10.0)}),
+            (5.0, {"force_range_N": (0.05, 1.0), "errors": {"position_rms_mm": 4.0}}),
+        )
+    )
+    np.testing.assert_allclose([wide / usual, noisy], [[3.0, 3.0, 5.0], [4.0, 4.0, usual[2]]])
 
 
 def test_folder_and_model_have_one_name(film, tmp_path):
