@@ -205,7 +205,7 @@ class Recording:
         chunk: Chunk | None = None
         latencies_us: list[float] = []
         for entry in self._lines(_Entry):
-            if entry.latency_us is not None and entry.timestamp is not None:
+            if entry.latency_us is not None:
                 latencies_us.append(entry.latency_us)
                 continue
             if chunk is not None:
@@ -263,7 +263,7 @@ class _Entry(Struct):
     chunk: tuple[Moment, Nanoseconds, Annotated[float, Meta(ge=0.0)], bytes] | None = None
 
     def __post_init__(self) -> None:
-        if self.timestamp is not None and self.latency_us is None:
+        if (self.timestamp is None) != (self.latency_us is None):
             raise WrongKey("latency_us")
         if all(key is None for key in (self.timestamp, self.tare, self.back, self.use, self.marker, self.chunk)):
             raise WrongKey("chunk")
