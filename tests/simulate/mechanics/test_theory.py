@@ -58,6 +58,7 @@ def test_theory_has_the_name_of_its_terms_and_is_found_by_it(film, terms, name):
         (2.0, 0.0, 1e-3, 1e-6, "linear plate"),
         (0.5, 0.0, 5.0, 1e-3, "nonlinear membrane + bending"),
         (2.0, 5.0, 1e-3, 1e-3, "pre-tensioned linear plate"),
+        (0.025, 5.0, 1e-4, 3e-2, "pre-tensioned linear plate"),
         (0.002, 10.0, 1e-6, 1e-2, "pre-tensioned linear membrane"),
         (0.11, 0.0, 1e-1, 1e-12, "nonlinear membrane + bending"),
     ],
