@@ -18,8 +18,7 @@ from kept import kept
 
 SENSOR = "three-25um-biaxial"
 DESCRIBED = load_sensor(SENSOR), Circle(1.0)
-FILM_9 = virtual_film(*DESCRIBED, 9)
-BUILD = ForwardMap.build
+FILM_9, BUILD = virtual_film(*DESCRIBED, 9), ForwardMap.build
 
 
 def small_map(sensor, probe):

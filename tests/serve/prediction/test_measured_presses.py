@@ -99,8 +99,7 @@ def test_a_list_of_presses_for_a_machine(tmp_path):
 
 
 def test_unknown_values(read):
-    presses = read(f"{HEADER}\n,,0.5,10,20,30\n1,2,,10,,30\n,,,10,20,30\n")
-    nan = np.nan
+    presses, nan = read(f"{HEADER}\n,,0.5,10,20,30\n1,2,,10,,30\n,,,10,20,30\n"), np.nan
     np.testing.assert_array_equal(presses.contact, [[nan, nan, 0.5], [1, 2, nan], [nan, nan, nan]])
     np.testing.assert_array_equal(presses.charge_pC[1], [10, nan, 30])
 
@@ -188,8 +187,7 @@ def test_shapes_that_disagree():
 
 # Round trips
 
-FINITE = st.floats(-LARGEST, LARGEST)
-POSITIVE = st.floats(0.0, LARGEST, exclude_min=True)
+FINITE, POSITIVE = st.floats(-LARGEST, LARGEST), st.floats(0.0, LARGEST, exclude_min=True)
 TEXT = st.text(st.characters(codec="utf-8"), min_size=1, max_size=8)
 
 

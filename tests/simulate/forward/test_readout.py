@@ -133,8 +133,7 @@ def test_a_trace_collects_the_stress_under_it(film, at):
 def test_an_electrode_with_a_dent_is_its_two_rectangles(solved):
     dented = Electrode("A", ((8.0, 0.0), (12.0, 0.0), (12.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0)))
     lying = Electrode("A", ((8.0, 0.0), (12.0, 0.0), (12.0, 1.0), (8.0, 1.0)))
-    standing = Electrode("B", ((8.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0)))
-    sensor = with_d33()
+    standing, sensor = Electrode("B", ((8.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0))), with_d33()
     whole, parts, union = (
         touch_charge(replace(sensor, electrodes=electrodes), solved)
         for electrodes in ((dented,), (lying, standing), (replace(lying, more=(standing.corners,)),))
