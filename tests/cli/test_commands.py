@@ -349,17 +349,15 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     ]  # each half second
     assert [*map(len, shown)] == [0, 6, 6]
     np.testing.assert_allclose(*np.split(np.array(shown[1:], float), 2, axis=1), atol=0.5)
-    model = load_model(out / "models" / SENSOR / "1")
-    said = np.array(re.findall(r"(\d+\.\d+) (?:mm|%)", table), float)
+    model, said = load_model(out / "models" / SENSOR / "1"), np.array(re.findall(r"(\d+\.\d+) (?:mm|%)", table), float)
     card = ("position_median_mm", "position_p95_mm") * 2 + ("force_median_percent", "force_rms_percent")
-    off = np.log(said / [model.metadata.errors[key] for key in card])
-    assert np.all(np.abs(off) < [0.15, 0.15, 0.9, 0.9, 0.15, 0.15])
+    ratios = said / [model.metadata.errors[key] for key in card]
+    assert np.all(np.abs(np.log(ratios)) < [0.15, 0.15, 0.9, 0.9, 0.15, 0.15])
     size, seconds = re.search(r"(\d+) KiB", table)[1], re.findall(r"(?:simulate|train|serve|show) (\d+\.\d)", table)
     assert (model.folder / "model.onnx").stat().st_size == pytest.approx(1024 * int(size), abs=512)
     assert 1.5 <= sum(map(float, seconds)) < 60.0
     (pressed, felt), (points, median, _) = ([*figures[0].axes[k].lines] for k in (2, -1))
     assert (pressed.get_label(), felt.get_label(), (out / "presses").is_dir()) == ("pressed", "estimated", True)
-    apart = np.hypot(*(np.array(pressed.get_data()) - felt.get_data()))
-    medians = [np.median(points.get_ydata()), np.median(apart)]
-    np.testing.assert_allclose(medians, said[[0, 2]], atol=1e-3)
+    apart = [points.get_ydata(), np.hypot(*(np.array(pressed.get_data()) - felt.get_data()))]
+    np.testing.assert_allclose([*map(np.median, apart)], said[[0, 2]], atol=1e-3)
     assert np.all(np.diff(median.get_xdata()) > 0.0)

@@ -78,8 +78,7 @@ def test_triton_serves_the_models_as_they_stand(monkeypatch):
 
 def test_triton_is_started_with_the_backend_for_onnx_beside_its_own(monkeypatch, tmp_path):
     """From a stand-in for the wheel."""
-    started, server = [], tmp_path / "pytriton/tritonserver"
-    stub = "triton_python_backend_stub"
+    started, server, stub = [], tmp_path / "pytriton/tritonserver", "triton_python_backend_stub"
     for file in (
         "../__init__.py",
         "backends/python/model.py",
@@ -115,8 +114,8 @@ def test_triton_is_started_with_the_backend_for_onnx_beside_its_own(monkeypatch,
         "grpc-address": "127.0.0.1",
         "grpc-port": "8081",
     }
-    first = [environment[name].split(":")[0] for name in ("LD_LIBRARY_PATH", "PYTHONPATH")]
-    assert first == [str(tmp_path / "nvidia_pytriton.libs"), str(tmp_path)]
+    libraries, packages = (environment[name].split(":")[0] for name in ("LD_LIBRARY_PATH", "PYTHONPATH"))
+    assert (libraries, packages) == (str(tmp_path / "nvidia_pytriton.libs"), str(tmp_path))
 
 
 # systemd

@@ -120,12 +120,11 @@ def test_misfit_alarms_are_the_flags_of_records():
         value(samples, "inference_seconds_sum", **of),
     ]
     assert seconds == pytest.approx([1e-9 * stats[stage]["ns"] for stage in ("compute_infer", "success")])
-    slower = [
-        (seconds[1] / float(labels[0][1]), value(samples, "inference_seconds_count", **of) - count)
+    assert all(  # Markov's inequality
+        value(samples, "inference_seconds_count", **of) - count <= seconds[1] / float(labels[0][1])
         for (name, *labels), count in samples.items()
         if name.endswith("inference_seconds_bucket") and ("model", MODEL) in labels
-    ]
-    assert all(count <= most for most, count in slower)  # Markov's inequality
+    )
     counts = [value(samples, f"{name}_total", **of) for name in ("presses", "misfit_checked", "misfit_alarms")]
     assert counts == [700, 400, sum(alarms) + 2 * sum(alarms[:50])]
 

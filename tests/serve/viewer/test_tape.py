@@ -103,7 +103,6 @@ def test_a_reader_does_not_wait_for_a_page_that_takes_nothing():
 def test_a_replay_stops_at_the_end_and_begins_anew():
     """It waits at the end of what is known so far."""
     head, ends = Playhead(speed=4.0), ((10.0, True), (3.0, False), (3.0, True), (3.0, True))
-    ended = [head.advance(0.5, end_s, is_complete=is_complete) for end_s, is_complete in ends]
-    assert (ended, head.at_s) == ([False, False, True, False], 3.0)
+    assert [head.advance(0.5, end_s, is_complete=known) for end_s, known in ends] == [False, False, True, False]
     head.apply(Play(), 3.0)
     assert head == Playhead(speed=4.0)
