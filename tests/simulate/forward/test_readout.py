@@ -60,8 +60,7 @@ def test_linear_stress_is_read_at_the_centre(sensor):
 def test_edges_are_the_papers():
     """Quadratic stresses tell the edges apart: s11 over left and right, s22 over lower and upper (eq. 3)."""
     square = Electrode.of_square("A", (5.0, -2.0), 3.0)
-    sensor = replace(load_sensor("four-25um-uniaxial"), electrodes=(square,), readout="edge")
-    h2 = 1.5**2
+    sensor, h2 = replace(load_sensor("four-25um-uniaxial"), electrodes=(square,), readout="edge"), 1.5**2
 
     def over_x(x, _):
         return (x - 5.0) ** 2, (x - 5.0) ** 2, 0 * x
