@@ -129,8 +129,7 @@ def deviations(
         yield Deviation("probe", notation, presses.contact, presses.noisy(case.noise, seed))
     if settings.mismatch_cases:
         film = replace(case.sensor.film, pretension=case.sensor.film.pretension + PRETENSION_OFF)
-        tighter = replace(case, sensor=replace(case.sensor, film=film))
-        maps = tighter.forward_maps(accuracy=ROUGH, executor=executor)
+        maps = replace(case, sensor=replace(case.sensor, film=film)).forward_maps(accuracy=ROUGH, executor=executor)
         presses = press_on(maps, case.sweep())
         name = f"+{PRETENSION_OFF:g} MPa"
         yield Deviation("pretension", name, presses.contact, presses.noisy(case.noise, seed))
