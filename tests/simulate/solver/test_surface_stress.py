@@ -22,8 +22,7 @@ from isocharge.simulate.mechanics.theory import theory_for
 
 PLATE = Theory(stretching=False, bending=True, pretensioned=False)
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
-FINE = Resolution(7, 8, 6, 2)
-FORCE = 1e-3
+FINE, FORCE = Resolution(7, 8, 6, 2), 1e-3
 
 
 @pytest.fixture(scope="module")
