@@ -19,8 +19,7 @@ from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration.folder import SESSION
 
-NAMES = ("A", "B", "C", "D")
-RATE_HZ = 200.0
+NAMES, RATE_HZ = ("A", "B", "C", "D"), 200.0
 
 
 class FakeSession:

@@ -69,8 +69,7 @@ def test_triton_serves_the_models_as_they_stand(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "tests/benchmarks"))
     bench_http = __import__("bench_http")
     before = {path: path.stat().st_mtime_ns for path in MODELS.rglob("*")}
-    address = ("127.0.0.1", bench_http.free_port())
-    python = bench_http.python_of("triton", ENVIRONMENTS)
+    address, python = ("127.0.0.1", bench_http.free_port()), bench_http.python_of("triton", ENVIRONMENTS)
     with bench_http.running([python, DEPLOY / "triton/start.py", MODELS, "--port", str(address[1])], address):
         assert_golden(address)
     assert {path: path.stat().st_mtime_ns for path in MODELS.rglob("*")} == before

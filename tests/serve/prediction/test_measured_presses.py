@@ -15,8 +15,7 @@ from isocharge.serve.prediction import measured_presses
 from isocharge.serve.prediction.measured_presses import KINDS, presses_text, read_press_list
 from isocharge.serve.prediction.table import LARGEST
 
-NAMES = ("A", "B", "C")
-HEADER = "x_mm,y_mm,force_N,A,B,C"
+NAMES, HEADER = ("A", "B", "C"), "x_mm,y_mm,force_N,A,B,C"
 
 
 @pytest.fixture
