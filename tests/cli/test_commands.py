@@ -4,6 +4,7 @@ import io
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -14,9 +15,11 @@ import numpy as np
 import pytest
 from pyarrow.parquet import read_table
 
+from isocharge.cli.demo.command import demo_command
 from isocharge.cli.shared.terminal import shown_progress
 from isocharge.common.progress import report
 from isocharge.common.toml_text import to_toml
+from isocharge.serve import find_model, load_model
 from isocharge.simulate import load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import solve_maps
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
@@ -322,15 +325,39 @@ def quick(folder):
     return path
 
 
-@pytest.mark.slow
-def test_the_demo_end_to_end(command, tmp_path, monkeypatch):
-    """The whole path with everything in it but the long sweep and training."""
-    monkeypatch.setattr("isocharge.cli.demo.command.SAMPLES", 4000)
-    monkeypatch.setattr("isocharge.cli.demo.command.solve_maps", partial(kept, solve_maps))
-    out = tmp_path / "first-light"
-    code, table, err = command("demo", "-o", out, "--seconds", 3, "--config", quick(tmp_path))
-    assert (code, (out / "presses" / "manifest.json").is_file()) == (0, True)
-    assert (out / "demo.png").stat().st_size > 50_000
-    for row in ("position error", "force error", "model", "one prediction", "seconds"):
-        assert row in table
-    assert "0 lost, 0 repeated" in err
+def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
+    """Without the long sweep, training and maps: it follows the released model, and finds the errors of its card."""
+    figures, released, out = [], find_model(SENSOR), tmp_path / "first-light"
+    for name, stub in {
+        "SAMPLES": 40,
+        "LATENCY_S": 0.05,
+        "solve_maps": partial(kept, solve_maps),
+        "fit": lambda *_: None,
+        "release": lambda _, folder, **__: load_model(shutil.copytree(released, folder / "1")),
+        "save_picture": lambda figure, _: figures.append(figure),
+        **dict.fromkeys(("press", "draw_deflection", "draw_section", "draw_charge_map"), lambda *_: None),
+    }.items():
+        monkeypatch.setattr(f"isocharge.cli.demo.command.{name}", stub)
+    demo_command(out, 1.5)
+    table, err = capsys.readouterr()
+    assert "300 frames, 0 lost, 0 repeated" in err
+    assert re.findall(r"^(\d)\. (\w+): ", err, re.M) == [
+        *zip("1234", ("simulate", "train", "serve", "show"), strict=True)
+    ]
+    shown = [
+        re.findall(r"-?\d+\.\d+", line) for line in err.splitlines() if line.startswith(" " * 4)
+    ]  # each half second
+    assert [*map(len, shown)] == [0, 6, 6]
+    np.testing.assert_allclose(*np.split(np.array(shown[1:], float), 2, axis=1), atol=0.5)
+    model, said = load_model(out / "models" / SENSOR / "1"), np.array(re.findall(r"(\d+\.\d+) (?:mm|%)", table), float)
+    card = ("position_median_mm", "position_p95_mm") * 2 + ("force_median_percent", "force_rms_percent")
+    ratios = said / [model.metadata.errors[key] for key in card]
+    assert np.all(np.abs(np.log(ratios)) < [0.15, 0.15, 0.9, 0.9, 0.15, 0.15])
+    size, seconds = re.search(r"(\d+) KiB", table)[1], re.findall(r"(?:simulate|train|serve|show) (\d+\.\d)", table)
+    assert (model.folder / "model.onnx").stat().st_size == pytest.approx(1024 * int(size), abs=512)
+    assert 1.5 <= sum(map(float, seconds)) < 60.0
+    (pressed, felt), (points, median, _) = ([*figures[0].axes[k].lines] for k in (2, -1))
+    assert (pressed.get_label(), felt.get_label(), (out / "presses").is_dir()) == ("pressed", "estimated", True)
+    apart = [points.get_ydata(), np.hypot(*(np.array(pressed.get_data()) - felt.get_data()))]
+    np.testing.assert_allclose([*map(np.median, apart)], said[[0, 2]], atol=1e-3)
+    assert np.all(np.diff(median.get_xdata()) > 0.0)

@@ -11,8 +11,7 @@ import pytest
 import isocharge.simulate
 import isocharge.train
 
-ROOT = Path(__file__).parents[2]
-ISOCHARGE = Path(sys.executable).parent / "isocharge"
+ROOT, ISOCHARGE = Path(__file__).parents[2], Path(sys.executable).parent / "isocharge"
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
 
 

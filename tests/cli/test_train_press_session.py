@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -18,8 +19,7 @@ from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration.folder import SESSION
 
-NAMES = ("A", "B", "C", "D")
-RATE_HZ = 200.0
+NAMES, RATE_HZ = ("A", "B", "C", "D"), 200.0
 
 
 class FakeSession:
@@ -93,7 +93,7 @@ def dialogue(*events, asks=True, contacts=None):
 
 
 def test_enter_takes_a_press_as_proposed(capsys):
-    session, _, taken = dialogue(HELD, LATER, LATE, STEADY, "", STEADY, "1.5 2 0.9", STEADY, "? ? 0.5")
+    session, _, taken = dialogue(TARED, HELD, LATER, LATE, STEADY, "", STEADY, "1.5 2 0.9", STEADY, "? ? 0.5")
     assert session.taken[:2] == [(0.0, 0.0, 1.0), (1.5, 2.0, 0.9)]
     assert np.isnan(session.taken[2][:2]).all()
     assert taken == [1, 2, 3]
@@ -101,7 +101,7 @@ def test_enter_takes_a_press_as_proposed(capsys):
     assert "\n1. Press 1.00 N at (0.0, 0.0) mm and hold." in said
     assert "hold it, 0.3 s: A 400.0, B 400.0, C 400.0, D 400.0 pC" in said
     assert ("0.8 s" in said, "hold it, 1.4 s" in said) == (False, True)  # one line a second
-    assert "steady after 0.7 s: A 500.0" in said
+    assert re.findall(r": A (\S+),", said) == ["400.0"] * 2 + ["500.0"] * 3
     assert said.count("so much is known") == 3
     assert said.endswith("The film is known well enough; --until 0 goes on.\n")
 
@@ -144,8 +144,8 @@ LIST = np.array([[1.0, 1.0, 0.5], [2.0, 2.0, 0.5], [3.0, 3.0, np.nan]])
 def test_presses_of_a_machine_are_those_of_its_list(capsys):
     session, script, _ = dialogue(TARED, STEADY, refused("it moves"), HELD, STEADY, contacts=LIST)
     np.testing.assert_array_equal(session.taken, LIST[[0, 2]])
-    assert script.armed == 0
     said = capsys.readouterr().err
+    assert script.armed == 0
     assert said.index("let the machine begin") < said.index("1. 0.50 N")
     assert "row 2 is left out: it moves" in said
 
@@ -232,8 +232,7 @@ def test_presses_of_a_machine_calibrate_a_film(command, desk, film, places):
     assert [(line["press"], line["problem"], line["next"]) for line in lines] == [
         (3, None, None)
     ]  # a machine asks for none
-    clean = film.charges(places)
-    taken = read_presses(desk / "film/1/presses.csv", NAMES)
+    clean, taken = film.charges(places), read_presses(desk / "film/1/presses.csv", NAMES)
     assert [[line["charge_pC"][name] for name in NAMES] for line in lines] == taken.charge_pC[2:].tolist()
     assert (np.abs(taken.charge_pC - clean) < 5 * np.hypot(1.0, 0.002 * clean) * np.sqrt(1 / 90 + 1 / 50)).all()
     assert lines[-1]["error_left"] == end["error_left"]

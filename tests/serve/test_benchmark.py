@@ -26,8 +26,7 @@ class Clock:
 
     def takes(self, *durations_us):
         """A call that takes the next of these durations each time."""
-        waiting = iter(1000 * duration for duration in durations_us)
-        last = [0]
+        waiting, last = iter(1000 * duration for duration in durations_us), [0]
 
         def call():
             last[0] = next(waiting, last[0])

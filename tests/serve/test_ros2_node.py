@@ -73,7 +73,14 @@ def numbers(message):
 
 
 def test_the_node_publishes_what_an_mcap_file_holds(published, record):
-    press = {"y_mm": -2.5, "force_N": 0.75, "x_std_mm": 0.05, "y_std_mm": 0.0625, "force_std_N": 0.01}
+    press = {
+        "y_mm": -2.5,
+        "force_N": 0.75,
+        "x_std_mm": 0.05,
+        "y_std_mm": 0.0625,
+        "force_std_N": 0.01,
+        "xy_correlation": 0.25,
+    }
     followed = {
         "follows": True,
         "tracked": {"x_mm": 1.0, "y_mm": -3.0, "force_N": 0.5, "x_std_mm": 0.01, "y_std_mm": 0.02},

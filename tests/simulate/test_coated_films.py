@@ -58,12 +58,18 @@ def test_strain_of_a_film_with_a_round_coat_is_the_closed_form(stiffening):
 def test_a_coat_on_both_sides_is_one_that_is_twice_as_stiff():
     both = tuple(replace(e, square=False, back=(e.corners,)) for e in INK.electrodes)
     two = replace(INK, electrodes=both, coating=0.5 * INK.coating)
-    points = (8.3 + 0.1 * np.arange(20) + 0.7j) / INK.film.radius  # across an edge
+    points = (7.3 + 0.1 * np.arange(30) + 0.7j) / INK.film.radius  # across an edge
     added = []
     for film in (two.coated_film, INK.coated_film):
         mesh = place_coated(film, PROBE, (0.0, 0.0), Resolution(2, 8, 2, 0), 0.02)
         added.append(mesh.coat.moduli(points))
     np.testing.assert_allclose(*added, atol=1e-9)
+    nu = INK.film.poisson
+    np.testing.assert_allclose(
+        added[0][[0, -1]],
+        np.multiply.outer([0.0, 0.3], np.array([[1, nu, 0], [nu, 1, 0], [0, 0, 0.5 - 0.5 * nu]]) / (1 - nu**2)),
+        atol=1e-9,
+    )
 
 
 def test_the_sensor_file_holds_the_coating():

@@ -109,8 +109,28 @@ def test_a_recording_is_drawn(command, recorded, models, tmp_path, figures):
     assert np.max(lines["force"]) == max(record["force_N"] for record in records)
     assert np.min(lines["x"]) == min(record["x_mm"] for record in contacts)
     assert np.max(lines["C"]) == max(r["charge_pC"]["C"] for r in records if r["charge_pC"])
-    words = [text.get_text() for axes in figures[0].axes for text in axes.get_yticklabels()]
-    assert {flag for record in records for flag in record["flags"]} <= set(words)
+    drawn = [
+        [y.min(), y.max()]
+        for band in next(axes for axes in figures[0].axes if axes.get_ylabel().startswith("position")).collections
+        for y in [np.concatenate([path.vertices for path in band.get_paths()])[:, 1]]
+    ]
+    expected = [  # two standard deviations, and the line
+        [end(r[name] + sign * k * r[std] for r in contacts) for end, sign in ((min, -1.0), (max, 1.0))]
+        for name, std in (("x_mm", "x_std_mm"), ("y_mm", "y_std_mm"))
+        for k in (2.0, 0.0)
+    ]
+    np.testing.assert_allclose(drawn, expected)
+    axes = next(axes for axes in figures[0].axes if axes.get_xlabel().startswith("time since"))
+    for word, bars in zip(axes.get_yticklabels(), axes.collections, strict=True):
+        begin, low, width, height = np.array([bar.get_extents().bounds for bar in bars.get_paths()]).T
+        at, y = records[0]["timestamp"], word.get_position()[1]
+        flagged = [(record["timestamp"] - at, y) for record in records if word.get_text() in record["flags"]]
+        np.testing.assert_allclose(np.column_stack([begin, low + 0.5 * height]), flagged, atol=1e-6)
+        least, most = np.array([1e-3, 1e-2]) * (records[-1]["timestamp"] - at)
+        assert least < width.min() <= width.max() < most  # a single frame is seen, and is one
+    assert {flag for record in records for flag in record["flags"]} == {
+        word.get_text() for word in axes.get_yticklabels()
+    }
     places = [np.asarray(points.get_offsets()) for points in film_of(figures[0]).collections]
     path_mm = next(offsets for offsets in places if len(offsets) == len(contacts))
     np.testing.assert_allclose(path_mm, [(record["x_mm"], record["y_mm"]) for record in contacts])
@@ -171,6 +191,12 @@ def test_lines_break_where_nothing_came(command, recorded, models, tmp_path, fig
             entry["timestamp"] += 3600.0
     path.write_text("\n".join([*lines, *map(json.dumps, later), ""]))
     assert command("serve", "plot", path, "--models", models, "-o", tmp_path / "touch.png")[0] == 0
-    assert bands_of(figures[0])["force"][:, 0].max() == pytest.approx(60.0, abs=1.0)
+    colours = [points.get_array() for points in film_of(figures[0]).collections if points.get_array() is not None]
+    bars = [
+        bar.get_extents().x1 for axes in figures[0].axes[:4] for bars in axes.collections for bar in bars.get_paths()
+    ]
+    length = float(figures[0].get_suptitle().split(" in ")[1].split()[0])
+    latest = [np.max(times) for times in (bands_of(figures[0])["force"][:, 0], *colours, bars, length)]
+    assert latest == pytest.approx([60.0] * 4, abs=1.0)
     force = next(b for axes in figures[0].axes for b in axes.collections if b.get_label() == "force")
     assert len(force.get_paths()) == 2

@@ -15,7 +15,7 @@ import pytest
 from isocharge.common.errors import ChargeError, ModelError, OutputExists
 from isocharge.common.files import sha256_of
 from isocharge.serve import ModelMetadata, check_golden, find_model, load_model, write_model
-from isocharge.serve.model.golden import make_golden
+from isocharge.serve.model.golden import contact_floors, make_golden
 
 
 @pytest.fixture
@@ -102,6 +102,18 @@ def test_golden_vectors_are_checked_before_a_version_appears(film, tmp_path, mon
     assert list(tmp_path.iterdir()) == []
 
 
+def test_floors_of_golden_answers_grow_with_area_and_force_and_are_no_less_than_the_error(film):
+    usual, wide, noisy = (
+        np.array(contact_floors(film.metadata(working_area_mm=((r, 0.0), (0.0, r), (-r, 0.0)), **changes)))
+        for r, changes in (
+            (20.0, {}),
+            (60.0, {"force_range_N": (0.05, 10.0)}),
+            (5.0, {"force_range_N": (0.05, 1.0), "errors": {"position_rms_mm": 4.0}}),
+        )
+    )
+    np.testing.assert_allclose([wide / usual, noisy], [[3.0, 3.0, 5.0], [4.0, 4.0, usual[2]]])
+
+
 def test_folder_and_model_have_one_name(film, tmp_path):
     with pytest.raises(ModelError, match="expected a folder named 'linear'"):
         write(film, tmp_path / "other")
@@ -166,8 +178,7 @@ def test_missing_golden(own_model):
     ],
 )
 def test_other_interface_is_refused(film, own_model, spoil, said):
-    data = film.onnx(film.metadata().to_props(), **spoil)
-    golden = own_model / "golden.json"
+    data, golden = film.onnx(film.metadata().to_props(), **spoil), own_model / "golden.json"
     golden.write_text(json.dumps(json.loads(golden.read_text()) | {"sha256": sha256_of(data)}))
     (own_model / "model.onnx").write_bytes(data)
     with pytest.raises(ModelError, match=said):

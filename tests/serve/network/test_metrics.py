@@ -16,8 +16,7 @@ from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.traffic import LATENCY_NS, Statistics
 from isocharge.serve.prediction.contact import Validity
 
-INFER = "/v2/models/linear/infer"
-MODEL = "three-25um-biaxial"
+INFER, MODEL = "/v2/models/linear/infer", "three-25um-biaxial"
 
 
 def body(charges, **more):
@@ -121,6 +120,11 @@ def test_misfit_alarms_are_the_flags_of_records():
         value(samples, "inference_seconds_sum", **of),
     ]
     assert seconds == pytest.approx([1e-9 * stats[stage]["ns"] for stage in ("compute_infer", "success")])
+    assert all(  # Markov's inequality
+        value(samples, "inference_seconds_count", **of) - count <= seconds[1] / float(labels[0][1])
+        for (name, *labels), count in samples.items()
+        if name.endswith("inference_seconds_bucket") and ("model", MODEL) in labels
+    )
     counts = [value(samples, f"{name}_total", **of) for name in ("presses", "misfit_checked", "misfit_alarms")]
     assert counts == [700, 400, sum(alarms) + 2 * sum(alarms[:50])]
 

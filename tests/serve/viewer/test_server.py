@@ -288,7 +288,7 @@ def test_other_paths(page, path):
 def test_files_of_the_page(page):
     """Every file that the page names is served, loads nothing from elsewhere, and a browser is told to see to it."""
     status, headers, body = page.get("/")
-    assert status == 200
+    assert (status, headers["X-Content-Type-Options"], headers["Referrer-Policy"]) == (200, "nosniff", "no-referrer")
     policy = headers["Content-Security-Policy"]
     assert "default-src 'none'" in policy
     assert "script-src 'self'" in policy

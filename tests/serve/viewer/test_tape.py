@@ -9,9 +9,9 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from isocharge.serve.viewer.hub import PIECES, RecordedTape, Tape
+from isocharge.serve.viewer.hub import PIECES, Playhead, RecordedTape, Tape
 from isocharge.serve.viewer.link import make_link
-from isocharge.serve.viewer.messages import SampleFormat
+from isocharge.serve.viewer.messages import Play, SampleFormat
 
 FORM = SampleFormat(("A",))
 
@@ -98,3 +98,11 @@ def test_a_reader_does_not_wait_for_a_page_that_takes_nothing():
     assert len(page.replies()) == told
     reader.close()
     page.close_here()
+
+
+def test_a_replay_stops_at_the_end_and_begins_anew():
+    """It waits at the end of what is known so far."""
+    head, ends = Playhead(speed=4.0), ((10.0, True), (3.0, False), (3.0, True), (3.0, True))
+    assert [head.advance(0.5, end_s, is_complete=known) for end_s, known in ends] == [False, False, True, False]
+    head.apply(Play(), 3.0)
+    assert head == Playhead(speed=4.0)

@@ -180,18 +180,17 @@ def test_an_electrode_within_the_area_is_no_fold(film):
 
 def test_the_nearest_fold_is_that_of_a_grid_of_a_tenth_of_a_millimetre(charges):
     """Brute force, with derivatives by differences: signs of det J."""
-    model = charges("three-25um-uniaxial")
-    steps = 0.1 * np.arange(-50, 51)
+    model, steps = charges("three-25um-uniaxial"), 0.1 * np.arange(-50, 51)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
     contact = np.stack([x, y, np.full(x.size, 0.316)], axis=1)
     sign = np.sign(np.linalg.det(differences(model.charges, contact, (0.01, 0.01, 1e-3))))
-    turned = sign != sign[x.size // 2]
-    folds = find_folds(model, Rings.spread(11.5), 0.316, REFERENCE).points
+    turned, folds = sign != sign[x.size // 2], find_folds(model, Rings.spread(11.5), 0.316, REFERENCE).points
     assert np.hypot(*folds[0]) == pytest.approx(np.hypot(x, y)[turned].min(), abs=0.1)
 
 
-def test_ambiguous_pairs_are_mirror_images_in_the_crease():
-    pairs = find_ambiguous_pairs(creased(), REFERENCE, 0.5, places=400)
+@pytest.mark.parametrize("forces", [FORCES, (0.5, 0.5)], ids=["a range", "one force"])
+def test_ambiguous_pairs_are_mirror_images_in_the_crease(forces):
+    pairs = find_ambiguous_pairs(creased(forces=forces), REFERENCE, 0.5, places=400)
     assert len(pairs) > 20
     assert pairs.first[:, 0] + pairs.second[:, 0] == pytest.approx(2.0 * CREASE, abs=0.5)
     assert pairs.first[:, 1] == pytest.approx(pairs.second[:, 1], abs=0.5)
@@ -222,7 +221,7 @@ def test_the_crease_bounds_the_working_area():
 
 def test_the_allowed_error_bounds_it_earlier():
     working = working_area(creased(), REFERENCE, error=0.2, search_pairs=False)
-    assert working.bound == "error"
+    assert (working.bound, "exceeds 0.2 mm" in working.summary) == ("error", True)
     ring = working.error_radius * np.exp(2j * np.pi * np.arange(360) / 360)
     contact = np.stack([ring.real, ring.imag, np.full(360, 0.05)], axis=1)
     assert limits_at(creased(), contact, REFERENCE).position.max() == pytest.approx(0.2, rel=0.01)

@@ -22,8 +22,7 @@ from isocharge.simulate import (
 from isocharge.simulate.identifiability.identification import Identification, map_to_search, search_radius
 from kept import kept
 
-REFERENCE = noise_model("reference")
-SENSOR = load_sensor("three-25um-biaxial")
+REFERENCE, SENSOR = noise_model("reference"), load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SensorError
-from isocharge.simulate import Calibration, Circle, Electrode, Film, Piezo, Sensor, load_sensor, press, touch_charge
+from isocharge.simulate import Calibration, Circle, Electrode, Piezo, Sensor, load_sensor, press, touch_charge
 from isocharge.simulate.sensor.film import Coat
 
 SQUARE = Electrode.of_square("D", (0.0, 0.0), 3.0)
@@ -227,8 +227,3 @@ def test_rotation_by_the_layouts_own_angle_permutes():
     rotated = replace(sensor, calibration=Calibration(rotation=0.5 * np.pi))
     expected = np.roll(touch_charge(sensor, solved), -1)
     np.testing.assert_allclose(touch_charge(rotated, solved), expected, rtol=1e-12)
-
-
-def test_sensors_are_values(three):
-    assert three == load_sensor("three-25um-biaxial") != load_sensor("three-25um-uniaxial")
-    assert three.film == Film(radius=45.0, thickness=0.025, young=3000.0, poisson=0.34)

@@ -1,6 +1,7 @@
 """From a fitted network to a model folder, what the outputs of released models mean, and students of them."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -123,7 +124,9 @@ def test_the_folder_is_complete_and_says_what_it_holds(released, dataset, sensor
     card = (released.folder / "card.md").read_text()
     assert f"{metadata.errors['position_median_mm']:g} mm" in card
     assert f"beyond {metadata.yield_force_N:g} N the film is stressed to more than 45 MPa" in card
-    assert "make it" in card
+    shares = "coverage_68", "coverage_95", "found_gain_20_percent", "found_dead_electrode"
+    said = re.findall(r"(?:intervals \||finds|20 %, and) (\S+) %", card)
+    np.testing.assert_allclose(np.array(said, float) / 100.0, [metadata.errors[share] for share in shares], atol=5e-4)
     _, block, _ = card.split("---\n", 2)
     [index] = yaml.safe_load(block)["model-index"]
     [result] = index["results"]

@@ -55,6 +55,29 @@ def test_errors_are_drawn_over_the_film():
         assert cells.get_clim() == pytest.approx((0.1 * unit, 0.2 * unit))
 
 
+@pytest.mark.parametrize("plot", ["latency", "throughput", "memory"])
+def test_better_is_to_the_left_and_below(plot):
+    """The best two are on the front; the released model is marked; a limit above all errors is left out."""
+    records = [
+        SimpleNamespace(
+            rival=SimpleNamespace(name=name, kind="network", given_force=False),
+            errors=SimpleNamespace(position_rms_mm=error),
+            error_mm=error,
+            competes=True,
+            cost={plot: cost}.get,
+            best_on={plot} if error < 0.5 else {},
+        )
+        for name, error, cost in ((pictures.RELEASED, 0.1, 8.0), ("small", 0.3, 2.0), ("large", 0.5, 9.0))
+    ]
+    axes = pictures.speed_plot(records, plot, {pictures.BAYES: 0.05, pictures.CRAMER_RAO: 0.7}).axes[0]
+    *points, front, limit = axes.lines
+    assert [line.get_marker() == "*" for line in points] == [True, False, False]
+    assert (axes.xaxis_inverted(), [*front.get_xdata()]) == (plot == "throughput", [2.0, 8.0])
+    # between two methods the error is that of the one that is no costlier
+    assert front.get_drawstyle() == ("steps-pre" if plot == "throughput" else "steps-post")
+    assert limit.get_ydata()[0] == 0.05
+
+
 def test_coverage_is_drawn_less_its_level():
     record = {"levels": [0.5, 0.9], "coverage": {name: [0.6, 0.85] for name in ("x", "y", "force")}}
     lines = pictures.calibration(record).axes[0].lines

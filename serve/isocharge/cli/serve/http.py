@@ -97,7 +97,7 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
         yield Traffic()
         return
     with LineQueue(write_stderr) as lines:
-        lines_of_json = RequestLog(lines.put, secret=token or "")
+        lines_of_json = RequestLog(lines.put, secret=token)
         logging.basicConfig(level=logging.WARNING, handlers=[lines_of_json], force=True)
         logging.captureWarnings(True)
         traffic = Traffic(lines_of_json)

@@ -158,7 +158,7 @@ def stream_command(
     board = with_section(board, "follow") if follow else board
     path = TouchStream(predictor, board, policy=policy, frame_id=name)
     latencies: deque[float] = deque(maxlen=LATENCIES)
-    recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name or "") if record else None
+    recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name) if record else None
     recorded = RecordedStream(path, recorder)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
@@ -177,7 +177,7 @@ def stream_command(
         put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
         write = record_writer(stack, output, udp, predictor.metadata.electrodes, put, path.fields)
         if page is not None:
-            header = None if recorder else (policy.value, board.table, name or "")
+            header = None if recorder else (policy.value, board.table, name)
             stack.enter_context(answering(page, recorded, header))
             feed = PageFeed(page, path, recorded)
             write = in_turn(write, lambda record, _: feed.put(record))

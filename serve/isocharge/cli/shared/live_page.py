@@ -148,7 +148,7 @@ class PageFeed:
 
 
 @contextmanager
-def answering(link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str] | None) -> Iterator[None]:
+def answering(link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str | None] | None) -> Iterator[None]:
     """Do what the page asks of a live stream while the block runs, and show warnings of the live path on the page.
 
     Args:
@@ -175,7 +175,9 @@ def answering(link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str
         logger.removeHandler(handler)
 
 
-def _do(request: LiveRequest, link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str] | None) -> None:
+def _do(
+    request: LiveRequest, link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str | None] | None
+) -> None:
     match request:
         case Marker(text=text):
             marker = recording.Marker(time.time(), text)

@@ -47,7 +47,7 @@ RECORD_TOPIC, WRENCH_TOPIC, POSE_TOPIC = "/isocharge/record", "/isocharge/wrench
 FLUSH_S = 1.0
 """Longest time for which records wait in memory, s; more are lost if the process is killed."""
 
-LARGEST_COUNT = (1 << 32) - 1
+LARGEST_COUNT = 0xFFFFFFFF
 """Largest sequence number of a message, after which it begins again at 0."""
 
 log = logging.getLogger(__name__)

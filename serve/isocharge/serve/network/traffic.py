@@ -57,7 +57,7 @@ class RequestLog(logging.Handler):
     """Writes lines of JSON; as a handler, the messages of Python's loggers too."""
 
     def __init__(
-        self, write: Callable[[str], object], *, secret: str = "", now: Callable[[], datetime] | None = None
+        self, write: Callable[[str], object], *, secret: str | None = None, now: Callable[[], datetime] | None = None
     ) -> None:
         """Set up the log.
 

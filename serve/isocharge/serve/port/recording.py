@@ -70,7 +70,7 @@ class Recorder:
         failed: Whether writing has stopped because the disk is full. What was written before is whole.
     """
 
-    def __init__(self, path: Path, model: str, policy: str, device: Mapping[str, Any], name: str = "") -> None:
+    def __init__(self, path: Path, model: str, policy: str, device: Mapping[str, Any], name: str | None = None) -> None:
         """Describe a recording; the file is created on entering the context.
 
         Args:
@@ -78,7 +78,7 @@ class Recorder:
             model: The model's label, `name/version`.
             policy: Which frames get a record.
             device: Content of the device file.
-            name: The film's own name in the records; empty for that of the model's sensor.
+            name: The film's own name in the records; None for that of the model's sensor.
         """
         self.path, self.model_label = path, model
         self.failed = False
@@ -205,7 +205,7 @@ class Recording:
         chunk: Chunk | None = None
         latencies_us: list[float] = []
         for entry in self._lines(_Entry):
-            if entry.latency_us is not None and entry.timestamp is not None:
+            if entry.latency_us is not None:
                 latencies_us.append(entry.latency_us)
                 continue
             if chunk is not None:
@@ -263,7 +263,7 @@ class _Entry(Struct):
     chunk: tuple[Moment, Nanoseconds, Annotated[float, Meta(ge=0.0)], bytes] | None = None
 
     def __post_init__(self) -> None:
-        if self.timestamp is not None and self.latency_us is None:
+        if (self.timestamp is None) != (self.latency_us is None):
             raise WrongKey("latency_us")
         if all(key is None for key in (self.timestamp, self.tare, self.back, self.use, self.marker, self.chunk)):
             raise WrongKey("chunk")

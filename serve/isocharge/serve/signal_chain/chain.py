@@ -186,18 +186,18 @@ def advance(
     drift = NO_DRIFT
     if chain.thermal is not None and touch.contact:
         drift = _drift(chain, state.drift, charge_pC, misfit, dt_s, saturated=saturated)
+    told = chain.thermal is not None and abs(drift.charge_pC) >= chain.thermal.tell_pC
     if touch.contact and drift.charge_pC != state.drift.charge_pC:
         change_pC = (drift.charge_pC - state.drift.charge_pC) * chain.pyro
         charge_pC = charge_pC - change_pC
         if memory is not None:
-            told = chain.thermal is not None and abs(drift.charge_pC) >= chain.thermal.tell_pC
             memory = warmer(memory, change_pC, drift.rate_pC_per_s * chain.pyro, learns=not told)
         else:
             leak, tare = _without_warmth(leak, tare, change_pC)
     after = ChainState(state.waiting_pC, hum, state.frames, state.patient, tare, leak, memory, touch, saturated, drift)
     flags += (SATURATED,) * saturated + (NEGATIVE,) * touch.below
-    if chain.thermal is not None and not saturated:
-        flags += (THERMAL,) * (abs(drift.charge_pC) >= chain.thermal.tell_pC) + (BLIND,) * drift.blind
+    if not saturated:
+        flags += (THERMAL,) * told + (BLIND,) * drift.blind
     return after, Reading(raw_pC, charge_pC, tare, touch.contact, flags, unknown)
 
 

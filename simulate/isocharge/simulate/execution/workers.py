@@ -55,7 +55,7 @@ def in_order(
         for job in jobs:
             with _loss_of_workers():
                 pending.append(executor.submit(task, job))
-            while pending and (len(pending) >= ahead or (pending[0].done() and pending[-1].done())):
+            while pending and (len(pending) >= ahead or all(future.done() for future in pending)):
                 yield _result(pending.popleft())
         while pending:
             yield _result(pending.popleft())

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
-from isocharge.simulate.numerics.polygon import area_in_disk
+from isocharge.simulate.numerics.polygon import area_in_disk, spare
 
 DIFFERENCE = 0.1
 """Step of the differences that give the normal, in widths of the band."""
@@ -74,8 +74,7 @@ class Coating:
         for layer in self.layers:
             covered = np.zeros(points.shape, dtype=bool)
             for part in layer:
-                step = np.roll(part, -1) - part
-                covered |= (np.conj(step) * (points[..., None] - part)).imag.min(axis=-1) >= 0.0
+                covered |= spare(part, points) >= 0.0
             depth += covered
         return depth
 
@@ -86,8 +85,7 @@ class Coating:
         x, y = (self._shares(points + d).sum(-1) - self._shares(points - d).sum(-1) for d in (step, 1j * step))
         size = np.hypot(x, y)
         x, y = (np.divide(part, size, out=np.full_like(size, np.sqrt(0.5)), where=size > 0.0) for part in (x, y))
-        ends = np.ones((*points.shape, 1))
-        shares = -np.diff(np.concatenate([ends, covered, 0.0 * ends], axis=-1))
+        shares = -np.diff(covered, prepend=1.0, append=0.0)
         across = np.zeros((*points.shape, 1, 3, 2))
         across[..., 0, 0, 0] = across[..., 0, 2, 1] = x
         across[..., 0, 1, 1] = across[..., 0, 2, 0] = y

@@ -17,7 +17,7 @@ from isocharge.simulate.mesh.coating import Coating
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.template import Template, sample_points
 from isocharge.simulate.numerics.interpolation import lagrange_values, lobatto_nodes, lobatto_weights, tensor_values
-from isocharge.simulate.numerics.polygon import area_of, to_corners
+from isocharge.simulate.numerics.polygon import area_of, spare, to_corners
 
 GRADING = 1.0
 """An element is split if a line lies nearer to its middle than this multiple of its longest side."""
@@ -187,6 +187,5 @@ def _edges(parts: tuple[Complexes, ...], finest: float) -> Complexes:
             outside.append(points[-1] - 1e-3j * finest * (end - start) / abs(end - start))
     beyond, inner = np.concatenate(outside), np.zeros(sum(map(len, points)), dtype=bool)
     for part in parts:
-        step = np.roll(part, -1) - part
-        inner |= (np.conj(step) * (beyond[:, None] - part)).imag.min(axis=1) > 0.0
+        inner |= spare(part, beyond) > 0.0
     return np.concatenate(points)[~inner]

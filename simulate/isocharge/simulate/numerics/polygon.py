@@ -52,6 +52,15 @@ def to_corners(z: Complexes) -> Array:
     return np.stack([z.real, z.imag], axis=1)
 
 
+def spare(corners: Complexes, points: Complexes) -> Array:
+    """How far points are inside a convex polygon, in its smallest product of a side and the distance from it.
+
+    Corners are anticlockwise; negative outside; of the shape of `points`.
+    """
+    step = np.roll(corners, -1) - corners
+    return np.asarray((np.conj(step) * (points[..., None] - corners)).imag.min(axis=-1))
+
+
 def shared_area(first: Complexes, second: Complexes) -> float:
     """Area common to two convex polygons with anticlockwise corners x + iy (Sutherland and Hodgman 1974)."""
     clipped = first

@@ -34,7 +34,7 @@ MOST_ORDERS = 3
 ANOTHER = 0.1
 """Relative difference above which two meshes have different equilibria: a film that wrinkles has many."""
 
-FIRST_LOAD, LOAD_STEPS = 1.0 / 16.0, 12
+FIRST_LOAD, LOAD_STEPS = 0.0625, 12
 """If the full load fails at once: share of the load to begin with, and how many loads to try at most."""
 
 

@@ -42,7 +42,7 @@ def serve(store):
         yield start
 
 
-def call(channel, name, metadata=None, **fields):
+def call(channel, name, /, metadata=None, **fields):
     request, response = METHODS[name]
     method = channel.unary_unary(
         f"/{SERVICE}/{name}",
@@ -125,9 +125,9 @@ def test_a_token(serve, monkeypatch):
     noted = []
     monkeypatch.setattr(Traffic, "note", lambda _, exchange: noted.append(exchange))
     ask = partial(call, serve(token=Token("open sesame"))())
-    assert ask("ServerLive").live
-    assert ask("ServerReady").ready
-    assert ask("ServerMetadata", metadata=[("authorization", "Bearer open sesame")]).name == "isocharge"
+    assert all((ask("ServerLive").live, ask("ServerReady").ready))
+    named = ask("ModelMetadata", metadata=[("authorization", "Bearer open sesame")], name="linear", version="1")
+    assert (named.name, [exchange.model for exchange in noted]) == ("linear", [None, None, "linear/1"])
     for metadata in ([], [("authorization", "Bearer sesame")]):
         with pytest.raises(grpc.RpcError, match="this server's token") as caught:
             ask("ServerMetadata", metadata=metadata)

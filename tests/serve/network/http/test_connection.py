@@ -83,8 +83,7 @@ def connect():
     with asyncio.Runner() as runner:
 
         def start():
-            connection = Connection(Echo(), set(), runner.get_loop())
-            wire = Wire()
+            connection, wire = Connection(Echo(), set(), runner.get_loop()), Wire()
             connection.connection_made(wire)
             return connection, wire
 

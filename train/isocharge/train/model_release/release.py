@@ -196,9 +196,10 @@ def _misfit(metadata: ModelMetadata, fitted: Fitted) -> str:
     of_unit = f" `{unit.name}` (1 pC and 0.2 %)" if unit != fitted.noise else ""
     rare = f",\n0.1 % exceed {errors['misfit_p999']:g}" if "misfit_p999" in errors else ""
     if "found_dead_electrode" in errors:
+        gain, dead = (100 * errors[share] for share in ("found_gain_20_percent", "found_dead_electrode"))
         shares = (
-            f"Of presses of about 1 N the former finds {100 * errors['found_gain_20_percent']:.3g} % where one gain\n"
-            f"is off by 20 %, and {100 * errors['found_dead_electrode']:.3g} % where one electrode is dead."
+            f"Of presses of about 1 N the former finds {gain:.3g} % where one gain\n"
+            f"is off by 20 %, and {dead:.3g} % where one electrode is dead."
         )
     sees = "Charges that disagree with each other (a wrong gain, a dead electrode, two presses) raise it."
     if len(metadata.electrodes) == 3:

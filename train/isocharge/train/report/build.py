@@ -169,7 +169,7 @@ class _Subject:
 
     def measure(self, folder: Path, stem: str, executor: Executor) -> dict[str, Any]:
         """Everything about this dataset: its section of the record, its pictures written."""
-        section, drawings = self._measured() if self.held is not None else self._simulated(executor)
+        section, drawings = self._simulated(executor) if self.held is None else self._measured(self.held)
         limits = pictures.limit_lines(section["limits"])
         for plot in pictures.AXES:
             drawings[plot] = lambda plot=plot: pictures.speed_plot(section["methods"], plot, limits)  # type: ignore[misc]
@@ -211,9 +211,8 @@ class _Subject:
         }
         return section, _drawings(section, case, draws)
 
-    def _measured(self) -> tuple[dict[str, Any], Drawings]:
+    def _measured(self, test: LabelledPresses) -> tuple[dict[str, Any], Drawings]:
         """The same of measured presses, as they are: what needs a simulator is left out."""
-        test = self.held or self.task.validation
         methods, refused = fit_all([*self._models(), *rivals(self.task), *self._networks()], self.task, test)
         records = records_of(methods, test, self.settings)
         section = {

@@ -141,17 +141,13 @@ class EvaluationCase:
     def forward_maps(
         self,
         *,
-        sensor: Sensor | None = None,
-        probes: tuple[Probe, ...] | None = None,
         further: float = FURTHER,
         accuracy: float | None = None,
         executor: Executor | None = None,
     ) -> tuple[ForwardMap, ...]:
-        """Forward maps of the sensor under its probes, or of another sensor, other probes, another reach."""
+        """Forward maps of the sensor under its probes, solved so much further than the dataset reaches."""
         settings = SolveSettings() if accuracy is None else SolveSettings(accuracy=accuracy)
-        return solve_maps(
-            sensor or self.sensor, probes or self.probes, self.sweep(further), settings, executor=executor
-        )
+        return solve_maps(self.sensor, self.probes, self.sweep(further), settings, executor=executor)
 
 
 def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:

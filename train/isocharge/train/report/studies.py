@@ -124,12 +124,12 @@ def deviations(
         louder = NoiseModel(f"x {level:g}", level * case.noise.white, level * case.noise.gain)
         yield Deviation("noise", louder.name, truth, clean.noisy(louder, seed))
     for notation in settings.shapes:
-        maps = case.forward_maps(probes=(parse_probe(notation),), accuracy=rough, executor=executor)
+        maps = replace(case, probes=(parse_probe(notation),)).forward_maps(accuracy=rough, executor=executor)
         presses = press_on(maps, case.sweep())
         yield Deviation("probe", notation, presses.contact, presses.noisy(case.noise, seed))
     if settings.mismatch_cases:
         film = replace(case.sensor.film, pretension=case.sensor.film.pretension + PRETENSION_OFF)
-        maps = case.forward_maps(sensor=replace(case.sensor, film=film), accuracy=ROUGH, executor=executor)
+        maps = replace(case, sensor=replace(case.sensor, film=film)).forward_maps(accuracy=ROUGH, executor=executor)
         presses = press_on(maps, case.sweep())
         name = f"+{PRETENSION_OFF:g} MPa"
         yield Deviation("pretension", name, presses.contact, presses.noisy(case.noise, seed))

@@ -186,7 +186,7 @@ def corrected_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Do
     for _ in range(GROSS_ROUNDS):
         chi2 = residuals.chi2(correction.log_factor(presses.contact))
         last, gross = gross, chi2 > GROSS * np.median(chi2)
-        if (gross == last).all():
+        if np.array_equal(gross, last):
             break
         correction = fit_correction(residuals[~gross])
     if gross.any():

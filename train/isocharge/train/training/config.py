@@ -66,7 +66,7 @@ class TrainingConfig(Settings, frozen=True):
     patience: Count = 3_000
     hold_out: Annotated[float, Meta(gt=0.0, lt=0.6, description="a number between 0 and 0.6")] = 0.1
     noise: Annotated[str | NoiseModel, Meta(description="a text")] = "reference"
-    seed: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 0
+    seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
     threads: Annotated[int, Meta(ge=1, le=64)] = 1
 
     @property
