@@ -135,8 +135,8 @@ class FilmsModel:
         presses = LabelledPresses(contact[:fresh], (charge * ratio)[:fresh])
         if factor is not None:
             taught = np.arange(fresh, fresh + TAUGHT).repeat(COPIES)
-            as_if = self.noise.add(charge[taught], rng)
-            network = network.corrected(as_if * ratio[taught], as_if)
+            noisy = self.noise.add((charge * ratio)[taught], rng)
+            network = network.corrected(noisy, noisy / ratio[taught], contact[taught])
         if correlation:
             of = slice(fresh, fresh + learned)
             examples = LabelledPresses(contact[of], (charge * ratio)[of])
