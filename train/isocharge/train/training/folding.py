@@ -24,8 +24,9 @@ them, over the mean square of a feature of size one."""
 EXACT, ROUGH = 1e-5, 0.03
 """Ridges for answers that are known, and for deviations of which single errors tell."""
 
-FARTHEST = 4.0
-"""Deviations as which a larger error counts when deviations are taught."""
+FARTHEST = 3.0
+"""Deviations as which a larger error counts where deviations are taught: its square changes their logarithms, and would
+go too far."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,11 @@ class FoldedLayers:
     def behind(self, matrix: Array, shift: Array) -> "FoldedLayers":
         """The layers that answer logarithms as these answer logarithms @ matrix + shift."""
         (weight, bias), *between = self.hidden
-        first, last = (matrix @ weight, bias + shift @ weight), (self.last[0], self.last[1] + shift @ self.skip)
-        return FoldedLayers(hidden=(first, *between), last=last, skip=matrix @ self.skip)
+        return FoldedLayers(
+            hidden=((matrix @ weight, bias + shift @ weight), *between),
+            last=(self.last[0], self.last[1] + shift @ self.skip),
+            skip=matrix @ self.skip,
+        )
 
     def taught(self, logs: Array, *lessons: Lesson) -> "FoldedLayers":
         """The same layers but for the last, which is changed by as little as gives other answers (ridge regression).
@@ -151,7 +155,7 @@ class FoldedNetwork:
         """The network that answers charges as this one answers others, with deviations as large as its errors are.
 
         A linear map between the logarithms goes into the first layer, and the last is taught the rest. For the
-        deviations the likelihood of a Gaussian is maximised by Fisher's scoring (McCullagh and Nelder 1989, 2.5): two
+        deviations the likelihood of a Gaussian is maximised by Fisher's scoring (McCullagh and Nelder 1989, 2.5): three
         regressions on (error / deviation)^2.
 
         Args:
@@ -171,7 +175,7 @@ class FoldedNetwork:
             return np.concatenate([before[:, :3], before[:, 3:6] + 0.5 * (error**2 - 1.0), before[:, 6:]], axis=1)
 
         behind = self.layers.behind(np.array(matrix), shift)
-        return replace(self, layers=behind.taught(logs, (wanted, EXACT), (nearer, ROUGH), (nearer, ROUGH)))
+        return replace(self, layers=behind.taught(logs, (wanted, EXACT), *[(nearer, ROUGH)] * 3))
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
