@@ -338,24 +338,22 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
         **dict.fromkeys(("press", "draw_deflection", "draw_section", "draw_charge_map"), lambda *_: None),
     }.items():
         monkeypatch.setattr(f"isocharge.cli.demo.command.{name}", stub)
-    demo_command(out, 1.5)
+    demo_command(out, 2.0)
     table, err = capsys.readouterr()
-    assert "300 frames, 0 lost, 0 repeated" in err
+    assert "400 frames, 0 lost, 0 repeated" in err
     assert re.findall(r"^(\d)\. (\w+): ", err, re.M) == [
         *zip("1234", ("simulate", "train", "serve", "show"), strict=True)
     ]
-    shown = [
-        re.findall(r"-?\d+\.\d+", line) for line in err.splitlines() if line.startswith(" " * 4)
-    ]  # each half second
-    assert [*map(len, shown)] == [0, 6, 6]
-    np.testing.assert_allclose(*np.split(np.array(shown[1:], float), 2, axis=1), atol=0.5)
+    shown = [re.findall(r"-?\d+\.\d+", line) for line in err.splitlines() if line.startswith(" " * 4)]
+    assert (len(shown), len(shown[0]), len(shown[-1])) == (4, 0, 6)  # each half second; presses come after a second
+    np.testing.assert_allclose(*np.split(np.array([row for row in shown if row], float), 2, axis=1), atol=0.5)
     model, said = load_model(out / "models" / SENSOR / "1"), np.array(re.findall(r"(\d+\.\d+) (?:mm|%)", table), float)
     card = ("position_median_mm", "position_p95_mm") * 2 + ("force_median_percent", "force_rms_percent")
     ratios = said / [model.metadata.errors[key] for key in card]
     assert np.all(np.abs(np.log(ratios)) < [0.15, 0.15, 0.9, 0.9, 0.15, 0.15])
     size, seconds = re.search(r"(\d+) KiB", table)[1], re.findall(r"(?:simulate|train|serve|show) (\d+\.\d)", table)
     assert (model.folder / "model.onnx").stat().st_size == pytest.approx(1024 * int(size), abs=512)
-    assert 1.5 <= sum(map(float, seconds)) < 60.0
+    assert 2.0 <= sum(map(float, seconds)) < 60.0
     (pressed, felt), (points, median, _) = ([*figures[0].axes[k].lines] for k in (2, -1))
     assert (pressed.get_label(), felt.get_label(), (out / "presses").is_dir()) == ("pressed", "estimated", True)
     apart = [points.get_ydata(), np.hypot(*(np.array(pressed.get_data()) - felt.get_data()))]

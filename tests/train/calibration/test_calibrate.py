@@ -482,7 +482,7 @@ def test_electrodes_with_traces_are_read_by_the_network_of_their_pads(problem):
     )
     off = fitted.predict(np.array(charge))[0] - contact[:10]
     assert fitted.sensor.electrodes == sensor.electrodes
-    assert np.hypot(off[:, 0], off[:, 1]).mean() < 0.1  # of the pads alone 0.9
+    assert np.hypot(off[:, 0], off[:, 1]).mean() < 0.05  # of the pads alone 0.9
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import ModelError, PressError, SceneError, SensorError
 from isocharge.serve.model.model_folder import find_model, model_names, repositories
 from isocharge.simulate import Circle, Domain, FilmPrior, NoiseModel, Probe, Sensor
-from isocharge.simulate.sensor.film_prior import SHARED
 from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.contacts import NUISANCES
 from isocharge.train.calibration.discrepancy import Hypothesis
@@ -208,9 +207,8 @@ class CalibrationProblem:
     ) -> Fitted:
         """The network of a film, arguments as `FilmsModel.film` takes them.
 
-        The charges of the film over those of the network's, its factor and what only the described electrodes have,
-        count as gains as far as they are the same everywhere; the network's last layer is changed for the rest. Only
-        one for `release` learns correlations and is judged.
+        The network is changed for its factor and for what only the described electrodes have. Only one for `release`
+        learns correlations and is judged.
         """
         about: dict[str, Any] = {} if release else {"correlation": False, "fresh": 0}
         described, own = self.charges.forward_map(parameters), self.films.forward_map(parameters)
@@ -220,11 +218,7 @@ class CalibrationProblem:
                 return factor(contact)
             return np.asarray(factor(contact) * described.charges(contact) / own.charges(contact))
 
-        alike = bool(self.sensor.calibration.crosstalk)  # which gains of each electrode would change
-        gains, scaled = np.median(over_own(left[0]), axis=None if alike else 0), parameters.copy()
-        scaled[len(SHARED) :] += np.log(gains)
-        fitted = self.films.film(scaled, left=left, factor=lambda contact: over_own(contact) / gains, **about)
-        return replace(fitted, sensor=described.sensor)
+        return replace(self.films.film(parameters, left=left, factor=over_own, **about), sensor=described.sensor)
 
     @property
     def domain(self) -> Domain:

@@ -17,7 +17,7 @@ from isocharge.train.training.fitted import Fitted, Provenance
 from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, PlainPerceptron, answer_units
 
 TAUGHT, COPIES = 750, 4
-"""Presses by which a last layer is changed, each with noise drawn so often; twice as many change errors by 0.5 %."""
+"""Presses by which layers are changed, each with noise drawn so often; twice as many change errors by 0.5 %."""
 
 CORRELATED = 1500
 """Presses from which correlations are learned, those among them."""
@@ -117,8 +117,8 @@ class FilmsModel:
                 known of the film, shape (n, 3): the deviations are larger by them.
             provenance: For the release, if there is something to say.
             factor: Contacts (x, y, F), shape (n, 3), mm and N, to factors on the charges, shape (n, n_electrode), if
-                they differ by some percent from those of the parameters: the network's last layer is changed
-                accordingly.
+                they differ from those of the parameters: the network's first and last layers are changed accordingly,
+                and its deviations are those of the errors that this leaves.
             correlation: Whether it learns how errors go together; that takes a second or two.
             fresh: How many presses it has to be judged on.
 
@@ -135,8 +135,8 @@ class FilmsModel:
         presses = LabelledPresses(contact[:fresh], (charge * ratio)[:fresh])
         if factor is not None:
             taught = np.arange(fresh, fresh + TAUGHT).repeat(COPIES)
-            as_if = self.noise.add(charge[taught], rng)
-            network = network.corrected(as_if * ratio[taught], as_if)
+            noisy = self.noise.add((charge * ratio)[taught], rng)
+            network = network.corrected(noisy, noisy / ratio[taught], contact[taught])
         if correlation:
             of = slice(fresh, fresh + learned)
             examples = LabelledPresses(contact[of], (charge * ratio)[of])

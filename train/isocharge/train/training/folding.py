@@ -17,8 +17,16 @@ from isocharge.train.training.features import MISFIT_UNIT, SignedCharges, bent
 Layer = tuple[Array, Array]
 """Weights (inputs, outputs) and bias."""
 
-RIDGE = 1e-5
-"""Ridge of a last layer that is taught, over the mean square of a feature of size one."""
+Lesson = tuple[Callable[[Array], Array], float]
+"""From the present answers to other ones, both of shape (n, n_answer), and the ridge by which a last layer is taught
+them, over the mean square of a feature of size one."""
+
+EXACT, ROUGH = 1e-5, 0.03
+"""Ridges for answers that are known, and for deviations of which single errors tell."""
+
+FARTHEST = 3.0
+"""Deviations as which a larger error counts where deviations are taught: its square changes their logarithms, and would
+go too far."""
 
 
 @dataclass(frozen=True)
@@ -83,25 +91,35 @@ class FoldedLayers:
             value = np.tanh(value @ weight + bias)
         return value
 
-    def taught(self, logs: Array, wanted: Callable[[Array], Array]) -> "FoldedLayers":
-        """The same layers but for the last, which is changed by as little as gives these answers (ridge regression).
+    def behind(self, matrix: Array, shift: Array) -> "FoldedLayers":
+        """The layers that answer logarithms as these answer logarithms @ matrix + shift."""
+        (weight, bias), *between = self.hidden
+        return FoldedLayers(
+            hidden=((matrix @ weight, bias + shift @ weight), *between),
+            last=(self.last[0], self.last[1] + shift @ self.skip),
+            skip=matrix @ self.skip,
+        )
+
+    def taught(self, logs: Array, *lessons: Lesson) -> "FoldedLayers":
+        """The same layers but for the last, which is changed by as little as gives other answers (ridge regression).
 
         Each answer keeps the features that it was made of.
 
         Args:
             logs: Logarithms of charges, shape (n, n_electrode).
-            wanted: From the present answers to these, both of shape (n, n_answer).
+            lessons: One after the other.
         """
         features = self.features(logs)
-        before = self.from_features(features, logs)
-        change = wanted(before) - before
         design = np.column_stack([features, logs, np.ones(len(logs))])
         weights = np.vstack([self.last[0], self.skip, self.last[1]])
-        for column in np.flatnonzero(change.any(axis=0)):
-            rows = np.append(weights[: features.shape[1], column] != 0.0, np.ones(logs.shape[1] + 1, dtype=bool))
-            normal = design[:, rows].T @ design[:, rows]
-            normal += RIDGE * len(logs) * np.eye(len(normal))
-            weights[rows, column] += np.linalg.solve(normal, design[:, rows].T @ change[:, column])
+        for wanted, ridge in lessons:
+            before = design @ weights
+            change = wanted(before) - before
+            for column in np.flatnonzero(change.any(axis=0)):
+                rows = np.append(weights[: features.shape[1], column] != 0.0, np.ones(logs.shape[1] + 1, dtype=bool))
+                normal = design[:, rows].T @ design[:, rows]
+                normal += ridge * len(logs) * np.eye(len(normal))
+                weights[rows, column] += np.linalg.solve(normal, design[:, rows].T @ change[:, column])
         last, skip, bias = np.split(weights, [features.shape[1], features.shape[1] + logs.shape[1]])
         return replace(self, last=(last, bias[0]), skip=skip)
 
@@ -133,14 +151,31 @@ class FoldedNetwork:
         """What the layers see of charges, shape (n, n_electrode), pC: their logarithms, or what stands for them."""
         return bent(charge, self.typical, self.signed)
 
-    def corrected(self, charge: Array, as_if: Array) -> "FoldedNetwork":
-        """The network that answers charges as this one answers others, both (n, n_electrode), pC."""
-        answers = self.layers.answers(self.inputs(as_if))
+    def corrected(self, charge: Array, as_if: Array, contact: Array) -> "FoldedNetwork":
+        """The network that answers charges as this one answers others, with deviations as large as its errors are.
 
-        def wanted(before: Array) -> Array:  # deviations stay
+        A linear map between the logarithms goes into the first layer, and the last is taught the rest. For the
+        deviations the likelihood of a Gaussian is maximised by Fisher's scoring (McCullagh and Nelder 1989, 2.5): three
+        regressions on (error / deviation)^2.
+
+        Args:
+            charge: With noise, shape (n, n_electrode), pC.
+            as_if: The others, of the same shape.
+            contact: Which they are of, (x, y, F), shape (n, 3), mm and N.
+        """
+        logs, others = self.inputs(charge), self.inputs(as_if)
+        *matrix, shift = np.linalg.lstsq(np.column_stack([logs, np.ones(len(logs))]), others)[0]
+        answers, truth = self.layers.answers(others), np.column_stack([contact[:, :2], np.log(contact[:, 2])])
+
+        def wanted(before: Array) -> Array:
             return np.concatenate([answers[:, :3], before[:, 3:6], answers[:, 6:]], axis=1)
 
-        return replace(self, layers=self.layers.taught(self.inputs(charge), wanted))
+        def nearer(before: Array) -> Array:
+            error = np.minimum(np.abs(before[:, :3] - truth) * np.exp(-_relative(before)), FARTHEST)
+            return np.concatenate([before[:, :3], before[:, 3:6] + 0.5 * (error**2 - 1.0), before[:, 6:]], axis=1)
+
+        behind = self.layers.behind(np.array(matrix), shift)
+        return replace(self, layers=behind.taught(logs, (wanted, EXACT), *[(nearer, ROUGH)] * 3))
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
         """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
@@ -180,11 +215,15 @@ class FoldedNetwork:
         """
 
         def wanted(before: Array) -> Array:
-            relative = before[:, 3:6] - before[:, 2:3] * [0.0, 0.0, 1.0]  # of the force: to a deviation of ln F
-            wider = before[:, 3:6] + 0.5 * np.log1p(variance * np.exp(-2.0 * relative))
+            wider = before[:, 3:6] + 0.5 * np.log1p(variance * np.exp(-2.0 * _relative(before)))
             return np.concatenate([before[:, :3], wider, before[:, 6:]], axis=1)
 
-        return replace(self, layers=self.layers.taught(self.inputs(charge), wanted))
+        return replace(self, layers=self.layers.taught(self.inputs(charge), (wanted, EXACT)))
+
+
+def _relative(answers: Array) -> Array:
+    """Logarithms of the standard deviations of x, y and ln F, shape (n, 3), from the answers."""
+    return np.asarray(answers[:, 3:6] - answers[:, 2:3] * [0.0, 0.0, 1.0])
 
 
 def answer_units(domain: Domain, rotation: Array, offset: Array, n_electrode: int) -> Layer:
