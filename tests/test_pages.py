@@ -16,7 +16,7 @@ PAGES = {
 }
 SMALLER = {
     "--samples 100000": "--samples 500",
-    "--samples 6000": "--samples 1500",
+    "--radius 8 --force 0.05 2 --samples 6000": "--radius 3 --force 0.5 1 --samples 800",
     "--link film --seconds 90": "--link film --seconds 900 --force-max 0.05",
     "train/configs/quick.toml": "quick.toml",
 }
@@ -28,9 +28,9 @@ QUICK = """
 hidden = [24, 24]
 misfit_hidden = [24, 24]
 [training]
-steps = 300
-misfit_steps = 20
-misfit_charges = 2000
+steps = 100
+misfit_steps = 10
+misfit_charges = 1000
 """
 
 EXAMPLE_PAGES = [page for page in PAGES if not page.startswith(("serve/", "CONTRIBUTING", "CHANGELOG"))]
@@ -52,7 +52,7 @@ def presses(tmp_path_factory):
     return write_sweep(
         tmp_path_factory.mktemp("data") / "presses",
         (kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0)),),
-        Sweep(samples=2000),
+        Sweep(samples=1000),
     )
 
 

@@ -18,7 +18,7 @@ from isocharge.train.report.methods import fit_all
 pytestmark = pytest.mark.timeout(900)  # every method and every picture in one fixture
 
 NAME = "three-25um-biaxial"
-SMALL = replace(QUICK, presses=128, learn_from=1500, steps=30, batch=64, seconds=1e-3, draws=2, limited=64, shapes=())
+SMALL = replace(QUICK, presses=128, learn_from=600, steps=30, batch=64, seconds=1e-3, draws=2, limited=64, shapes=())
 PICTURES = {"latency", "throughput", "memory", "maps", "force", "calibration", "noise", "effects"}
 METHODS = {
     "released network",
