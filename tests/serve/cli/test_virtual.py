@@ -112,7 +112,7 @@ def test_described_frames_with_the_faults_of_a_script(played, tmp_path):
         int, re.search(r"(\d+) lost and (\d+) damaged on purpose, (\d+) times", result.stderr).groups()
     )
     assert lost > 100
-    assert damaged > 0
+    assert 0 < damaged < lost  # 1.4 of 5 %
     assert unplugged >= 1
 
 
