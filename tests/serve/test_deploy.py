@@ -69,7 +69,8 @@ def test_triton_serves_the_models_as_they_stand(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "tests/benchmarks"))
     bench_http = __import__("bench_http")
     before = {path: path.stat().st_mtime_ns for path in MODELS.rglob("*")}
-    address, python = ("127.0.0.1", bench_http.free_port()), bench_http.python_of("triton", ENVIRONMENTS)
+    address = ("127.0.0.1", bench_http.free_port())
+    python = bench_http.python_of("triton", ENVIRONMENTS)
     with bench_http.running([python, DEPLOY / "triton/start.py", MODELS, "--port", str(address[1])], address):
         assert_golden(address)
     assert {path: path.stat().st_mtime_ns for path in MODELS.rglob("*")} == before
@@ -123,7 +124,8 @@ def test_triton_is_started_with_the_backend_for_onnx_beside_its_own(monkeypatch,
 @pytest.fixture
 def unit(tmp_path):
     """The unit with the program of this environment, which `verify` looks for."""
-    path, program = tmp_path / "isocharge.service", str(Path(sys.executable).with_name("isocharge"))
+    path = tmp_path / "isocharge.service"
+    program = str(Path(sys.executable).with_name("isocharge"))
     path.write_text(UNIT.read_text().replace("ExecStart=/opt/isocharge/bin/isocharge", f"ExecStart={program}"))
     return path
 

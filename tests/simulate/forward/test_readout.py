@@ -60,7 +60,8 @@ def test_linear_stress_is_read_at_the_centre(sensor):
 def test_edges_are_the_papers():
     """Quadratic stresses tell the edges apart: s11 over left and right, s22 over lower and upper (eq. 3)."""
     square = Electrode.of_square("A", (5.0, -2.0), 3.0)
-    sensor, h2 = replace(load_sensor("four-25um-uniaxial"), electrodes=(square,), readout="edge"), 1.5**2
+    sensor = replace(load_sensor("four-25um-uniaxial"), electrodes=(square,), readout="edge")
+    h2 = 1.5**2
 
     def over_x(x, _):
         return (x - 5.0) ** 2, (x - 5.0) ** 2, 0 * x
@@ -132,7 +133,8 @@ def test_a_trace_collects_the_stress_under_it(film, at):
 def test_an_electrode_with_a_dent_is_its_two_rectangles(solved):
     dented = Electrode("A", ((8.0, 0.0), (12.0, 0.0), (12.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0)))
     lying = Electrode("A", ((8.0, 0.0), (12.0, 0.0), (12.0, 1.0), (8.0, 1.0)))
-    standing, sensor = Electrode("B", ((8.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0))), with_d33()
+    standing = Electrode("B", ((8.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0)))
+    sensor = with_d33()
     whole, parts, union = (
         touch_charge(replace(sensor, electrodes=electrodes), solved)
         for electrodes in ((dented,), (lying, standing), (replace(lying, more=(standing.corners,)),))

@@ -180,11 +180,13 @@ def test_an_electrode_within_the_area_is_no_fold(film):
 
 def test_the_nearest_fold_is_that_of_a_grid_of_a_tenth_of_a_millimetre(charges):
     """Brute force, with derivatives by differences: signs of det J."""
-    model, steps = charges("three-25um-uniaxial"), 0.1 * np.arange(-50, 51)
+    model = charges("three-25um-uniaxial")
+    steps = 0.1 * np.arange(-50, 51)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
     contact = np.stack([x, y, np.full(x.size, 0.316)], axis=1)
     sign = np.sign(np.linalg.det(differences(model.charges, contact, (0.01, 0.01, 1e-3))))
-    turned, folds = sign != sign[x.size // 2], find_folds(model, Rings.spread(11.5), 0.316, REFERENCE).points
+    turned = sign != sign[x.size // 2]
+    folds = find_folds(model, Rings.spread(11.5), 0.316, REFERENCE).points
     assert np.hypot(*folds[0]) == pytest.approx(np.hypot(x, y)[turned].min(), abs=0.1)
 
 

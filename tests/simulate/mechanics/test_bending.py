@@ -43,7 +43,8 @@ def test_lowest_frequency_of_a_clamped_plate(mesh_of, probe):
     laplace = np.zeros((mesh.template.n_node,) * 2)
     for numbers, block in zip(mesh.template.nodes, local, strict=True):
         laplace[np.ix_(numbers, numbers)] += block
-    mass, unit = geometry.gather(geometry.mass), np.eye(mesh.template.n_node)[:, inside]
+    mass = geometry.gather(geometry.mass)
+    unit = np.eye(mesh.template.n_node)[:, inside]
     plate = np.stack([geometry.gather(Bending(geometry, 1.0).forces(column)) for column in unit.T], axis=1)[inside]
     lowest = eigh(plate, np.diag(mass[inside]), eigvals_only=True, subset_by_index=[0, 0])[0]
     assert lowest == pytest.approx(k**4, rel=2e-4)
