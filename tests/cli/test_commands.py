@@ -349,7 +349,8 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     ]  # each half second
     assert [*map(len, shown)] == [0, 6, 6]
     np.testing.assert_allclose(*np.split(np.array(shown[1:], float), 2, axis=1), atol=0.5)
-    model, said = load_model(out / "models" / SENSOR / "1"), np.array(re.findall(r"(\d+\.\d+) (?:mm|%)", table), float)
+    model = load_model(out / "models" / SENSOR / "1")
+    said = np.array(re.findall(r"(\d+\.\d+) (?:mm|%)", table), float)
     card = ("position_median_mm", "position_p95_mm") * 2 + ("force_median_percent", "force_rms_percent")
     ratios = said / [model.metadata.errors[key] for key in card]
     assert np.all(np.abs(np.log(ratios)) < [0.15, 0.15, 0.9, 0.9, 0.15, 0.15])

@@ -78,7 +78,9 @@ def test_triton_serves_the_models_as_they_stand(monkeypatch):
 
 def test_triton_is_started_with_the_backend_for_onnx_beside_its_own(monkeypatch, tmp_path):
     """From a stand-in for the wheel."""
-    started, server, stub = [], tmp_path / "pytriton/tritonserver", "triton_python_backend_stub"
+    started = []
+    server = tmp_path / "pytriton/tritonserver"
+    stub = "triton_python_backend_stub"
     for file in (
         "../__init__.py",
         "backends/python/model.py",
@@ -87,12 +89,9 @@ def test_triton_is_started_with_the_backend_for_onnx_beside_its_own(monkeypatch,
         (server / file).parent.mkdir(parents=True, exist_ok=True)
         (server / file).touch()
     monkeypatch.syspath_prepend(tmp_path)
-    for where, name, value in (
-        (sys, "prefix", str(tmp_path)),
-        (sys, "argv", ["start.py", str(MODELS), "--port", "8080", "--grpc-port", "8081"]),
-        (os, "execve", lambda *call: started.append(call)),
-    ):
-        monkeypatch.setattr(where, name, value)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["start.py", str(MODELS), "--port", "8080", "--grpc-port", "8081"])
+    monkeypatch.setattr(os, "execve", lambda *call: started.append(call))
     runpy.run_path(str(DEPLOY / "triton/start.py"), run_name="__main__")
     ((program, words, environment),) = started
     given = dict(word.removeprefix("--").split("=") for word in words[1:])
@@ -101,11 +100,8 @@ def test_triton_is_started_with_the_backend_for_onnx_beside_its_own(monkeypatch,
         "python/model.py",
         "onnxruntime/model.py",
     }
-    assert (program, words[0], (folder / "python" / stub).is_file()) == (
-        str(server / "bin/tritonserver"),
-        program,
-        True,
-    )
+    assert program == words[0] == str(server / "bin/tritonserver")
+    assert (folder / "python" / stub).is_file()
     assert given == {
         "model-repository": str(MODELS.resolve()),
         "http-address": "127.0.0.1",
