@@ -118,16 +118,12 @@ def tables(entries: list[dict[str, Any]]) -> str:
     """The record for people."""
     solved = [entry for entry in entries if entry["status"] == "converged"]
     lines = [f"{len(entries)} draws: {Counter(entry['status'] for entry in entries)}"]
-    lines += [f"theories: {Counter(entry['theory'] for entry in solved)}"]
     for name in ("iterations", "residual", "seconds", "estimate"):
         median, high, worst = np.quantile([entry[name] for entry in solved], [0.5, 0.95, 1.0])
         lines.append(f"{name}: median {median:.3g}, 95 % {high:.3g}, worst {worst:.3g}")
     again = [entry for entry in solved if "error" in entry]
     within = sum(entry["error"] <= entry["estimate"] for entry in again)
     lines.append(f"solved again: {len(again)}, error within its estimate: {within}")
-    for name in ("error", "iterations", "residual"):
-        ranked = sorted((entry for entry in solved if name in entry), key=lambda entry: -entry[name])
-        lines += ["", f"worst by {name}", *(f"{entry[name]:.3g}: {entry['scene']}" for entry in ranked[:12])]
     refused = [entry for entry in entries if entry["status"] != "converged"]
     return "\n".join([*lines, "", "no answer", *(f"{entry['number']}: {entry['message']}" for entry in refused)])
 

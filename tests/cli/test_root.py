@@ -11,7 +11,8 @@ import pytest
 import isocharge.simulate
 import isocharge.train
 
-ROOT, ISOCHARGE = Path(__file__).parents[2], Path(sys.executable).parent / "isocharge"
+ROOT = Path(__file__).parents[2]
+ISOCHARGE = Path(sys.executable).parent / "isocharge"
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
 
 

@@ -19,7 +19,8 @@ from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration.folder import SESSION
 
-NAMES, RATE_HZ = ("A", "B", "C", "D"), 200.0
+NAMES = ("A", "B", "C", "D")
+RATE_HZ = 200.0
 
 
 class FakeSession:
@@ -232,7 +233,8 @@ def test_presses_of_a_machine_calibrate_a_film(command, desk, film, places):
     assert [(line["press"], line["problem"], line["next"]) for line in lines] == [
         (3, None, None)
     ]  # a machine asks for none
-    clean, taken = film.charges(places), read_presses(desk / "film/1/presses.csv", NAMES)
+    clean = film.charges(places)
+    taken = read_presses(desk / "film/1/presses.csv", NAMES)
     assert [[line["charge_pC"][name] for name in NAMES] for line in lines] == taken.charge_pC[2:].tolist()
     assert (np.abs(taken.charge_pC - clean) < 5 * np.hypot(1.0, 0.002 * clean) * np.sqrt(1 / 90 + 1 / 50)).all()
     assert lines[-1]["error_left"] == end["error_left"]

@@ -26,7 +26,8 @@ class Clock:
 
     def takes(self, *durations_us):
         """A call that takes the next of these durations each time."""
-        waiting, last = iter(1000 * duration for duration in durations_us), [0]
+        waiting = iter(1000 * duration for duration in durations_us)
+        last = [0]
 
         def call():
             last[0] = next(waiting, last[0])

@@ -127,7 +127,8 @@ def documented(begin, end):
 
 def test_every_key_of_the_device_file_is_explained_and_exists():
     """Both ways, by what the reader itself says that it knows."""
-    described, common = REQUIRED["frames"], {"format", "request", "request_Hz", "echo"}
+    described = REQUIRED["frames"]
+    common = {"format", "request", "request_Hz", "echo"}
     assert documented("`[frames]`:", "More keys of described") == known_keys({"frames": {"zz": 1}})
     assert (
         documented("More keys of described", "The keys of a field")

@@ -139,7 +139,8 @@ def test_plate_under_a_disk(at, radius):
     theory = FULL if at == PLACES[1] else Theory(False, True, False)
     solved = press(THICK, probe, at, TINY, SolveSettings(accuracy=1e-4, theory=theory))
     points, z = read_outside(THICK, probe, at)
-    c, scale = complex(*at) / THICK.radius, TINY * THICK.radius**2 / plate_stiffness(THICK)
+    c = complex(*at) / THICK.radius
+    scale = TINY * THICK.radius**2 / plate_stiffness(THICK)
     exact = scale * michell_under_a_disk(z, c, radius / THICK.radius)
     np.testing.assert_allclose(deflection(solved, points), exact, atol=1e-4 * exact.max())
     if radius < 1.0:
@@ -166,7 +167,8 @@ def test_taut_plate_under_a_centred_disk(tension_MPa):
     _, rim = ladder(1.0)
     parabola = -np.array([c**2, 2 * c, 2.0, 0.0]) / (4.0 * np.pi * c**2)  # in units of F / N: q a^2 / N = 1 / pi c^2
     matrix = np.block([[inner, -outer], [np.zeros((2, 2)), rim[:2]]])
-    weights, scale = np.linalg.solve(matrix, np.concatenate([-parabola, [0.0, 0.0]])), TINY / tension
+    weights = np.linalg.solve(matrix, np.concatenate([-parabola, [0.0, 0.0]]))
+    scale = TINY / tension
     for theory in (Theory(False, True, True), Theory(True, True, True)):
         solved = press(
             film,

@@ -18,7 +18,8 @@ from kept import kept
 
 SENSOR = "three-25um-biaxial"
 DESCRIBED = load_sensor(SENSOR), Circle(1.0)
-FILM_9, BUILD = virtual_film(*DESCRIBED, 9), ForwardMap.build
+FILM_9 = virtual_film(*DESCRIBED, 9)
+BUILD = ForwardMap.build
 
 
 def small_map(sensor, probe):
@@ -135,7 +136,8 @@ def test_a_seed_is_one_draw(run, asked):
     """The same film for the same seed, another for another, the described without one."""
     for words in ((), ("--film", 3), ("--film", 3, "--seed", 8), ("--film", 4)):
         run("virtual", "four-25um-biaxial", "--probe", "circle:1.5", "--seconds", 0, *words)
-    described, films = (load_sensor("four-25um-biaxial"), Circle(1.5)), [one[:2] for one in asked]
+    described = load_sensor("four-25um-biaxial"), Circle(1.5)
+    films = [one[:2] for one in asked]
     assert films[0] == described
     assert films[1] == films[2] == virtual_film(*described, 3)
     assert films[3] == virtual_film(*described, 4) != films[1]

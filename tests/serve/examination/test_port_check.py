@@ -19,7 +19,8 @@ from isocharge.serve.examination.port_check import channel_health, device_text, 
 from isocharge.serve.port.serial_line import Request
 
 RATE_HZ = 200.0
-FOUR, AT_REST = ("A", "B", "C", "D"), device_from_table({"leak": {"tau_s": 10.0}}, "test")
+FOUR = ("A", "B", "C", "D")
+AT_REST = device_from_table({"leak": {"tau_s": 10.0}}, "test")
 
 
 def heard(encode, n=400, **options):

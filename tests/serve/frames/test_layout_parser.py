@@ -78,7 +78,8 @@ def test_every_flipped_bit_is_noticed(name, counts, data):
     at, bit = data.draw(st.integers(0, len(good) - 1)), data.draw(st.integers(0, 7))
     if name == "bota_sensone" and at == 0:
         return  # its header is not covered by the checksum, but without it there is no frame
-    bad, parser = good[:at] + bytes([good[at] ^ 1 << bit]) + good[at + 1 :], DescribedParser(LAYOUTS[name])
+    bad = good[:at] + bytes([good[at] ^ 1 << bit]) + good[at + 1 :]
+    parser = DescribedParser(LAYOUTS[name])
     assert parser.feed(bad + good + bytes(len(good))) == DescribedParser(LAYOUTS[name]).feed(good)
 
 
@@ -284,6 +285,7 @@ def test_fields_that_make_no_frame(fields, said):
     ],
 )
 def test_wrong_parameters_of_a_check(change, said):
-    check, fields = {"width": 16, "polynomial": "1021"} | change, [{"name": "A", "type": "u8"}]
+    check = {"width": 16, "polynomial": "1021"} | change
+    fields = [{"name": "A", "type": "u8"}]
     with pytest.raises(DeviceError, match=said):
         frame_layout({"sync": "55", "length": 4, "checksum": check, "fields": fields}, "device.toml")

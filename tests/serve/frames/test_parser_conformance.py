@@ -61,7 +61,8 @@ class SkipsAFrame:
     def feed(self, data):
         frames = []
         for byte in data:
-            dropped, new = self._parser.counts.bytes_dropped, self._parser.feed(bytes([byte]))
+            dropped = self._parser.counts.bytes_dropped
+            new = self._parser.feed(bytes([byte]))
             self._skips |= self._parser.counts.bytes_dropped > dropped
             if new and self._skips:
                 new, self._skips = new[1:], False
@@ -89,7 +90,8 @@ def text(notation, make=TextParser):
 
 def described(table):
     """Noise before its frames often has the sync pattern in it."""
-    layout, values = frame_layout(table, "test"), st.tuples(*[st.integers(-32768, 32767).map(float)] * 3)
+    layout = frame_layout(table, "test")
+    values = st.tuples(*[st.integers(-32768, 32767).map(float)] * 3)
     noise = st.one_of(st.just(layout.sync), st.just(layout.sync[:1]), st.binary(max_size=6))
     return Format(
         partial(described_parser, layout),

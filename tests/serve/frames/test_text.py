@@ -114,7 +114,8 @@ def test_cycle_of_lines_joined_in_the_middle():
 
 
 def test_lost_line_of_a_cycle_costs_its_cycle_only():
-    parser, lines = TextParser(), [f"{name}:{100 * k + j}" for k in range(6) for j, name in enumerate("ABC")]
+    parser = TextParser()
+    lines = [f"{name}:{100 * k + j}" for k in range(6) for j, name in enumerate("ABC")]
     frames = feed(*lines[:12], *lines[13:], parser=parser)  # the fifth A is lost
     assert [frame.values[0] for frame in frames] == [0, 100, 200, 300, 500]
     assert parser.counts.malformed == 1
@@ -229,7 +230,8 @@ ENCODERS = {"binary": encode_frame} | {name: partial(encode_text, notation=name)
 @pytest.mark.parametrize("name", ENCODERS)
 @pytest.mark.parametrize("start", [0, 7, 19])
 def test_format_is_recognised_from_anywhere(name, start):
-    frames, parser = [Frame(k, 1000 * k, (800.0 + k, -7.5, 3.25)) for k in range(20)], AutoParser()
+    frames = [Frame(k, 1000 * k, (800.0 + k, -7.5, 3.25)) for k in range(20)]
+    parser = AutoParser()
     got = parser.feed(b"".join(map(ENCODERS[name], frames))[start:])
     assert len(got) >= 17
     assert [frame.values[0] for frame in got] == [frame.values[0] for frame in frames][-len(got) :]

@@ -31,7 +31,8 @@ def test_csv_has_the_fields_of_a_record(contract, record):
 @pytest.mark.parametrize("name", ["mine, left hand", 'the "good" one', "two\nlines", "cr\rlf", " blank "])
 def test_csv_takes_any_name(name, record):
     """Electrodes too may have any name."""
-    electrodes, charges = ("A", name), {"A": 1.0, name: 2.0}
+    electrodes = ("A", name)
+    charges = {"A": 1.0, name: 2.0}
     lines = csv_header(electrodes) + "\n" + csv_line(record(frame_id=name, charge_pC=charges), electrodes) + "\n"
     (row,) = csv.DictReader(io.StringIO(lines, newline=""), strict=True)
     assert (row["frame_id"], row[f"charge_pC.{name}"], row["model"]) == (name, "2.000000", "linear/1")

@@ -15,7 +15,8 @@ from isocharge.serve.port.device_clock import ReadingTime
 from isocharge.serve.signal_chain.chain import Reading
 from isocharge.serve.signal_chain.tare import Tare
 
-RATE_HZ, PRESS = 200.0, np.array([800.0, 400.0, 300.0, 500.0])
+RATE_HZ = 200.0
+PRESS = np.array([800.0, 400.0, 300.0, 500.0])
 NAMES = ("A", "B", "C", "D")
 
 
@@ -24,7 +25,8 @@ def readings(charge_pC, *, noise_pC=1.0, flags=None):
     tare, rng = Tare(np.zeros(4), np.full(4, noise_pC), 100), np.random.default_rng(1)
     for k, clean in enumerate(charge_pC):
         noisy = clean + np.hypot(noise_pC, 0.002 * clean) * rng.standard_normal(4)
-        contact, words = clean[0] > 20.0, flags(k) if flags else ()
+        contact = clean[0] > 20.0
+        words = flags(k) if flags else ()
         reading = Reading(noisy, None if TARE in words else noisy, tare, contact and TARE not in words, words)
         yield TimedReading(reading, ReadingTime(1e9 + k / RATE_HZ, round(1e6 * k / RATE_HZ), 1.0 / RATE_HZ))
 

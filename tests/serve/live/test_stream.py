@@ -126,7 +126,8 @@ def test_press_outside_the_domain_is_flagged(film, play, press, flags):
 
 
 def test_flags_of_the_frame_are_in_the_record(film, play):
-    charges, gaps = tuple((pressed(film) + OFFSET).tolist()), SequenceGaps()
+    charges = tuple((pressed(film) + OFFSET).tolist())
+    gaps = SequenceGaps()
     records = play(
         Frame(10, 0, charges), Frame(13, 0, charges, flags=1), Frame(13, 0, charges), Frame(2, 0, charges), gaps=gaps
     )

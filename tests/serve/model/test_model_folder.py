@@ -178,7 +178,8 @@ def test_missing_golden(own_model):
     ],
 )
 def test_other_interface_is_refused(film, own_model, spoil, said):
-    data, golden = film.onnx(film.metadata().to_props(), **spoil), own_model / "golden.json"
+    data = film.onnx(film.metadata().to_props(), **spoil)
+    golden = own_model / "golden.json"
     golden.write_text(json.dumps(json.loads(golden.read_text()) | {"sha256": sha256_of(data)}))
     (own_model / "model.onnx").write_bytes(data)
     with pytest.raises(ModelError, match=said):

@@ -16,7 +16,8 @@ from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.traffic import LATENCY_NS, Statistics
 from isocharge.serve.prediction.contact import Validity
 
-INFER, MODEL = "/v2/models/linear/infer", "three-25um-biaxial"
+INFER = "/v2/models/linear/infer"
+MODEL = "three-25um-biaxial"
 
 
 def body(charges, **more):

@@ -259,7 +259,8 @@ def test_no_client_can_forge_a_line_or_plant_a_secret(released, method, path, he
 
 def test_messages_of_loggers_are_lines_too(lines):
     """With tracebacks, line feeds, halves of surrogates, secrets, and far too much text."""
-    log, logger = RequestLog(lines.append, secret=SECRET), logging.Logger("isocharge.test")
+    log = RequestLog(lines.append, secret=SECRET)
+    logger = logging.Logger("isocharge.test")
     logger.addHandler(log)
     logger.warning("two\nlines \udc80 %s", FORGED + SECRET)
     try:

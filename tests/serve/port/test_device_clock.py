@@ -9,7 +9,8 @@ MODULUS, START_S = 2**32, 1_700_000_000.0
 
 
 def follow(t_us, arrived_s, modulus=MODULUS):
-    clock, times = DeviceClock(), []
+    clock = DeviceClock()
+    times = []
     for device, host in zip(t_us, arrived_s, strict=True):
         times.append(clock.read(int(device) % modulus, modulus, host))
         clock.arrived(host)
@@ -30,7 +31,8 @@ def test_fit_follows_the_rate_and_smooths_the_jitter(ppm):
     true_s = START_S + t_s * (1 + ppm * 1e-6)
     arrived_s = true_s + np.random.default_rng(0).normal(0.0, 1e-3, t_s.size)
     clock, times = follow(t_s * 1e6, arrived_s)
-    fitted_s, late = np.array([time.host_s for time in times]), slice(t_s.size // 2, None)
+    fitted_s = np.array([time.host_s for time in times])
+    late = slice(t_s.size // 2, None)
     assert np.std((fitted_s - true_s)[late]) < 0.2e-3
     assert abs(np.mean((fitted_s - true_s)[late])) < 0.1e-3
     assert (clock.rate - 1.0) * 1e6 == pytest.approx(ppm, abs=20.0)

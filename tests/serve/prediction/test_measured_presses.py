@@ -15,7 +15,8 @@ from isocharge.serve.prediction import measured_presses
 from isocharge.serve.prediction.measured_presses import KINDS, presses_text, read_press_list
 from isocharge.serve.prediction.table import LARGEST
 
-NAMES, HEADER = ("A", "B", "C"), "x_mm,y_mm,force_N,A,B,C"
+NAMES = ("A", "B", "C")
+HEADER = "x_mm,y_mm,force_N,A,B,C"
 
 
 @pytest.fixture
@@ -98,7 +99,8 @@ def test_a_list_of_presses_for_a_machine(tmp_path):
 
 
 def test_unknown_values(read):
-    presses, nan = read(f"{HEADER}\n,,0.5,10,20,30\n1,2,,10,,30\n,,,10,20,30\n"), np.nan
+    presses = read(f"{HEADER}\n,,0.5,10,20,30\n1,2,,10,,30\n,,,10,20,30\n")
+    nan = np.nan
     np.testing.assert_array_equal(presses.contact, [[nan, nan, 0.5], [1, 2, nan], [nan, nan, nan]])
     np.testing.assert_array_equal(presses.charge_pC[1], [10, nan, 30])
 
@@ -186,7 +188,8 @@ def test_shapes_that_disagree():
 
 # Round trips
 
-FINITE, POSITIVE = st.floats(-LARGEST, LARGEST), st.floats(0.0, LARGEST, exclude_min=True)
+FINITE = st.floats(-LARGEST, LARGEST)
+POSITIVE = st.floats(0.0, LARGEST, exclude_min=True)
 TEXT = st.text(st.characters(codec="utf-8"), min_size=1, max_size=8)
 
 

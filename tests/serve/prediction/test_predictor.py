@@ -1,7 +1,6 @@
 """The predictor answers what the session answers, quickly, and refuses what are no charges."""
 
 import math
-import pickle
 import re
 import tracemalloc
 from decimal import Decimal
@@ -202,9 +201,6 @@ def test_the_numbers_of_a_contact_stay_in_their_order():
     """Other programs, exported C code among them, take them by their place."""
     names = ("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit")
     assert Contact._fields == Contacts._fields == (*names, "xy_correlation", "xF_correlation", "yF_correlation")
-    contact = Contact(*map(float, range(10)))
-    assert tuple(contact) == tuple(map(float, range(10)))
-    assert pickle.loads(pickle.dumps(contact)) == contact
 
 
 def test_a_model_with_correlations_gives_them_behind_the_seven_numbers():

@@ -52,7 +52,8 @@ def test_errors_of_single_presses(film, predictor):
     pressed = np.array([[1.3, 1.6, 0.55], [-3.0, 0.5, 0.98], [0.0, 0.0, 1.02], [0.0, 1.5, 1.0]])
     stds = np.full(4, 0.1), np.full(4, 0.01)
     presses = MeasuredPresses(contact, film.charge_pC(*pressed.T), *stds, film.electrodes, (2, 3, 4, 5))
-    errors, nan = check_presses(predictor, presses).errors, np.nan
+    errors = check_presses(predictor, presses).errors
+    nan = np.nan
     np.testing.assert_allclose(errors.position_error_mm, [0.5, 0.0, nan, 0.5], atol=1e-5)
     np.testing.assert_allclose(errors.error[:, 2], [0.1, -0.02, 0.02, nan], atol=1e-6)
     np.testing.assert_allclose(errors.answer[:, :3], pressed, atol=1e-5)

@@ -38,7 +38,8 @@ def test_charges_are_the_same_from_every_kind_of_csv(text):
 
 
 def test_further_columns_are_ignored_with_a_word():
-    words, text = [], io.StringIO("x_mm,A,B,,C,x_mm\nhere,1,2,?,3,\n")
+    words = []
+    text = io.StringIO("x_mm,A,B,,C,x_mm\nhere,1,2,?,3,\n")
     np.testing.assert_array_equal(read_charges(text, NAMES, "presses.csv", words.append), [[1, 2, 3]])
     assert words == ["presses.csv: ignored columns: ['x_mm', '', 'x_mm']"]
 

@@ -13,7 +13,8 @@ from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.tare import TareRule, measure_tare
 
 RULE, OFFSET = TareRule(), np.array([12.0, -7.0, 3.0])
-RATE_HZ, ONE_PC = 200.0, np.ones(3)
+RATE_HZ = 200.0
+ONE_PC = np.ones(3)
 
 
 def rest(n, seed=0, sigma=1.0):

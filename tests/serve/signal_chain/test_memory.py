@@ -11,7 +11,8 @@ from isocharge.serve.signal_chain.memory import DECADES_S
 from isocharge.train.export_c.folder import device_header
 
 RATE_HZ, CREEP, STEP, WARMTH_S = 200.0, 0.08, 0.06, 2.5
-MEMORY, SHAPE = {"memory": {"creep": CREEP, "thermoelastic": STEP}}, np.array([500.0, 400.0, 600.0])
+MEMORY = {"memory": {"creep": CREEP, "thermoelastic": STEP}}
+SHAPE = np.array([500.0, 400.0, 600.0])
 NAMES = ("A", "B", "C")
 
 
@@ -74,7 +75,8 @@ def test_a_minute_of_creep_and_cooling_leaves_half_a_percent():
 
 @pytest.mark.parametrize("wrong", [(0.8, 0.8), (1.2, 1.2), (0.8, 1.2), (1.2, 0.8)])
 def test_what_is_known_to_a_fifth_is_said_and_learned_from_the_first_release(wrong):
-    t, table = times(105.0), {"memory": {"creep": CREEP * wrong[0], "thermoelastic": STEP * wrong[1]}}
+    t = times(105.0)
+    table = {"memory": {"creep": CREEP * wrong[0], "thermoelastic": STEP * wrong[1]}}
     got, contact, doubt = undo(np.outer(shown(t, (5.0, 65.0), (75.0, 100.0)), SHAPE), table)
     error = np.abs(got / SHAPE - 1.0).max(axis=1)
     first, second = pressed(t, 5.1, 64.9), pressed(t, 75.1, 99.9)
@@ -122,7 +124,8 @@ def test_warmth_that_comes_during_a_press_is_taken_from_it_by_the_fourth_electro
 
 def test_a_doubt_widens_contact_and_its_correlations():
     """The covariance of two independent errors is the sum of theirs."""
-    one, shift = Contact(1.0, 2.0, 0.5, 0.1, 0.2, 0.01, 0.3, 0.5, -0.2, 0.1), np.array([0.05, -0.1, 0.03])
+    one = Contact(1.0, 2.0, 0.5, 0.1, 0.2, 0.01, 0.3, 0.5, -0.2, 0.1)
+    shift = np.array([0.05, -0.1, 0.03])
 
     def covariance(contact):
         xy, xF, yF = contact[7:]

@@ -64,7 +64,8 @@ def test_charge_and_slope_are_estimated_by_a_kalman_filter():
     before, known = ThermalDrift(3.0, 40.0, covariance=5.0, rate_variance=20.0), np.array([[40.0, 5.0], [5.0, 20.0]])
     flow = expm(t * np.array([[0.0, 1.0], [0.0, -1.0 / warmth_s]]))
     walk = 3.0 * rule.wander_pC**2 * np.array([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]])
-    predicted, across = flow @ known @ flow.T + walk, np.linalg.svd(UNIAXIAL)[0][:, 3]
+    predicted = flow @ known @ flow.T + walk
+    across = np.linalg.svd(UNIAXIAL)[0][:, 3]
     gain = predicted[:, 0] / (predicted[0, 0] + (rule.noise * 2.0 / across.sum()) ** 2)
     after = track_thermal_drift(rule, before, PRESS + off_pC, misfit_of(UNIAXIAL), t, warmth_s=warmth_s)
     found = after.charge_pC - 3.0, after.rate_pC_per_s, after.variance_pC2, after.covariance, after.rate_variance
@@ -79,7 +80,8 @@ def test_misfit_is_evaluated_twenty_times_a_second():
     assert 19 <= len(asked) <= 20
 
 
-PRESS, TARE = UNIAXIAL @ [850.0, 3.0, -2.0], Tare(np.full(4, 7.0), np.ones(4), 100)
+PRESS = UNIAXIAL @ [850.0, 3.0, -2.0]
+TARE = Tare(np.full(4, 7.0), np.ones(4), 100)
 
 
 def in_contact(**changes):
@@ -90,7 +92,8 @@ def in_contact(**changes):
 
 def step(state, common_pC, *, chain=None, limited=False):
     """The next frame: the press, and the same charge more on each electrode."""
-    values, chain = PRESS + common_pC + TARE.charge_pC, chain or Chain(thermal=ThermalRule())
+    values = PRESS + common_pC + TARE.charge_pC
+    chain = chain or Chain(thermal=ThermalRule())
     return advance(chain, state, values, 0.0, 0.005, misfit=misfit_of(UNIAXIAL), limited=limited)
 
 

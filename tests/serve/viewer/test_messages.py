@@ -224,7 +224,8 @@ def test_the_page_interpolates_the_deflection():
     distance = field.distance_mm[column]
     at = points_mm(field.film["radius_mm"], field.probe_radius_mm, distance, np.array(field.rings), 13)[ring, angle]
     for mirrored in (at, at.conjugate()):
-        place, press = mirrored * np.exp(1j * turn), distance * np.exp(1j * turn)
+        place = mirrored * np.exp(1j * turn)
+        press = distance * np.exp(1j * turn)
         got = node(
             f"""import {{ readFileSync }} from "node:fs";
             import {{ Deflection }} from "{(VIEWER / "page/deflection.js").as_uri()}";

@@ -18,7 +18,8 @@ from isocharge.simulate.contours.charge_curves import Curves, Mapping
 from kept import kept
 
 SENSOR = load_sensor("three-25um-biaxial")
-MEMBRANE, DEG = Theory(stretching=True, bending=False, pretensioned=False), np.pi / 180.0
+MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+DEG = np.pi / 180.0
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,8 @@ def charge_at(distance: np.ndarray) -> np.ndarray:
 
 
 def curves_of(sensor, name: str) -> Curves:
-    mapping, centres = Mapping.lines(sensor, name), np.array([e.centre for e in sensor.electrodes])
+    mapping = Mapping.lines(sensor, name)
+    centres = np.array([e.centre for e in sensor.electrodes])
     distance = np.linalg.norm(mapping.points[:, :, None] - centres, axis=3)
     return Curves(mapping, sensor.electrode_names, 1.0, charge_at(distance))
 

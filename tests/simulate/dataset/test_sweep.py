@@ -75,7 +75,8 @@ def test_samples_are_the_presses_and_their_charges(small_dataset):
 
 def test_manifest_of_a_sweep(small_dataset, three_map):
     manifest = read_dataset(small_dataset).manifest
-    mesh, ranges = three_map.resolution, {"radius_mm": 8.0, "force_N": [0.05, 2.0], "orientation": "fixed"}
+    mesh = three_map.resolution
+    ranges = {"radius_mm": 8.0, "force_N": [0.05, 2.0], "orientation": "fixed"}
     assert (manifest["probes"], manifest["ranges"]) == (["circle:1.0"], ranges)
     assert manifest["sampling"].startswith("scrambled Sobol")
     assert (manifest["seed"], manifest["noise"], manifest["samples"]) == (7, "clean", 500)

@@ -27,6 +27,7 @@ def test_fingerprint_of_a_copy_is_the_same():
 
 @pytest.mark.parametrize("name", ["solver/newton.py", "sensors/three-25um-biaxial.toml"])
 def test_fingerprint_changes_with_any_file(package, name):
-    before, path = fingerprint(), package / name
+    before = fingerprint()
+    path = package / name
     path.write_text(path.read_text("utf-8") + "\n# changed\n", "utf-8")
     assert fingerprint() != before

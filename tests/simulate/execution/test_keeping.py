@@ -59,7 +59,8 @@ def test_cancelling_what_is_kept_cancels_the_task_and_a_pool_that_is_shut_down_i
     with resume_parts(tmp_path / "out", {}) as run:
         pool, gate = ThreadPoolExecutor(1), threading.Event()
         pool.submit(gate.wait)
-        squares, keeping = Squares(), run.keeping("solve", pool)
+        squares = Squares()
+        keeping = run.keeping("solve", pool)
         assert keeping.submit(squares, 1).cancel()
         results = in_order(keeping, squares, [2, 3], ahead=2)
         threading.Timer(0.05, lambda: (pool.shutdown(wait=False, cancel_futures=True), gate.set())).start()

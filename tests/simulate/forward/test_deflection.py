@@ -23,7 +23,8 @@ def field():
 def interpolated(field, x_mm, y_mm, distance_mm, force_N):
     """Deflection under a press on the x axis, as the docstring of the file says."""
     p, r = distance_mm / 45.0, 1.0 / 45.0
-    c, place = math.tanh(0.5 * (math.atanh(p + r) + math.atanh(p - r))), (x_mm + 1j * y_mm) / 45.0
+    c = math.tanh(0.5 * (math.atanh(p + r) + math.atanh(p - r)))
+    place = (x_mm + 1j * y_mm) / 45.0
     z = (place - c) / (1.0 - c * place)
     scaled = field.deflection_mm / np.cbrt(field.force_N)[:, None, None, None]
     axes = (np.log(field.force_N), field.distance_mm, field.rings, np.linspace(0.0, math.pi, scaled.shape[3]))

@@ -56,7 +56,8 @@ def test_modulus_and_loads_scale_exactly(prior, family):
 
 
 def test_arrays_give_the_family_back(prior, family):
-    again, film = FilmFamily.from_arrays(family.to_arrays()), prior.film(prior.mean)
+    again = FilmFamily.from_arrays(family.to_arrays())
+    film = prior.film(prior.mean)
     for x in (0.0, 2.5):
         expected = charges(family, *film, x, -1.0, 1.0)
         np.testing.assert_allclose(charges(again, *film, x, -1.0, 1.0), expected, rtol=1e-4)

@@ -13,7 +13,8 @@ from isocharge.simulate.forward.film_modes import MODES, FilmModes
 from isocharge.simulate.mechanics.stress import stress_turn
 from kept import kept
 
-CONTACTS, STEP = np.array([[2.0, 1.0, 0.9], [-0.5, -1.5, 1.1]]), 0.02
+CONTACTS = np.array([[2.0, 1.0, 0.9], [-0.5, -1.5, 1.1]])
+STEP = 0.02
 
 
 def narrow_modes(family, film):

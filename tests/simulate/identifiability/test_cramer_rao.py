@@ -11,7 +11,8 @@ from isocharge.simulate import ChargeSpline, Domain, Electrode, FunctionMap, Noi
 from isocharge.simulate.identifiability.cramer_rao import cramer_rao
 from isocharge.simulate.numerics.disk import square_grid
 
-REFERENCE, AT = noise_model("reference"), np.array([[8.0, 0.0], [0.0, 8.0], [-8.0, 0.0], [0.0, -8.0]])
+REFERENCE = noise_model("reference")
+AT = np.array([[8.0, 0.0], [0.0, 8.0], [-8.0, 0.0], [0.0, -8.0]])
 
 
 def far_field(contact):

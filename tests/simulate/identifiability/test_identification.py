@@ -22,7 +22,8 @@ from isocharge.simulate import (
 from isocharge.simulate.identifiability.identification import Identification, map_to_search, search_radius
 from kept import kept
 
-REFERENCE, SENSOR = noise_model("reference"), load_sensor("three-25um-biaxial")
+REFERENCE = noise_model("reference")
+SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
 
 

@@ -31,13 +31,3 @@ def test_rows_are_the_charges_of_presses_and_their_derivatives(tables, name, at)
     for number, tolerance in enumerate(TOLERANCE):
         scale = tolerance * np.abs(expected[:, number]).max()
         np.testing.assert_allclose(rows[:, number], expected[:, number], rtol=0.0, atol=scale)
-
-
-def test_squares_are_electrodes_of_that_shape(tables):
-    """The same squares by the rule of moving squares and by that of any electrode."""
-    presses = np.random.default_rng(0).uniform(-2.5, 2.5, (30, 2))
-    squares = tuple(Electrode.of_square("A", (x, y), 3.0) for x, y in CENTRES.tolist())
-    for table in tables.values():
-        moving, given = table.rows(presses, CENTRES, 3.0), table.rows(presses, CENTRES[:0], 3.0, squares)
-        assert (np.abs(moving - given) <= 0.02 * np.abs(given).max(axis=(0, 1))).all()
-        assert moving[..., 0] == pytest.approx(given[..., 0], rel=1e-3)

@@ -1,4 +1,4 @@
-"""Bending against Laplacians on paper, a clamped plate's energy and its lowest frequency."""
+"""Bending against planes, which have none, and a clamped plate's lowest frequency."""
 
 import numpy as np
 import pytest
@@ -18,13 +18,6 @@ def fine(request, mesh_of):
     return mesh_of(request.param, (0.3, 0.0), FINE)
 
 
-def test_energy_of_a_clamped_shape(fine):
-    """W = (1 - r^2)^2: lap W = 16 r^2 - 8, and the integral of its square over the disk is 64 pi / 3."""
-    shape = (1.0 - np.sum(fine.points**2, axis=1)) ** 2
-    energy = fine.template.copies * Bending(fine.geometry, 3.0).energy(shape)
-    assert energy == pytest.approx(0.5 * 3.0 * 64.0 * np.pi / 3.0, rel=1e-4)
-
-
 def test_tilt_is_felt_at_the_clamped_rim_only(fine):
     """A plane has no curvature inside; against the clamp it is a kink. Bending knows nothing of the mean of W."""
     bent = Bending(fine.geometry, 1.0).laplacian(fine.points @ [0.5, 0.0])
@@ -39,13 +32,8 @@ def test_lowest_frequency_of_a_clamped_plate(mesh_of, probe):
     k = brentq(lambda k: jv(0, k) * iv(1, k) + iv(0, k) * jv(1, k), 3.0, 3.4)
     mesh = mesh_of(probe, (0.3, 0.0), Resolution(4, 8, 4))
     geometry, inside = mesh.geometry, np.flatnonzero(mesh.inside)
-    local = np.einsum("ep,epam,epan->emn", geometry.weights, geometry.gradient, geometry.gradient)
-    laplace = np.zeros((mesh.template.n_node,) * 2)
-    for numbers, block in zip(mesh.template.nodes, local, strict=True):
-        laplace[np.ix_(numbers, numbers)] += block
-    mass, unit = geometry.gather(geometry.mass), np.eye(mesh.template.n_node)[:, inside]
+    mass = geometry.gather(geometry.mass)
+    unit = np.eye(mesh.template.n_node)[:, inside]
     plate = np.stack([geometry.gather(Bending(geometry, 1.0).forces(column)) for column in unit.T], axis=1)[inside]
     lowest = eigh(plate, np.diag(mass[inside]), eigvals_only=True, subset_by_index=[0, 0])[0]
     assert lowest == pytest.approx(k**4, rel=2e-4)
-    drum = eigh(laplace[np.ix_(inside, inside)], np.diag(mass[inside]), eigvals_only=True, subset_by_index=[0, 0])[0]
-    assert drum == pytest.approx(5.7832, rel=1e-4)  # the module's bound on the shift: half of what is allowed

@@ -36,7 +36,8 @@ def dense(mesh, matrix: np.ndarray) -> np.ndarray:
 
 def condensed(mesh, matrix: np.ndarray) -> np.ndarray:
     """The same over (U1, U2, W) alone: the Schur complement of the carried Laplacian; (3 n_node, 3 n_node)."""
-    whole, size = dense(mesh, matrix), 3 * mesh.template.n_node
+    whole = dense(mesh, matrix)
+    size = 3 * mesh.template.n_node
     first = whole[:, :3, :, :3].reshape(size, size)
     if matrix.shape[2] == 3:
         return first

@@ -15,7 +15,8 @@ from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.solver.load_case import LoadCase, choose_mesh
 
 RADIUS = 45.0
-FILM, FULL = Film(RADIUS, 0.025, 3000.0, 0.34), Theory(stretching=True, bending=True, pretensioned=False)
+FILM = Film(RADIUS, 0.025, 3000.0, 0.34)
+FULL = Theory(stretching=True, bending=True, pretensioned=False)
 COMMON = settings(derandomize=True, deadline=None, max_examples=15)
 
 
@@ -91,7 +92,8 @@ def test_locate_finds_any_point_where_it_was(scene, seed):
 def test_accepted_presses_have_no_folded_elements(scene):
     """Jacobians positive at every integration point and node; the film's area is there."""
     probe, at, resolution, layer = scene
-    mesh, geometry = template_for(probe, resolution), place(FILM, probe, at, resolution, layer).geometry
+    mesh = template_for(probe, resolution)
+    geometry = place(FILM, probe, at, resolution, layer).geometry
     assert geometry.weights.min() > 0.0
     assert geometry.mass.min() > 0.0
     assert mesh.copies * geometry.weights.sum() == pytest.approx(np.pi, rel=3e-3)
@@ -104,7 +106,8 @@ def test_footprint_is_the_probes(scene):
     probe, at, resolution, layer = scene
     mesh, distance = template_for(probe, resolution), float(np.hypot(*at)) / RADIUS
     placed = place(FILM, probe, at, resolution, layer)
-    geometry, exact = placed.geometry, 1e-9 if isinstance(probe, Polygon) else 1e-4
+    geometry = placed.geometry
+    exact = 1e-9 if isinstance(probe, Polygon) else 1e-4
     inner = geometry.weights[mesh.footprint]
     assert mesh.copies * inner.sum() == pytest.approx(probe.area / RADIUS**2, rel=exact)
     assert mesh.copies * geometry.load.sum() == pytest.approx(1.0, rel=1e-12)

@@ -86,12 +86,6 @@ def test_shared_area_of_two_squares(shift, expected):
     assert shared_area(SQUARE, SQUARE + shift) == pytest.approx(expected, abs=1e-15)
 
 
-def test_shared_area_of_square_and_diamond():
-    """The unit square cut by |x| + |y| <= c about its centre: an octagon."""
-    diamond = 0.5 + 0.5j + 0.75 * np.array([1.0, 1.0j, -1.0, -1.0j])
-    assert shared_area(SQUARE, diamond) == pytest.approx(1.0 - 4 * 0.5 * 0.25**2, rel=1e-14)
-
-
 @pytest.mark.parametrize(
     ("centre", "radius", "expected"),
     [

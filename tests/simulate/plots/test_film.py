@@ -13,7 +13,8 @@ from isocharge.simulate.plots.film import draw_charge_map, draw_electrodes, draw
 def test_all_metal_is_drawn_where_it_lies():
     pad, back = Electrode.of_square("A", (5.0, 0.0), 3.0), ((0.0, -9.0), (9.0, -9.0), (9.0, 9.0))
     electrode = replace(pad.with_trace(((5.0, 0.0), (9.0, 0.0)), 0.5), back=(back,))
-    sensor, axes = replace(load_sensor("three-25um-biaxial"), electrodes=(electrode,)), Figure().subplots()
+    sensor = replace(load_sensor("three-25um-biaxial"), electrodes=(electrode,))
+    axes = Figure().subplots()
     draw_electrodes(axes, replace(sensor, calibration=Calibration(shift=(1.0, 0.0))))
     corners = [patch.get_xy()[:-1] - [1.0, 0.0] for patch in axes.patches]
     for drawn, polygon in zip(corners, (*electrode.front, back), strict=True):

@@ -28,7 +28,8 @@ def dense_solution(mesh: Template, matrix: np.ndarray, right: np.ndarray) -> np.
     free = np.ones((mesh.n_node, components), dtype=bool)
     free[mesh.on_rim, :3] = False
     free[mesh.on_axis, 1] = False
-    keep, padded = np.flatnonzero(free), np.pad(right, ((0, 0), (0, components - 3))).ravel()
+    keep = np.flatnonzero(free)
+    padded = np.pad(right, ((0, 0), (0, components - 3))).ravel()
     solution = np.zeros(free.size)
     solution[keep] = np.linalg.solve(assembled(mesh, matrix)[np.ix_(keep, keep)], padded[keep])
     return solution.reshape(-1, components)[:, :3]

@@ -86,19 +86,6 @@ def test_stress_of_a_linear_field_is_constant_and_rotated(film, made_up, at):
     np.testing.assert_allclose(nodal - local, 0.0, atol=1e-9 * np.abs(local).max())
 
 
-@pytest.mark.parametrize("surface", ["middle", "top"])
-def test_rigid_rotation_has_no_stress_and_no_charge(film, made_up, surface):
-    """Out of plane by 50 degrees, then by 20 in the plane."""
-    a, b, amplitude2 = np.deg2rad(50.0), np.deg2rad(20.0), 0.1
-    tilt = np.array([[np.cos(a), 0.0], [0.0, 1.0], [np.sin(a), 0.0]])
-    rotation = np.array([[np.cos(b), -np.sin(b), 0.0], [np.sin(b), np.cos(b), 0.0], [0.0, 0.0, 1.0]])
-    gradient = ((rotation @ tilt - np.eye(3, 2)) / np.array([[0.1], [0.1], [np.sqrt(0.1)]])).T
-    moved = made_up(lambda x: x @ gradient, (4.0, 3.0), amplitude2=amplitude2)
-    assert np.abs(touch_stress(moved, np.zeros((1, 2)), surface)).max() < 1e-10 * film.young
-    sensor = replace(load_sensor("four-25um-uniaxial"), surface=surface)
-    assert np.abs(touch_charge(sensor, moved)).max() < 1e-10 * film.young * 20.0 * 9.0
-
-
 # Real ones
 
 

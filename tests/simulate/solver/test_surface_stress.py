@@ -22,7 +22,8 @@ from isocharge.simulate.mechanics.theory import theory_for
 
 PLATE = Theory(stretching=False, bending=True, pretensioned=False)
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
-FINE, FORCE = Resolution(7, 8, 6, 2), 1e-3
+FINE = Resolution(7, 8, 6, 2)
+FORCE = 1e-3
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +38,11 @@ def outer(film, force: float, c: float, r: float) -> tuple[float, float]:
     its mean over the disk; curvatures w'' and w' / r; touched side: s = E h / 2 (1 - nu^2) (w'' + nu w' / r).
     """
     a, h, nu = film.radius, film.thickness, film.poisson
-    k, log = force / (16.0 * np.pi * film.young * h**3 / (12.0 * (1.0 - nu**2))), np.log(a / r)
+    k = force / (16.0 * np.pi * film.young * h**3 / (12.0 * (1.0 - nu**2)))
+    log = np.log(a / r)
     slope = k * (-4.0 * r * log + c**2 / r - c**2 * r / a**2)
-    second, scale = k * (4.0 - 4.0 * log - c**2 / r**2 - c**2 / a**2), 0.5 * h * film.young / (1.0 - nu**2)
+    second = k * (4.0 - 4.0 * log - c**2 / r**2 - c**2 / a**2)
+    scale = 0.5 * h * film.young / (1.0 - nu**2)
     return scale * (second + nu * slope / r), scale * (slope / r + nu * second)
 
 

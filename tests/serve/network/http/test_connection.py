@@ -83,7 +83,8 @@ def connect():
     with asyncio.Runner() as runner:
 
         def start():
-            connection, wire = Connection(Echo(), set(), runner.get_loop()), Wire()
+            connection = Connection(Echo(), set(), runner.get_loop())
+            wire = Wire()
             connection.connection_made(wire)
             return connection, wire
 
