@@ -27,7 +27,7 @@ def _rough(tables, sensor):
     build = ForwardMap.build
     with pytest.MonkeyPatch.context() as patch:
         for module, name, value in (
-            (case_module, "CELLS", 14),
+            (case_module, "CELLS", 10),
             (case_module, "PRESSES", 60),
             (search_module, "STARTS", 3),
             (search_module, "GRID", 12),

@@ -113,7 +113,7 @@ def test_as_brute_force(spline, noise, contact):
     charge = spline.charges(np.array([contact])) + (noise is REFERENCE) * np.array([[0.5, -1.0, 0.3]])
     mean, std = Posterior(spline, noise, spline.domain.radius).mean_and_std(charge)
     centre, reach = np.append(mean[0, :2], np.log(mean[0, 2])), 6.5 * np.append(std[0, :2], std[0, 2] / mean[0, 2])
-    expected_mean, expected_std = brute_force(spline, noise, charge[0], centre, reach, (120, 120, 40))
+    expected_mean, expected_std = brute_force(spline, noise, charge[0], centre, reach, (100, 100, 20))
     assert std[0] == pytest.approx(expected_std, rel=0.01)
     assert (np.abs(mean[0] - expected_mean) < 0.01 * expected_std).all()
 
