@@ -204,9 +204,7 @@ def test_what_no_parameter_describes_is_corrected_and_its_error_is_said(problem)
     charge = bent(at, problem.charges.charges(truth, at))
     errors = [np.hypot(*(network.predict(charge)[0] - at)[:, :2].T).mean() for network in (corrected, plain)]
     assert errors[0] < 0.6 * errors[1]
-    assert re.search(
-        r"charges of this film differ by \d.* 30 more presses would reach 0\.\d+ mm", " ".join(result.summary)
-    )
+    assert re.search(r"charges of this film differ by \d.* 30 more presses would reach 0\.\d+ mm", str(result.summary))
 
 
 def test_a_turned_stage_is_named(problem):
@@ -472,10 +470,8 @@ def test_electrodes_with_traces_are_read_by_the_network_of_their_pads(problem):
     """On charges of direct solves; a trace collects as much as its pad."""
     outward = [e.with_trace((e.centre, (4.0 * e.centre[0], 4.0 * e.centre[1])), 0.5) for e in problem.sensor.electrodes]
     traced = CalibrationProblem.of(replace(problem.sensor, electrodes=tuple(outward)), problem.probe)
-    contact, (sensor, probe) = (
-        draw_contacts(np.random.default_rng(3), traced.domain, 40),
-        traced.prior.film(traced.prior.mean),
-    )
+    contact = draw_contacts(np.random.default_rng(3), traced.domain, 40)
+    sensor, probe = traced.prior.film(traced.prior.mean)
     charge = [touch_charge(sensor, press(sensor.film, probe, (x, y), force)) for x, y, force in contact[:10]]
     fitted = traced.fitted(
         traced.prior.mean, (contact[10:], np.zeros((30, 3))), lambda at: np.ones((len(at), 4)), release=False
