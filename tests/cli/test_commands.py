@@ -340,14 +340,12 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
         monkeypatch.setattr(f"isocharge.cli.demo.command.{name}", stub)
     demo_command(out, 2.0)
     table, err = capsys.readouterr()
-    assert (
-        300 < (frames := int(re.search(r"(\d+) frames, 0 lost, 0 repeated", err)[1])) <= 400
-    )  # a busy machine is late
+    assert 400 <= int(re.search(r"(\d+) frames, 0 lost, 0 repeated", err)[1]) < 500  # more came than were followed
     assert re.findall(r"^(\d)\. (\w+): ", err, re.M) == [
         *zip("1234", ("simulate", "train", "serve", "show"), strict=True)
     ]
     shown = [re.findall(r"-?\d+\.\d+", line) for line in err.splitlines() if line.startswith(" " * 4)]
-    assert [len(shown), *shown[0]] == [frames // 100]  # each half second; presses come after a second
+    assert [len(shown), *shown[0]] == [4]  # each half second; presses come after a second
     np.testing.assert_allclose(*np.split(np.array([row for row in shown if row], float), 2, axis=1), atol=0.5)
     model = load_model(out / "models" / SENSOR / "1")
     said = np.array(re.findall(r"(\d+\.\d+) (?:mm|%)", table), float)
