@@ -82,8 +82,8 @@ def solved(film) -> Equilibrium:
 
 def test_polygon_integrates_polynomials_exactly():
     """Triangle (0, 0), (6, 0), (0, 3) mm: the mean of x^2 is b^2 / 6, of x y is b h / 12."""
-    triangle = Electrode("A", ((0.0, 0.0), (6.0, 0.0), (0.0, 3.0)))
-    sensor = replace(load_sensor("four-25um-uniaxial"), electrodes=(triangle,))
+    triangle = Electrode("A", np.array([[0.0, 0.0], [6.0, 0.0], [0.0, 3.0]]))
+    sensor = replace(load_sensor("four-25um-uniaxial"), electrodes=[triangle])
     charge = charge_of(sensor, lambda x, y: (x**2, x * y, 0 * x))
     assert charge[0] == pytest.approx(9.0 * (D31 * 36.0 / 6 + D32 * 18.0 / 12), rel=1e-12)
 

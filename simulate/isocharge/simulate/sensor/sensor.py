@@ -69,6 +69,10 @@ class Electrode:
     more: tuple[Corners, ...] = ()
     back: tuple[Corners, ...] = ()
 
+    def __post_init__(self) -> None:
+        for polygons in ("corners", "more", "back"):
+            object.__setattr__(self, polygons, _as_tuples(getattr(self, polygons)))
+
     @classmethod
     def of_square(cls, name: str, centre: tuple[float, float], side: float) -> "Electrode":
         """A square along the axes, centre and side in mm; the first corner is the lower left one."""
@@ -204,6 +208,7 @@ class Sensor:
     coating: float = 0.0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "electrodes", _as_tuples(self.electrodes))
         for value, options in ((self.readout, get_args(Readout)), (self.surface, get_args(Surface))):
             if value not in options:
                 raise SensorError(f"expected one of {options}, got {value!r}")
@@ -271,6 +276,11 @@ def electrode_index(sensor: Sensor, name: str) -> int:
     if name not in sensor.electrode_names:
         raise SensorError(f"no electrode {name!r} on {sensor.name}: it has {', '.join(sensor.electrode_names)}")
     return sensor.electrode_names.index(name)
+
+
+def _as_tuples(value: object) -> object:
+    """Lists and arrays as tuples all the way down, so that layouts can be compared; other values as they are."""
+    return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple | np.ndarray) else value
 
 
 def _check_name(name: str) -> None:
