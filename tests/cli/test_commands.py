@@ -180,8 +180,14 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
 def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
     """Three uniaxial electrodes fold within 8 mm, and the user is told."""
     monkeypatch.setattr("isocharge.cli.shared.forward_maps.SAMPLES", 4000)
-    words = ("--sensor", "three-25um-uniaxial", "--config", quick(tmp_path), "--json", "-o", tmp_path / "models" / "u")
-    _, out, err = command("train", "fit", *words)
+    (tmp_path / "quick.toml").write_text(
+        "[network]\nhidden = [24, 24]\nmisfit_hidden = [24, 24]\n"
+        "[training]\nsteps = 300\nmisfit_steps = 50\nmisfit_charges = 1000\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    _, out, err = command(
+        "train", "fit", "--sensor", "three-25um-uniaxial", "--config", "quick.toml", "--json", "-o", "models/u"
+    )
     assert "caution: 2 N under circle:1.0 stress the film to 74." in err
     folded = re.search(r"caution: the map from contacts to charges seems to fold about ([0-9.]+) mm", err)
     assert 1.5 < float(folded[1]) < 5.0
@@ -314,15 +320,6 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(refused, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     refused(*words, said=message, code=code)
     assert list(Path().iterdir()) == []
-
-
-def quick(folder):
-    path = folder / "quick.toml"
-    path.write_text(
-        "[network]\nhidden = [24, 24]\nmisfit_hidden = [24, 24]\n"
-        "[training]\nsteps = 300\nmisfit_steps = 50\nmisfit_charges = 1000\n"
-    )
-    return path
 
 
 def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):

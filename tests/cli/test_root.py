@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-import isocharge.simulate
-import isocharge.train
+from isocharge import serve, simulate, train
 
 ROOT = Path(__file__).parents[2]
 ISOCHARGE = Path(sys.executable).parent / "isocharge"
@@ -23,19 +22,11 @@ def run(*words, **variables):
 
 def test_version(command):
     assert command("--version") == (0, f"isocharge {VERSION}\n", "")
+    assert serve.__version__ == simulate.__version__ == train.__version__ == VERSION
 
 
 def test_the_module_is_the_command():
     assert run(sys.executable, "-m", "isocharge.cli", "--version") == run(ISOCHARGE, "--version")
-
-
-def test_the_version_costs_nothing_until_it_is_asked_for():
-    code = (
-        "import sys, isocharge.serve as s; loaded = 'importlib.metadata' in sys.modules\n"
-        "print(s.__version__, loaded, hasattr(s, 'nothing'))"
-    )
-    assert run(sys.executable, "-c", code).split() == [VERSION, "False", "False"]
-    assert isocharge.simulate.__version__ == isocharge.train.__version__ == VERSION
 
 
 @pytest.mark.parametrize(

@@ -216,8 +216,10 @@ def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path, whole):
         while is_running(pid) and time.monotonic() < deadline:
             time.sleep(0.02)
         assert not is_running(pid)
-    sweep_to(tmp_path / "presses")
+    executor = Counting()
+    sweep_to(tmp_path / "presses", executor=executor)
     assert files(tmp_path / "presses") == whole[0]
+    assert executor.jobs < whole[1]
 
 
 def is_running(pid: int) -> bool:

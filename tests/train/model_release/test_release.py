@@ -205,6 +205,14 @@ def test_the_joint_deviations_are_honest(whitened, touch):
                 assert np.mean(level < 0.95) == pytest.approx(0.95, abs=0.02)
 
 
+def test_the_joint_posterior_passes_a_rank_test(whitened):
+    """Simulation-based calibration (Talts et al. 2018): ranks of the truth among 99 draws, along random directions."""
+    rng, (_, errors) = np.random.default_rng(9), whitened
+    direction, draws = rng.standard_normal(errors.shape), rng.standard_normal((99, *errors.shape))
+    ranks = np.sum(np.sum(draws * direction, axis=2) < np.sum(errors * direction, axis=1), axis=0)
+    np.testing.assert_allclose(np.bincount(ranks // 10, minlength=10) / len(ranks), 0.1, atol=0.01)
+
+
 def test_four_electrodes_have_one_check_to_spare(known, truth, touch):
     """Inside the domain the misfit of good presses is the length of one normal deviate."""
     if len(touch.metadata.electrodes) != 4:
