@@ -11,13 +11,12 @@ import pytest
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
 RECIPES = dict(re.findall(r"^## (Add .*?)\n(.*?)(?=^## |\Z)", TEXT, re.DOTALL | re.MULTILINE))
-ENOUGH = ("simulate", "train", "serve", "tests", "models", "pyproject.toml")
 
 
 @pytest.fixture
 def project(tmp_path):
     """A copy of the project."""
-    for name in ENOUGH:
+    for name in ("simulate", "train", "serve", "tests", "models", "pyproject.toml"):
         source, target = ROOT / name, tmp_path / name
         if source.is_dir():
             shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", "pictures", "benchmarks"))
@@ -56,13 +55,20 @@ def follow(recipe, project):
         (project / name).write_text(content, "utf-8")
 
 
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_recipe_fits_the_project(name, project):
+    follow(RECIPES[name], project)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RECIPES)
 def test_a_recipe_works(name, project, run_commands):
     """On a copy of the project: its packages come first, then this environment's."""
     follow(RECIPES[name], project)
     (commands,) = re.findall(r"^```sh\n(.*?)^```", RECIPES[name], re.DOTALL | re.MULTILINE)
-    folders = ":".join(str(project / name) for name in ("simulate", "train", "serve"))
-    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    printed = run_commands(commands, project, os.environ | {"PYTHONPATH": folders, "PATH": path})
+    found = {
+        "PYTHONPATH": ":".join(str(project / name) for name in ("simulate", "train", "serve")),
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+    }
+    printed = run_commands(commands, project, os.environ | found)
     assert int(re.search(r"(\d+) passed", printed)[1]) > 0
