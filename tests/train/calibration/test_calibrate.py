@@ -66,11 +66,12 @@ def test_derivatives_contain_what_a_parameter_does_to_the_rest(problem, names, b
         np.testing.assert_allclose(found[:, :, number] / size, expected / size, atol=1e-3, err_msg=name)
 
 
-def test_it_is_the_minimum_of_the_joint_problem(problem, monkeypatch):
+@pytest.mark.parametrize(("count", "seed"), [(4, 11), (6, 2)], ids=["inside", "on a bound"])
+def test_it_is_the_minimum_of_the_joint_problem(count, seed, problem, monkeypatch):
     """SciPy over parameters and contacts together, with differences for derivatives, finds the same film."""
     monkeypatch.setattr(discrepancy, "hypotheses", lambda: [discrepancy.Hypothesis()])
     charges, prior = problem.charges, problem.prior
-    truth, presses = rig(problem, 4, seed=11)
+    truth, presses = rig(problem, count, seed=seed)
     data, ours, n = data_of(problem, presses), fit(problem, presses), len(presses)
 
     def residual(unknown):

@@ -160,7 +160,7 @@ def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate, at_C: 
         if everything.evidence > known.mixture.evidence + surprise:
             known = problem.settle(data, np.ones_like(keep), freedom, known.solved, everything.best)
     keep, mixture = known.keep, known.mixture
-    unit = np.clip(problem.mean + mixture.mean, *problem.bounds)
+    unit = _within(problem.bounds, problem.mean + mixture.mean, mixture.covariance)
     begin = known.solved.contacts.contact if keep.all() else None
     scatter = float(np.sqrt(sum(weight * each.scatter**2 for each, weight in mixture.weights.items())))
     contacts, n = problem.adjusted(unit, data.scattered(mixture.best.scatter), begin), len(before.parameters)
@@ -221,6 +221,18 @@ def _good_presses(problem: "_Fit", data: PressData, solved: _Solved, freedom: Ar
     scatter = np.median(adjusted.chi2 / np.maximum(scipy.stats.chi2.median(freedom), 0.1))
     keep = adjusted.chi2 <= scipy.stats.chi2.isf(BAD / len(data), freedom) * max(1.0, scatter)
     return (keep if np.mean(~keep) <= LARGEST_BAD_SHARE else np.ones_like(keep)), start
+
+
+def _within(bounds: tuple[Array, Array], unit: Array, covariance: Array) -> Array:
+    """The most probable unknowns within bounds, of a normal distribution: what one gives up, the others make good."""
+    for _ in unit:
+        beyond = unit - np.clip(unit, *bounds)
+        far = int(np.abs(beyond).argmax())
+        if abs(beyond[far]) < 1e-9:
+            break
+        along = covariance[:, far] / covariance[far, far]
+        unit, covariance = unit - beyond[far] * along, covariance - np.outer(along, covariance[far])
+    return np.clip(unit, *bounds)
 
 
 @dataclass(frozen=True)
