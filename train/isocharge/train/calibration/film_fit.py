@@ -160,7 +160,7 @@ def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate, at_C: 
         if everything.evidence > known.mixture.evidence + surprise:
             known = problem.settle(data, np.ones_like(keep), freedom, known.solved, everything.best)
     keep, mixture = known.keep, known.mixture
-    unit = _within(problem.bounds, problem.mean + mixture.mean, mixture.covariance)
+    unit = np.clip(problem.mean + mixture.mean, *problem.bounds)
     begin = known.solved.contacts.contact if keep.all() else None
     scatter = float(np.sqrt(sum(weight * each.scatter**2 for each, weight in mixture.weights.items())))
     contacts, n = problem.adjusted(unit, data.scattered(mixture.best.scatter), begin), len(before.parameters)
@@ -385,4 +385,6 @@ class _Fit:
         along = np.einsum("nk,nku->nu", direction, jacobian), (direction * contacts.residual).sum(axis=1)
         off = unit - self.mean
         good = Linearised.of(jacobian.reshape(-1, unit.size), contacts.residual.ravel(), off)
-        return weigh({each: good.less(*along, off, (each * size) ** 2) for each in SCATTERS}, self._before)
+        mixture = weigh({each: good.less(*along, off, (each * size) ** 2) for each in SCATTERS}, self._before)
+        within = _within(self.bounds, self.mean + mixture.mean, mixture.covariance)
+        return mixture._replace(mean=within - self.mean)
