@@ -5,8 +5,7 @@ position.
 """
 
 import json
-from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 from isocharge.serve.prediction.contact import Contact
 
@@ -28,8 +27,7 @@ def is_name(text: str) -> bool:
     return 0 < len(text) <= LONGEST_NAME and text.isprintable()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PredictionRecord:
+class PredictionRecord(NamedTuple):
     """One reading of a sensor and the model's answer.
 
     Attributes:
@@ -68,9 +66,9 @@ class PredictionRecord:
     y_std_mm: float | None
     force_std_N: float | None
     misfit: float | None
-    xy_correlation: float | None = None
-    xF_correlation: float | None = None
-    yF_correlation: float | None = None
+    xy_correlation: float | None
+    xF_correlation: float | None
+    yF_correlation: float | None
     contact: bool
     charge_pC: Charges | None
     charge_raw_pC: Charges | None
@@ -95,7 +93,8 @@ class PredictionRecord:
         Raises:
             ValueError: If a number is not finite.
         """
-        return _ENCODE({name: _plain(getattr(self, name)) for name in self.written})
+        values = self._asdict()
+        return _ENCODE({name: _plain(values[name]) for name in self.written})
 
 
 OF_TRACKING = ("tracked", "event")
@@ -104,7 +103,7 @@ OF_TRACKING = ("tracked", "event")
 OF_FILM = ("film",)
 """Those where the film is followed."""
 
-FIELDS = tuple(f.name for f in fields(PredictionRecord) if f.name not in (*OF_TRACKING, *OF_FILM, "follows"))
+FIELDS = tuple(name for name in PredictionRecord._fields if name not in (*OF_TRACKING, *OF_FILM, "follows"))
 
 UNKNOWN: dict[str, Any] = dict.fromkeys(Contact._fields)
 """The fields of the contact where nothing was computed."""
