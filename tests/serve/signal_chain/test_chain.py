@@ -1,7 +1,5 @@
 """The signal chain: what is tared, what counts as touch."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -138,7 +136,7 @@ def test_invalid_frame_passes_no_stage(value, gain):
         state, _ = advance(chain, state, raw, k / RATE_HZ, 1 / RATE_HZ)
     bad = np.array([1.0, value / (gain or 1.0), 2.0])
     after, reading = advance(chain, state, bad, 150 / RATE_HZ, 0.25, flags=("gap",))
-    assert after == replace(state, invalid_s=0.25)
+    assert after == state._replace(invalid_s=0.25)
     assert (reading.charge_pC, reading.tare, reading.contact, reading.flags) == (None, None, False, ("gap", "invalid"))
 
 

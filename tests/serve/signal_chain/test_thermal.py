@@ -5,8 +5,6 @@ from it. On the biaxial film that space holds equal charges, and warming looks l
 electrodes differ, it does not.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -87,7 +85,7 @@ TARE = Tare(np.full(4, 7.0), np.ones(4), 100)
 def in_contact(**changes):
     """The state of a chain in the middle of a press, just before an estimate is due."""
     state = ChainState(np.empty((0, 4)), None, tare=TARE, touch=Touch(True, 1000.0, 1000.0))
-    return replace(state, drift=ThermalDrift(waited_s=1.0), **changes)
+    return state._replace(drift=ThermalDrift(waited_s=1.0), **changes)
 
 
 def step(state, common_pC, *, chain=None, limited=False):

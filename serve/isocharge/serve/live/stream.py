@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -314,4 +314,4 @@ class TouchStream:
 def _after(skipped: set[str], reading: Reading) -> Reading:
     """A reading with the flags of the skipped frames before it that say what happened meanwhile."""
     earlier = tuple(flag for flag in LASTING_FLAGS if flag in skipped and flag not in reading.flags)
-    return replace(reading, flags=earlier + reading.flags)
+    return reading._replace(flags=earlier + reading.flags)

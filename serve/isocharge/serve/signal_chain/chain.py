@@ -18,6 +18,7 @@ A frame with a value that cannot be a charge passes none of them; its time count
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,8 +78,7 @@ class Chain:
         return charges if self.gain_pC is None else charges * self.gain_pC
 
 
-@dataclass(frozen=True, slots=True)
-class ChainState:
+class ChainState(NamedTuple):
     """What the chain remembers between frames.
 
     Attributes:
@@ -102,7 +102,7 @@ class ChainState:
     tare: Tare | None = None
     leak: Leak | None = None
     memory: Memory | None = None
-    touch: Touch = field(default_factory=Touch)
+    touch: Touch = Touch()
     saturated: bool = False
     drift: ThermalDrift = NO_DRIFT
     invalid_s: float = 0.0
@@ -114,12 +114,11 @@ class ChainState:
 
     def without_tare(self) -> "ChainState":
         """The state in which the film is tared again, however long that takes; what is known about hum stays."""
-        hum = replace(self.hum, raw_pC=None)
+        hum = self.hum._replace(raw_pC=None)
         return ChainState(self.waiting_pC[:0], hum, patient=True, invalid_s=self.invalid_s)
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(NamedTuple):
     """One frame after the chain.
 
     Attributes:
@@ -167,7 +166,7 @@ def advance(
         ValueError: If the chain has a thermal stage and no misfit is given.
     """
     if not math.hypot(*values.tolist()) <= chain.largest:
-        return replace(state, invalid_s=state.invalid_s + dt_s), _invalid(chain, values, flags)
+        return state._replace(invalid_s=state.invalid_s + dt_s), _invalid(chain, values, flags)
     dt_s += state.invalid_s
     raw_pC = chain.raw(values)
     limited = limited or (chain.limit_pC is not None and bool((np.abs(raw_pC) >= chain.limit_pC).any()))

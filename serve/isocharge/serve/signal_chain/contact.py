@@ -5,7 +5,7 @@ peak: an absolute release threshold would never release once the base has drifte
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,7 @@ class TouchRule(Rule, frozen=True, kw_only=True):
     release_share: Setting = 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class Touch:
+class Touch(NamedTuple):
     """Whether something touches.
 
     Attributes:

@@ -9,7 +9,7 @@ delayed.
 
 import cmath
 import math
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +35,7 @@ class HumRule(Rule, frozen=True, kw_only=True):
     limit_pC: Setting = 5.0
 
 
-@dataclass(frozen=True, slots=True)
-class Hum:
+class Hum(NamedTuple):
     """The hum.
 
     Attributes:
@@ -47,7 +46,7 @@ class Hum:
 
     phasor_pC: NDArray[np.complex128]
     turn: complex = 1.0 + 0.0j
-    raw_pC: Array | None = field(default=None)
+    raw_pC: Array | None = None
 
     @classmethod
     def start(cls, electrodes: int) -> "Hum":
