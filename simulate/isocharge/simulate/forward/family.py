@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -11,11 +12,12 @@ from isocharge.common.errors import SceneError
 from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.forward.film_grid import FilmGrid
 from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film, Surface
-from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
 from isocharge.simulate.solver.load_case import SolveSettings, check_press
@@ -175,6 +177,29 @@ class Chain:
 def solve_chains(chains: Sequence[Chain], executor: Executor | None) -> Array:
     """What each chain reads at the nodes, seen from the probe, shape (n_chain, n_force, its size)."""
     return np.stack(list(track(in_order(executor, _solve_chain, chains), "solving the film", len(chains))))
+
+
+def solve_films(
+    film: Film,
+    surface: Surface,
+    grid: FilmGrid,
+    settings: SolveSettings,
+    executor: Executor | None,
+    read: Callable[[Equilibrium, Surface], Array] = nodal_stress,
+) -> Array:
+    """What presses of round probes read on the films of a grid, of the radius and Young's modulus of one of them.
+
+    Returns:
+        What `read` gives at the nodes of the template, shape (*grid.shape, its size).
+    """
+    a, chains = film.radius, []
+    for distance, tension, thickness, reach in product(grid.distance, grid.tension, grid.thickness, grid.reach):
+        other = replace(film, pretension=float(tension) * film.young, thickness=float(thickness) * a)
+        forces = grid.load[::-1] * film.young * other.thickness * a
+        chains.append(Chain(other, Circle(float(reach) * a), float(distance) * a, forces, surface, settings, read))
+    rows = solve_chains(chains, executor)[:, ::-1]
+    by_axis = rows.reshape(*(grid.shape[axis] for axis in (0, 2, 3, 4, 1)), -1)
+    return np.moveaxis(by_axis, 4, 1)
 
 
 def _solve_chain(chain: Chain) -> Array:

@@ -17,7 +17,6 @@ In a file, coefficients and modes are integers, of fewer bits where there is lit
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, fields, replace
-from itertools import product
 from typing import Any, cast, get_args
 
 import numpy as np
@@ -26,7 +25,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, SceneError, SolveError
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.forward.family import Chain, Family, check_family, solve_chains
+from isocharge.simulate.forward.family import Family, check_family, solve_films
 from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, FilmLimits, bits_of, decompose, quantised
 from isocharge.simulate.forward.film_modes import MODES, FilmModes, ModeMap
 from isocharge.simulate.forward.forward_map import ForwardMap, relative_error
@@ -123,7 +122,7 @@ class FilmFamily:
         smallest = Circle(limits["reach"][0] * a)
         resolution = needed_resolution(film, smallest, (radius, 0.0), middle, settings)
         settings = replace(settings, resolution=resolution)
-        coefficients, modes = decompose(_solve_films(film, surface, grid, settings, executor), MODES_LEFT)
+        coefficients, modes = decompose(solve_films(film, surface, grid, settings, executor), MODES_LEFT)
         family = cls(film.poisson, surface, limits, grid, resolution, layer, coefficients, modes, np.nan)
         error = _check_against_solves(family, prior, domain)
         if error > LARGEST_ERROR:
@@ -263,17 +262,3 @@ def _limits_of(prior: FilmPrior, domain: Domain) -> FilmLimits:
         "thickness": (film.thickness / a * np.exp(low["thickness"]), film.thickness / a * np.exp(high["thickness"])),
         "reach": ((prior.probe.radius + low["probe_radius"]) / a, (prior.probe.radius + high["probe_radius"]) / a),
     }
-
-
-def _solve_films(
-    film: Film, surface: Surface, grid: FilmGrid, settings: SolveSettings, executor: Executor | None
-) -> Array:
-    """Scaled stress at the nodes of the template, shape (*grid.shape, n_element * n_local * 3)."""
-    a, chains = film.radius, []
-    for distance, tension, thickness, reach in product(grid.distance, grid.tension, grid.thickness, grid.reach):
-        other = replace(film, pretension=float(tension) * film.young, thickness=float(thickness) * a)
-        forces = grid.load[::-1] * film.young * other.thickness * a
-        chains.append(Chain(other, Circle(float(reach) * a), float(distance) * a, forces, surface, settings))
-    rows = solve_chains(chains, executor)[:, ::-1]
-    by_axis = rows.reshape(*(grid.shape[axis] for axis in (0, 2, 3, 4, 1)), -1)
-    return np.moveaxis(by_axis, 4, 1)

@@ -10,7 +10,6 @@ thickness and probe: they are corrections.
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +17,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, SceneError
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.forward.family import Chain, Family, solve_chains
+from isocharge.simulate.forward.family import Family, solve_films
 from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, bits_of, decompose, quantised
 from isocharge.simulate.forward.forward_map import EVEN, ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
@@ -166,17 +165,8 @@ class FilmModes:
         """
         grid = FilmGrid.spread(family.limits, COUNTS)
         settings = SolveSettings(theory=THEORY, resolution=family.resolution, layer=family.layer)
-        a, chains = film.radius, []
-        thickness, reach = float(grid.thickness[0]), float(grid.reach[0])
-        for distance, tension in product(grid.distance, grid.tension):
-            other = replace(film, pretension=float(tension) * film.young, thickness=thickness * a)
-            forces = grid.load[::-1] * film.young * other.thickness * a
-            chains.append(
-                Chain(other, Circle(reach * a), float(distance) * a, forces, family.surface, settings, stress_changes)
-            )
-        rows = solve_chains(chains, executor)[:, ::-1]
-        stacked = rows.reshape(grid.distance.size, grid.tension.size, grid.load.size, -1).swapaxes(1, 2)
-        return cls(grid, *decompose(stacked[:, :, :, None, None], LEFT_OUT))
+        changes = solve_films(film, family.surface, grid, settings, executor, stress_changes)
+        return cls(grid, *decompose(changes, LEFT_OUT))
 
     def mode_map(self, film: ForwardMap, names: Sequence[str] = tuple(MODES)) -> ModeMap:
         """The modes of one film; only the fields that the names need are computed.
