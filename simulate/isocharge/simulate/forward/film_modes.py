@@ -99,14 +99,15 @@ class ModeMap:
             by_field = self.fields.by_field(contact, ODD[list(self.which)])
             charge = dict(zip(self.which, np.moveaxis(by_field, 2, 0), strict=True))
             scale = sensor.film.young * amplitude_squared(sensor.film, contact[:, 2]) + sensor.film.pretension
-            for name, (first, second), (along, across) in _pairs():
+            for kind, (along, across) in PAIRS.items():
+                first = KINDS.index(kind)
                 if first in charge:
-                    per_unit = scale[:, None] if name == "tension" else 1.0
-                    even, odd = charge[first] / per_unit, charge[second] / per_unit
+                    per_unit = scale[:, None] if kind == "tension" else 1.0
+                    even, odd = charge[first] / per_unit, charge[first + 1] / per_unit
                     columns[along] = np.cos(angle) * even - np.sin(angle) * odd
                     columns[across] = np.sin(angle) * even + np.cos(angle) * odd
-            if POISSON in charge:
-                columns["poisson"] = charge[POISSON]
+            if "poisson" in self.names:
+                columns["poisson"] = charge[KINDS.index("poisson")]
         if "d12" in self.names:
             shear = replace(self.film, sensor=replace(self.film.sensor, piezo=Piezo(0.0, 0.0, d12=1.0)))
             columns["d12"] = shear.by_field(contact, EVEN)[..., 0]
@@ -116,17 +117,8 @@ class ModeMap:
         return np.stack([columns[name] for name in self.names], axis=2)
 
 
-def _numbers() -> dict[str, tuple[int, ...]]:
-    """Numbers of the fields of each kind of imperfection."""
-    count, numbers = 0, {}
-    for name, fields in FIELDS.items():
-        numbers[name] = tuple(range(count, count + len(fields)))
-        count += len(fields)
-    return numbers
-
-
-NUMBERS = _numbers()
-POISSON = NUMBERS["poisson"][0]
+KINDS = [kind for kind, fields in FIELDS.items() for _ in fields]
+"""Kind of imperfection of each field, in the order of their numbers; of the two of a kind the even one comes first."""
 
 PAIRS = {
     "tension": ("tension_difference", "tension_shear"),
@@ -134,10 +126,6 @@ PAIRS = {
     "oval": ("oval_x", "oval_xy"),
 }
 """Modes with two axes."""
-
-
-def _pairs() -> list[tuple[str, tuple[int, ...], tuple[str, str]]]:
-    return [(name, NUMBERS[name], modes) for name, modes in PAIRS.items()]
 
 
 @dataclass(frozen=True)
@@ -183,7 +171,7 @@ class FilmModes:
             raise SceneError(f"modes: expected some of {', '.join(MODES)}, got {', '.join(unknown)}")
         kinds = [kind for kind, modes in PAIRS.items() if set(modes) & set(names)]
         kinds += ["poisson"] * ("poisson" in names)
-        which = tuple(sorted(number for kind in kinds for number in NUMBERS[kind]))
+        which = tuple(number for number, kind in enumerate(KINDS) if kind in kinds)
         return ModeMap(tuple(names), film, self._table(film, which) if which else None, which)
 
     def _table(self, film: ForwardMap, which: tuple[int, ...]) -> ForwardMap:
