@@ -40,10 +40,7 @@ class Coating:
 
     def near(self, points: Complexes) -> Booleans:
         """Which points a coat may reach, of the shape of `points`."""
-        near = np.zeros(points.shape, dtype=bool)
-        for part in self.layers[0]:
-            near |= self._within(part, points)
-        return near
+        return np.asarray(np.any([self._within(part, points) for part in self.layers[0]], axis=0))
 
     def moduli(self, points: Complexes) -> Array:
         """What is added to C over E at points, shape (..., 3, 3)."""
@@ -70,13 +67,8 @@ class Coating:
 
     def _depth(self, points: Complexes) -> Integers:
         """How often each point is coated, of the shape of `points`."""
-        depth = np.zeros(points.shape, dtype=np.intp)
-        for layer in self.layers:
-            covered = np.zeros(points.shape, dtype=bool)
-            for part in layer:
-                covered |= spare(part, points) >= 0.0
-            depth += covered
-        return depth
+        covered = [np.any([spare(part, points) >= 0.0 for part in layer], axis=0) for layer in self.layers]
+        return np.asarray(np.sum(covered, axis=0))
 
     def _phases(self, points: Complexes) -> tuple[Array, Array, Array]:
         """Shares of the phases, shape (..., n_phase), their C over E, shape (n_phase, 3, 3), and the matrices to their

@@ -185,7 +185,6 @@ def _edges(parts: tuple[Complexes, ...], finest: float) -> Complexes:
             along = (np.arange(count) + 0.5) / count
             points.append(start + along * (end - start))
             outside.append(points[-1] - 1e-3j * finest * (end - start) / abs(end - start))
-    beyond, inner = np.concatenate(outside), np.zeros(sum(map(len, points)), dtype=bool)
-    for part in parts:
-        inner |= spare(part, beyond) > 0.0
-    return np.concatenate(points)[~inner]
+    beyond = np.concatenate(outside)
+    inner = [spare(part, beyond) > 0.0 for part in parts]
+    return np.asarray(np.concatenate(points)[~np.any(inner, axis=0)])
