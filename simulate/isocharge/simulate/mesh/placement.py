@@ -16,7 +16,7 @@ of the film are found in the mesh by closed formulas and, inside the circle, a f
 """
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -101,14 +101,11 @@ class Placement:
 
     def __getitem__(self, which: Integers) -> "Placement":
         """Some of the placements."""
-        return Placement(*(value[which] for value in self._values()))
+        return Placement(**{name: value[which] for name, value in vars(self).items()})
 
     def batch(self) -> "Placement":
         """One placement as a batch of one."""
-        return Placement(*(np.asarray(value)[None] for value in self._values()))
-
-    def _values(self) -> tuple[Any, ...]:
-        return self.c, self.rho, self.corners, self.start, self.end, self.depth
+        return Placement(**{name: np.asarray(value)[None] for name, value in vars(self).items()})
 
     def to_film(self, z: Complexes) -> Complexes:
         """Template points, shape (..., n), to film points (unit radius)."""
