@@ -124,7 +124,7 @@ LARGER = 1.3
 
 @dataclass(frozen=True)
 class RigFilm:
-    """A film as its rig shows it: a `ChargeMap`.
+    """A film as its rig shows it.
 
     Attributes:
         forward_map: Of the calibrated film, or of the sensor as described.
@@ -142,18 +142,9 @@ class RigFilm:
     scattered: bool
     calibration: CalibrationResult | None = None
 
-    @property
-    def electrodes(self) -> tuple[str, ...]:
-        """See `ChargeMap`."""
-        return self.forward_map.electrodes
-
     def charges(self, contact: Array) -> Array:
-        """See `ChargeMap`."""
+        """Charges of contacts (x, y, F), shape (n, 3), mm and N: (n, n_electrode), pC."""
         return np.asarray(self.forward_map.charges(contact) * np.exp(self.correction.log_factor(contact)))
-
-    def derivatives(self, contact: Array) -> Array:
-        """See `ChargeMap`."""
-        return differences(self.charges, contact, CONTACT_STEPS)
 
     def correction_percent(self, contact: Array) -> float:
         """Root mean square of the correction at contacts (n, 3), percent of the charges."""
