@@ -11,7 +11,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from isocharge.simulate import Domain, Sensor
 from isocharge.simulate.numerics.statistics import rms
-from isocharge.simulate.plots.figure import FELT, INK, new_figure
+from isocharge.simulate.plots.figure import FELT, INK, new_axes, new_figure
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
 from isocharge.train.baselines.networks import RELEASED
 from isocharge.train.data.presses import position_error
@@ -52,8 +52,7 @@ def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: Mapping[str,
         plot: Which of AXES.
         limits: Name to position error, mm, of what is drawn as a line, unless every method is below it.
     """
-    figure = new_figure(10.5, 6.0)
-    axes = figure.subplots()
+    figure, axes = new_axes(10.5, 6.0)
     shown = [record for record in records if record.errors.position_rms_mm]
     markers = {kind: cycle(MARKERS) for kind in KINDS}
     for record in sorted(shown, key=lambda record: record.error_mm):
@@ -111,8 +110,7 @@ def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Figure:
 
 def error_lines(x: Sequence[float], lines: Mapping[str, Sequence[float | None]], label: str) -> Figure:
     """Position errors of several methods, and the limits, against what `label` says."""
-    figure = new_figure(8.0, 5.0)
-    axes = figure.subplots()
+    figure, axes = new_axes(8.0, 5.0)
     for name, values in lines.items():
         axes.plot(x, np.array(values, dtype=float), label=name, **_style(name))
     _logarithmic(axes, label, "position error, rms, mm")
@@ -126,8 +124,8 @@ def _style(name: str) -> dict[str, Any]:
 
 def calibration(record: Mapping[str, Any]) -> Figure:
     """Coverage of the released model's intervals less their nominal level."""
-    figure = new_figure(6.5, 4.4)
-    axes, level = figure.subplots(), 100.0 * np.array(record["levels"])
+    figure, axes = new_axes(6.5, 4.4)
+    level = 100.0 * np.array(record["levels"])
     axes.axhspan(-2.0, 2.0, color=GREY, alpha=0.15, lw=0)
     for name in COORDINATES:
         axes.plot(level, 100.0 * np.array(record["coverage"][name]) - level, ".-", label=name)
