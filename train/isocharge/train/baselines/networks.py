@@ -43,8 +43,7 @@ class OnnxContact(GivenMethod):
 
     def predict(self, charge: Array) -> Array:
         """Contacts, shape (n, 3)."""
-        contact: Array = self._session.run(["contact"], {INPUT: charge.astype(np.float32)})[0].astype(float)
-        return contact
+        return np.asarray(self._session.run(["contact"], {INPUT: charge.astype(np.float32)})[0], dtype=float)
 
     def single(self, charge: Array) -> Callable[[], object]:
         """One press, shape (n_electrode,), ready to be computed: into the bound input, run, out of the bound output."""

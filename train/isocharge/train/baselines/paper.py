@@ -151,9 +151,8 @@ class AffineTable(BaseEstimator, RegressorMixin):  # type: ignore[misc]
     def predict(self, values: Array) -> Array:
         """The nearest entries' maps."""
         rows = self.tree_.query(values)[1]
-        answers: Array = np.einsum("ne,nek->nk", values - self.tree_.data[rows], self.maps_[rows, :-1])
-        answers += self.maps_[rows, -1]
-        return answers
+        linear = np.einsum("ne,nek->nk", values - self.tree_.data[rows], self.maps_[rows, :-1])
+        return np.asarray(linear + self.maps_[rows, -1])
 
 
 def affine_maps(offset: Array, target: Array) -> Array:

@@ -87,8 +87,7 @@ class FitConfig(Settings, frozen=True):
 
     def to_dict(self) -> dict[str, Any]:
         """As the tables of the file, ready for JSON."""
-        table: dict[str, Any] = json.decode(json.encode(self))
-        return table
+        return json.decode(json.encode(self), type=dict[str, Any])
 
     def checked(self) -> "FitConfig":
         """The same, once every value is found to be in its range, as it is when a file is read.
