@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.common.errors import SceneError
 from isocharge.common.progress import report
 from isocharge.common.resumable_run import ResumableRun, output_errors, refuse_finished, resume_folder
 from isocharge.simulate.dataset.sampling import PLANS, Sweep, SweepPresses
@@ -90,7 +89,14 @@ def run_sweep(
     }
     with single_threaded_blas(), resume_folder(folder, identity, fresh=fresh) as run:
         maps = [
-            _solved(sensor, probe, sweep, settings, run.keeping(f"solve-{number:02d}", executor))
+            ForwardMap.build(
+                sensor,
+                probe,
+                sweep.radius,
+                sweep.force_range,
+                settings,
+                executor=run.keeping(f"solve-{number:02d}", executor),
+            )
             for number, probe in enumerate(probes)
         ]
         entries = _finish_shards(run, maps, presses, executor, shard)
@@ -108,21 +114,16 @@ def solve_maps(
     executor: Executor | None = None,
 ) -> tuple[ForwardMap, ...]:
     """A forward map for each probe, over the sweep's ranges."""
-    if not probes:
-        raise SceneError("probes: expected at least one, got none")
-    return tuple(_solved(sensor, probe, sweep, settings, executor) for probe in probes)
+    return tuple(
+        ForwardMap.build(sensor, probe, sweep.radius, sweep.force_range, settings, executor=executor)
+        for probe in probes
+    )
 
 
 def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
     """Write a sweep's presses and charges, given the solved maps, in this process; see `run_sweep`."""
     presses = sweep.over([forward_map.probe for forward_map in maps])
     return write_dataset(folder, maps[0].sensor, _samples(maps, _cut(presses, SHARD), None), _about(maps, sweep))
-
-
-def _solved(
-    sensor: Sensor, probe: Probe, sweep: Sweep, settings: SolveSettings, executor: Executor | None
-) -> ForwardMap:
-    return ForwardMap.build(sensor, probe, sweep.radius, sweep.force_range, settings, executor=executor)
 
 
 def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
