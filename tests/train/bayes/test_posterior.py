@@ -139,7 +139,7 @@ def test_charges_of_nothing_still_give_an_answer(spline):
         ({}, np.ones((2, 4)), r"shape \(n, 3\), n at least 1, got shape \(2, 4\)"),
         ({}, np.array([[np.nan, 1.0, 1.0]]), "finite"),
         ({"noise": noise_model("clean")}, np.ones((2, 3)), "white noise"),
-        ({"radius": 9.0}, np.ones((2, 3)), "up to 8 mm"),
+        ({"radius": 9.0}, np.ones((2, 3)), "up to the charge table's 8 mm"),
     ],
 )
 def test_bad_input_is_refused(spline, changes, charge, message):

@@ -24,7 +24,7 @@ from isocharge.common.errors import ChargeError, InputError
 from isocharge.common.progress import track
 from isocharge.simulate import ChargeSpline, NoiseModel
 from isocharge.simulate.execution.workers import in_order
-from isocharge.simulate.forward.charge_map import SLACK
+from isocharge.simulate.forward.charge_map import check_radius
 from isocharge.simulate.identifiability.folds import singular_values
 from isocharge.simulate.identifiability.force_profile import ForceProfile
 from isocharge.simulate.numerics.disk import onto_disk
@@ -150,11 +150,7 @@ class Posterior:
     def __post_init__(self) -> None:
         if self.noise.white <= 0.0:
             raise InputError(f"noise: expected white noise above 0 pC, got {self.noise.name!r}: nothing to integrate")
-        largest = self.charges.domain.radius
-        if not 0.0 < self.radius <= largest * SLACK:
-            raise InputError(
-                f"radius: expected up to {largest:g} mm, where the charges are known, got {self.radius:g} mm"
-            )
+        check_radius(self.radius, self.charges.domain.radius, "charge table")
 
     def mean_and_std(self, charge: Array, executor: Executor | None = None) -> tuple[Array, Array]:
         """Mean and standard deviation of (x, y, F), mm and N, each (n, 3), from noisy charges (n, n_electrode), pC.
