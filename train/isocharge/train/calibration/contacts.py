@@ -216,10 +216,10 @@ def _between(of_films: list[tuple[Array, Array]], shares: Array) -> tuple[Array,
 
 def sum_over(of_films: Sequence[Array], shares: Array) -> Array:
     """Weighted sum of arrays (n, ...) with shares (n, k)."""
-    total = np.zeros_like(of_films[0])
-    for part, share in zip(of_films, shares.T, strict=True):
-        total += part * share.reshape(-1, *(1,) * (part.ndim - 1))
-    return total
+    weighted = (
+        part * share.reshape(-1, *(1,) * (part.ndim - 1)) for part, share in zip(of_films, shares.T, strict=True)
+    )
+    return np.asarray(sum(weighted))
 
 
 def _linearised(function: Callable[[Array], Array], contact: Array) -> tuple[Array, Array]:
