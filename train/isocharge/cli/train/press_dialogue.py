@@ -95,23 +95,20 @@ class PressEvents:
                 return event
 
     def _read_port(self) -> None:
+        armed = self._armed
         try:
-            self._watch_port()
+            for chunk in self._chunks:
+                if self._stop.is_set():
+                    return
+                if armed != self._armed:
+                    armed = self._armed
+                    self._watch.arm()
+                for reading in self._stream.feed(chunk):
+                    self._queue.put((armed, self._watch.feed(reading)))
+            self._stream.finish()
             self._queue.put((0, Stopped()))
         except Exception as error:  # passed on to the thread that asks
             self._queue.put((0, error))
-
-    def _watch_port(self) -> None:
-        armed = self._armed
-        for chunk in self._chunks:
-            if self._stop.is_set():
-                return
-            if armed != self._armed:
-                armed = self._armed
-                self._watch.arm()
-            for reading in self._stream.feed(chunk):
-                self._queue.put((armed, self._watch.feed(reading)))
-        self._stream.finish()
 
     def _read_keyboard(self, keyboard: int) -> None:
         for line in FileIO(keyboard, closefd=False):  # unbuffered: no lock that is held when the program ends
