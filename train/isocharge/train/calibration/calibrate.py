@@ -15,7 +15,7 @@ from isocharge.simulate import Circle, Sensor
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
 from isocharge.train.calibration.contacts import PressData, temperatures
-from isocharge.train.calibration.diagnosis import check_before, explain, find_mistakes, misfit, outside
+from isocharge.train.calibration.diagnosis import check_channels, check_places, explain, find_mistakes, misfit, outside
 from isocharge.train.calibration.discrepancy import Hypothesis
 from isocharge.train.calibration.film_fit import MISTAKEN, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
@@ -207,7 +207,8 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
         PressError: If the presses cannot be what they say, or no film explains them; with the reason where it is found.
     """
     presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
-    check_before(presses, problem.charges)
+    check_places(presses, problem.prior.sensor.film.radius)
+    check_channels(presses, problem.charges)
     _check_enough_known(presses, problem)
     far, cautions = outside(presses.contact, problem.charges.domain), []
     if far.any():

@@ -69,17 +69,12 @@ AXES = (
 """In words, and the matrix from positions as written to positions on the film."""
 
 
-def check_before(presses: MeasuredPresses, charges: FilmCharges) -> None:
-    """Refuse presses that cannot be what they say, before anything is fitted.
+def check_places(presses: MeasuredPresses, radius: float) -> None:
+    """Refuse presses off a film of this radius (mm), and places in metres.
 
     Raises:
-        PressError: If a place is off the film, places are in metres, or a channel is dead or has the wrong sign.
+        PressError: If there are any.
     """
-    _check_places(presses, charges.prior.sensor.film.radius)
-    _check_channels(presses, charges)
-
-
-def _check_places(presses: MeasuredPresses, radius: float) -> None:
     places = presses.contact[:, :2]
     for row in np.flatnonzero(np.hypot(*places.T) >= radius)[:1]:
         raise PressError(
@@ -94,7 +89,12 @@ def _check_places(presses: MeasuredPresses, radius: float) -> None:
         )
 
 
-def _check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
+def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
+    """Refuse channels that are dead or have the wrong sign.
+
+    Raises:
+        PressError: If there are any.
+    """
     charge, placed = presses.charge_pC, presses.contact[presses.placed]
     for name, column in zip(presses.electrodes, charge.T, strict=True):
         if np.isnan(column).all():
