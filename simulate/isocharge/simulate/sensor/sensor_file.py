@@ -145,8 +145,23 @@ def load_sensor(sensor: str | Path) -> Sensor:
 def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
     """Build a sensor from the tables of its file (units in the keys); `where` opens the error messages."""
     file = convert(table, SensorTable, where, SensorError)
+    piezo, calibration, coating = file.piezo, file.calibration, file.electrodes.get(COATING)
     try:
-        return _build(file)
+        return Sensor(
+            name=file.name,
+            film=_film(file.film),
+            piezo=Piezo(piezo.d31, piezo.d32, piezo.d33, piezo.pyro_uC_per_m2_K, piezo.d12),
+            electrodes=tuple(_electrodes(file.electrodes)),
+            coating=coating if isinstance(coating, float) else 0.0,
+            readout=file.readout,
+            surface=file.surface,
+            calibration=Calibration(
+                calibration.gain,
+                calibration.shift_mm,
+                float(np.deg2rad(calibration.rotation_deg)),
+                calibration.crosstalk,
+            ),
+        )
     except SensorError as error:
         raise SensorError(f"{where}: {error}") from error
 
@@ -254,22 +269,6 @@ def _corners(polygon: Corners) -> list[list[float]]:
     return [[tidy(value) for value in corner] for corner in polygon]
 
 
-def _build(file: SensorTable) -> Sensor:
-    film, piezo, calibration = file.film, file.piezo, file.calibration
-    return Sensor(
-        name=file.name,
-        film=_film(film),
-        piezo=Piezo(piezo.d31, piezo.d32, piezo.d33, piezo.pyro_uC_per_m2_K, piezo.d12),
-        electrodes=tuple(_electrodes(file.electrodes)),
-        coating=_coating(file.electrodes),
-        readout=file.readout,
-        surface=file.surface,
-        calibration=Calibration(
-            calibration.gain, calibration.shift_mm, float(np.deg2rad(calibration.rotation_deg)), calibration.crosstalk
-        ),
-    )
-
-
 def _film(table: FilmTable) -> Film:
     young, tension = table.young_GPa, table.pretension_MPa
     first, second = young if isinstance(young, list) else (young, young)
@@ -287,11 +286,6 @@ def _film(table: FilmTable) -> Film:
         oval=table.oval,
         oval_axis=float(np.deg2rad(table.oval_axis_deg)),
     )
-
-
-def _coating(table: Mapping[str, float | Point | PolygonTable]) -> float:
-    value = table.get(COATING)
-    return value if isinstance(value, float) else 0.0
 
 
 def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:
