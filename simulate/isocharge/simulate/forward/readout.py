@@ -86,8 +86,7 @@ class ReadoutPoints:
 
     def charge(self, stress: Array) -> Array:
         """Charges (..., n_electrode), pC, from stress at the points, shape (..., n_electrode, n_point, 3), MPa."""
-        charge: Array = np.einsum("...epc,epc->...e", stress, self.weights)
-        return charge
+        return np.asarray(np.einsum("...epc,epc->...e", stress, self.weights))
 
 
 @lru_cache(maxsize=32)
@@ -144,8 +143,7 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     for electrode, (centre, reach) in zip(sensor.electrodes, sensor.discs, strict=True):
         near = np.flatnonzero(np.abs(complex(*at) - centre) < reach + probe.reach)
         covered.append(sum(_covered(sensor.calibration.place(electrode.parts[i]), probe, complex(*at)) for i in near))
-    charge: Array = -0.5 * sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered)
-    return charge
+    return np.asarray(-0.5 * sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered))
 
 
 def _covered(corners: Array, probe: Probe, at: complex) -> float:
@@ -162,8 +160,7 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
     as the film does: what a rim holds back is stress, and belongs to the pretension.
     """
     areas = np.array([electrode.area for electrode in sensor.electrodes])
-    charge: Array = sensor.gains * areas * sensor.piezo.pyro * step
-    return sensor.calibration.read(charge)
+    return sensor.calibration.read(sensor.gains * areas * sensor.piezo.pyro * step)
 
 
 def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tuple[Array, Array]:
