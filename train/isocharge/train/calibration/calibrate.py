@@ -261,9 +261,13 @@ def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved:
         scatter=0.0,
         weights={Hypothesis(modes=float(film.coefficients.size > 0)): 1.0},
     )
-    electrodes = problem.electrodes
-    presses = MeasuredPresses(np.empty((0, 3)), np.empty((0, len(electrodes))), none, none, electrodes, ())
-    return CalibrationResult(problem, presses, posterior, moved=moved)
+    return CalibrationResult(problem, no_presses(problem.electrodes), posterior, moved=moved)
+
+
+def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:
+    """What was measured before the first press."""
+    none = np.empty(0)
+    return MeasuredPresses(np.empty((0, 3)), np.empty((0, len(electrodes))), none, none, electrodes, ())
 
 
 def _check_enough_known(presses: MeasuredPresses, problem: CalibrationProblem) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.prediction.measured_presses import FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.train.calibration.calibrate import FEW, CalibrationResult, calibrate
+from isocharge.train.calibration.calibrate import FEW, CalibrationResult, calibrate, no_presses
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.diagnosis import outside
 from isocharge.train.calibration.problem import CalibrationProblem
@@ -112,13 +112,10 @@ class PressSession:
             force_std: How well it knows a force, share.
             until: Error left by the film as a share of that of noise, at which it is enough; 0 for never.
         """
-        if presses is None:
-            n, names = len(problem.electrodes), problem.electrodes
-            presses = MeasuredPresses(np.empty((0, 3)), np.empty((0, n)), np.empty(0), np.empty(0), names, ())
         self.problem, self._save, self._until = problem, save, until
         self._std = {"position_std_mm": position_std_mm, "force_std": force_std}
         self._skipped: list[tuple[float, float]] = []
-        self._fit(presses)
+        self._fit(presses or no_presses(problem.electrodes))
 
     def __len__(self) -> int:
         return len(self.presses)
