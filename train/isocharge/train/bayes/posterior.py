@@ -139,13 +139,11 @@ class Posterior:
         charges: Charges of a contact.
         noise: Of the readings.
         radius: Of the disk of the prior, mm.
-        step: Largest side of a cell in standard deviations; half of it is the check.
     """
 
     charges: ChargeSpline
     noise: NoiseModel
     radius: float
-    step: float = STEP
 
     def __post_init__(self) -> None:
         if self.noise.white <= 0.0:
@@ -212,7 +210,7 @@ class Posterior:
             np.maximum.at(stiffest, cells.press[alive], stiffness)
             cut_off = np.zeros(len(charge), dtype=bool)
             cut_off[cells.press[cells.on_edge(self.radius) & (chi2 <= best[cells.press] + NEAR)]] = True
-            done = (stiffest * cells.side <= self.step)[cells.press] | (cut == MOST_CUTS)
+            done = (stiffest * cells.side <= STEP)[cells.press] | (cut == MOST_CUTS)
             ready = cells[done & (chi2 <= best[cells.press] + MARGIN)]
             yield ready[~cut_off[ready.press]]
             yield from ready[cut_off[ready.press]].finer(self.radius)
