@@ -128,9 +128,7 @@ class FilmPrior:
     @property
     def described(self) -> Array:
         """The parameters of the film exactly as described, shape (n_parameter,)."""
-        parameters = np.zeros(len(self.names))
-        parameters[0] = self.sensor.film.pretension
-        return parameters
+        return self.parameters_of(self.sensor, self.probe)
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
         """Films drawn from the spread, shape (count, n_parameter); deviations beyond the bounds are drawn again."""
