@@ -211,5 +211,4 @@ class Measurement:
         if not bits:
             return clipped
         step = 2.0 * limit / (1 << bits)
-        rounded: Array = np.clip(np.round(clipped / step), -(1 << bits - 1), (1 << bits - 1) - 1) * step
-        return rounded
+        return np.asarray(np.clip(np.round(clipped / step), -(1 << bits - 1), (1 << bits - 1) - 1) * step)
