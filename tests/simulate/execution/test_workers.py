@@ -87,10 +87,10 @@ def waited(seconds: float) -> float:
 
 def test_worker_with_another_isocharge_is_refused(monkeypatch):
     """Its bytes might differ."""
-    function = module.SameCodeOnly(waited)
+    fingerprint = module.code_fingerprint()
     monkeypatch.setattr(module, "code_fingerprint", lambda: "isocharge 9.9")
     with pytest.raises(WorkersLost, match=r"a worker runs isocharge 9\.9, expected isocharge 0\.1\.0 \([0-9a-f]{12}\)"):
-        function(0.0)
+        module.run_same_code(fingerprint, waited, 0.0)
 
 
 # Dask

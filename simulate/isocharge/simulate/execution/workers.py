@@ -12,8 +12,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing.connection import Connection
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 from isocharge.common.errors import InputError, WorkersLost
 from isocharge.common.extras import require
@@ -49,7 +50,7 @@ def in_order(
     if executor is None:
         yield from map(function, jobs)
         return
-    task = SameCodeOnly(function)
+    task = partial(run_same_code, code_fingerprint(), function)
     pending: deque[Future[Result]] = deque()
     try:
         for job in jobs:
@@ -84,19 +85,18 @@ def _loss_of_workers() -> Iterator[None]:
         raise WorkersLost(f"the Dask cluster gave up: {error}") from error
 
 
-class SameCodeOnly(Generic[Job, Result]):
-    """A function that a worker runs only if it has the same isocharge as the sender: else its bytes would differ."""
+def run_same_code(fingerprint: str, function: Callable[[Job], Result], job: Job) -> Result:
+    """Run a job where isocharge is the same as the sender's: else its bytes would differ.
 
-    def __init__(self, function: Callable[[Job], Result]) -> None:
-        self._function, self._fingerprint = function, code_fingerprint()
-
-    def __call__(self, job: Job) -> Result:
-        if code_fingerprint() != self._fingerprint:
-            raise WorkersLost(
-                f"a worker runs {code_fingerprint()}, expected {self._fingerprint}; install the same on all of them"
-            )
-        with single_threaded_blas():
-            return self._function(job)
+    Raises:
+        WorkersLost: If it is another.
+    """
+    if code_fingerprint() != fingerprint:
+        raise WorkersLost(
+            f"a worker runs {code_fingerprint()}, expected {fingerprint}; install the same on all of them"
+        )
+    with single_threaded_blas():
+        return function(job)
 
 
 def cores() -> int:
