@@ -142,12 +142,13 @@ class EvaluationCase:
         self,
         *,
         further: float = FURTHER,
-        accuracy: float | None = None,
+        accuracy: float = ACCURACY,
         executor: Executor | None = None,
     ) -> tuple[ForwardMap, ...]:
         """Forward maps of the sensor under its probes, solved so much further than the dataset reaches."""
-        settings = SolveSettings() if accuracy is None else SolveSettings(accuracy=accuracy)
-        return solve_maps(self.sensor, self.probes, self.sweep(further), settings, executor=executor)
+        return solve_maps(
+            self.sensor, self.probes, self.sweep(further), SolveSettings(accuracy=accuracy), executor=executor
+        )
 
 
 def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
