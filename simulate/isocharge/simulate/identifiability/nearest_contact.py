@@ -41,9 +41,7 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
     return contact, np.linalg.norm(residual, axis=1)
 
 
-def explain(
-    charge_map: ChargeMap, charge: Array, sigma: Array, start: Array, steps: int = MOST_STEPS
-) -> tuple[Array, Array]:
+def explain(charge_map: ChargeMap, charge: Array, sigma: Array, start: Array) -> tuple[Array, Array]:
     """The contacts that descent from a start leads to.
 
     Args:
@@ -51,12 +49,11 @@ def explain(
         charge: To be explained, shape (n, n_electrode), pC.
         sigma: The unit of distance, shape (n, n_electrode), pC.
         start: Contacts (x, y, F), shape (n, 3), mm and N.
-        steps: Most steps.
 
     Returns:
         Contacts within the map's domain, shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
-    return _descent(charge_map, charge, lambda rows, _: sigma[rows], start, steps)
+    return _descent(charge_map, charge, lambda rows, _: sigma[rows], start, MOST_STEPS)
 
 
 def _descent(

@@ -34,9 +34,9 @@ def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool 
             axes.annotate(electrode.name, centre, ha="center", va="center", color=colour, fontsize=9, path_effects=halo)
 
 
-def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "", colour: str = FELT) -> None:
+def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "") -> None:
     """The footprint of a press at (x, y), mm."""
-    style: dict[str, Any] = {"fill": True, "fc": colour, "ec": colour, "alpha": 0.35, "zorder": 2, "label": label}
+    style: dict[str, Any] = {"fill": True, "fc": FELT, "ec": FELT, "alpha": 0.35, "zorder": 2, "label": label}
     if isinstance(probe, Circle):
         axes.add_patch(Disk(at, probe.radius, **style))
     else:

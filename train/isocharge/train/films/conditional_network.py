@@ -72,25 +72,21 @@ class ConditionalPerceptron(Trainable):
         hidden: Widths of the hidden layers.
         outputs: Number of outputs.
         context: Number of context values.
-        bases: Matrices that a layer's weights are made of, besides the constant one.
-        psi: Width of the context's network.
     """
 
-    def __init__(
-        self, inputs: int, hidden: tuple[int, ...], outputs: int, context: int, bases: int = BASES, psi: int = PSI
-    ) -> None:
+    def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int, context: int) -> None:
         super().__init__()
         sizes = list(pairwise((inputs, *hidden, outputs)))
-        self.context = nn.Sequential(nn.Linear(context, psi), nn.Tanh(), nn.Linear(psi, psi), nn.Tanh())
+        self.context = nn.Sequential(nn.Linear(context, PSI), nn.Tanh(), nn.Linear(PSI, PSI), nn.Tanh())
         self.constant = nn.ParameterList([_uniform(1.0, *size) for size in sizes])
-        self.bases = nn.ParameterList([_uniform(FIRST_BASIS, *size, count=bases) for size in sizes])
-        self.bias = nn.ModuleList([nn.Linear(psi, size[1]) for size in sizes])
+        self.bases = nn.ParameterList([_uniform(FIRST_BASIS, *size, count=BASES) for size in sizes])
+        self.bias = nn.ModuleList([nn.Linear(PSI, size[1]) for size in sizes])
         self.skip = nn.Parameter(torch.zeros(inputs, outputs))
-        self.skip_bases = nn.Parameter(torch.zeros(bases, inputs, outputs))
-        self.phi = nn.Linear(psi, bases * (len(sizes) + 1))
+        self.skip_bases = nn.Parameter(torch.zeros(BASES, inputs, outputs))
+        self.phi = nn.Linear(PSI, BASES * (len(sizes) + 1))
         for linear in self.bias:
             nn.init.zeros_(linear.weight)  # type: ignore[arg-type]
-        nn.init.normal_(self.phi.weight, std=FIRST_SHARE / np.sqrt(psi))
+        nn.init.normal_(self.phi.weight, std=FIRST_SHARE / np.sqrt(PSI))
         nn.init.zeros_(self.phi.bias)
 
     def forward(self, inputs: Tensor, context: Tensor) -> Tensor:
