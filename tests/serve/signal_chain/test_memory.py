@@ -1,11 +1,14 @@
 """The film's memory undone: against filters of scipy, the logarithm itself, and a law of cooling."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Contact, Frame, TouchStream, device_from_table, encode_frame
+from isocharge.serve.prediction.contact import Sensitivity
 from isocharge.serve.signal_chain.chain import ChainState, advance
 from isocharge.serve.signal_chain.memory import DECADES_S
 from isocharge.train.export_c.folder import device_header
@@ -133,6 +136,19 @@ def test_a_doubt_widens_contact_and_its_correlations():
 
     expected = covariance(one) + np.outer(shift, shift)
     np.testing.assert_allclose(covariance(one.widened(tuple(shift.tolist()))), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("moved", "again"),
+    [((0.2, -0.2, 0.02), 0.0), ((0.4, 0.0, 0.0), 1.0), ((0.0, -0.4, 0.0), 1.0), ((0.0, 0.0, 0.03), 1.0)],
+)
+def test_a_second_answer_is_asked_for_again_once_the_contact_has_moved(moved, again):
+    """A model whose answer grows in proportion to what is not known: half a unit moves it by half of where it was."""
+    told, first = Sensitivity(0.1), np.array([2.0, 1.0, 0.5])
+    for x, y, force in (first, first + moved):
+        contact = Contact(x, y, force, 0.1, 0.1, 0.01, 0.0)
+        shift = told.shift(contact, 0.05, partial(contact._replace, x_mm=2.0 * x, y_mm=2.0 * y, force_N=2.0 * force))
+    np.testing.assert_allclose(shift, 0.5 * (first + again * np.array(moved)), rtol=1e-12)
 
 
 def test_records_say_it(film, predictor):

@@ -14,7 +14,7 @@ from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.live.reading_stream import ReadingStream, TimedReading
 from isocharge.serve.port.source import Chunk
-from isocharge.serve.prediction.contact import Contact
+from isocharge.serve.prediction.contact import Contact, Sensitivity
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import (
     FIELDS,
@@ -31,6 +31,10 @@ from isocharge.serve.tracking.tracker import Tracker
 
 LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
 """Flags of a frame without a record that pass to the next record: they say what happened before it."""
+
+
+DOUBT = 0.01
+"""Share of all touch charges by which it is told how contacts depend on what is not known of the film's memory."""
 
 
 class Policy(StrEnum):
@@ -159,6 +163,7 @@ class TouchStream:
         self.predictor, self._validity = predictor, predictor.validity
         self._electrodes, self._label = predictor.metadata.electrodes, predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
+        self._of_doubt = Sensitivity(DOUBT)
 
     def use(self, predictor: Predictor) -> None:
         """Go on with another model of the same electrodes; tare and chain stay as they are.
@@ -191,6 +196,7 @@ class TouchStream:
             self._follower.back()
 
     def _forget_contact(self) -> None:
+        self._of_doubt = Sensitivity(DOUBT)
         if self._follower is not None:
             self._follower.forget()
         if self._tracker is not None:
@@ -263,8 +269,8 @@ class TouchStream:
         if self._tracker is not None:
             tracked, event = self._tracker.update(contact, when.clock_s, flags)
         if contact is not None and reading.doubt > 0.0 and reading.charge_pC is not None:
-            likely = self._answers.predict(reading.charge_pC * (1.0 + reading.doubt))
-            shift = likely.x_mm - contact.x_mm, likely.y_mm - contact.y_mm, likely.force_N - contact.force_N
+            more_pC = reading.charge_pC * (1.0 + DOUBT)
+            shift = self._of_doubt.shift(contact, reading.doubt, lambda: self._answers.predict(more_pC))
             contact, tracked = contact.widened(shift), tracked and tracked.widened(shift)
         return PredictionRecord(
             timestamp=when.host_s,

@@ -5,7 +5,7 @@ model was trained for: the flags `outside`, `misfit` and `beyond`.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
@@ -71,6 +71,45 @@ class Contact(NamedTuple):
             certain = math.isfinite(std) and std > 0.0
             decimals = min(max(1 - math.floor(math.log10(std)), 0), MOST_DECIMALS) if certain else MOST_DECIMALS
             yield name, f"{value:.{decimals}f}", f"{std:.{decimals}f}"
+
+
+NEAR_MM, NEAR_FORCE = 0.3, 0.05
+"""Way along x or y, mm, and share of the force, within which a contact depends on what is not known as before."""
+
+
+class Sensitivity:
+    """How a contact changes with something that is not known, by a second answer of a model.
+
+    It is asked for once while a contact stays near: a frame of a held press takes one prediction, not two.
+    """
+
+    def __init__(self, unit: float) -> None:
+        """Begin without an answer; `unit` is how much of it lies between the two answers."""
+        self._unit = unit
+        self._asked: Contact | None = None
+        self._change = (0.0, 0.0, 0.0)
+
+    def shift(self, contact: Contact, size: float, other: Callable[[], Contact]) -> tuple[float, float, float]:
+        """How far so much of it moves x and y, mm, and force, N.
+
+        Args:
+            contact: The first answer.
+            size: How much, in the unit of `unit`.
+            other: Asks for the second answer, that of one unit more.
+        """
+        x_mm, y_mm, force_N = contact[:3]
+        asked = self._asked
+        if (
+            asked is None
+            or abs(x_mm - asked.x_mm) > NEAR_MM
+            or abs(y_mm - asked.y_mm) > NEAR_MM
+            or abs(force_N - asked.force_N) > NEAR_FORCE * asked.force_N
+        ):
+            self._asked, beside = contact, other()
+            self._change = beside.x_mm - x_mm, beside.y_mm - y_mm, beside.force_N - force_N
+        by_x, by_y, by_F = self._change
+        units = size / self._unit
+        return units * by_x, units * by_y, units * by_F
 
 
 NO_CORRELATION = dict.fromkeys(Contact._fields[SEVEN:])

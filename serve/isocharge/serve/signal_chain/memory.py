@@ -300,10 +300,11 @@ def warmer(memory: Memory, change_pC: Array | float, rate_pC_per_s: Array | floa
 
 def doubt(memory: Memory) -> float:
     """Relative standard deviation of all touch charges together, because creep and step are not known better."""
-    total_pC = sum(memory.rows_pC[HELD].tolist())
+    rows_pC = memory.rows_pC.sum(axis=1)
+    total_pC = float(rows_pC[HELD])
     if total_pC <= 0.0:
         return 0.0
-    crept, cooled = map(sum, OF_SCALES.dot(memory.rows_pC).tolist())
+    crept, cooled = OF_SCALES.dot(rows_pC).tolist()
     crept, cooled = memory.film.creep * crept / total_pC, memory.film.thermoelastic * cooled / total_pC
     of_creep, of_step, both = memory.film.variances
     return math.sqrt(max(crept * crept * of_creep + cooled * cooled * of_step + 2.0 * crept * cooled * both, 0.0))

@@ -13,6 +13,7 @@ them.
 
 import math
 from collections import deque
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from isocharge.common.arrays import Array, Reals
 from isocharge.common.errors import ModelError
 from isocharge.serve.flags import BEYOND, GAP, MISFIT, OUTSIDE, REPEAT, STRESS
 from isocharge.serve.model.pretensions import read_pretensions
-from isocharge.serve.prediction.contact import Contact
+from isocharge.serve.prediction.contact import Contact, Sensitivity
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.signal_chain.rule import Rule, Setting
 
@@ -115,7 +116,6 @@ class FilmFollower:
         self._grid = np.linspace(low, high, max(round((high - low) / STEP_MPa), 1) + 1)
         self._films = self._known.at(np.linspace(low, high, max(round((high - low) / COARSE_MPa), 1) + 1))
         self._gains = 1.0 + np.kron(np.eye(len(electrodes)), GAINS[:, None])
-        self._beside: Predictor | None = None
         self._drift = (rule or FollowRule()).drift_MPa_per_root_hour
         self._check()
         self.back()
@@ -142,7 +142,7 @@ class FilmFollower:
         self._probability = _normal(self._grid - known.calibrated_MPa, known.std_MPa)
         self._gain = np.zeros((self._grid.size, known.typical_pC.size))
         self._spread = np.tile(np.eye(known.typical_pC.size), (self._grid.size, 1, 1))
-        self._beside = None
+        self._beside: Predictor | None = None
         self._when_s: float | None = None
         self._touches, self._walked = 0, 0.0
         self._recent: deque[tuple[Array, ...]] = deque(maxlen=RECENT)
@@ -184,9 +184,8 @@ class FilmFollower:
         """A contact of the model with what is not known of the pretension in its deviations, once it is followed."""
         if self._beside is None:
             return contact
-        other, share = self._beside.predict(charge_pC), self._answered_std / BESIDE_MPa
-        x, y, force = other.x_mm - contact.x_mm, other.y_mm - contact.y_mm, other.force_N - contact.force_N
-        return contact.widened((share * x, share * y, share * force))
+        beside = partial(self._beside.predict, charge_pC)
+        return contact.widened(self._sensitivity.shift(contact, self._answered_std, beside))
 
     def take(self, charge_pC: Array, clock_s: float) -> None:
         """Take in a touch, charges of shape (n_electrode,), pC."""
@@ -269,7 +268,7 @@ class FilmFollower:
         elif self._beside is not None:
             return
         side = -BESIDE_MPa if self._answered_MPa + BESIDE_MPa > self._grid[-1] else BESIDE_MPa
-        self._beside = self._at(self._answered_MPa + side)
+        self._beside, self._sensitivity = self._at(self._answered_MPa + side), Sensitivity(BESIDE_MPa)
 
     def _at(self, pretension_MPa: float) -> Predictor:
         return self._calibrated.with_constants(self._known.constants(pretension_MPa))
