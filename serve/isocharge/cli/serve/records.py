@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing
 from enum import StrEnum
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Self
 
 import numpy as np
@@ -153,12 +152,10 @@ class McapOutput:
         self._stack.enter_context(self._queue)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Write what waits and close the file."""
         try:
-            self._stack.__exit__(kind, error, trace)
+            self._stack.close()
         except OSError as failure:
             self._file.give_up(failure)
         if self._queue.lost:

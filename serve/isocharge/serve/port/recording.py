@@ -19,7 +19,6 @@ import logging
 from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
 from msgspec import Meta, Struct
@@ -99,9 +98,7 @@ class Recorder:
         self._write(json.dumps(self._header))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the file."""
         self.close()
 
