@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame
 from isocharge.serve.frames.formats import frame_layout
-from isocharge.serve.frames.frame_layout import DescribedParser, described_parser
+from isocharge.serve.frames.frame_layout import DescribedParser
 
 FOLDER = Path(__file__).parents[2] / "data" / "frames"
 LAYOUTS = {path.stem: frame_layout(tomllib.loads(path.read_text("utf-8")), path.name) for path in FOLDER.glob("*.toml")}
@@ -155,7 +155,7 @@ def test_stuffed_frames(framing, stuff):
     sent = [stuff(data + struct.pack("<I", binascii.crc32(data))) for data in datas]
     bad = stuff(datas[0] + struct.pack("<I", binascii.crc32(datas[1])))
     stream = b"".join(sent[:9]) + bad + stuff(b"123") + b"".join(sent[9:])
-    parser = described_parser(stuffed(framing))
+    parser = stuffed(framing).parser()
     frames = [frame for at in range(0, len(stream), 7) for frame in parser.feed(stream[at : at + 7])]
     assert [frame.seq for frame in frames] == list(range(256))
     assert frames[3].values == struct.unpack("<f", struct.pack("<f", 0.1 * 3))
@@ -164,7 +164,7 @@ def test_stuffed_frames(framing, stuff):
 
 
 def test_datagrams_hold_whole_frames():
-    parser = described_parser(stuffed("datagram", length=5, checksum="none"))
+    parser = stuffed("datagram", length=5, checksum="none").parser()
     one, two = (struct.pack("<Bf", k, k / 2) for k in (1, 2))
     assert [frame.values for frame in parser.feed(one + two)] == [(0.5,), (1.0,)]
     assert parser.feed(one[:3]) == []

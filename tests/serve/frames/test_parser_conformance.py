@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from isocharge.serve import AutoParser, BinaryParser, Frame, encode_frame, encode_text
 from isocharge.serve.frames.formats import frame_layout
 from isocharge.serve.frames.frame import Parser, SequenceGaps
-from isocharge.serve.frames.frame_layout import described_parser
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_lines import TEXT_FORMATS
 from isocharge.serve.virtual_sensor.script import corrupt
@@ -94,7 +93,7 @@ def described(table):
     values = st.tuples(*[st.integers(-32768, 32767).map(float)] * 3)
     noise = st.one_of(st.just(layout.sync), st.just(layout.sync[:1]), st.binary(max_size=6))
     return Format(
-        partial(described_parser, layout),
+        layout.parser,
         layout.encode,
         st.builds(Frame, seq=SEQ, t_us=T_US, values=values),
         st.lists(noise, min_size=1, max_size=5).map(b"".join),

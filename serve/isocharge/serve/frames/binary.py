@@ -7,7 +7,7 @@ a parser that is out of step is back in step at the next zero: a damaged frame c
 import binascii
 import struct
 
-from isocharge.serve.frames.frame import ChecksumError, DelimitedParser, Frame
+from isocharge.serve.frames.frame import ChecksumError, Frame, StuffedParser
 from isocharge.serve.frames.stuffing import cobs_decode, cobs_encode
 
 FORMAT = "binary frames of isocharge"
@@ -43,30 +43,33 @@ def encode_frame(frame: Frame) -> bytes:
     return cobs_encode(payload + CRC.pack(crc16(payload))) + DELIMITER
 
 
+def decode_frame(piece: bytes) -> Frame:
+    """The frame in these bytes, without delimiter.
+
+    Raises:
+        ChecksumError: If its CRC does not fit.
+        ValueError: If they are no frame.
+    """
+    payload = cobs_decode(piece)
+    if len(payload) < HEAD.size + CRC.size:
+        raise ValueError("shorter than a frame without charges")
+    body = payload[: -CRC.size]
+    if CRC.pack(crc16(body)) != payload[-CRC.size :]:
+        raise ChecksumError("another CRC")
+    version, seq, t_us, n, flags = HEAD.unpack_from(body)
+    if version != FRAME_VERSION or len(body) != HEAD.size + 4 * n:
+        raise ValueError("another version, or another number of charges than announced")
+    return Frame(seq, t_us, struct.unpack_from(f"<{n}f", body, HEAD.size), flags)
+
+
 def crc16(data: bytes) -> int:
     """CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, not reflected."""
     return binascii.crc_hqx(data, 0xFFFF)
 
 
-class BinaryParser(DelimitedParser):
+class BinaryParser(StuffedParser):
     """Bytes in, frames out. Memory is bounded by the longest possible frame."""
 
-    def __init__(self, delimiter: bytes = DELIMITER, longest: int = LONGEST_PIECE) -> None:
-        """Begin without bytes; the arguments are those of `DelimitedParser`."""
-        super().__init__(delimiter, longest, FORMAT)
-
-    def _take(self, piece: bytes) -> list[Frame]:
-        """The frame of a piece; an empty one is an idle line."""
-        return self._attempt(self._decode, piece, len(piece) + 1) if piece else []
-
-    def _decode(self, piece: bytes) -> Frame:
-        payload = cobs_decode(piece)
-        if len(payload) < HEAD.size + CRC.size:
-            raise ValueError("shorter than a frame without charges")
-        body = payload[: -CRC.size]
-        if CRC.pack(crc16(body)) != payload[-CRC.size :]:
-            raise ChecksumError("another CRC")
-        version, seq, t_us, n, flags = HEAD.unpack_from(body)
-        if version != FRAME_VERSION or len(body) != HEAD.size + 4 * n:
-            raise ValueError("another version, or another number of charges than announced")
-        return Frame(seq, t_us, struct.unpack_from(f"<{n}f", body, HEAD.size), flags)
+    def __init__(self) -> None:
+        """Begin without bytes."""
+        super().__init__(DELIMITER, LONGEST_PIECE, decode_frame, FORMAT)

@@ -8,7 +8,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.common.structs import convert
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import Frame, Parser
-from isocharge.serve.frames.frame_layout import FrameLayout, FrameSection, described_parser
+from isocharge.serve.frames.frame_layout import FrameLayout, FrameSection
 from isocharge.serve.frames.text import TextParser
 
 _STEP = re.compile(rb"[^\0\n]*[\0\n]|[^\0\n]+")
@@ -91,21 +91,13 @@ class BinaryFrames(FrameSection, tag="binary", frozen=True):
         return BinaryParser()
 
 
-class DescribedFrames(FrameLayout, tag="described", frozen=True):
-    """Frames of a described layout."""
-
-    def parser(self) -> Parser:
-        """A new parser."""
-        return described_parser(self)
-
-
-def frame_layout(table: Mapping[str, Any], where: str) -> DescribedFrames:
+def frame_layout(table: Mapping[str, Any], where: str) -> FrameLayout:
     """Read the keys of a described frame; `where` opens messages.
 
     Raises:
         DeviceError: If a key is missing, unknown or wrong, or the length is not that of the fields.
     """
-    return convert({"format": "described", **table}, DescribedFrames, where, DeviceError)
+    return convert({"format": "described", **table}, FrameLayout, where, DeviceError)
 
 
-Frames = AutoFrames | TextFrames | BinaryFrames | DescribedFrames
+Frames = AutoFrames | TextFrames | BinaryFrames | FrameLayout

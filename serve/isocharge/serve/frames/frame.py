@@ -285,3 +285,15 @@ class DelimitedParser(Parser):
     @abstractmethod
     def _take(self, piece: bytes) -> list[Frame]:
         """The frames that a piece completes; what is none is counted."""
+
+
+class StuffedParser(DelimitedParser):
+    """A parser of frames with byte stuffing: each piece is a frame, and an empty one an idle line."""
+
+    def __init__(self, delimiter: bytes, longest: int, decode: Callable[[bytes], Frame], *about: Any) -> None:
+        """Begin without bytes; `decode` turns a piece into its frame, the other arguments are of `DelimitedParser`."""
+        super().__init__(delimiter, longest, *about)
+        self._decode = decode
+
+    def _take(self, piece: bytes) -> list[Frame]:
+        return self._attempt(self._decode, piece, len(piece) + 1) if piece else []

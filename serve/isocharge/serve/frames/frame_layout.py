@@ -39,11 +39,11 @@ from isocharge.serve.frames.frame import (
     TIMES_US,
     ChecksumError,
     Columns,
-    DelimitedParser,
     Frame,
     Parser,
+    StuffedParser,
 )
-from isocharge.serve.frames.stuffing import STUFFINGS, Stuffing
+from isocharge.serve.frames.stuffing import STUFFINGS
 
 TYPES = {
     **{"u8": "B", "u16": "H", "u24": "3s", "u32": "I"},
@@ -274,9 +274,11 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
         Raises:
             ChecksumError: If its checksum does not fit.
-            ValueError: If a constant byte is another one, or number or clock is none.
+            ValueError: If length, sync or a constant byte is another one, or number or clock is none.
             OverflowError: If number or clock is infinite.
         """
+        if len(data) != self.length or not data.startswith(self.sync):
+            raise ValueError("another length or sync")
         end = self.length - self.check.size
         if self.check.size and self.checked(data[:end]) != data[end:]:
             raise ChecksumError("another checksum")
@@ -304,6 +306,14 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         for at, constant in self.constants:
             data = data[:at] + constant + data[at + len(constant) :]
         return data + self.checked(data)
+
+    def parser(self) -> Parser:
+        """A new parser."""
+        if self.framing in STUFFINGS:
+            delimiter, unstuffed = STUFFINGS[self.framing]
+            longest = 2 * self.length + 2
+            return StuffedParser(delimiter, longest, lambda piece: self.decode(unstuffed(piece)), *_about(self))
+        return DatagramParser(self) if self.framing == DATAGRAM else DescribedParser(self)
 
 
 def _about(layout: FrameLayout) -> tuple[str, int, int]:
@@ -335,24 +345,6 @@ class DescribedParser(Parser):
         return frames
 
 
-class StuffedParser(DelimitedParser):
-    """Bytes in, frames out, for a layout with byte stuffing."""
-
-    def __init__(self, layout: FrameLayout, stuffing: Stuffing) -> None:
-        super().__init__(stuffing.delimiter, 2 * layout.length + 2, *_about(layout))
-        self.layout, self._unstuffed = layout, stuffing.decode
-
-    def _take(self, piece: bytes) -> list[Frame]:
-        """The frame of a piece; an empty one is an idle line."""
-        return self._attempt(self._decode, piece, len(piece) + 1) if piece else []
-
-    def _decode(self, piece: bytes) -> Frame:
-        data = self._unstuffed(piece)
-        if len(data) != self.layout.length or not data.startswith(self.layout.sync):
-            raise ValueError("another length or sync")
-        return self.layout.decode(data)
-
-
 class DatagramParser(DescribedParser):
     """Datagrams in, frames out: each chunk is a datagram, which holds one or more whole frames."""
 
@@ -363,16 +355,4 @@ class DatagramParser(DescribedParser):
             self.counts.refuse(len(data))
             return []
         pieces = [data[at : at + length] for at in range(0, len(data), length)]
-        return [frame for piece in pieces for frame in self._attempt(self._decode, piece, length)]
-
-    def _decode(self, piece: bytes) -> Frame:
-        if not piece.startswith(self.layout.sync):
-            raise ValueError("another sync")
-        return self.layout.decode(piece)
-
-
-def described_parser(layout: FrameLayout) -> DescribedParser | StuffedParser:
-    """A new parser for frames of this layout, whatever their framing."""
-    if layout.framing in STUFFINGS:
-        return StuffedParser(layout, STUFFINGS[layout.framing])
-    return DatagramParser(layout) if layout.framing == DATAGRAM else DescribedParser(layout)
+        return [frame for piece in pieces for frame in self._attempt(self.layout.decode, piece, length)]

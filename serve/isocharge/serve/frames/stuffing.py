@@ -7,14 +7,13 @@ own, and send another two for it where it stands in the data.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 LONGEST_BLOCK = 254
 """Largest number of bytes without a zero after one distance of COBS."""
 
 
-@dataclass(frozen=True)
-class Stuffing:
+class Stuffing(NamedTuple):
     """A kind of byte stuffing.
 
     Attributes:
