@@ -65,10 +65,6 @@ class Crc:
         return register ^ self.final
 
 
-def _xor(data: bytes) -> int:
-    return reduce(xor, data, 0)
-
-
 def _fletcher(data: bytes) -> int:
     """Fletcher's checksum (1982): the sum in the low byte, the sum of the sums in the high one, both modulo 255."""
     low = high = 0
@@ -107,7 +103,7 @@ CHECKSUMS = {
     "sum-8": Checksum(lambda data: sum(data) & 0xFF, 1),
     "sum-8/negative": Checksum(lambda data: -sum(data) & 0xFF, 1),
     "sum-8/inverted": Checksum(lambda data: ~sum(data) & 0xFF, 1),
-    "xor-8": Checksum(_xor, 1),
+    "xor-8": Checksum(lambda data: reduce(xor, data, 0), 1),
     "sum-16": Checksum(lambda data: sum(data) & 0xFFFF, 2),
     "fletcher-16": Checksum(_fletcher, 2),
     **{name: Checksum(crc, crc.width // 8) for name, crc in CRCS.items()},

@@ -215,7 +215,7 @@ def _before(name: str) -> tuple[bool, str]:
 
 def _period(lines: list[Line]) -> int:
     """Number of lines in the cycle that has just come three times in a row, or 0; only named values make cycles."""
-    signatures = [line.signature for line in lines]
+    signatures = [(line.notation, line.names, len(line.values)) for line in lines]
     last = signatures[-1]
     back = signatures[-2::-1]
     period = back.index(last) + 1 if last in back else 0

@@ -60,11 +60,6 @@ class Line(NamedTuple):
     names: tuple[str, ...] = ()
     values: tuple[float, ...] = ()
 
-    @property
-    def signature(self) -> tuple[Notation, tuple[str, ...], int]:
-        """What lines of one layout have in common."""
-        return self.notation, self.names, len(self.values)
-
 
 NOTHING = Line(Notation.nothing)
 
@@ -164,21 +159,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, float)
 
 
-def _csv_line(frame: Frame) -> str:
-    return ",".join(f"{value:.7g}" for value in frame.values)
-
-
-def _pairs_line(frame: Frame) -> str:
-    return ",".join(f"{name}:{value}" for name, value in _fields(frame))
-
-
 def _teleplot_lines(frame: Frame) -> str:
     stamp = "" if frame.t_us is None else f"{frame.t_us / 1e3:.3f}:"
     return "\n".join(f">{name}:{stamp}{value}" for name, value in _fields(frame) if name not in TIMES_US)
-
-
-def _json_line(frame: Frame) -> str:
-    return "{" + ", ".join(f"{json.dumps(name)}: {value}" for name, value in _fields(frame)) + "}"
 
 
 def _fields(frame: Frame) -> list[tuple[str, str]]:
@@ -190,10 +173,10 @@ def _fields(frame: Frame) -> list[tuple[str, str]]:
 
 
 TEXT_FORMATS: dict[str, Callable[[Frame], str]] = {
-    "csv": _csv_line,
-    "pairs": _pairs_line,
+    "csv": lambda frame: ",".join(f"{value:.7g}" for value in frame.values),
+    "pairs": lambda frame: ",".join(f"{name}:{value}" for name, value in _fields(frame)),
     "teleplot": _teleplot_lines,
-    "json": _json_line,
+    "json": lambda frame: "{" + ", ".join(f"{json.dumps(name)}: {value}" for name, value in _fields(frame)) + "}",
 }
 """Notations by name, with their writers. CSV has only the channels and no header, as the simplest boards send it."""
 
