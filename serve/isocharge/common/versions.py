@@ -1,10 +1,12 @@
 """The version of the installed package, looked up only when somebody asks: importlib.metadata is slow to import."""
 
 from collections.abc import Callable
+from functools import cache
 
 
+@cache
 def package_version() -> str:
-    """The version of isocharge, as pip knows it."""
+    """The version of isocharge, as pip knows it; kept, because it is read from files, which a busy server may lack."""
     from importlib.metadata import version  # late, see above
 
     return version("isocharge")

@@ -6,15 +6,14 @@ browser to run or load anything, should one of them get through.
 
 import base64
 import hashlib
-from functools import lru_cache
 from html import escape
-from importlib.metadata import version
 from typing import Any
 from urllib.parse import quote
 
 import msgspec
 
 from isocharge.common.files import read_whole
+from isocharge.common.versions import package_version
 from isocharge.serve.model.model_folder import Model
 from isocharge.serve.model.session import INPUT, OUTPUTS
 from isocharge.serve.network.address import ServerLimits
@@ -38,24 +37,17 @@ NO_LOAD_PARAMETERS = "load: parameters are not supported; put the files into the
 
 def server_metadata() -> dict[str, Any]:
     """Name, version and extensions."""
-    return {"name": "isocharge", "version": _version(), "extensions": list(EXTENSIONS)}
-
-
-@lru_cache(1)
-def _version() -> str:
-    """The package's version; to read it opens files, which a server with many connections may not have left."""
-    return version("isocharge")
+    return {"name": "isocharge", "version": package_version(), "extensions": list(EXTENSIONS)}
 
 
 def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:
     """Tensors of a model, and under `properties` everything that its file says about itself, as JSON texts."""
     metadata = loaded.metadata
-    widths = {INPUT: len(metadata.electrodes)}
     return {
         "name": metadata.name,
         "versions": [other.version for other in store.named(metadata.name)],
         "platform": PLATFORM,
-        "inputs": [_tensor(name, width) for name, width in widths.items()],
+        "inputs": [_tensor(INPUT, len(metadata.electrodes))],
         "outputs": [_tensor(name, OUTPUTS[name]) for name in loaded.outputs],
         "properties": metadata.to_props(),
     }
