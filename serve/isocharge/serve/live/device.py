@@ -31,9 +31,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
-from msgspec import field
+from msgspec import field, structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DeviceError
@@ -249,7 +248,7 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     """
     frames = table.get("frames")
     tagged = {**table, "frames": {"format": "auto", **frames}} if isinstance(frames, Mapping) else table
-    sections = msgspec.structs.asdict(convert(tagged, DeviceSections, where, DeviceError))
+    sections = structs.asdict(convert(tagged, DeviceSections, where, DeviceError))
     on: dict[str, Any] = {name: None if isinstance(one, Rule) and not one.on else one for name, one in sections.items()}
     return Device(**on, table=table, where=where)
 

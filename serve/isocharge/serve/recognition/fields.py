@@ -12,9 +12,8 @@ from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.frames.frame_layout import ByteOrder
 from isocharge.serve.recognition.framing import Bytes, usual_bytes
 
@@ -127,7 +126,7 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
 
 
 def _numbers(
-    cut: Bytes, constant: NDArray[np.bool_], is_zero: NDArray[np.bool_], kind: str, rate_Hz: float, weights: Weights
+    cut: Bytes, constant: Booleans, is_zero: Booleans, kind: str, rate_Hz: float, weights: Weights
 ) -> Iterator[Part]:
     """What bytes, lowest first, may be as a number of a type: a frame's number or a clock, and a channel.
 

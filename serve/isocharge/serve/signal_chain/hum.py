@@ -12,9 +12,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Complexes
 from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
 LEAST_TURN = 0.02
@@ -44,7 +43,7 @@ class Hum(NamedTuple):
         raw_pC: Charges of the frame before, shape (electrodes,), pC; None before the first.
     """
 
-    phasor_pC: NDArray[np.complex128]
+    phasor_pC: Complexes
     turn: complex = 1.0 + 0.0j
     raw_pC: Array | None = None
 

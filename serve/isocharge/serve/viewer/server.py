@@ -26,11 +26,10 @@ from http import HTTPStatus
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from websockets import http11
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
-from websockets.http11 import Request
-from websockets.http11 import Response as WebResponse
 from websockets.typing import Subprotocol
 
 from isocharge.common.errors import OriginError, RequestError, TooMany, UnknownPath
@@ -205,7 +204,7 @@ class PageServer:
         ):
             yield
 
-    def _answer(self, _connection: ServerConnection, request: Request) -> WebResponse | None:
+    def _answer(self, _connection: ServerConnection, request: http11.Request) -> http11.Response | None:
         """A file of the page, which everybody may have, or the description of the film; None lets a viewer in."""
         try:
             path = request.path.partition("?")[0]
@@ -283,11 +282,11 @@ def _our_protocol(_connection: ServerConnection, offered: Sequence[Subprotocol])
     return Subprotocol(PROTOCOL) if PROTOCOL in offered else None
 
 
-def _to_send(response: Response) -> WebResponse:
+def _to_send(response: Response) -> http11.Response:
     """A response as `websockets` sends it, the last one of its connection."""
     headers = Headers([(name.decode(), value.decode()) for name, value in response.headers])
     headers["Connection"] = "close"
-    return WebResponse(response.status, HTTPStatus(response.status).phrase, headers, response.body)
+    return http11.Response(response.status, HTTPStatus(response.status).phrase, headers, response.body)
 
 
 def page_files() -> dict[str, Response]:

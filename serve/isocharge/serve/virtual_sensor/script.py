@@ -7,9 +7,8 @@ from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans, Complexes
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError
 from isocharge.common.structs import Finite, NotNegative, Settings, WrongKey, read_toml
@@ -190,13 +189,13 @@ def wander(
     return Script(position.real, position.imag, force_N, rate_Hz)
 
 
-def _random_path(rng: np.random.Generator, t: Array) -> NDArray[np.complex128]:
+def _random_path(rng: np.random.Generator, t: Array) -> Complexes:
     """Points of a smooth random path inside the unit disk at times t from 0 on, s, shape (n,)."""
     start = np.sqrt(rng.uniform()) * np.exp(2j * np.pi * rng.uniform())
     turns_per_s = rng.uniform(-0.5, 0.5, size=(3, 1))
     sway = 0.25 * (np.exp(2j * np.pi * turns_per_s * t) - 1.0)
     path = start + (np.exp(2j * np.pi * rng.uniform(size=(3, 1))) * sway).sum(axis=0)
-    squashed: NDArray[np.complex128] = path / (1.0 + np.abs(path) ** 8) ** (1 / 8)  # points well inside hardly move
+    squashed: Complexes = path / (1.0 + np.abs(path) ** 8) ** (1 / 8)  # points well inside hardly move
     return squashed
 
 

@@ -15,7 +15,6 @@ from isocharge.serve.network.address import ServerLimits, Token
 from isocharge.serve.network.metrics import CONTENT_TYPE, Metrics
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol import describe
-from isocharge.serve.network.protocol.describe import PAGE_HEADERS, openapi, page
 from isocharge.serve.network.protocol.inference import answer_inference, read_infer, read_object, write_answer
 from isocharge.serve.network.protocol.response import (
     Response,
@@ -84,7 +83,7 @@ class Handler:
         self._fixed: dict[str, Route] = {
             "/": ("GET", self._page),
             "/metrics": ("GET", lambda _: response_of(200, CONTENT_TYPE, metrics.text())),
-            "/openapi.json": ("GET", lambda _: json_response(openapi(store))),
+            "/openapi.json": ("GET", lambda _: json_response(describe.openapi(store))),
             "/v2": ("GET", lambda _: json_response(describe.server_metadata())),
             "/v2/health/live": ("GET", lambda _: json_response({"live": True})),
             "/v2/health/ready": ("GET", self._ready),
@@ -207,6 +206,6 @@ class Handler:
         return json_response({})
 
     def _page(self, _: Request) -> Response:
-        response = response_of(200, b"text/html; charset=utf-8", page(self.store).encode())
-        response.headers.extend(PAGE_HEADERS)
+        response = response_of(200, b"text/html; charset=utf-8", describe.page(self.store).encode())
+        response.headers.extend(describe.PAGE_HEADERS)
         return response

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import orjson
 
 from isocharge.common import errors
-from isocharge.common.errors import RequestError, TooLarge, UnknownEncoding
 
 log = logging.getLogger(__name__)
 
@@ -103,16 +102,18 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     if encoding in (b"", b"identity"):
         return body
     if encoding not in _WINDOW:
-        raise UnknownEncoding(f"Content-Encoding {_text(encoding)}: expected gzip, deflate or identity")
+        raise errors.UnknownEncoding(f"Content-Encoding {_text(encoding)}: expected gzip, deflate or identity")
     reader = zlib.decompressobj(_WINDOW[encoding])
     try:
         plain = reader.decompress(body, limit + 1)
     except zlib.error as error:
-        raise RequestError(f"the body is not {_text(encoding)}, as its Content-Encoding says: {error}") from error
+        raise errors.RequestError(
+            f"the body is not {_text(encoding)}, as its Content-Encoding says: {error}"
+        ) from error
     if len(plain) > limit:
-        raise TooLarge(f"the body unpacks to more than {limit} bytes; send smaller batches")
+        raise errors.TooLarge(f"the body unpacks to more than {limit} bytes; send smaller batches")
     if not reader.eof or reader.unused_data:
-        raise RequestError(f"the body ends before, or goes on after, the end of its {_text(encoding)} data")
+        raise errors.RequestError(f"the body ends before, or goes on after, the end of its {_text(encoding)} data")
     return plain
 
 
