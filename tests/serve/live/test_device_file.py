@@ -16,7 +16,7 @@ from isocharge.serve import (
 )
 from isocharge.serve.frames.frame_layout import DescribedParser
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.live.device import ANY_BOARD, with_offset_limit
+from isocharge.serve.live.device import ANY_BOARD, with_settings
 from isocharge.serve.live.reading_stream import ChannelPicker
 from isocharge.serve.signal_chain.chain import ChainState, advance
 
@@ -178,12 +178,13 @@ def test_table_stays_as_it_came(device):
 
 
 def test_offset_limit_changes_in_the_rule_and_in_the_table(device):
-    board = with_offset_limit(device(FULL), 250.0)
+    board = with_settings(device(FULL), "tare", offset_limit_pC=250.0)
     assert (board.tare.frames, board.tare.offset_limit_pC) == (50, 250.0)
     assert board.table["tare"] == {"frames": 50, "offset_limit_pC": 250.0}
-    assert (with_offset_limit(ANY_BOARD, 250.0).tare.offset_limit_pC, ANY_BOARD.table) == (250.0, {})
+    other = with_settings(ANY_BOARD, "tare", offset_limit_pC=250.0)
+    assert (other.tare.offset_limit_pC, ANY_BOARD.table) == (250.0, {})
     with pytest.raises(DeviceError, match=r"device\.toml: tare\.offset_limit_pC: expected a number from 0"):
-        with_offset_limit(board, -1.0)
+        with_settings(board, "tare", offset_limit_pC=-1.0)
 
 
 def test_device_file_that_does_not_exist(tmp_path):

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from isocharge.serve import Chunk, Contact, Device, Frame, TouchStream, encode_frame
 from isocharge.serve.flags import INVALID
-from isocharge.serve.live.device import device_from_table, with_section
+from isocharge.serve.live.device import device_from_table, with_settings
 from isocharge.serve.tracking.modes import CALMEST, Modes, Movement
 from isocharge.serve.tracking.noise import LINE, Scatter, Shape
 from isocharge.serve.tracking.tracker import PLACE, Tracker, TrackRule
@@ -193,4 +193,4 @@ def test_records_carry_it_beside_the_answer_of_the_frame_and_repeat_bit_for_bit(
 def test_the_device_file_switches_it_on_and_a_recording_keeps_it():
     assert Device().track is None
     assert device_from_table({"track": {"lasting": 0.9}}, "b").track == TrackRule(lasting=0.9)
-    assert with_section(device_from_table({}, "b"), "track").table == {"track": {"on": True}}
+    assert with_settings(device_from_table({}, "b"), "track", on=True).table == {"track": {"on": True}}

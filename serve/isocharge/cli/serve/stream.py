@@ -53,7 +53,7 @@ from isocharge.serve import (
     open_source,
 )
 from isocharge.serve.export.record_messages import RecordEncoding
-from isocharge.serve.live.device import with_offset_limit, with_section
+from isocharge.serve.live.device import with_settings
 from isocharge.serve.live.outputs import LineQueue
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.port.recording import Marker
@@ -153,9 +153,9 @@ def stream_command(
     address = None if live is None else page_address(live, token)
     predictor, board = Predictor(model, models=models), load_device(device)
     if offset_limit_pC is not None:
-        board = with_offset_limit(board, offset_limit_pC)
-    board = with_section(board, "track") if track else board
-    board = with_section(board, "follow") if follow else board
+        board = with_settings(board, "tare", offset_limit_pC=offset_limit_pC)
+    board = with_settings(board, "track", on=True) if track else board
+    board = with_settings(board, "follow", on=True) if follow else board
     path = TouchStream(predictor, board, policy=policy, frame_id=name)
     latencies: deque[float] = deque(maxlen=LATENCIES)
     recorder = Recorder(record, predictor.metadata.label, policy.value, board.table, name) if record else None

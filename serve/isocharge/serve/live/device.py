@@ -29,7 +29,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from msgspec import field, structs
@@ -253,19 +253,11 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     return Device(**on, table=table, where=where)
 
 
-def with_section(device: Device, name: Literal["track", "follow"]) -> Device:
-    """A board with this section switched on; in its table too, so that a recording keeps it."""
-    if getattr(device, name) is not None:
-        return device
-    section = {**device.table.get(name, {}), "on": True}
-    return device_from_table({**device.table, name: section}, device.where)
-
-
-def with_offset_limit(device: Device, offset_limit_pC: float) -> Device:
-    """A board with another `offset_limit_pC` of its tare, pC; in its table too, so that a recording keeps it.
+def with_settings(device: Device, section: str, **settings: Any) -> Device:
+    """A board with other settings in a section; in its table too, so that a recording keeps them.
 
     Raises:
-        DeviceError: If the limit is out of its range.
+        DeviceError: If a setting is out of its range.
     """
-    tare = {**device.table.get("tare", {}), "offset_limit_pC": offset_limit_pC}
-    return device_from_table({**device.table, "tare": tare}, device.where)
+    changed = {**device.table.get(section, {}), **settings}
+    return device_from_table({**device.table, section: changed}, device.where)
