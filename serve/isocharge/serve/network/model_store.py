@@ -50,11 +50,6 @@ class LoadedVersion:
         return Validity.of(self.metadata)
 
     @cached_property
-    def misfit_limit(self) -> float:
-        """Misfit above which a press has the flag `misfit`, in standard deviations."""
-        return self.validity.misfit_limit
-
-    @cached_property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs that the model has."""
         return tuple(outputs_of(self.model.session))

@@ -244,12 +244,12 @@ def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
     content: dict[str, Any] = {"model_name": answer.name, "model_version": answer.version}
     if answer.id:
         content["id"] = answer.id
-    content["outputs"] = [_tensor(name, rows, name in answer.binary) for name, rows in answer.outputs.items()]
+    parts = {name: packed(rows) for name, rows in answer.outputs.items() if name in answer.binary}
+    content["outputs"] = [_tensor(name, rows, parts.get(name)) for name, rows in answer.outputs.items()]
     text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
-    if not answer.binary:
+    if not parts:
         return text, None
-    parts = [packed(rows) for name, rows in answer.outputs.items() if name in answer.binary]
-    return b"".join([text, *parts]), len(text)
+    return b"".join([text, *parts.values()]), len(text)
 
 
 def packed(rows: Rows) -> bytes:
@@ -259,17 +259,13 @@ def packed(rows: Rows) -> bytes:
     return b"".join(struct.pack("<I", len(text)) + text.encode() for text in rows.ravel().tolist())
 
 
-def _tensor(name: str, rows: Rows, in_binary: bool) -> dict[str, Any]:
-    """One tensor, its numbers or texts flat and row by row, or only their number of bytes."""
-    if name == FLAGS:
-        content = (
-            {"parameters": {"binary_data_size": len(packed(rows))}} if in_binary else {"data": rows[:, 0].tolist()}
-        )
-        return {"name": name, "datatype": "BYTES", "shape": rows.shape, **content}
-    if in_binary:
-        size = {"binary_data_size": rows.nbytes}
-        return {"name": name, "datatype": "FP32", "shape": rows.shape, "parameters": size}
-    return {"name": name, "datatype": "FP32", "shape": rows.shape, "data": rows.ravel()}
+def _tensor(name: str, rows: Rows, binary: bytes | None) -> dict[str, Any]:
+    """One tensor: its numbers or texts, flat and row by row, or how many bytes of them follow the JSON."""
+    is_text = name == FLAGS
+    tensor = {"name": name, "datatype": "BYTES" if is_text else "FP32", "shape": rows.shape}
+    if binary is not None:
+        return tensor | {"parameters": {"binary_data_size": len(binary)}}
+    return tensor | {"data": rows.ravel().tolist() if is_text else rows.ravel()}
 
 
 Written = TypeVar("Written")
@@ -292,12 +288,16 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
     if len(charge_pC) == 1:
         row, columns = _one_press(loaded, charge_pC[0])
         misfit = row[:, columns["misfit"]]
-        return {name: row[:, columns[name]] for name in names}, 0, int(not misfit.item() <= loaded.misfit_limit)
+        return (
+            {name: row[:, columns[name]] for name in names},
+            0,
+            int(not misfit.item() <= loaded.validity.misfit_limit),
+        )
     outputs = dict[str, Rows](run(loaded.model.session, charge_pC, names))
     check_rows(outputs, len(charge_pC), loaded.metadata.label)
     if "misfit" not in outputs:
         return outputs, len(charge_pC), 0
-    return outputs, 0, len(charge_pC) - int(np.count_nonzero(outputs["misfit"] <= loaded.misfit_limit))
+    return outputs, 0, len(charge_pC) - int(np.count_nonzero(outputs["misfit"] <= loaded.validity.misfit_limit))
 
 
 def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
