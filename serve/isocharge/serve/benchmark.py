@@ -4,7 +4,6 @@ import os
 import platform
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from importlib import metadata
 from itertools import cycle
 from pathlib import Path
@@ -46,8 +45,7 @@ class Contender(NamedTuple):
     call: Callable[[], object]
 
 
-@dataclass(frozen=True)
-class Timing:
+class Timing(NamedTuple):
     """How long the calls of one contender took.
 
     Attributes:

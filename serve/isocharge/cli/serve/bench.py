@@ -2,7 +2,6 @@
 
 import json as json_module
 from collections.abc import Iterator
-from dataclasses import asdict
 from typing import Annotated
 
 import typer
@@ -44,7 +43,7 @@ def bench_command(
     errors = {name: known[name] for names in ERRORS.values() for name in names if name in known}
     if json:
         report = {"model": loaded.metadata.label, "seconds": seconds, "machine": machine()}
-        report |= {"timings": [asdict(timing) for timing in timings], "errors": errors}
+        report |= {"timings": [timing._asdict() for timing in timings], "errors": errors}
         typer.echo(json_module.dumps(report, allow_nan=False))
     else:
         typer.echo("\n".join(_lines(loaded, timings, errors)))

@@ -7,7 +7,6 @@ count as touch. A press that saturates an amplifier, moves, creeps, or ends too 
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -41,8 +40,7 @@ ALIKE = 0.3
 """Largest difference of the charges' relative slopes, over their mean, at which all electrodes change alike."""
 
 
-@dataclass(frozen=True, slots=True)
-class SteadyRule:
+class SteadyRule(NamedTuple):
     """When a press is steady.
 
     Attributes:
@@ -83,8 +81,7 @@ class Phase(StrEnum):
     refused = "refused"
 
 
-@dataclass(frozen=True)
-class SteadyPress:
+class SteadyPress(NamedTuple):
     """A press that was held still.
 
     Attributes:

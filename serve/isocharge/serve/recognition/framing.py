@@ -11,7 +11,6 @@ in frames of one length, start and final value and whatever is the same in all f
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import chain, islice
 from math import gcd
 from typing import Any, NamedTuple
@@ -50,8 +49,7 @@ CONSTANT_SHARE = 0.98
 """Share of frames in which a constant byte has its value, dimensionless: some may be damaged."""
 
 
-@dataclass(frozen=True)
-class Windows:
+class Windows(NamedTuple):
     """Frames of one length in a stream.
 
     Attributes:
