@@ -16,7 +16,6 @@ from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import partial
 from typing import Any, NamedTuple
 
 import orjson
@@ -56,25 +55,21 @@ class Exchange(NamedTuple):
 class RequestLog(logging.Handler):
     """Writes lines of JSON; as a handler, the messages of Python's loggers too."""
 
-    def __init__(
-        self, write: Callable[[str], object], *, secret: str | None = None, now: Callable[[], datetime] | None = None
-    ) -> None:
+    def __init__(self, write: Callable[[str], object], *, secret: str | None = None) -> None:
         """Set up the log.
 
         Args:
             write: Takes a line, without a line feed; called from any thread, and must not wait.
             secret: What no message may say; `[secret]` stands in its place.
-            now: The clock.
         """
         super().__init__()
         self._write, self._secret = write, secret
-        self._now = now or partial(datetime.now, UTC)
 
     def exchange(self, exchange: Exchange) -> None:
         """Write the line of a request."""
         transport, route, status, model, error, ns, bytes_in, bytes_out, client = exchange
         line = {
-            "time": self._now(),
+            "time": datetime.now(UTC),
             "level": "error" if status in (500, "INTERNAL") else "info",
             "event": "request",
             "transport": transport,
@@ -101,7 +96,7 @@ class RequestLog(logging.Handler):
         self._line(record.levelname.lower(), **fields)
 
     def _line(self, level: str, **fields: str) -> None:
-        self._write(orjson.dumps({"time": self._now(), "level": level} | fields).decode())
+        self._write(orjson.dumps({"time": datetime.now(UTC), "level": level} | fields).decode())
 
     def _cut(self, text: str) -> str:
         text = text.encode("utf-8", "replace").decode()

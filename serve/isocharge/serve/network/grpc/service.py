@@ -148,7 +148,9 @@ class Service:
             "ModelReady": lambda request: {"ready": store.label(request.name, request.version) is not None},
             "ServerMetadata": lambda _: describe.server_metadata(),
             "ModelMetadata": lambda request: describe.model_metadata(store.get(request.name, request.version), store),
-            "ModelConfig": self._config,
+            "ModelConfig": lambda request: {
+                "config": describe.model_config(store.get(request.name, request.version), self._limits)
+            },
             "ModelStatistics": lambda request: describe.statistics_of(store, request.name, request.version),
             "RepositoryIndex": lambda request: {"models": describe.repository_index(store, ready=request.ready)},
             "RepositoryModelLoad": self._load,
@@ -217,9 +219,6 @@ class Service:
         message: bytes = answer.SerializeToString()
         call.bytes_out += len(message)
         return message
-
-    def _config(self, request: Any) -> dict[str, Any]:
-        return {"config": describe.model_config(self._store.get(request.name, request.version), self._limits)}
 
     def _load(self, request: Any) -> None:
         if request.parameters:

@@ -62,9 +62,6 @@ class Found(NamedTuple):
     version: str = ""
 
 
-NOT_FOUND = Found(None, "unknown")
-
-
 class Handler:
     """Answers requests from the models of a store, counts them, and writes them into the log."""
 
@@ -164,7 +161,7 @@ class Handler:
             if match is not None and (tail := match["tail"] or "") in routes:
                 version = match.groupdict().get("version") or ""
                 return Found(routes[tail], (base + tail).rstrip("/"), match["name"], version)
-        return NOT_FOUND
+        return Found(None, "unknown")
 
     def _loaded(self, request: Request) -> LoadedVersion:
         return self.store.get(request.name, request.version)
