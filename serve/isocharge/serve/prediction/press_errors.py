@@ -56,8 +56,7 @@ class PressErrors:
     @property
     def position_error_mm(self) -> Array:
         """Distance from the known place, shape (n,), mm; NaN where unknown."""
-        distance: Array = np.hypot(self.error[:, 0], self.error[:, 1])
-        return distance
+        return np.hypot(self.error[:, 0], self.error[:, 1])
 
     def row(self, press: int) -> dict[str, Any]:
         """One press, names with units."""

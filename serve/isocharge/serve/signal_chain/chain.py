@@ -184,15 +184,17 @@ def advance(
     saturated = limited or (state.saturated and touch.contact)
     drift = NO_DRIFT
     if chain.thermal is not None and touch.contact:
-        drift = _drift(chain, state.drift, charge_pC, misfit, dt_s, saturated=saturated)
+        drift = _drift(chain, chain.thermal, state.drift, charge_pC, misfit, dt_s, saturated=saturated)
     told = chain.thermal is not None and abs(drift.charge_pC) >= chain.thermal.tell_pC
     if touch.contact and drift.charge_pC != state.drift.charge_pC:
         change_pC = (drift.charge_pC - state.drift.charge_pC) * chain.pyro
         charge_pC = charge_pC - change_pC
         if memory is not None:
             memory = warmer(memory, change_pC, drift.rate_pC_per_s * chain.pyro, learns=not told)
+        elif leak is not None:
+            leak = leak._replace(charge_pC=leak.charge_pC - change_pC)
         else:
-            leak, tare = _without_warmth(leak, tare, change_pC)
+            tare = replace(tare, charge_pC=tare.charge_pC + change_pC)
     after = ChainState(state.waiting_pC, hum, state.frames, state.patient, tare, leak, memory, touch, saturated, drift)
     flags += (SATURATED,) * saturated + (NEGATIVE,) * touch.below
     if not saturated:
@@ -208,7 +210,8 @@ def _invalid(chain: Chain, values: Array, flags: tuple[str, ...]) -> Reading:
 def _look_for_tare(chain: Chain, state: ChainState, hum: Hum, quiet_pC: Array) -> ChainState:
     """Tare on the latest frames as soon as they are enough and quiet."""
     if chain.tare is None:
-        return ChainState(state.waiting_pC, hum, tare=Tare.none(quiet_pC.size))
+        nothing_pC = np.zeros_like(quiet_pC)
+        return ChainState(state.waiting_pC, hum, tare=Tare(nothing_pC, nothing_pC, 0))
     waiting = np.vstack([state.waiting_pC, quiet_pC])[-chain.tare.frames :]
     frames = 0 if state.patient else state.frames + 1
     tare = look_for_tare(chain.tare, waiting, frames)
@@ -249,19 +252,18 @@ def _touch(chain: Chain, state: ChainState, charge_pC: Array, tare: Tare, dt_s: 
 
 
 def _drift(
-    chain: Chain, drift: ThermalDrift, charge_pC: Array, misfit: Misfit | None, dt_s: float, *, saturated: bool
+    chain: Chain,
+    rule: ThermalRule,
+    drift: ThermalDrift,
+    charge_pC: Array,
+    misfit: Misfit | None,
+    dt_s: float,
+    *,
+    saturated: bool,
 ) -> ThermalDrift:
     if misfit is None:
         raise ValueError("the thermal stage needs the misfit of a model, got None")
     if saturated:  # a clipped charge fits no contact, whatever the temperature
         return drift
-    assert chain.thermal is not None
     warmth_s = None if chain.memory is None else chain.memory.warmth_s
-    return track_thermal_drift(chain.thermal, drift, charge_pC, misfit, dt_s, chain.pyro, warmth_s)
-
-
-def _without_warmth(leak: Leak | None, tare: Tare, change_pC: Array | float) -> tuple[Leak | None, Tare]:
-    """Lower the charges from here on: in the leak's charge if there is a leak, else in the tare."""
-    if leak is not None:
-        return leak._replace(charge_pC=leak.charge_pC - change_pC), tare
-    return None, replace(tare, charge_pC=tare.charge_pC + change_pC)
+    return track_thermal_drift(rule, drift, charge_pC, misfit, dt_s, chain.pyro, warmth_s)

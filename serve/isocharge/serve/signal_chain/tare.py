@@ -34,11 +34,6 @@ class Tare:
     noise_pC: Array
     frames: int
 
-    @classmethod
-    def none(cls, electrodes: int) -> "Tare":
-        """Nothing to subtract."""
-        return cls(np.zeros(electrodes), np.zeros(electrodes), 0)
-
 
 def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None:
     """The tare of the latest frames, if they are enough and quiet.
