@@ -217,7 +217,7 @@ def show_live_film(sensor: str, rate_Hz: float, seed: int, address: Address, sec
     live = RecordedStream(touch)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
-        link, _ = stack.enter_context(live_page(address, None, sensor, predictor.metadata, find_model(sensor)))
+        link = stack.enter_context(live_page(address, None, sensor, predictor.metadata, find_model(sensor)))
         board = stack.enter_context(virtual_sensor(forward_map, "reference", seed, rate_Hz))
         port = stack.enter_context(Port(board.url))
         stack.enter_context(answering(link, live, ("every", {}, "")))

@@ -7,7 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -82,8 +82,8 @@ def page_address(live: str, token: str | None) -> Address:
 @contextmanager
 def live_page(
     address: Address, token: str | None, name: str, metadata: ModelMetadata, model: Path, *, is_recording: bool = False
-) -> Iterator[tuple[ReaderEnd, str]]:
-    """The page of a stream in a process of its own; says where it is. Yields the reader's end of the link, and the URL.
+) -> Iterator[ReaderEnd]:
+    """The page of a stream in a process of its own; says where it is. Yields the reader's end of the link.
 
     Args:
         address: Where it listens.
@@ -98,17 +98,12 @@ def live_page(
 
     description = describe_film(name, metadata, find_field(model, metadata))
     reader, end = make_link()
-    try:
-        with page_process(Page(end, description, address, given_token(token), is_recording)) as url:
-            if is_recording:
-                reader.wait()
-            say(f"{'replay' if is_recording else 'live'} page: {url}")
-            try:
-                yield reader, url
-            finally:
-                reader.close()  # the page's process ends by that
-    finally:
-        reader.close()
+    page = Page(end, description, address, given_token(token), is_recording)
+    with closing(reader), page_process(page) as url, closing(reader):  # the page's process ends when its reader closes
+        if is_recording:
+            reader.wait()
+        say(f"{'replay' if is_recording else 'live'} page: {url}")
+        yield reader
 
 
 class PageFeed:

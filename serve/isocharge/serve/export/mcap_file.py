@@ -16,6 +16,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Self
 
@@ -107,12 +108,9 @@ class McapFile:
         Raises:
             OSError: If the disk is full, or gone.
         """
-        with self._lock:
-            try:
-                if not self.failed:
-                    self._writer.finish()  # type: ignore[no-untyped-call]
-            finally:
-                self._file.close()
+        with self._lock, closing(self._file):
+            if not self.failed:
+                self._writer.finish()  # type: ignore[no-untyped-call]
 
     def write(self, line: str) -> None:
         """Write a record.

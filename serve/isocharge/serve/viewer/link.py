@@ -45,6 +45,14 @@ class LinkEnd:
         self.messages.close()
         self.samples.close()
 
+    def _send(self, message: bytes, flags: int) -> bool:
+        """Send a message; False where there was no room for it."""
+        try:
+            self.messages.send(message, flags)
+        except OSError:
+            return False
+        return True
+
 
 @dataclass
 class ReaderEnd(LinkEnd):
@@ -74,11 +82,7 @@ class ReaderEnd(LinkEnd):
 
     def tell(self, **content: Any) -> bool:
         """Send a message; False where there was no room for it."""
-        try:
-            self.messages.send(json.dumps(content).encode(), 0 if self.waits else socket.MSG_DONTWAIT)
-        except OSError:
-            return False
-        return True
+        return self._send(json.dumps(content).encode(), 0 if self.waits else socket.MSG_DONTWAIT)
 
     def request(self) -> LiveRequest | None:
         """Wait for what the page asks for; None once its process has ended."""
@@ -127,11 +131,7 @@ class PageEnd(LinkEnd):
 
     def ask(self, request: LiveRequest) -> bool:
         """Send a request to the reader; False where it has ended, or takes none."""
-        try:
-            self.messages.send(msgspec.json.encode(request), socket.MSG_DONTWAIT)
-        except OSError:
-            return False
-        return True
+        return self._send(msgspec.json.encode(request), socket.MSG_DONTWAIT)
 
 
 def make_link() -> tuple[ReaderEnd, PageEnd]:
