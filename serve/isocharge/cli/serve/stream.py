@@ -57,7 +57,9 @@ from isocharge.serve.live.device import with_settings
 from isocharge.serve.live.outputs import LineQueue
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.port.recording import Marker
-from isocharge.serve.prediction.record import LONGEST_NAME, NAME, is_name
+
+LONGEST_NAME = 100
+"""Characters of a film's name."""
 
 
 def stream_command(
@@ -148,8 +150,8 @@ def stream_command(
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
-    if name is not None and not is_name(name):
-        raise InputError(f"--name: expected {NAME}, got {name[:LONGEST_NAME]!r}")
+    if name is not None and not (0 < len(name) <= LONGEST_NAME and name.isprintable()):
+        raise InputError(f"--name: expected 1 to {LONGEST_NAME} printable characters, got {name[:LONGEST_NAME]!r}")
     address = None if live is None else page_address(live, token)
     predictor, board = Predictor(model, models=models), load_device(device)
     if offset_limit_pC is not None:
@@ -165,7 +167,7 @@ def stream_command(
         page = None
         if address is not None:
             shown = live_page(address, token, path.frame_id, predictor.metadata, find_model(model, models))
-            page, _ = stack.enter_context(shown)
+            page = stack.enter_context(shown)
         opened = open_source(port, baud=baud, reconnect=reconnect, request=board.request, wait=wait)
         source = stack.enter_context(opened)
         stack.enter_context(on_signal(signal.SIGUSR1, recorded.request_tare))
@@ -252,7 +254,7 @@ def replay_command(
         else:
             folder = find_model(model or recording.model, models)
             page = live_page(address, token, file.name, predictor.metadata, folder, is_recording=True)
-            link, _ = stack.enter_context(page)
+            link = stack.enter_context(page)
             feed = PageFeed(link, path)
 
             def mark(marker: Marker) -> None:

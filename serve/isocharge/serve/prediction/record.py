@@ -15,17 +15,6 @@ DECIMALS = 6
 Charges = dict[str, float | None]
 """Electrode name to charge, pC; None where the device sent no number."""
 
-LONGEST_NAME = 100
-"""Characters of a film's name."""
-
-NAME = f"1 to {LONGEST_NAME} printable characters"
-"""What a film's name is, for messages."""
-
-
-def is_name(text: str) -> bool:
-    """Whether a text can be a film's name, the `frame_id` of its records."""
-    return 0 < len(text) <= LONGEST_NAME and text.isprintable()
-
 
 class PredictionRecord(NamedTuple):
     """One reading of a sensor and the model's answer.
