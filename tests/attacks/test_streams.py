@@ -18,7 +18,6 @@ from isocharge.serve import (
     encode_frame,
     encode_text,
 )
-from isocharge.serve.frames.formats import frame_layout
 from isocharge.serve.frames.stuffing import cobs_encode
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.recognition.recognise import recognise
@@ -26,6 +25,7 @@ from isocharge.serve.recognition.recognise import recognise
 FRAMES = [Frame(seq, 5000 * seq, (800.0 + seq, 700.0 - seq, 900.5), 0, ("A", "B", "C")) for seq in range(6)]
 
 DESCRIBED = {
+    "format": "described",
     "sync": "A5 5A",
     "length": 20,
     "byte_order": "little",
@@ -48,7 +48,8 @@ def stuffed(framing):
     """Frames of 24 bits with a constant byte, stuffed as the framing wants it."""
     fields = [{"name": "seq", "type": "u8"}, {"type": "pad", "value": "0C"}]
     fields += [{"name": name, "type": "i24"} for name in "ABC"]
-    layout = frame_layout({"framing": framing, "length": 12, "checksum": "crc-8", "fields": fields}, "attack")
+    keys = {"format": "described", "framing": framing, "length": 12, "checksum": "crc-8", "fields": fields}
+    layout = device_from_table({"frames": keys}, "attack").frames
     escapes = {
         "cobs": lambda data: cobs_encode(data) + b"\0",
         "slip": lambda data: data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0",
@@ -59,7 +60,7 @@ def stuffed(framing):
 
 
 def formats():
-    layout = frame_layout(DESCRIBED, "attack")
+    layout = device_from_table({"frames": DESCRIBED}, "attack").frames
     yield "binary", BinaryParser, b"".join(map(encode_frame, FRAMES))
     yield "described", layout.parser, b"".join(map(layout.encode, FRAMES))
     for framing in ("cobs", "slip", "hdlc", "datagram"):

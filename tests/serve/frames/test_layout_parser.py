@@ -18,12 +18,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import DeviceError
-from isocharge.serve import Frame
-from isocharge.serve.frames.formats import frame_layout
+from isocharge.serve import Frame, device_from_table
 from isocharge.serve.frames.frame_layout import DescribedParser
 
 FOLDER = Path(__file__).parents[2] / "data" / "frames"
-LAYOUTS = {path.stem: frame_layout(tomllib.loads(path.read_text("utf-8")), path.name) for path in FOLDER.glob("*.toml")}
+
+
+def layout(keys):
+    """Of the keys of `[frames]` in a device file, a table or a text."""
+    table = tomllib.loads(keys) if isinstance(keys, str) else keys
+    return device_from_table({"frames": {"format": "described"} | table}, "device.toml").frames
+
+
+LAYOUTS = {path.stem: layout(path.read_text("utf-8")) for path in FOLDER.glob("*.toml")}
 
 
 def modbus_crc(data):
@@ -101,9 +108,9 @@ def test_every_byte_is_a_part_of_a_frame_or_counted_as_dropped(parts, step):
 def test_a_number_or_clock_that_is_no_number_costs_its_frame_only(name, value):
     """Without a checksum nothing else tells that the line was damaged."""
     fields = f'fields = [{{name = "{name}", type = "f32"}}, {{name = "A", type = "f32"}}]'
-    layout = frame_layout(tomllib.loads(f'sync = "20 4E"\nlength = 10\n{fields}'), "test")
+    described = layout(f'sync = "20 4E"\nlength = 10\n{fields}')
     good, bad = (b"\x20\x4e" + struct.pack("<ff", number, 1.0) for number in (2.0, value))
-    parser = DescribedParser(layout)
+    parser = DescribedParser(described)
     assert [frame.values for frame in parser.feed(good + bad + good)] == [(1.0,), (1.0,)]
     assert (parser.counts.frames, parser.counts.malformed, parser.counts.bytes_dropped) == (2, 1, 10)
 
@@ -128,17 +135,17 @@ fields = [{{name = "A", type = "i24"}}, {{name = "B", type = "u24", scale = 0.5}
 )
 def test_three_bytes(a, b, c, order):
     """Packed by int.to_bytes and crcmod; the checksum skips the sync and has a byte order of its own."""
-    layout = frame_layout(tomllib.loads(TRIPLES.format(order=order)), "test")
+    described = layout(TRIPLES.format(order=order))
     body = a.to_bytes(3, order, signed=True) + b.to_bytes(3, order) + c.to_bytes(3, order, signed=True)
     data = b"\xa5\x5a" + body + struct.pack("<H", mkPredefinedCrcFun("xmodem")(body))
-    (frame,) = DescribedParser(layout).feed(data)
+    (frame,) = DescribedParser(described).feed(data)
     assert frame.values == (a, b / 2, c)
-    assert layout.encode(frame) == data
+    assert described.encode(frame) == data
 
 
 def stuffed(framing, **others):
     fields = [{"name": "seq", "type": "u8"}, {"name": "A", "type": "f32"}]
-    return frame_layout({"framing": framing, "length": 9, "checksum": "crc-32", "fields": fields} | others, "test")
+    return layout({"framing": framing, "length": 9, "checksum": "crc-32", "fields": fields} | others)
 
 
 @pytest.mark.parametrize(
@@ -164,12 +171,12 @@ def test_stuffed_frames(framing, stuff):
 
 
 def test_datagrams_hold_whole_frames():
-    parser = stuffed("datagram", length=5, checksum="none").parser()
-    one, two = (struct.pack("<Bf", k, k / 2) for k in (1, 2))
+    parser = stuffed("datagram", sync="A5", length=6, checksum="none").parser()
+    one, two = (struct.pack("<BBf", 0xA5, k, k / 2) for k in (1, 2))
     assert [frame.values for frame in parser.feed(one + two)] == [(0.5,), (1.0,)]
     assert parser.feed(one[:3]) == []
-    assert [frame.values for frame in parser.feed(two)] == [(1.0,)]
-    assert (parser.counts.malformed, parser.counts.bytes_dropped) == (1, 3)
+    assert [frame.values for frame in parser.feed(b"\x5a" + one[1:] + two)] == [(1.0,)]  # the first of another sync
+    assert (parser.counts.malformed, parser.counts.bytes_dropped) == (2, 9)
 
 
 def test_constant_bytes_are_checked():
@@ -179,26 +186,22 @@ sync = "7E"
 length = 5
 fields = [{name = "seq", type = "u8"}, {type = "pad", value = "02"}, {name = "A", type = "i16"}]
 """
-    layout = frame_layout(tomllib.loads(text), "test")
-    frames = DescribedParser(layout).feed(bytes.fromhex("7E 01 02 10 00  7E 02 09 11 22  7E 03 02 20 00"))
+    described = layout(text)
+    frames = DescribedParser(described).feed(bytes.fromhex("7E 01 02 10 00  7E 02 09 11 22  7E 03 02 20 00"))
     assert [(frame.seq, frame.values) for frame in frames] == [(1, (16.0,)), (3, (32.0,))]
-    assert layout.encode(Frame(1, 0, (16.0,))) == bytes.fromhex("7E 01 02 10 00")
+    assert described.encode(Frame(1, 0, (16.0,))) == bytes.fromhex("7E 01 02 10 00")
 
 
 def test_check_of_given_parameters():
     """CRC-16/GENIBUS by its parameters, against crcmod."""
     check = {"width": 16, "polynomial": "1021", "start": "FFFF", "final": "FFFF"}
     fields = [{"name": "A", "type": "u8"}]
-    layout = frame_layout({"sync": "55", "length": 4, "byte_order": "big", "checksum": check, "fields": fields}, "test")
+    described = layout({"sync": "55", "length": 4, "byte_order": "big", "checksum": check, "fields": fields})
     data = b"\x55\x07"
-    assert layout.checked(data) == mkPredefinedCrcFun("crc-16-genibus")(data).to_bytes(2, "big")
+    assert described.checked(data) == mkPredefinedCrcFun("crc-16-genibus")(data).to_bytes(2, "big")
 
 
 ROBOTIQ = (Path(__file__).parents[2] / "data" / "frames" / "robotiq_ft300.toml").read_text("utf-8")
-
-
-def layout(text):
-    return frame_layout(tomllib.loads(text), "device.toml")
 
 
 def test_counters_and_clocks_wrap_and_channels_stay_at_their_limit():
@@ -256,7 +259,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("good", "bad", "said"), WRONG)
 def test_wrong_descriptions(good, bad, said):
-    with pytest.raises(DeviceError, match=rf"^device\.toml: (unknown key |key )?\'?{said}"):
+    with pytest.raises(DeviceError, match=rf"^device\.toml: (unknown key |key )?\'?frames\.{said}"):
         layout(ROBOTIQ.replace(good, bad, 1))
 
 
@@ -280,7 +283,7 @@ def test_fields_that_make_no_frame(fields, said):
         ({"width": 12}, "width: expected one of 8, 16, 24, 32"),
         ({"polynomial": "11021"}, "polynomial: expected a number of 16 bits in hexadecimal"),
         ({"polynomial": "x"}, "polynomial: expected a number in hexadecimal"),
-        ({"poly": "1021"}, "unknown key 'checksum.poly'"),
+        ({"poly": "1021"}, "unknown key 'frames.checksum.poly'"),
         ({"reflected": 1}, "reflected: expected true or false"),
     ],
 )
@@ -288,4 +291,4 @@ def test_wrong_parameters_of_a_check(change, said):
     check = {"width": 16, "polynomial": "1021"} | change
     fields = [{"name": "A", "type": "u8"}]
     with pytest.raises(DeviceError, match=said):
-        frame_layout({"sync": "55", "length": 4, "checksum": check, "fields": fields}, "device.toml")
+        layout({"sync": "55", "length": 4, "checksum": check, "fields": fields})

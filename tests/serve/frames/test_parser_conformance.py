@@ -16,8 +16,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from isocharge.serve import AutoParser, BinaryParser, Frame, encode_frame, encode_text
-from isocharge.serve.frames.formats import frame_layout
+from isocharge.serve import AutoParser, BinaryParser, Frame, device_from_table, encode_frame, encode_text
 from isocharge.serve.frames.frame import Parser, SequenceGaps
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.frames.text_lines import TEXT_FORMATS
@@ -26,9 +25,15 @@ from isocharge.serve.virtual_sensor.script import corrupt
 HEAD = [{"name": "seq", "type": "u16"}, {"name": "t_us", "type": "u32"}]
 FLOATS = [{"name": name, "type": "f32"} for name in "ABC"]
 TRIPLES = [{"type": "pad", "value": "0C"}, *({"name": name, "type": "i24"} for name in "ABC")]
-SYNCED = {"sync": "AA 55", "length": 22, "checksum": "crc-16/x-25", "fields": HEAD + FLOATS}
-BITS_24 = {"sync": "A5 5A", "length": 16, "byte_order": "big", "checksum": "crc-16/ccitt-false", "checksum_from": 2}
-STUFFED = {"framing": "slip", "length": 20, "checksum": "crc-16/modbus", "fields": HEAD + FLOATS}
+SYNCED = {"format": "described", "sync": "AA 55", "length": 22, "checksum": "crc-16/x-25", "fields": HEAD + FLOATS}
+BITS_24 = SYNCED | {
+    "sync": "A5 5A",
+    "length": 16,
+    "byte_order": "big",
+    "checksum": "crc-16/ccitt-false",
+    "checksum_from": 2,
+}
+STUFFED = {"format": "described", "framing": "slip", "length": 20, "checksum": "crc-16/modbus", "fields": HEAD + FLOATS}
 
 
 class Format(NamedTuple):
@@ -89,7 +94,7 @@ def text(notation, make=TextParser):
 
 def described(table):
     """Noise before its frames often has the sync pattern in it."""
-    layout = frame_layout(table, "test")
+    layout = device_from_table({"frames": table}, "test").frames
     values = st.tuples(*[st.integers(-32768, 32767).map(float)] * 3)
     noise = st.one_of(st.just(layout.sync), st.just(layout.sync[:1]), st.binary(max_size=6))
     return Format(
@@ -103,7 +108,7 @@ def described(table):
 
 def slip(frame):
     """As RFC 1055 stuffs it."""
-    data = frame_layout(STUFFED, "test").encode(frame)
+    data = device_from_table({"frames": STUFFED}, "test").frames.encode(frame)
     return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
 
 

@@ -2,10 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from typing import Any
 
-from isocharge.common.errors import DeviceError
-from isocharge.common.structs import convert
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import Frame, Parser
 from isocharge.serve.frames.frame_layout import FrameLayout, FrameSection
@@ -89,15 +86,6 @@ class BinaryFrames(FrameSection, tag="binary", frozen=True):
     def parser(self) -> Parser:
         """A new parser."""
         return BinaryParser()
-
-
-def frame_layout(table: Mapping[str, Any], where: str) -> FrameLayout:
-    """Read the keys of a described frame; `where` opens messages.
-
-    Raises:
-        DeviceError: If a key is missing, unknown or wrong, or the length is not that of the fields.
-    """
-    return convert({"format": "described", **table}, FrameLayout, where, DeviceError)
 
 
 Frames = AutoFrames | TextFrames | BinaryFrames | FrameLayout
