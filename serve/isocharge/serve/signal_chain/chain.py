@@ -17,7 +17,7 @@ A frame with a value that cannot be a charge passes none of them; its time count
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -194,7 +194,7 @@ def advance(
         elif leak is not None:
             leak = leak._replace(charge_pC=leak.charge_pC - change_pC)
         else:
-            tare = replace(tare, charge_pC=tare.charge_pC + change_pC)
+            tare = tare._replace(charge_pC=tare.charge_pC + change_pC)
     after = ChainState(state.waiting_pC, hum, state.frames, state.patient, tare, leak, memory, touch, saturated, drift)
     flags += (SATURATED,) * saturated + (NEGATIVE,) * touch.below
     if not saturated:

@@ -1,6 +1,6 @@
 """Tare: the charge of each electrode at rest, mean and noise, from frames in which nothing moves."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,8 +26,7 @@ class TareRule(Rule, frozen=True, kw_only=True):
     patience: Count = 2000
 
 
-@dataclass(frozen=True, slots=True)
-class Tare:
+class Tare(NamedTuple):
     """Charge at rest: `charge_pC` (electrodes,) and its standard deviation `noise_pC` (electrodes,), from `frames`."""
 
     charge_pC: Array

@@ -12,7 +12,7 @@ electrodes, and near the centre of a biaxial film. There p stays as it is, and t
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,8 +47,7 @@ class ThermalRule(Rule, frozen=True, kw_only=True):
     tell_pC: Setting = 10.0
 
 
-@dataclass(frozen=True, slots=True)
-class ThermalDrift:
+class ThermalDrift(NamedTuple):
     """Warming in this touch.
 
     Attributes:
@@ -94,13 +93,13 @@ def track_thermal_drift(
     """
     waited_s = state.waited_s + dt_s
     if waited_s < rule.every_s:
-        return replace(state, waited_s=waited_s, rate_pC_per_s=0.0)
+        return state._replace(waited_s=waited_s, rate_pC_per_s=0.0)
     predicted_pC2, covariance, rate_variance = _predicted(rule, state, waited_s, warmth_s)
     tried_pC = charge_pC - TRIED_PC[:, np.newaxis] * ratios
     _, slope, curvature = (_PARABOLA_FIT @ np.square(misfit(tried_pC), dtype=float)).tolist()
     estimate_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
     if estimate_pC2 > rule.blind_pC**2:
-        return replace(state, waited_s=0.0, blind=True, rate_pC_per_s=0.0)
+        return state._replace(waited_s=0.0, blind=True, rate_pC_per_s=0.0)
     change_pC = min(max(-slope / (2.0 * curvature), float(TRIED_PC[0])), float(TRIED_PC[-1]))
     gain = predicted_pC2 / (predicted_pC2 + estimate_pC2)
     turn = covariance / (predicted_pC2 + estimate_pC2)
