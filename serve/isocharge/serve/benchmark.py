@@ -105,32 +105,29 @@ def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
     return durations
 
 
-def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0, presses: int = CHARGES) -> Singles:
+def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Singles:
     """Presses drawn from the golden vectors of a model, pC: from those that it takes for presses, without a flag.
 
-    Shape (presses, electrodes) from (n, electrodes).
+    Shape (CHARGES, electrodes) from (n, electrodes).
     """
     flags = predictor.validity.batch_flags(predictor.predict_batch(golden_pC))
     sound: Singles = golden_pC[[not words for words in flags]]
-    return sound[np.random.default_rng(seed).integers(0, len(sound), presses)]
+    return sound[np.random.default_rng(seed).integers(0, len(sound), CHARGES)]
 
 
-def in_process_contenders(
-    predictor: Predictor, charge_pC: Singles, batches: Sequence[int] = BATCHES
-) -> list[Contender]:
+def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Contender]:
     """Every method of a predictor.
 
     Args:
         predictor: The model.
-        charge_pC: Shape (n, electrodes), pC; each call of one press takes the next row.
-        batches: Presses of the batches; those above n are left out.
+        charge_pC: Shape (n, electrodes), pC; each call of one press takes the next row. Batches above n are left out.
     """
     rows, lists, out = cycle(charge_pC), cycle(charge_pC.tolist()), np.zeros(7, np.float32)
     contenders = [
         Contender("predict_into, float32 array", 1, lambda: predictor.predict_into(next(rows), out)),
         Contender("predict, list of numbers", 1, lambda: predictor.predict(next(lists))),
     ]
-    return contenders + [_batch(predictor, charge_pC[:n]) for n in batches if n <= len(charge_pC)]
+    return contenders + [_batch(predictor, charge_pC[:n]) for n in BATCHES if n <= len(charge_pC)]
 
 
 def _batch(predictor: Predictor, charge_pC: Singles) -> Contender:

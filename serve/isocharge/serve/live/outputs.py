@@ -118,18 +118,15 @@ class LineQueue:
         lost: Lines that were never written, the oldest of those that waited.
     """
 
-    def __init__(
-        self, write: Callable[[str], object], is_ready: Callable[[], bool] = lambda: True, most: int = MOST_LINES
-    ) -> None:
+    def __init__(self, write: Callable[[str], object], is_ready: Callable[[], bool] = lambda: True) -> None:
         """Set up the queue.
 
         Args:
             write: Called in the thread with each line.
             is_ready: Called before that; waits a little while, and says whether the consumer would take a line now.
-            most: Lines that may wait.
         """
         self.lost = 0
-        self._write, self._is_ready, self._most = write, is_ready, most
+        self._write, self._is_ready = write, is_ready
         self._lines: deque[str] = deque()
         self._change = threading.Condition()
         self._taken, self._is_closed = 0, False  # taken: lines that went to `write`
@@ -153,7 +150,7 @@ class LineQueue:
         """
         with self._change:
             self._raise_error()
-            if len(self._lines) >= self._most:
+            if len(self._lines) >= MOST_LINES:
                 self._lines.popleft()
                 self.lost += 1
             self._lines.append(line)

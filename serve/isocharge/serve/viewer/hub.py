@@ -10,7 +10,6 @@ import json
 import tempfile
 import time
 from bisect import bisect_right
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -215,15 +214,12 @@ class Hub:
         state: What changes seldom: counters, recording, notes; for the page.
         version: Counts the changes of `state`.
         viewers: Those that are there.
-        clock: Unix seconds.
         has_ended: Whether the reader has ended.
     """
 
-    def __init__(
-        self, link: PageEnd, description: dict[str, Any], *, is_recording: bool, clock: Callable[[], float] = time.time
-    ) -> None:
+    def __init__(self, link: PageEnd, description: dict[str, Any], *, is_recording: bool) -> None:
         """Show a live stream or a recording, of which nothing has come yet."""
-        self.description, self.clock = description, clock
+        self.description = description
         self.state: dict[str, Any] = {}
         self.version = 0
         self.viewers: set[Viewer] = set()
@@ -251,8 +247,8 @@ class Hub:
         looked_s = 0.0
         while self._link.is_open:
             self._drain()
-            if self.clock() - looked_s > STATE_S:
-                looked_s = self.clock()
+            if time.time() - looked_s > STATE_S:
+                looked_s = time.time()
                 self._show_progress()
             self._wake()
             await asyncio.sleep(TICK_S if self.viewers else IDLE_S)
@@ -293,7 +289,7 @@ class Viewer:
     """
 
     def __init__(self, hub: Hub) -> None:
-        now_s = hub.clock()
+        now_s = time.time()
         self.wake = asyncio.Event()
         self._hub, self._playhead = hub, Playhead() if hub.is_replay else None
         self._next = hub.tape.index(now_s - BACKFILL_S)

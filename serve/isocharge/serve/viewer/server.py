@@ -257,7 +257,7 @@ class PageServer:
                 await viewer.wake.wait()
                 viewer.wake.clear()
                 async with asyncio.timeout(TAKE_S):
-                    for message in viewer.messages(self._hub.clock()):
+                    for message in viewer.messages(time.time()):
                         await connection.send(message)
             await connection.close(1012, "the stream has ended")
         except TimeoutError:
