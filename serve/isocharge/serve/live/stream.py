@@ -32,7 +32,6 @@ from isocharge.serve.tracking.tracker import Tracker
 LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
 """Flags of a frame without a record that pass to the next record: they say what happened before it."""
 
-
 DOUBT = 0.01
 """Share of all touch charges by which it is told how contacts depend on what is not known of the film's memory."""
 
@@ -268,9 +267,11 @@ class TouchStream:
         tracked, event = None, None
         if self._tracker is not None:
             tracked, event = self._tracker.update(contact, when.clock_s, flags)
-        if contact is not None and reading.doubt > 0.0 and reading.charge_pC is not None:
-            more_pC = reading.charge_pC * (1.0 + DOUBT)
-            shift = self._of_doubt.shift(contact, reading.doubt, lambda: self._answers.predict(more_pC))
+        charge_pC = reading.charge_pC
+        if contact is not None and reading.doubt > 0.0 and charge_pC is not None:
+            shift = self._of_doubt.shift(
+                contact, reading.doubt, lambda: self._answers.predict(charge_pC * (1.0 + DOUBT))
+            )
             contact, tracked = contact.widened(shift), tracked and tracked.widened(shift)
         return PredictionRecord(
             timestamp=when.host_s,
