@@ -26,6 +26,7 @@ from isocharge.serve.prediction.record import (
     PredictionRecord,
 )
 from isocharge.serve.signal_chain.chain import Chain, Reading
+from isocharge.serve.tracking.branches import branches_of
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.serve.tracking.tracker import Tracker
 
@@ -152,7 +153,7 @@ class TouchStream:
         )
         self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
         self.counts = StreamCounts()
-        self._tracker = None if device.track is None else Tracker(device.track)
+        self._track = device.track
         self._before_restart = StreamTotals()
         self._policy, self._now_ns, self._given_name, self._follow = policy, now_ns, frame_id, device.follow
         self._use(predictor)
@@ -160,6 +161,7 @@ class TouchStream:
     def _use(self, predictor: Predictor) -> None:
         self._follower = None if self._follow is None else FilmFollower(predictor, self._follow)
         self.predictor, self._validity = predictor, predictor.validity
+        self._tracker = None if self._track is None else Tracker(self._track, branches_of(predictor))
         self._electrodes, self._label = predictor.metadata.electrodes, predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
         self._of_doubt = Sensitivity(DOUBT)
@@ -182,7 +184,7 @@ class TouchStream:
     @property
     def fields(self) -> tuple[str, ...]:
         """Names of the fields that its records are written with."""
-        return FIELDS + OF_TRACKING * (self._tracker is not None) + OF_FILM * (self._follow is not None)
+        return FIELDS + OF_TRACKING * (self._track is not None) + OF_FILM * (self._follow is not None)
 
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
@@ -264,10 +266,10 @@ class TouchStream:
             film = self._follower.film._asdict()
             self._follower.see(reading.charge_pC, contact, flags, when.clock_s)
             flags += (FILM,) * (contact is not None and self._follower.is_lost)
-        tracked, event = None, None
+        tracked, event, other, charge_pC = None, None, None, reading.charge_pC
         if self._tracker is not None:
-            tracked, event = self._tracker.update(contact, when.clock_s, flags)
-        charge_pC = reading.charge_pC
+            tracked, event = self._tracker.update(contact, when.clock_s, flags, charge_pC)
+            other = self._tracker.other
         if contact is not None and reading.doubt > 0.0 and charge_pC is not None:
             shift = self._of_doubt.shift(
                 contact, reading.doubt, lambda: self._answers.predict(charge_pC * (1.0 + DOUBT))
@@ -288,6 +290,7 @@ class TouchStream:
             frame_id=self.frame_id,
             tracked=None if tracked is None else tracked._asdict(),
             event=event,
+            other=None if other is None else other._asdict(),
             follows=self._tracker is not None,
             film=film,
         )
