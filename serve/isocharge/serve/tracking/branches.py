@@ -55,8 +55,10 @@ MOST, LEAST_LOG = 8, -14.0
 ALIKE = 0.7
 """Deviations within which two Gaussians are one."""
 
-WING = 1.5
-"""Deviations at which the two wings lie that a Gaussian over a fold is given, each with half its deviation."""
+REACH, WING = 4.0, 2.5
+"""Deviations within which a fold gives a Gaussian two wings, and at which they lie, each with half its deviation.
+
+Gains that are off hide a fold: the contact seems to stop short of it, and the Gaussian does not know how far it is."""
 
 NARROW_MM = 0.05
 """Deviation below which a Gaussian needs no wings, mm."""
@@ -245,10 +247,10 @@ class Branches:
             return
         reach = spread[:, :2] @ axes[:, 1] / std
         wings = mean + WING * np.outer([1.0, -1.0], reach)
-        if self._turned(mean, mean + 2.0 * np.outer([1.0, -1.0], reach)).any():
+        if self._turned(mean, mean + REACH * np.outer([1.0, -1.0], reach)).any():
             narrow = spread - 0.75 * np.outer(reach, reach)
             self._mean, self._spread = np.vstack([self._mean, wings]), np.concatenate([self._spread, [narrow, narrow]])
-            self._weight = np.append(self._weight, [self._weight[best] - WING] * 2)
+            self._weight = np.append(self._weight, [self._weight[best] - 0.5 * WING**2] * 2)
 
     def _turned(self, one: Array, others: Array) -> Booleans:
         """Whether the map turns over between a contact and others, shape (n, state)."""

@@ -141,8 +141,12 @@ class Tracker:
             `hold`, `slide`, `tap` and `release` this frame begins with.
         """
         if contact is None:
-            if INVALID in flags or self._last is None:
+            if INVALID in flags:
                 return self._last, None
+            if self._last is None:
+                if self._branches is not None:
+                    self._branches.forget()
+                return None, None
             ended = "tap" if self._state == "press" and t_s - self._began_s <= TAP_S else "release"
             self.forget()
             return None, ended

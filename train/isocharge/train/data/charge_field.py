@@ -228,6 +228,7 @@ def invertible_domain(
             f"the map from contacts to charges folds beyond {fold:g} mm: two contacts give the same charges there; the "
             f"model is trained for {fold:g} mm, not {asked.radius:g} mm, on {len(presses.within(fold))} of "
             f"{len(presses)} presses"
+            + ("" if field.of_positive is None else f"; 'serve stream --track' follows contacts to {asked.radius:g} mm")
         )
     if field.error < SMOOTH:
         inner = within(field, RIM * domain.radius)
