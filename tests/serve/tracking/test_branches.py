@@ -129,6 +129,8 @@ def test_records_say_the_other_contact_and_repeat_bit_for_bit(model):
     assert first == lines()
     last, released = json.loads(first[45]), json.loads(first[-1])
     assert abs(last["tracked"]["x_mm"] + last["other"]["x_mm"] - 2.0 * FOLD) < 1.0
+    assert [last[name] for name in ("x_mm", "y_mm", "force_N")] == list(last["tracked"].values())[:3]
+    assert last["flags"] == []
     assert (released["tracked"], released["other"]) == (None, None)
 
 

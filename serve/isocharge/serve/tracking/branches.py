@@ -15,6 +15,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.model.charge_series import ChargeSeries, read_charges
+from isocharge.serve.prediction.contact import Contact
 from isocharge.serve.prediction.predictor import Predictor
 
 STEP_s, SHORT_s = 0.005, 1e-5
@@ -83,17 +84,29 @@ class Branch(NamedTuple):
         mean: (x, y, ln F), its rates and the logarithms of the gains, mm, N and s.
         covariance: Of these.
         probability: That it is this one.
+        misfit: Distance of the charges from its own, in standard deviations.
     """
 
     mean: Array
     covariance: Array
     probability: float
+    misfit: float
 
     def after(self, dt_s: float) -> "Branch":
         """The same, moved on for less than a frame or two."""
         mean = self.mean.copy()
         mean[:3] += dt_s * mean[3:6]
         return self._replace(mean=mean)
+
+    @property
+    def contact(self) -> Contact:
+        """As a model would say it."""
+        x, y, log_force = self.mean[:3].tolist()
+        std = np.sqrt(self.covariance.diagonal()[:3])
+        (_, xy, xF), (_, _, yF), _ = (self.covariance[:3, :3] / np.outer(std, std)).tolist()
+        x_std, y_std, relative = std.tolist()
+        force = math.exp(log_force)
+        return Contact(x, y, force, x_std, y_std, relative * force, self.misfit, xy, xF, yF)
 
     @property
     def moves(self) -> float:
@@ -115,7 +128,7 @@ class Branches:
 
     def forget(self) -> None:
         """Forget the contact."""
-        self._weight = np.zeros(0)
+        self._weight, self._misfit = np.zeros(0), 0.0
         self._block: list[tuple[Array, float]] = []
         self._began_s = self._t_s = self._again_s = -math.inf
         self._found: list[Branch] = []
@@ -203,6 +216,7 @@ class Branches:
         if not (square[best] < LOST and np.isfinite(weight[best])):
             return False
         spread = spread - reached.swapaxes(1, 2) @ np.linalg.solve(from_state + noise, reached)
+        self._misfit = math.sqrt(misfit[best])
         self._mean, self._spread, self._weight = found, 0.5 * (spread + spread.swapaxes(1, 2)), weight - weight[best]
         self._prune()
         self._split()
@@ -274,7 +288,7 @@ class Branches:
             mean = part @ self._mean[rows]
             off = self._mean[rows] - mean
             covariance = np.tensordot(part, self._spread[rows], 1) + (part[:, None] * off).T @ off
-            branches.append(Branch(mean, covariance, float(share[rows].sum())))
+            branches.append(Branch(mean, covariance, float(share[rows].sum()), self._misfit))
             left = left[~near]
         return sorted(branches, key=lambda branch: -branch.probability)
 

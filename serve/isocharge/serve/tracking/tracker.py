@@ -106,6 +106,7 @@ class Tracker:
     """Follows one contact at a time; belongs to one thread. The same frames give the same answers, bit for bit.
 
     Attributes:
+        answer: Where the map folds, the contact in the place of the model's, which knows one side alone; else None.
         other: What the contact may be besides; None where it is known, as it is wherever the map does not fold.
     """
 
@@ -118,6 +119,7 @@ class Tracker:
         """Forget the contact, as after an outage or a new tare."""
         self._of_place, self._of_force = Modes.start(0j, 1.0, PLACE), Modes.start(0.0, 1.0, FORCE)
         self._last: Tracked | None = None
+        self.answer: Contact | None = None
         self.other: Other | None = None
         if self._branches is not None:
             self._branches.forget()
@@ -140,6 +142,7 @@ class Tracker:
             The contact by now, None if nothing touches or no contact explains the charges; and which of `press`,
             `hold`, `slide`, `tap` and `release` this frame begins with.
         """
+        self.answer = None
         if contact is None:
             if INVALID in flags:
                 return self._last, None
@@ -158,7 +161,9 @@ class Tracker:
         elif SATURATED in flags or not (found := self._branches.update(charge_pC, t_s)):
             return self._last, None
         else:
-            tracked, self.other = _tracked(found[0]), _other(found)
+            self.answer, self.other = found[0].contact, _other(found)
+            vx, vy = found[0].mean[3:5].tolist()
+            tracked = Tracked(*self.answer[:6], vx, vy, found[0].moves)
         event = self._event(tracked, t_s, began=began)
         self._last = tracked
         return tracked, event
@@ -224,15 +229,7 @@ class Tracker:
         return None
 
 
-def _tracked(branch: Branch) -> Tracked:
-    x, y, log_force, vx, vy = branch.mean[:5].tolist()
-    x_std, y_std, relative = (math.sqrt(variance) for variance in branch.covariance.diagonal()[:3].tolist())
-    force = math.exp(log_force)
-    return Tracked(x, y, force, x_std, y_std, force * relative, vx, vy, branch.moves)
-
-
 def _other(found: list[Branch]) -> Other | None:
     if found[0].probability > KNOWN or len(found) == 1:
         return None
-    x, y, log_force = found[1].mean[:3].tolist()
-    return Other(x, y, math.exp(log_force), found[1].probability)
+    return Other(*found[1].contact[:3], found[1].probability)
