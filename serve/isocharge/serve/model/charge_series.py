@@ -102,7 +102,8 @@ class ChargeSeries:
     def corners_mm(self) -> Array:
         """Corners of a polygon about the area, shape (64, 2), mm."""
         angle = 2.0 * np.pi * np.arange(64) / 64
-        return np.column_stack([np.cos(angle), np.sin(angle)]) * (self.radius_mm / np.cos(np.pi / 64))
+        reach_mm = self.radius_mm / np.cos(np.pi / 64)
+        return np.asarray(reach_mm * np.column_stack([np.cos(angle), np.sin(angle)]))
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Charges, pC, and their derivatives by x and y, mm, and ln F: (n, 3) to (n, e) and (n, e, 3).
