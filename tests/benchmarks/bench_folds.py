@@ -79,8 +79,16 @@ def main() -> None:
             tracked, other = found[k]
             said = np.array([one[:3] for one in (tracked, other) if one is not None])
             said[:, 2] = np.clip(said[:, 2], *forces)
+            said[:, :2] *= np.minimum((radius + BEYOND_MM) / np.hypot(*said[:, :2].T), 1.0)[:, None]
             right = sides(film, said) == side[k]
-            rows.append((other is None, right[0], right.any(), np.hypot(*(said[0, :2] - contact[k, :2]))))
+            rows.append(
+                (
+                    other is None,
+                    right[0],
+                    right.any(),
+                    np.hypot(tracked.x_mm - contact[k, 0], tracked.y_mm - contact[k, 1]),
+                )
+            )
     known, right, said, error = np.array(rows, dtype=float).T
     results = {
         "known_percent": 100.0 * known.mean(),

@@ -127,7 +127,7 @@ def stream_command(
         bool,
         typer.Option(
             "--track",
-            help="Follow contacts in time: records get `tracked` and `event`, as by [track]. (default: off)",
+            help="Follow contacts in time: records get `tracked`, `event` and `other`, as by [track]. (default: off)",
         ),
     ] = False,
     follow: Annotated[
