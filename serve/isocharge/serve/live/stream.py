@@ -156,7 +156,7 @@ class TouchStream:
         )
         self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
         self.counts = StreamCounts()
-        self._track = device.track
+        self._tracker = None if device.track is None else Tracker(device.track)
         self._before_restart = StreamTotals()
         self._policy, self._now_ns, self._given_name, self._follow = policy, now_ns, frame_id, device.follow
         self._use(predictor)
@@ -164,10 +164,10 @@ class TouchStream:
     def _use(self, predictor: Predictor) -> None:
         self._follower = None if self._follow is None else FilmFollower(predictor, self._follow)
         self.predictor, self._validity = predictor, predictor.validity
-        branches = branches_of(predictor)
-        self._tracker = None if self._track is None else Tracker(self._track, branches)
-        corners_mm = self._validity.corners_mm if branches is None else branches.charges.corners_mm
-        self._followed_validity = replace(self._validity, corners_mm=corners_mm)
+        if self._tracker is not None:
+            self._tracker.branches = branches = branches_of(predictor)
+            corners_mm = self._validity.corners_mm if branches is None else branches.charges.corners_mm
+            self._validity_followed = replace(self._validity, corners_mm=corners_mm)
         self._electrodes, self._label = predictor.metadata.electrodes, predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
         self._of_doubt = Sensitivity(DOUBT)
@@ -190,7 +190,7 @@ class TouchStream:
     @property
     def fields(self) -> tuple[str, ...]:
         """Names of the fields that its records are written with."""
-        return FIELDS + OF_TRACKING * (self._track is not None) + OF_FILM * (self._follow is not None)
+        return FIELDS + OF_TRACKING * (self._tracker is not None) + OF_FILM * (self._follow is not None)
 
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
@@ -277,7 +277,7 @@ class TouchStream:
             tracked, event = self._tracker.update(contact, when.clock_s, flags, charge_pC)
             other = self._tracker.other
         if self._tracker is not None and (answer := self._tracker.answer) is not None:
-            contact, flags = answer, reading.flags + self._followed_validity.flags(answer)
+            contact, flags = answer, reading.flags + self._validity_followed.flags(answer)
             shift = 0.0, 0.0, LARGEST_POWER * reading.doubt * answer.force_N
             contact, tracked = contact.widened(shift), tracked and tracked.widened(shift)
         elif contact is not None and reading.doubt > 0.0 and charge_pC is not None:

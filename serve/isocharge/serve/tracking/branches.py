@@ -4,8 +4,9 @@ Where the map from contacts to charges folds, one frame has several solutions, a
 contact that moves on passes the fold, one that stays on its side turns back just there; so motion and the frames before
 tell. The state is (x, y, ln F), its rates, and the logarithm of each gain, which may be off by `GAIN`. Its distribution
 is a sum of Gaussians (Alspach and Sorenson 1972), each an iterated extended Kalman filter (Bell and Cathey 1993) of the
-charges themselves: it begins with one for each solution, one that spreads over a fold is split, one that is surprised
-has a rival that moves otherwise from now on. Frames are averaged over `STEP_s`; more often tells hardly more.
+charges themselves. A touch begins with some all over the film, of which few explain the charges; one that comes near a
+fold gets wings beyond it; one that is surprised, or moves, gets a rival that moves otherwise or stops from now on.
+Frames are averaged over `STEP_s`; more often tells hardly more.
 """
 
 import math
@@ -72,6 +73,9 @@ STARTS = 121
 
 STEPS, START_STEPS = 3, 20
 """Steps to the most probable state given the charges, and at first."""
+
+LONGEST_MM, LONGEST_LOG = 0.5, 0.2
+"""Longest of these steps, in the place and in ln F: beyond, charges are not what their derivatives say."""
 
 TURNS = 2.399963
 """The golden angle: places that fill a disk evenly (Vogel 1979)."""
@@ -141,12 +145,12 @@ class Branches:
             t_s: Time of the frame, s, on any clock.
         """
         self._block.append((charge_pC, t_s))
-        if t_s - self._began_s >= STEP_s - SHORT_s:
+        if not 0.0 <= t_s - self._began_s < STEP_s - SHORT_s:
             charges, times = zip(*self._block, strict=True)
             charge_pC, middle_s, count = np.mean(charges, axis=0), sum(times) / len(times), len(times)
             self._block, self._began_s, dt_s, self._t_s = [], t_s, middle_s - self._t_s, middle_s
             variance = (self._white**2 + (self._gain * charge_pC) ** 2) / count + (COLOURED * charge_pC) ** 2
-            follows = self._weight.size > 0 and dt_s < LONGEST_STEP_s
+            follows = self._weight.size > 0 and 0.0 < dt_s < LONGEST_STEP_s
             if not (follows and self._advance(charge_pC, variance, dt_s)):
                 self._weight = np.zeros(0)
                 if t_s >= self._again_s:
@@ -206,7 +210,7 @@ class Branches:
             weighed = np.linalg.solve(from_state + noise, off[:, :, None])
             if number < steps:
                 step = mean + (reached.swapaxes(1, 2) @ weighed)[:, :, 0] - found
-                longest = np.maximum(np.hypot(step[:, 0], step[:, 1]) / 0.5, np.abs(step[:, 2]) / 0.2)
+                longest = np.maximum(np.hypot(step[:, 0], step[:, 1]) / LONGEST_MM, np.abs(step[:, 2]) / LONGEST_LOG)
                 found += step / np.maximum(longest, 1.0)[:, None]
         misfit = ((charge_pC - charge) ** 2 / variance).sum(axis=1)
         square = misfit + (weighed.swapaxes(1, 2) @ from_state @ weighed)[:, 0, 0]

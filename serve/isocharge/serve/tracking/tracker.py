@@ -106,13 +106,14 @@ class Tracker:
     """Follows one contact at a time; belongs to one thread. The same frames give the same answers, bit for bit.
 
     Attributes:
+        branches: What follows the contact by its charges where the map folds; None where it does not.
         answer: Where the map folds, the contact in the place of the model's, which knows one side alone; else None.
         other: What the contact may be besides; None where it is known, as it is wherever the map does not fold.
     """
 
     def __init__(self, rule: TrackRule | None = None, branches: Branches | None = None) -> None:
         """Begin without a contact; by default with the settings of an empty section, and of a film without folds."""
-        self._lasting, self._branches = (rule or TrackRule()).lasting ** 2, branches
+        self._lasting, self.branches = (rule or TrackRule()).lasting ** 2, branches
         self.forget()
 
     def forget(self) -> None:
@@ -121,8 +122,8 @@ class Tracker:
         self._last: Tracked | None = None
         self.answer: Contact | None = None
         self.other: Other | None = None
-        if self._branches is not None:
-            self._branches.forget()
+        if self.branches is not None:
+            self.branches.forget()
         self._far, self._t_s = 0, 0.0
         self._began_s = self._rest_s = 0.0
         self._rest, self._state = 0j, ""
@@ -147,8 +148,8 @@ class Tracker:
             if INVALID in flags:
                 return self._last, None
             if self._last is None:
-                if self._branches is not None:
-                    self._branches.forget()
+                if self.branches is not None:
+                    self.branches.forget()
                 return None, None
             ended = "tap" if self._state == "press" and t_s - self._began_s <= TAP_S else "release"
             self.forget()
@@ -156,9 +157,9 @@ class Tracker:
         began = self._last is None
         if began:
             self._began_s = t_s
-        if self._branches is None or charge_pC is None:
+        if self.branches is None or charge_pC is None:
             tracked = self._advance(contact, t_s, flags)
-        elif SATURATED in flags or not (found := self._branches.update(charge_pC, t_s)):
+        elif SATURATED in flags or not (found := self.branches.update(charge_pC, t_s)):
             return self._last, None
         else:
             self.answer, self.other = found[0].contact, _other(found)
