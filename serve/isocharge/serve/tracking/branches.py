@@ -273,7 +273,6 @@ class Branches:
     def _turned(self, one: Array, others: Array) -> Booleans:
         """Whether the map turns over between a contact and others, shape (n, state)."""
         slopes = self.charges.linearised(np.vstack([one, others])[:, :3])[1]
-        slopes = slopes / np.linalg.norm(slopes, axis=1, keepdims=True)
         return np.asarray(np.linalg.det(slopes[0].T @ slopes[1:]) < 0.0)
 
     def _branches(self) -> list[Branch]:
