@@ -236,20 +236,6 @@ def test_one_electrode_gets_a_warning(tmp_path, command, caplog):
     assert said in err
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (b"[film\nradius_mm = 45", "not a TOML file: .*line 1"),
-        (b"\xff\xfe\x00name", "not a TOML file: not text"),
-    ],
-)
-def test_file_that_is_not_toml(tmp_path, data, message):
-    path = tmp_path / "mine.toml"
-    path.write_bytes(data)
-    with pytest.raises(SensorError, match=rf"^{path}: {message}"):
-        load_sensor(path)
-
-
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("count", [65, 200_000])
 def test_too_many_electrodes_are_refused_at_once(tmp_path, count):

@@ -418,10 +418,7 @@ def test_an_earlier_calibration_is_the_prior_of_the_next(warmed, problem):
     rng = np.random.default_rng(10)
     at = draw_contacts(rng, problem.domain, 3)
     presses = presses_of(problem, at, problem.noise.add(problem.charges.charges(truth, at), rng))
-    result = calibrate(presses, again)
-    assert result.left.position_mm < 0.7 * calibrate(presses, problem).left.position_mm
-    pretension = result.quantities["pretension_MPa"]
-    assert abs(pretension.value - truth[0]) < 4.0 * pretension.std
+    assert calibrate(presses, again).left.position_mm < 0.7 * calibrate(presses, problem).left.position_mm
 
 
 NOBODY_KNOWS = (np.nan, np.nan, np.nan)
