@@ -67,8 +67,7 @@ class Windows(NamedTuple):
     def rows(self) -> Bytes:
         """The bytes of each window and as many after it, shape (frames, 2 * length): frames begin anywhere in it."""
         starts = self.starts[self.starts + 2 * self.length <= len(self.stream)]
-        rows: Bytes = self.stream[starts[:, None] + np.arange(2 * self.length)]
-        return rows
+        return np.asarray(self.stream[starts[:, None] + np.arange(2 * self.length)])
 
 
 def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
