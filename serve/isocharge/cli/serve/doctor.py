@@ -203,7 +203,9 @@ def report_lines(examination: Examination) -> Iterator[str]:
         figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
         digits = (5, 6, 5, 5, 5) if examination.unit == "V" else (2, 3, 2, 2, 2)
         columns = zip(figures, (12, 11, 12, 10, 10), digits, strict=True)
-        yield f"{channel.name:8.8s}" + "".join(_column(*column) for column in columns)
+        yield f"{channel.name:8.8s}" + "".join(
+            f"{'?' if figure is None else f'{figure:.{digits}f}':>{width}s}" for figure, width, digits in columns
+        )
     if examination.held:
         yield examination.held
     yield "missing to get a touch: nothing" if not examination.missing else "missing to get a touch:"
@@ -211,7 +213,3 @@ def report_lines(examination: Examination) -> Iterator[str]:
 
 
 _HEAD = "channel    offset pC   noise pC  drift pC/s  50 Hz pC  60 Hz pC"
-
-
-def _column(figure: float | None, width: int, digits: int) -> str:
-    return f"{'?' if figure is None else f'{figure:.{digits}f}':>{width}s}"
