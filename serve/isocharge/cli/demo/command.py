@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
-from itertools import count, islice
+from itertools import chain, count, islice
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -128,9 +128,8 @@ def _step(name: str, description: str, durations_s: dict[str, float]) -> Iterato
 
 def _free_name(base: Path) -> Path:
     """`base`, or the first of base-2, base-3, ... that does not exist."""
-    if not base.exists():
-        return base
-    return next(path for path in (base.with_name(f"{base.name}-{k}") for k in count(2)) if not path.exists())
+    further = (base.with_name(f"{base.name}-{k}") for k in count(2))
+    return next(path for path in chain([base], further) if not path.exists())
 
 
 def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, StreamTotals]:

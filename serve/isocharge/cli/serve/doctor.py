@@ -139,8 +139,7 @@ def port_lines() -> Iterator[str]:
 
 def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
     """Names of the models with as many electrodes; those that cannot be read are left out."""
-    names = dict.fromkeys(name for root in repositories(models) for name in model_names(root))
-    for name in names:
+    for name in dict.fromkeys(name for root in repositories(models) for name in model_names(root)):
         with suppress(IsochargeError):
             if len(Predictor(name, models=models).metadata.electrodes) == electrodes:
                 yield name

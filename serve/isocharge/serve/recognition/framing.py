@@ -118,8 +118,7 @@ def _synchronised(stream: Bytes) -> Iterator[Windows]:
             coverage = len(starts) * length / len(stream) - less
             if coverage > best.get(length, (COVERED_SHARE - less,))[0]:
                 best[length] = coverage, starts
-    ranked = sorted(best, key=lambda length: (-round(best[length][0], 1), length))
-    for length in ranked[:MOST_LENGTHS]:
+    for length in sorted(best, key=lambda length: (-round(best[length][0], 1), length))[:MOST_LENGTHS]:
         yield Windows(SYNC, stream, best[length][1], length)
 
 
