@@ -174,10 +174,8 @@ def _write(path: Path, examination: Examination) -> None:
         write_whole(path, device_text(examination).encode())
     except OSError as error:
         raise InputError(f"--write {path}: cannot be written ({error.strerror}); choose another path") from error
-    if examination.works:
-        say(f"{path} written; use it with: isocharge serve stream MODEL --port {examination.url} --device {path}")
-    else:
-        say(f"{path} written; it gives no touches yet: put in what is missing above")
+    use = f"use it with: isocharge serve stream MODEL --port {examination.url} --device {path}"
+    say(f"{path} written; {use if examination.works else 'it gives no touches yet: put in what is missing above'}")
 
 
 def report_lines(examination: Examination) -> Iterator[str]:

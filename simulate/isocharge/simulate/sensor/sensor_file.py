@@ -258,10 +258,11 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
         if sides.get(electrode.name) == shared is not None:
             tables[electrode.name] = [tidy(value) for value in electrode.centre]
         else:
-            tables[electrode.name] = {"polygon_mm": _corners(electrode.corners)}
-            for key, polygons in (("more_mm", electrode.more), ("back_mm", electrode.back)):
-                if polygons:
-                    tables[electrode.name][key] = [_corners(polygon) for polygon in polygons]
+            more = {"more_mm": electrode.more, "back_mm": electrode.back}
+            tables[electrode.name] = {
+                "polygon_mm": _corners(electrode.corners),
+                **{key: [_corners(polygon) for polygon in polygons] for key, polygons in more.items() if polygons},
+            }
     return tables
 
 
