@@ -47,8 +47,13 @@ class OnnxContact(GivenMethod):
 
     def single(self, charge: Array) -> Callable[[], object]:
         """One press, shape (n_electrode,), ready to be computed: through bound memory, as `Predictor` does it."""
-        press = BoundPress(self._session, charge.size)
-        return partial(press.run_into, charge.astype(np.float32), np.zeros(3, np.float32))
+        press, row, out = BoundPress(self._session, charge.size), charge.astype(np.float32), np.zeros(3, np.float32)
+
+        def compute() -> object:
+            press.run_into(row, out)
+            return out
+
+        return compute
 
     def __getstate__(self) -> dict[str, Any]:
         return {"graph": self.graph}
