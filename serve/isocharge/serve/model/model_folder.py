@@ -23,7 +23,7 @@ import onnxruntime as ort
 from numpy.typing import ArrayLike
 
 from isocharge.common.defaults import MAX_BATCH
-from isocharge.common.errors import ModelError, OutputExists
+from isocharge.common.errors import ModelError, OutputExists, told_where
 from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
 from isocharge.serve.model.golden import Golden, check_answers, contact_floors, make_golden, read_golden
 from isocharge.serve.model.metadata import NAME, ModelMetadata
@@ -186,10 +186,8 @@ def check_golden(model: Model) -> None:
         ModelError: If an answer differs from that in golden.json.
     """
     where, charge_pC = str(model.folder / "model.onnx"), model.golden.charge_pC
-    try:
+    with told_where(f"{where}: ", ModelError):
         answers = run(model.session, charge_pC)
-    except ModelError as error:
-        raise ModelError(f"{where}: {error}") from error
     check_rows(answers, len(charge_pC), where)
     check_answers(model.golden, answers, where)
 
