@@ -115,5 +115,4 @@ class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
     def predict(self, values: Array) -> Array:
         """The posterior mean."""
-        parts = [self.process_.predict(values[k : k + BATCH]) for k in range(0, len(values), BATCH)]
-        return np.concatenate(parts)
+        return np.concatenate([self.process_.predict(values[k : k + BATCH]) for k in range(0, len(values), BATCH)])
