@@ -89,9 +89,8 @@ def make_golden(
     """
     outputs = run(session, charge_pC)
     for name, rows in outputs.items():
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-        if bad.size:
-            raise ModelError(f"the new model answers {name} = {rows[bad[0]]} to the charges {charge_pC[bad[0]]} pC")
+        for bad in np.flatnonzero(~np.isfinite(rows).all(axis=1))[:1]:
+            raise ModelError(f"the new model answers {name} = {rows[bad]} to the charges {charge_pC[bad]} pC")
     floors = FLOORS | {"contact": contact, "contact_std": contact}
     return Golden(sha256_of(onnx_model), charge_pC, outputs, RELATIVE, {name: floors[name] for name in outputs})
 
