@@ -89,8 +89,9 @@ def make_golden(
     """
     outputs = run(session, charge_pC)
     for name, rows in outputs.items():
-        for bad in np.flatnonzero(~np.isfinite(rows).all(axis=1))[:1]:
-            raise ModelError(f"the new model answers {name} = {rows[bad]} to the charges {charge_pC[bad]} pC")
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        if bad.size:
+            raise ModelError(f"the new model answers {name} = {rows[bad[0]]} to the charges {charge_pC[bad[0]]} pC")
     floors = FLOORS | {"contact": contact, "contact_std": contact}
     return Golden(sha256_of(onnx_model), charge_pC, outputs, RELATIVE, {name: floors[name] for name in outputs})
 

@@ -52,8 +52,9 @@ def whitening() -> Pipeline:
 class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """ln(max(Q, 1 pC)) of charges, shape (n, n_electrode); asinh(2 Q / usual size) if they have both signs."""
 
-    def fit(self, charge: Array, _target: object = None) -> "Logarithms":
+    def fit(self, charge: Array, target: object = None) -> "Logarithms":
         """Noise alone does not make a sign."""
+        del target
         signed = (np.mean(charge <= 0.0, axis=0) > BOTH_SIGNS).any()
         self.bend_ = LEAST_BEND * usual_size(charge) if signed else None
         return self
@@ -115,4 +116,5 @@ class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
 
     def predict(self, values: Array) -> Array:
         """The posterior mean."""
-        return np.concatenate([self.process_.predict(values[k : k + BATCH]) for k in range(0, len(values), BATCH)])
+        parts = [self.process_.predict(values[k : k + BATCH]) for k in range(0, len(values), BATCH)]
+        return np.concatenate(parts)

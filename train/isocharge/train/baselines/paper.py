@@ -31,8 +31,9 @@ class Triangulate(BaseEstimator, RegressorMixin):  # type: ignore[misc]
     def __init__(self, charge_map: ChargeMap, *, given_force: bool = False) -> None:
         self.charge_map, self.given_force = charge_map, given_force
 
-    def fit(self, _charge: Array, _contact: Array) -> "Triangulate":
+    def fit(self, charge: Array, contact: Array) -> "Triangulate":
         """Nothing is learned from presses."""
+        del charge, contact
         self.contours_ = Triangulation(self.charge_map)
         return self
 
