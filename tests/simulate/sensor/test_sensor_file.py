@@ -125,12 +125,6 @@ def test_optional_keys_may_be_left_out():
     assert (sensor.piezo.d33, sensor.piezo.pyro, sensor.calibration) == (0.0, 0.0, Calibration())
 
 
-def test_polygons_need_no_side():
-    table = whole() | {"readout": "area", "electrodes": {"T": {"polygon_mm": [[-12, 4], [-8, 4], [-10, 8.0]]}}}
-    table["calibration"] = {}
-    assert sensor_from_dict(table).electrodes == (Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0))),)
-
-
 def test_traces_and_metal_of_the_back_arrive():
     """A trace is written as the polygon that it is."""
     pad, back = ((8.0, 0.0), (12.0, 0.0), (10.0, 4.0)), (((0.0, -9.0), (9.0, -9.0), (9.0, 9.0), (0.0, 9.0)),)
