@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 
 from isocharge.simulate import DesignCase, design, load_sensor
 from isocharge.simulate.layout.case import KNOWN
-from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
+from isocharge.simulate.plots.film import draw_layout
 
 result = design(DesignCase(load_sensor("three-25um-biaxial"), electrodes=3, radius=8.0, nuisances=KNOWN))
 figure, pair = plt.subplots(1, 2, figsize=(11.0, 5.0), layout="constrained", sharex=True, sharey=True)
@@ -20,8 +20,6 @@ for axes, (sensor, errors) in zip(pair, layouts, strict=True):
     worst = errors.known.max()
     print(f"{sensor.name}: at worst {worst:.3f} mm")
     shades = axes.tripcolor(*errors.presses.T, errors.known, shading="gouraud", vmin=0.0, vmax=most)
-    draw_electrodes(axes, sensor)
-    draw_working_area(axes, result.case.radius)
-    frame_film(axes, sensor, 8.0, f"{sensor.name}\nat worst {worst:.3f} mm")
+    draw_layout(axes, sensor, result.case.radius, f"{sensor.name}\nat worst {worst:.3f} mm")
 figure.colorbar(shades, ax=list(pair), label="least position error (rms), mm")
 plt.show()

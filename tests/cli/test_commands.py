@@ -106,13 +106,15 @@ def test_fresh_throws_an_unfinished_sweep_of_other_settings_away(command, tmp_pa
     part = tmp_path / "presses.part"
     for folder in ("parts", "data"):
         (part / folder).mkdir(parents=True)
-    (part / "lock").touch()
+    for name in ("lock", "data/old"):
+        (part / name).touch()
     (part / "run.json").write_text('{"sweep": {"samples": 7}}')
     words = ["--samples", 300, "--sampling", "grid", "--orientation", "random", "--workers", 1, "--fresh"]
     code, _, err = command(*SMALL, *words, "-o", tmp_path / "presses")
     assert code == 0
     assert f"293 presses in {tmp_path / 'presses'}" in err
     assert not part.exists()
+    assert not (tmp_path / "presses" / "old").exists()
     assert "caution: 1 N under circle:1.0 stress the film to 49 MPa, the limit is 45 MPa" in err
 
 

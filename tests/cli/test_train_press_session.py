@@ -250,6 +250,7 @@ def test_presses_of_a_machine_calibrate_a_film(command, desk, film, places):
         (["--from", "film", "--temperature", "23", "--port", "some.bin"], "--temperature: presses from --port"),
         (["--next", "2"], "nothing is calibrated without PRESSES.csv"),
         (["list.csv", "--probe", "triangle:4.0"], "expected a round one"),
+        (["metres.csv"], "were they written in metres"),
         (["--port", "some.bin", "list.csv"], "leave out PRESSES.csv, --next"),
         (["--press-list", "list.csv"], "belong to --port"),
         (["--port", "some.bin", "--press-list", "far.csv"], "far.csv, press 2: expected a press within 9"),
@@ -260,6 +261,7 @@ def test_presses_of_a_machine_calibrate_a_film(command, desk, film, places):
 )
 def test_what_cannot_be_is_said_before_the_first_press(refused, desk, words, message):
     (desk / "far.csv").write_text("x_mm,y_mm,force_N\n1,1,1\n30,1,1\n")
+    (desk / "metres.csv").write_text("x_mm,y_mm,force_N,A,B,C,D\n0.001,0,1,9,8,7,6\n0,0.002,1,9,8,7,6\n")
     (desk / "half.csv").write_text("x_mm,y_mm,force_N\n1,,1\n")
     (desk / "noise.bin").write_bytes(bytes(range(256)) * 100)
     refused(*CALIBRATE, *words, said=message, code=1 if "noise.bin" in words else 2)

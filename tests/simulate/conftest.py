@@ -88,6 +88,16 @@ def mesh(request: pytest.FixtureRequest) -> Mesh:
     return _mesh(request.param, (0.4, 0.0), Resolution(3, 8, 2, 1))
 
 
+def assembled(mesh: Template, matrix: np.ndarray) -> np.ndarray:
+    """The whole matrix, entry by entry, no cleverness."""
+    components = matrix.shape[2]
+    unknown = (components * mesh.nodes[..., None] + np.arange(components)).reshape(mesh.n_element, -1)
+    dense = np.zeros((components * mesh.n_node, components * mesh.n_node))
+    for numbers, block in zip(unknown, matrix.reshape(mesh.n_element, unknown.shape[1], -1), strict=True):
+        dense[np.ix_(numbers, numbers)] += block
+    return dense
+
+
 @pytest.fixture(scope="session")
 def made_up() -> Callable[..., Equilibrium]:
     """A made-up equilibrium with a given field.

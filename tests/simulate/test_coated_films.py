@@ -11,7 +11,6 @@ from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.numerics.interpolation import gauss_reference_square, tensor_values
 from isocharge.simulate.sensor.film import Coat
-from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.simulate.solver.assembly import assembly
 from isocharge.simulate.solver.load_case import place_coated
 
@@ -70,12 +69,6 @@ def test_a_coat_on_both_sides_is_one_that_is_twice_as_stiff():
         np.multiply.outer([0.0, 0.3], np.array([[1, nu, 0], [nu, 1, 0], [0, 0, 0.5 - 0.5 * nu]]) / (1 - nu**2)),
         atol=1e-9,
     )
-
-
-def test_the_sensor_file_holds_the_coating():
-    table = sensor_to_dict(INK)
-    assert table["electrodes"]["coating_N_per_mm"] == 22.5
-    assert sensor_to_dict(sensor_from_dict(table)) == table
 
 
 def test_what_is_pressed_and_what_is_read_must_be_the_same_film():

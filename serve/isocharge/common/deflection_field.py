@@ -91,8 +91,7 @@ def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, ring
     p, r = distance_mm / radius_mm, probe_radius_mm / radius_mm
     c = math.tanh(0.5 * (math.atanh(p + r) + math.atanh(p - r)))
     z = rings[:, None] * np.exp(1j * np.linspace(0.0, math.pi, angles))
-    placed: Complexes = radius_mm * (z + c) / (1.0 + c * z)
-    return placed
+    return np.asarray(radius_mm * (z + c) / (1.0 + c * z))
 
 
 def read_deflection_field(path: Path) -> DeflectionField:

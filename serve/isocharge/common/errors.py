@@ -5,6 +5,9 @@ A message says what was expected, what was got, where, and what to do. The comma
 `isocharge.serve.network.protocol.response`.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 LONGEST_VALUE = 200
 """Characters of a wrong value, or of a list of keys, that a message shows."""
 
@@ -144,3 +147,12 @@ class TareError(IsochargeError, RuntimeError):
 
 class MissingExtra(IsochargeError, ImportError):
     """A part of isocharge needs packages that are not installed; the message names the install command."""
+
+
+@contextmanager
+def told_where(where: str, kind: type[IsochargeError]) -> Iterator[None]:
+    """Put `where` before the messages of the errors of a kind that the block raises."""
+    try:
+        yield
+    except kind as error:
+        raise kind(f"{where}{error}") from error

@@ -66,6 +66,14 @@ def bounded_lines(file: TextIO, longest: int = LONGEST_LINE) -> Iterator[str]:
         yield line
 
 
+def read_needed(path: Path, error: type[IsochargeError], advice: str, most: int = MOST_BYTES) -> bytes:
+    """As `read_whole`, but raises `error`, with advice on what to do."""
+    try:
+        return read_whole(path, most)
+    except OSError as cause:
+        raise error(f"{path}: cannot be read ({cause.strerror}); {advice}") from cause
+
+
 def refuse_existing(path: Path) -> None:
     """Raise OutputExists if there is something at `path` already."""
     if path.exists():

@@ -145,15 +145,14 @@ class _Keeping(Executor):
         kept: Future[Any] = Future()
         if (saved := self._run.load(part, _array)) is not None:
             kept.set_result(saved)
-            return kept
-        if self._executor is None:
+        elif self._executor is None:
             result = function(*args, **kwargs)
             self._run.save(part, _npy(result))
             kept.set_result(result)
-            return kept
-        computed = self._executor.submit(function, *args, **kwargs)
-        computed.add_done_callback(lambda _: self._keep(part, computed, kept))
-        kept.add_done_callback(lambda _: computed.cancel())
+        else:
+            computed = self._executor.submit(function, *args, **kwargs)
+            computed.add_done_callback(lambda _: self._keep(part, computed, kept))
+            kept.add_done_callback(lambda _: computed.cancel())
         return kept
 
     def _keep(self, part: str, computed: Future[Any], kept: Future[Any]) -> None:

@@ -32,7 +32,7 @@ import msgspec
 from msgspec import Meta, Struct, inspect
 
 from isocharge.common.errors import InputError, cut, shown
-from isocharge.common.files import read_whole
+from isocharge.common.files import read_needed
 
 T = TypeVar("T")
 
@@ -88,10 +88,9 @@ def read_json(path: Path, what: str, error: type[InputError], kind: type[T]) -> 
 
 
 def _text(path: Path, most: int, what: str, language: str, error: type[InputError]) -> str:
+    data = read_needed(path, error, f"expected {what} in {language}", most)
     try:
-        return read_whole(path, most).decode("utf-8")
-    except OSError as cause:
-        raise error(f"{path}: cannot be read ({cause.strerror}); expected {what} in {language}") from cause
+        return data.decode("utf-8")
     except UnicodeDecodeError as cause:
         raise error(f"{path}: not a {language} file: not text in UTF-8: {cause}") from cause
 

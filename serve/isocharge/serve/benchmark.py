@@ -4,6 +4,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import metadata
 from itertools import cycle
 from pathlib import Path
@@ -127,11 +128,11 @@ def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Cont
         Contender("predict_into, float32 array", 1, lambda: predictor.predict_into(next(rows), out)),
         Contender("predict, list of numbers", 1, lambda: predictor.predict(next(lists))),
     ]
-    return contenders + [_batch(predictor, charge_pC[:n]) for n in BATCHES if n <= len(charge_pC)]
-
-
-def _batch(predictor: Predictor, charge_pC: Singles) -> Contender:
-    return Contender(f"predict_batch, {len(charge_pC)}", len(charge_pC), lambda: predictor.predict_batch(charge_pC))
+    return contenders + [
+        Contender(f"predict_batch, {n}", n, partial(predictor.predict_batch, charge_pC[:n]))
+        for n in BATCHES
+        if n <= len(charge_pC)
+    ]
 
 
 def machine(packages: Sequence[str] = ("numpy", "onnxruntime")) -> dict[str, str]:

@@ -125,8 +125,14 @@ def _zoom(axes: Any, drawn: list[DrawnContour], at: Array, mean: Array) -> None:
     axes.plot(*np.reshape(nearest, (-1, 2)).T, "o", mfc="none", color=INK, ms=8, label="crossings")
     axes.plot(*mean, "x", color=INK, ms=9, mew=2, label="their mean")
     axes.plot(*at, "+", color=FELT, ms=12, mew=2, label="the press")
-    axes.set(xlim=(at[0] - AROUND, at[0] + AROUND), ylim=(at[1] - AROUND, at[1] + AROUND))
-    axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="near the press")
+    axes.set(
+        xlim=(at[0] - AROUND, at[0] + AROUND),
+        ylim=(at[1] - AROUND, at[1] + AROUND),
+        aspect="equal",
+        xlabel="x, mm",
+        ylabel="y, mm",
+        title="near the press",
+    )
     axes.legend(fontsize=8)
 
 

@@ -165,9 +165,10 @@ def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
     draw_curves(left, curves, smooth)
     left.set_title("Fig. 8: rectangular probe, biaxial film, 1 N")
     others, mean = {"color": PRESSED, "lw": 0.7}, smooth.own.mean(axis=0)
-    styles = {190.0: others | {"label": "the others"}}
-    for named, colour in zip(FIG_8_DEG, COLOURS, strict=False):
-        styles[named] = {"color": colour, "lw": 2.4, "label": f"{named:.0f}°"}
+    styles = {190.0: others | {"label": "the others"}} | {
+        named: {"color": colour, "lw": 2.4, "label": f"{named:.0f}°"}
+        for named, colour in zip(FIG_8_DEG, COLOURS, strict=False)
+    }
     for angle, charge in zip(np.rad2deg(curves.mapping.angle).round(6).tolist(), smooth.own, strict=True):
         right.plot(smooth.mapping.distance, 100.0 * (charge / mean - 1.0), **styles.get(angle, others))
     ratio, title = "charge over the mean of the lines, %", "the same, against the mean of the lines"

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from choices import ELEMENTS, FIG_8_DEG
+from choices import ELEMENTS
 from matplotlib.collections import LineCollection
 from page import Entry, Row
 from solves import FINEST, FORCE, MESHES, Solves
@@ -120,17 +120,8 @@ def _triangle(sensor: Sensor) -> tuple[list[float], str, str]:
     return sides, ", ".join(f"{side:.2f}" for side in sides) + " mm", directions
 
 
-def fig_4(solves: Solves) -> Entry:
-    """The scheme from A."""
-    return _scheme(solves, "Fig. 4", "A", FIG_4_DEG)
-
-
-def fig_7(solves: Solves) -> Entry:
-    """The scheme from B."""
-    return _scheme(solves, "Fig. 7", "B", FIG_8_DEG)
-
-
-def _scheme(solves: Solves, heading: str, electrode: str, degrees: tuple[float, float]) -> Entry:
+def scheme(solves: Solves, heading: str, electrode: str, degrees: tuple[float, float]) -> Entry:
+    """Figs. 4 and 7: the lines from an electrode between two angles."""
     sensor, (first, last) = solves.choices.sensor("three"), np.deg2rad(degrees)
     mapping = Mapping.lines(sensor, electrode, (first, last), length=solves.choices.length)
     figure, axes = new_axes(6.8, 6.8)
@@ -171,8 +162,14 @@ def fig_5(solves: Solves) -> Entry:
     ):
         _draw_mesh(axes, solves.shown)
         draw_electrodes(axes, solves.choices.sensor("three"), names=axes is near, ink="#2e6f9e")
-        axes.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", title=title)
-        axes.set(xlabel="x, mm", ylabel="y, mm")
+        axes.set(
+            xlim=(x - reach, x + reach),
+            ylim=(y - reach, y + reach),
+            xlabel="x, mm",
+            ylabel="y, mm",
+            aspect="equal",
+            title=title,
+        )
     errors.loglog(unknowns, 100.0 * error, "o-", color=FELT, label="ours, the shown press")
     errors.axhline(0.1, color=INK, lw=0.8, ls=":", label="0.1 %")
     errors.set_xticks(unknowns, [f"{n:,}" for n in unknowns])

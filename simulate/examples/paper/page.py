@@ -72,11 +72,12 @@ def page(entries: Sequence[Entry], choices: Choices, seconds: float) -> str:
     rows = [(entry.heading, *row) for entry in entries for row in entry.rows]
     parts = [INTRODUCTION, settings, "\n## Table\n", _table(("figure", *HEADS), rows)]
     for entry in entries:
-        parts.append(f"\n## {entry.heading}\n\n{entry.caption}")
-        if entry.figure is not None:
-            parts.append(f"\n![{entry.heading}: {entry.caption}]({entry.slug}.png)\n\n[as SVG]({entry.slug}.svg)")
-        else:
-            parts.append("\n" + _table(HEADS, entry.rows))
+        shown = (
+            _table(HEADS, entry.rows)
+            if entry.figure is None
+            else f"![{entry.heading}: {entry.caption}]({entry.slug}.png)\n\n[as SVG]({entry.slug}.svg)"
+        )
+        parts += [f"\n## {entry.heading}\n\n{entry.caption}", f"\n{shown}"]
     return "\n".join(parts) + "\n"
 
 

@@ -254,6 +254,16 @@ WRONG = [
         r"checksum_from: expected less than 14, inside the frame, got 14",
     ),
     ("length = 16", "length = 16\nchecksum_from = -1", r"checksum_from: expected a whole number from 0, got -1"),
+    *(
+        ('"crc-16/modbus"', f"{{{check}}}", said)
+        for check, said in [
+            ('width = 12, polynomial = "1021"', r"checksum\.width: expected one of 8, 16, 24, 32"),
+            ('width = 16, polynomial = "11021"', r"checksum\.polynomial: expected a number of 16 bits in hexadecimal"),
+            ('width = 16, polynomial = "x"', r"checksum\.polynomial: expected a number in hexadecimal"),
+            ('width = 16, poly = "1021"', r"checksum\.poly'"),
+            ('width = 16, polynomial = "1021", reflected = 1', r"checksum\.reflected: expected true or false"),
+        ]
+    ),
 ]
 
 
@@ -275,20 +285,3 @@ def test_wrong_descriptions(good, bad, said):
 def test_fields_that_make_no_frame(fields, said):
     with pytest.raises(DeviceError, match=said):
         layout(f'sync = "55"\nlength = 2\nfields = {fields}')
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"width": 12}, "width: expected one of 8, 16, 24, 32"),
-        ({"polynomial": "11021"}, "polynomial: expected a number of 16 bits in hexadecimal"),
-        ({"polynomial": "x"}, "polynomial: expected a number in hexadecimal"),
-        ({"poly": "1021"}, "unknown key 'frames.checksum.poly'"),
-        ({"reflected": 1}, "reflected: expected true or false"),
-    ],
-)
-def test_wrong_parameters_of_a_check(change, said):
-    check = {"width": 16, "polynomial": "1021"} | change
-    fields = [{"name": "A", "type": "u8"}]
-    with pytest.raises(DeviceError, match=said):
-        layout({"sync": "55", "length": 4, "checksum": check, "fields": fields})

@@ -212,27 +212,20 @@ def test_damage_of_one_percent_of_bytes(name):
 
 
 @pytest.mark.parametrize(
-    ("numbers", "counts", "flags"),
+    ("numbers", "modulus", "counts", "flags"),
     [
-        ((65534, 65535, 0, 1), (0, 0, 0), [()] * 4),
-        ((65530, 65533, 2, 2, 3, 0, 1), (2 + 4, 1, 1), [(), ("gap",), ("gap",), ("repeat",), (), ("restart",), ()]),
+        ((65534, 65535, 0, 1), (), (0, 0, 0), [()] * 4),
+        ((65530, 65533, 2, 2, 3, 0, 1), (), (2 + 4, 1, 1), [(), ("gap",), ("gap",), ("repeat",), (), ("restart",), ()]),
+        ((254, 255, 0, 3), (256,), (2, 0, 0), [(), (), (), ("gap",)]),
+        ((None, 5, None, 8), (), (2, 0, 0), [(), (), (), ("gap",)]),
     ],
+    ids=["wrap", "gaps, a repeat and a restart", "one byte", "some without a number"],
 )
-def test_sequence_gaps_repeats_and_restarts(numbers, counts, flags):
+def test_sequence_gaps_repeats_and_restarts(numbers, modulus, counts, flags):
+    """Numbers of two bytes, unless it is said otherwise."""
     gaps = SequenceGaps()
-    assert [gaps.update(seq) for seq in numbers] == flags
+    assert [gaps.update(seq, *modulus) for seq in numbers] == flags
     assert (gaps.lost, gaps.repeated, gaps.restarts) == counts
-
-
-def test_numbers_of_one_byte_wrap_at_256():
-    gaps = SequenceGaps()
-    assert [gaps.update(seq, 256) for seq in (254, 255, 0, 3)] == [(), (), (), ("gap",)]
-    assert gaps.lost == 2
-
-
-def test_no_number_is_no_gap():
-    gaps = SequenceGaps()
-    assert [gaps.update(None), gaps.update(5), gaps.update(None), gaps.update(6)] == [()] * 4
 
 
 def test_a_new_connection_is_no_gap():

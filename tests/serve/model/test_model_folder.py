@@ -163,12 +163,6 @@ def test_damaged_golden(own_model, spoil, said):
         load_model(own_model)
 
 
-def test_missing_golden(own_model):
-    (own_model / "golden.json").unlink()
-    with pytest.raises(ModelError, match=r"golden\.json: missing; a model comes with"):
-        load_model(own_model)
-
-
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [

@@ -119,5 +119,5 @@ def test_the_scheme_has_no_case(scheme):
 
 @pytest.mark.parametrize("header", [b"sesame", b"Basic sesame", b"Bearersesame", b"Bearer", b" Bearer sesame", b""])
 def test_other_schemes_do_not_count(header):
-    with pytest.raises(TokenError):
+    with pytest.raises(TokenError, match="`Authorization: Bearer TOKEN`"):
         Token("sesame").check(header)

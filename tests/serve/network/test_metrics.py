@@ -157,6 +157,7 @@ def test_metrics_are_behind_the_token(store):
     for headers, status in (([], 401), ([(b"authorization", b"Bearer no")], 401), (BEARER, 200)):
         answer = handler.answer("GET", "/metrics", headers, b"")
         assert (answer.status, b"isocharge_requests" in answer.body) == (status, status == 200)
+        assert dict(answer.headers).get(b"www-authenticate") == (b"Bearer" if status == 401 else None)
     again = handler.answer("GET", "/metrics", BEARER, b"").body
     assert b'isocharge_requests_total{route="/metrics",status="401",transport="http"} 2.0' in again
 

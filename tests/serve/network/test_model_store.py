@@ -22,6 +22,7 @@ from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.common.files import sha256_of
 from isocharge.serve.network.address import Token
 from isocharge.serve.network.grpc import grpc_server
+from isocharge.serve.network.grpc.service import SERVICE
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.describe import page
@@ -76,22 +77,15 @@ def a_pipe(version):
     os.mkfifo(version / "model.onnx")
 
 
-def six_gigabytes(version):
-    """Of which the disk has nothing."""
-    with (version / "model.onnx").open("r+b") as file:
-        file.truncate(6 << 30)
-
-
 FAULTS = {
     "cut": (lambda version: os.truncate(version / "model.onnx", 1000), "the file is damaged or changed"),
-    "half copied": (lambda version: (version / "golden.json").unlink(), "golden.json: missing"),
+    "half copied": (lambda version: (version / "golden.json").unlink(), "golden.json: missing; a model comes with"),
     "answers": (golden(lambda rows: rows[0].__setitem__(0, 9.0)), r"contact\[0, 0\] is .*golden.json says"),
     "unequal": (golden(lambda rows: rows.pop()), r"expected answers of shape \(8, 3\), got \(7, 3\)"),
     "no graph": (lambda version: put_in_place(version, b"no graph"), "cannot read these 8 bytes as a model"),
     "failing graph": (a_failing_graph, "the model's graph fails when it is run"),
     "nested": (lambda version: (version / "golden.json").write_text("[" * 100_000), "expected JSON"),
     "pipe": (a_pipe, "cannot be read .not a regular file"),
-    "sparse": (six_gigabytes, "cannot be read .larger than"),
 }
 
 
@@ -277,24 +271,29 @@ def test_messages_of_loggers_are_lines_too(lines):
     assert not any("sesame" in line for line in lines)
 
 
-def test_calls_of_grpc_are_lines(app, lines):
+def test_calls_of_grpc_are_lines(store, lines):
+    """About no model, about one by its name and version, without a tensor, and without the token."""
+    app = Handler(store, None, Traffic(RequestLog(lines.append, secret=SECRET)), Token(SECRET))
+    told, forged = ([("authorization", value)] for value in (f"Bearer {SECRET}", FORGED.replace("\n", " ")))
     with (
         grpc_server(app, "127.0.0.1", 0) as url,
         grpc.insecure_channel(url.removeprefix("grpc://")) as channel,
     ):
-        ready = channel.unary_unary("/inference.GRPCInferenceService/ServerReady")
-        infer = channel.unary_unary("/inference.GRPCInferenceService/ModelInfer")
-        ready(b"", timeout=20)
-        for metadata in ([("authorization", f"Bearer {SECRET}")], [("authorization", FORGED.replace("\n", " "))]):
+        ask = {name: channel.unary_unary(f"/{SERVICE}/{name}") for name in ("ServerReady", "ModelReady", "ModelInfer")}
+        ask["ServerReady"](b"", timeout=20)
+        ask["ModelReady"](b"\x0a\x06linear\x12\x011", metadata=told, timeout=20)
+        for metadata in (told, forged):
             with pytest.raises(grpc.RpcError):
-                infer(b"\x0a\x06linear", metadata=metadata, timeout=20)  # the model's name and no tensor
+                ask["ModelInfer"](b"\x0a\x06linear", metadata=metadata, timeout=20)
     said = [(line["route"], line["status"], line["model"], line["error"]) for line in map(json.loads, lines)]
     assert said == [
         ("ServerReady", "OK", None, None),
-        ("ModelInfer", "INVALID_ARGUMENT", "linear/1", "RequestError"),
+        ("ModelReady", "OK", "linear/1", None),
+        ("ModelInfer", "INVALID_ARGUMENT", "linear/2", "RequestError"),
         ("ModelInfer", "UNAUTHENTICATED", None, "TokenError"),
     ]
-    assert all(json.loads(line)["client"].startswith("ipv4:127.0.0.1:") for line in lines)
+    assert {json.loads(line)["client"][:15] for line in lines} == {"ipv4:127.0.0.1:"}
+    assert all(0 < json.loads(line)["duration_us"] < 20e6 for line in lines)
     assert not any("sesame" in line for line in lines)
 
 

@@ -154,12 +154,6 @@ def _unshared(press, session, electrodes):  # noqa: ARG001
     press.columns = {"contact": slice(0, 3), "contact_std": slice(3, 6), "misfit": slice(6, 7)}
 
 
-def test_a_predictor_tells_whether_to_trust_a_contact(film, predictor):
-    inside, outside = film.charge_pC([1.0, 9.0], [0.5, 0.0], [1.0, 0.5])
-    assert predictor.flags(predictor.predict(inside)) == ()
-    assert predictor.flags(predictor.predict(outside)) == ("outside",)
-
-
 @pytest.mark.parametrize("place", [(200.0, 0.0), (0.0, 200.0), (150.0, -150.0)])
 def test_what_is_far_from_the_film_is_no_measurement(models, film, caplog, place):
     Predictor("linear", models=models).predict(film.charge_pC(*np.array([[*place, 1.0]]).T)[0])
@@ -168,7 +162,8 @@ def test_what_is_far_from_the_film_is_no_measurement(models, film, caplog, place
 
 def test_what_is_no_measurement_is_said_once(models, film, caplog):
     predictor = Predictor("linear", models=models)
-    predictor.predict(film.charge_pC([0.0], [0.0], [5.9])[0])
+    presses = film.charge_pC([0.0, 0.0], [0.0, 0.0], [1.0, 5.9])
+    assert [predictor.flags(predictor.predict(charge_pC)) for charge_pC in presses] == [(), ("outside",)]
     assert caplog.messages == []
     assert predictor.flags(predictor.predict([9e9, 9e9, 9e9])) == ("outside", "beyond")
     predictor.predict([9e9, 9e9, 9e9])
@@ -216,12 +211,6 @@ def test_a_model_with_correlations_gives_them_behind_the_seven_numbers():
     np.testing.assert_array_equal(seven, expected[:7])
     assert touch.predict(charges[0]) == tuple(expected.tolist())
     assert touch.predict(charges[0]).fields()["xF_correlation"] == expected[8]
-
-
-def test_correlations_that_a_model_does_not_give_are_none_in_a_record(predictor):
-    contact = predictor.predict([100.0, 100.0, 100.0])
-    assert math.isnan(contact.xy_correlation)
-    assert [contact.fields()[name] for name in Contact._fields[7:]] == [None, None, None]
 
 
 def test_a_predictor_is_shown_with_its_domain(predictor):

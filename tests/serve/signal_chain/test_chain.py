@@ -73,37 +73,29 @@ def test_second_tare_never_gives_up():
     assert tared.index(True) == 220
 
 
-def touches(totals, rule=None, noise=ONE_PC):
+THRESHOLD_PC = 10.0 + 6.0 * np.sqrt(3.0)
+
+
+@pytest.mark.parametrize(
+    ("totals", "noise", "expected"),
+    [
+        ([THRESHOLD_PC - 0.1, THRESHOLD_PC + 0.1], ONE_PC, [0, 1]),
+        ([9.9, 10.1], 0.0 * ONE_PC, [0, 1]),
+        ([15.0, 25.0, 15.0, 11.0, 9.0, 15.0], ONE_PC, [0, 1, 1, 1, 0, 0]),
+        ([1000.0, 4000.0, 4000.0, 201.0, 199.0], ONE_PC, [1, 1, 1, 1, 0]),
+        # an absolute release threshold under the drift of 60 pC never would release
+        ([2060.0, 2060.0, 60.0, 62.0, 58.0, 60.0, 75.0, 79.0], ONE_PC, [1, 1, 0, 0, 0, 0, 0, 1]),
+        # one absurd frame, at the first touch too, neither releases the press nor hides it
+        *(([*before, 3e38, *[850.0] * 4], ONE_PC, [1] * (len(before) + 5)) for before in ([], [850.0], [850.0] * 5)),
+    ],
+    ids=["floor and noise", "floor", "hysteresis", "share of the peak", "drifted base", *["spike"] * 3],
+)
+def test_touches_begin_and_end(totals, noise, expected):
     touch, seen = Touch(), []
     for total in totals:
-        touch = update_contact(rule or TouchRule(), touch, total, noise)
+        touch = update_contact(TouchRule(), touch, total, noise)
         seen.append(touch.contact)
-    return seen
-
-
-def test_touch_threshold_is_floor_plus_noise():
-    threshold = 10.0 + 6.0 * np.sqrt(3.0)
-    assert touches([threshold - 0.1, threshold + 0.1]) == [False, True]
-    assert touches([9.9, 10.1], noise=np.zeros(3)) == [False, True]
-
-
-def test_hysteresis():
-    assert touches([15.0, 25.0, 15.0, 11.0, 9.0, 15.0]) == [False, True, True, True, False, False]
-
-
-@pytest.mark.parametrize("before", [[], [850.0], [850.0] * 5])
-def test_spike_is_no_peak(before):
-    """One absurd frame, at the first touch too, neither releases the press nor hides it."""
-    assert touches([*before, 3e38, *[850.0] * 4])[-4:] == [True] * 4
-
-
-def test_release_at_a_share_of_the_peak():
-    assert touches([1000.0, 4000.0, 4000.0, 201.0, 199.0]) == [True, True, True, True, False]
-
-
-def test_drifted_base_releases_and_is_no_new_touch():
-    """An absolute release threshold under the drift of 60 pC never would release."""
-    assert touches([2060.0, 2060.0, 60.0, 62.0, 58.0, 60.0, 75.0, 100.0]) == [True] * 2 + [False] * 5 + [True]
+    assert seen == expected
 
 
 def test_smallest_press_is_detected_at_once():

@@ -50,11 +50,6 @@ def test_warming_that_is_inseparable_from_force_is_not_subtracted():
     assert state.blind
 
 
-def test_warming_of_a_quiet_film_stays_small():
-    estimates, _ = warmed(UNIAXIAL, np.zeros(400))
-    assert np.abs(estimates).max() < 5.0
-
-
 def test_charge_and_slope_are_estimated_by_a_kalman_filter():
     """Of a slope that decays and walks at random, so that the charge changes by `wander_pC` in a second, in matrices;
     the misfit weighs the sum of its direction's parts."""

@@ -184,9 +184,10 @@ def test_records_carry_it_beside_the_answer_of_the_frame_and_repeat_bit_for_bit(
     assert [json.loads(line)["event"] for line in first].count("press") == 1
     assert json.loads(first[40])["event"] == "tap"
     for mine, theirs in zip(map(json.loads, first), map(json.loads, plain), strict=True):
-        tracked, _ = mine.pop("tracked"), mine.pop("event")
+        tracked, *none = (mine.pop(name) for name in ("tracked", "other", "event"))
         assert mine == theirs
         assert (tracked is None) == (not mine["contact"])
+        assert none[0] is None
     assert abs(json.loads(first[39])["tracked"]["x_mm"] - 2.0) < 0.05
 
 

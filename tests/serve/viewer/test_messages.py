@@ -110,9 +110,11 @@ def test_what_no_float32_holds_is_clipped(record):
 
 def test_a_contact_that_is_followed_is_shown_in_place_of_the_frames(record):
     followed = record(x_mm=1.0, misfit=0.5, xy_correlation=0.25, follows=True, tracked={"x_mm": 2.0, "x_std_mm": 0.01})
+    followed = followed._replace(other={"x_mm": 5.0, "y_mm": -1.0, "force_N": 1.0, "probability": 0.25})
     sample = np.frombuffer(FORM.pack(followed), FORM.dtype)[0]
     assert (sample["x_mm"], sample["misfit"], sample["xy_correlation"]) == (2.0, 0.5, 0.25)
     assert sample["x_std_mm"] == np.float32(0.01)
+    assert (sample["other_x_mm"], sample["other_y_mm"]) == (5.0, -1.0)
 
 
 def test_electrodes_are_drawn_where_they_lie(film):
@@ -197,6 +199,7 @@ def test_the_page_reads_what_the_server_writes(record):
         "y_mm": 2.5,
         "flags": ("gap", "misfit"),
         "latency_us": 9.0,
+        "other": {"x_mm": 5.0, "y_mm": -1.5},
     }
     data = form.pack(record(**changes)) + form.pack(record(contact=False, x_mm=None, flags=()))
     message = samples_message(77, 123.5, np.frombuffer(data, form.dtype), 4, begin_anew=True)
@@ -211,6 +214,7 @@ def test_the_page_reads_what_the_server_writes(record):
     assert (whole["number"], whole["sent_s"], whole["missed"], whole["beginsAnew"]) == (77, 123.5, 4, True)
     first, second = whole["samples"]
     expected = {"charges": [1.5, None, -3.0], "contact": True, "y": 2.5, "t": 1763600000.1234567, "latency": 9.0}
+    expected |= {"otherX": 5.0, "otherY": -1.5}
     assert expected.items() <= first.items()
     assert bin(first["bits"]).count("1") == 2
     assert {"contact": False, "x": None, "bits": 0}.items() <= second.items()

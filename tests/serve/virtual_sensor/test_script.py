@@ -35,16 +35,6 @@ def test_wander_depends_on_the_seed_alone():
 
 
 @pytest.mark.parametrize(
-    ("t_s", "is_silent"), [(0.0, False), (0.5, False), (2.0, True), (2.4, True), (2.5, False), (4.1, True)]
-)
-def test_faults_recur_and_the_first_comes_after_one_period(t_s, is_silent):
-    gap, unplugged = Faults(gap_every_s=2.0, gap_s=0.5), Faults(unplug_every_s=2.0, unplug_s=0.5)
-    assert gap.is_silent(t_s) == unplugged.is_silent(t_s) == unplugged.is_unplugged(t_s) == is_silent
-    assert not gap.is_unplugged(t_s)
-    assert not Faults().is_silent(t_s)
-
-
-@pytest.mark.parametrize(
     ("make", "message"),
     [
         *(

@@ -81,6 +81,7 @@ def test_forward_map_that_is_refused(charges):
 def test_silence_comes_when_asked(film, faults, silent):
     frames = sent(VirtualSensor(film.charges, steady(rate_Hz=512.0), faults=faults), 300)
     assert [k for k, frame in enumerate(frames) if frame is None] == silent
+    assert [k for k in range(300) if faults.is_unplugged(k / 512.0)] == (silent if faults.unplug_every_s else [])
 
 
 def test_clock_drift(film):

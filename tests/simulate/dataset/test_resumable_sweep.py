@@ -103,13 +103,6 @@ def test_a_draft_of_other_settings_is_left_alone(stopped, whole, changes, messag
     assert files(sweep_to(stopped)) == whole[0]
 
 
-def test_fresh_throws_the_draft_away(stopped, whole):
-    executor = Counting()
-    sweep_to(stopped, shard=20, fresh=True, executor=executor)
-    assert executor.jobs == whole[1] - 3  # all of them, in half as many shards
-    assert not draft_of(stopped).exists()
-
-
 @pytest.mark.parametrize(("content", "fresh"), [(None, True), ("{", False)])
 def test_a_folder_in_the_way_is_left_alone(tmp_path, content, fresh):
     """Somebody's own folder, or a draft that cannot be recognised as one."""

@@ -5,6 +5,7 @@ The energy is a polynomial of degree four in the nodal values, so five-point dif
 
 import numpy as np
 import pytest
+from tests.simulate.conftest import assembled
 
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
@@ -24,20 +25,10 @@ def elastic(request, mesh) -> ElasticFilm:
     return ElasticFilm(mesh.geometry, request.param)
 
 
-def dense(mesh, matrix: np.ndarray) -> np.ndarray:
-    """The whole matrix (n_node, components, n_node, components) from element matrices, entry by entry."""
-    components, n_node = matrix.shape[2], mesh.template.n_node
-    unknown = (components * mesh.template.nodes[..., None] + np.arange(components)).reshape(len(matrix), -1)
-    whole = np.zeros((components * n_node, components * n_node))
-    for numbers, block in zip(unknown, matrix.reshape(len(matrix), unknown.shape[1], -1), strict=True):
-        whole[np.ix_(numbers, numbers)] += block
-    return whole.reshape(n_node, components, n_node, components)
-
-
 def condensed(mesh, matrix: np.ndarray) -> np.ndarray:
-    """The same over (U1, U2, W) alone: the Schur complement of the carried Laplacian; (3 n_node, 3 n_node)."""
-    whole = dense(mesh, matrix)
-    size = 3 * mesh.template.n_node
+    """The whole matrix over (U1, U2, W) alone: the Schur complement of the carried Laplacian; (3 n_node, 3 n_node)."""
+    n_node, size = mesh.template.n_node, 3 * mesh.template.n_node
+    whole = assembled(mesh.template, matrix).reshape(n_node, -1, n_node, matrix.shape[2])
     first = whole[:, :3, :, :3].reshape(size, size)
     if matrix.shape[2] == 3:
         return first

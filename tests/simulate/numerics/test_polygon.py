@@ -45,11 +45,6 @@ def test_area_and_centroid_add_up(z):
     assert not is_convex(whole[::-1])
 
 
-def test_convexity_excludes_a_dent_and_a_star():
-    dart, star, twice = np.array([0, 2, 0.5 + 0.5j, 2j]), np.exp(0.8j * np.pi * np.arange(5)), np.array([0, 1, 1, 1j])
-    assert [is_convex(corners_of(z)) for z in (dart, star, twice)] == [False] * 3
-
-
 @given(a=convex(), b=convex())
 @COMMON
 def test_shared_area_is_symmetric_bounded_and_additive(a, b):

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import truncnorm
 
 from isocharge.common.errors import SceneError, SensorError
-from isocharge.simulate import Circle, Electrode, FilmPrior, load_sensor, virtual_film
+from isocharge.simulate import Circle, Electrode, FilmPrior, load_sensor
 from isocharge.simulate.sensor.film_prior import FilmSpread
 
 PRIOR = FilmPrior(load_sensor("four-25um-uniaxial"), Circle(1.0))
@@ -37,11 +37,6 @@ def test_a_parameter_changes_what_its_name_says():
     sensor, probe = PRIOR.film(parameters)
     assert (sensor.film.young, *sensor.gains) == pytest.approx((3300.0, 1.0, 1.0, 0.9, 1.0))
     assert (sensor.calibration.shift, probe) == ((0.0, 0.2), Circle(1.1))
-
-
-def test_a_virtual_film_is_drawn_by_its_seed():
-    first, again, other = (virtual_film(PRIOR.sensor, PRIOR.probe, seed) for seed in (5, 5, 6))
-    assert first == again != other
 
 
 @pytest.mark.parametrize(

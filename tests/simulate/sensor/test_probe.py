@@ -100,6 +100,8 @@ CORNERS = "expected 3 to 64 corners"
         (Polygon.of, HOUSE[::-1], r"convex polygon with its corners anticlockwise, got \[\["),
         (Polygon.of, np.array([(0, 0), (2, 0), (0.5, 0.5), (0, 2)]), "convex polygon"),
         (Polygon.of, np.array([(0, 0), (1, 0), (2, 0), (0, 1)]), "convex polygon"),
+        (Polygon.of, np.array([(0, 0), (1, 0), (1, 0), (0, 1)]), "convex polygon"),
+        (Polygon.of, np.array([(np.cos(a), np.sin(a)) for a in 0.8 * np.pi * np.arange(5)]), "convex polygon"),
         (Polygon.of, HOUSE[:2], CORNERS),
         (Polygon.of, np.array([(0, 0), (1, 0), (np.nan, 1)]), CORNERS),
         (Polygon.of, np.stack([np.cos(np.arange(65) / 11), np.sin(np.arange(65) / 11)], axis=1), CORNERS),

@@ -125,12 +125,6 @@ def test_optional_keys_may_be_left_out():
     assert (sensor.piezo.d33, sensor.piezo.pyro, sensor.calibration) == (0.0, 0.0, Calibration())
 
 
-def test_polygons_need_no_side():
-    table = whole() | {"readout": "area", "electrodes": {"T": {"polygon_mm": [[-12, 4], [-8, 4], [-10, 8.0]]}}}
-    table["calibration"] = {}
-    assert sensor_from_dict(table).electrodes == (Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0))),)
-
-
 def test_traces_and_metal_of_the_back_arrive():
     """A trace is written as the polygon that it is."""
     pad, back = ((8.0, 0.0), (12.0, 0.0), (10.0, 4.0)), (((0.0, -9.0), (9.0, -9.0), (9.0, 9.0), (0.0, 9.0)),)
@@ -234,20 +228,6 @@ def test_one_electrode_gets_a_warning(tmp_path, command, caplog):
     code, out, err = command("simulate", "point", path, "--at", "1,2", "--json")
     assert (code, json.loads(out)["status"]) == (0, "converged")
     assert said in err
-
-
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (b"[film\nradius_mm = 45", "not a TOML file: .*line 1"),
-        (b"\xff\xfe\x00name", "not a TOML file: not text"),
-    ],
-)
-def test_file_that_is_not_toml(tmp_path, data, message):
-    path = tmp_path / "mine.toml"
-    path.write_bytes(data)
-    with pytest.raises(SensorError, match=rf"^{path}: {message}"):
-        load_sensor(path)
 
 
 @pytest.mark.timeout(20)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.simulate.conftest import assembled
 
 from isocharge.simulate import Resolution
 from isocharge.simulate.mechanics.energy import ElasticFilm
@@ -10,16 +11,6 @@ from isocharge.simulate.mesh.template import Template, template
 from isocharge.simulate.solver.assembly import Assembly
 
 SMALL = ((Resolution(2, 8, 1), 0), (Resolution(3, 8, 2, 1), 0), (Resolution(3, 8, 1), 3), (Resolution(2, 8, 1, 2), 4))
-
-
-def assembled(mesh: Template, matrix: np.ndarray) -> np.ndarray:
-    """The whole matrix, entry by entry, no cleverness."""
-    components = matrix.shape[2]
-    unknown = (components * mesh.nodes[..., None] + np.arange(components)).reshape(mesh.n_element, -1)
-    dense = np.zeros((components * mesh.n_node, components * mesh.n_node))
-    for numbers, block in zip(unknown, matrix.reshape(mesh.n_element, unknown.shape[1], -1), strict=True):
-        dense[np.ix_(numbers, numbers)] += block
-    return dense
 
 
 def dense_solution(mesh: Template, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:

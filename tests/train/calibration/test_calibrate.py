@@ -341,6 +341,10 @@ IMPOSSIBLE = {
     "negative": (lambda c, q: (c, q * [1.0, -1.0, 1.0, 1.0]), "electrode 'B': 12 of its 12 charges are negative"),
     "missing": (lambda c, q: (c, np.where(np.arange(4) == 3, np.nan, q)), "electrode 'D': no press has a charge"),
     "too strong": (lambda c, q: (c * [1.0, 1.0, 100.0], q), "most of them lie outside"),
+    "mixed up": (
+        lambda c, q: (c, q[::-1]),
+        "no film of 'four-25um-biaxial' explains these 12.*is it this layout and this",
+    ),
 }
 
 
@@ -367,15 +371,6 @@ def test_presses_that_cannot_be_are_refused_with_the_reason(problem, name):
     _, presses = rig(problem, 12, seed=7)
     with pytest.raises(PressError, match=reason):
         calibrate(presses_of(problem, *mistake(presses.contact, presses.charge_pC)), problem)
-
-
-def test_what_no_film_explains_is_refused(problem):
-    """Rows that were mixed up."""
-    _, presses = rig(problem, 2, seed=7)
-    with pytest.raises(
-        PressError, match=r"no film of 'four-25um-biaxial' explains these 2.*is it this layout and this"
-    ):
-        calibrate(replace(presses, charge_pC=presses.charge_pC[::-1]), problem)
 
 
 def test_proposed_presses_tell_more_than_random_ones(problem):
@@ -418,10 +413,7 @@ def test_an_earlier_calibration_is_the_prior_of_the_next(warmed, problem):
     rng = np.random.default_rng(10)
     at = draw_contacts(rng, problem.domain, 3)
     presses = presses_of(problem, at, problem.noise.add(problem.charges.charges(truth, at), rng))
-    result = calibrate(presses, again)
-    assert result.left.position_mm < 0.7 * calibrate(presses, problem).left.position_mm
-    pretension = result.quantities["pretension_MPa"]
-    assert abs(pretension.value - truth[0]) < 4.0 * pretension.std
+    assert calibrate(presses, again).left.position_mm < 0.7 * calibrate(presses, problem).left.position_mm
 
 
 NOBODY_KNOWS = (np.nan, np.nan, np.nan)

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -160,10 +159,3 @@ def test_presses_are_proposed_before_the_first(command):
     proposed = json.loads(command(*CALIBRATE, "--next", 3, "--json")[1])["next"]
     assert [*proposed[0]] == ["x_mm", "y_mm", "force_N", "position_mm", "force_percent"]
     assert proposed[2]["position_mm"] < proposed[0]["position_mm"]
-
-
-def test_a_refused_file_leaves_no_folder(film, tmp_path, refused):
-    presses = film[1].presses
-    write_presses(tmp_path / "m.csv", replace(presses, contact=presses.contact / [1e3, 1e3, 1.0]))
-    refused(*CALIBRATE, tmp_path / "m.csv", "-o", tmp_path / "film", said="were they written in metres")
-    assert not (tmp_path / "film").exists()

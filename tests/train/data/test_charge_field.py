@@ -8,6 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from isocharge.common.errors import DatasetError, TrainingError
+from isocharge.serve.model.charge_series import read_charges
 from isocharge.simulate import Domain, Electrode, Sweep, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.forward.charge_map import differences
@@ -17,6 +18,7 @@ from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, relea
 from isocharge.train.data.charge_field import ChargeField, invertible_domain
 from isocharge.train.data.misfit_charges import draw_misfit_examples
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
+from isocharge.train.training.source import TrainingData
 
 DOMAIN = Domain(8.0, (0.05, 2.0))
 
@@ -130,6 +132,20 @@ def test_a_fit_across_a_fold_is_in_log_card_and_metadata(film, sensor, tmp_path,
     assert "seems to fold about 0." in caution or "seems to fold about 1." in caution
     assert model.metadata.made_with["cautions"] == [caution]
     assert f"- {caution}." in (model.folder / "card.md").read_text("utf-8")
+
+
+def test_where_the_map_folds_for_certain_the_charges_of_all_contacts_go_beside_the_model(sensor, trained, tmp_path):
+    contact = draw_contacts(np.random.default_rng(0), DOMAIN, 3000)
+    presses = LabelledPresses(contact, 1000.0 * folded_at(5.0)(*contact.T))
+    data = TrainingData(sensor=sensor, probes=("circle:1.0",), domain=DOMAIN, presses=presses, sha256="0" * 64)
+    fitted = fit(data, TINY)
+    (tmp_path / "charges.npz").write_bytes(fitted.provenance.files["charges.npz"])
+    known = read_charges(tmp_path, 3)
+    charge, _ = known.linearised(np.column_stack([contact[:, :2], np.log(contact[:, 2])]))
+    assert np.allclose(charge, presses.charge, rtol=2e-3)
+    assert fitted.domain.radius < 5.2 < known.radius_mm
+    assert "'serve stream --track' follows contacts to 8 mm" in fitted.cautions[0]
+    assert trained.split.folded is None
 
 
 NOISE = noise_model("reference")

@@ -122,17 +122,22 @@ def test_what_is_linear_in_the_logarithms_is_corrected_exactly(films, drawn):
     np.testing.assert_allclose(np.hstack(found[::2]), np.hstack(expected[::2]), rtol=1e-6)
 
 
+NO_FILM = r"expected 13 finite parameters \(pretension, young"
+
+
 @pytest.mark.parametrize(
-    "parameters", [np.zeros(3), np.full(13, np.nan), np.zeros((2, 13))], ids=["few", "not finite", "two films"]
+    ("parameters", "error", "message"),
+    [
+        (np.zeros(3), InputError, NO_FILM),
+        (np.full(13, np.nan), InputError, NO_FILM),
+        (np.zeros((2, 13)), InputError, NO_FILM),
+        (np.append(20.0, np.zeros(12)), SceneError, r"tension .* is outside the family"),
+    ],
+    ids=["few", "not finite", "two films", "outside"],
 )
-def test_what_is_no_film_is_refused(films, parameters):
-    with pytest.raises(InputError, match=r"expected 13 finite parameters \(pretension, young"):
+def test_what_is_no_film_is_refused(films, parameters, error, message):
+    with pytest.raises(error, match=message):
         films.film(parameters)
-
-
-def test_a_film_outside_the_family_is_named(films):
-    with pytest.raises(SceneError, match=r"tension .* is outside the family"):
-        films.film(np.concatenate([[20.0], films.prior.mean[1:]]))
 
 
 def test_a_film_becomes_a_served_model(films, random_films, drawn, tmp_path):

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
-from itertools import count, islice
+from itertools import chain, count, islice
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -32,9 +32,8 @@ from isocharge.simulate.plots.film import (
     draw_charge_map,
     draw_deflection,
     draw_electrodes,
+    draw_layout,
     draw_section,
-    draw_working_area,
-    frame_film,
 )
 from isocharge.train import fit, load_config, release
 
@@ -129,9 +128,8 @@ def _step(name: str, description: str, durations_s: dict[str, float]) -> Iterato
 
 def _free_name(base: Path) -> Path:
     """`base`, or the first of base-2, base-3, ... that does not exist."""
-    if not base.exists():
-        return base
-    return next(path for path in (base.with_name(f"{base.name}-{k}") for k in count(2)) if not path.exists())
+    further = (base.with_name(f"{base.name}-{k}") for k in count(2))
+    return next(path for path in chain([base], further) if not path.exists())
 
 
 def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, StreamTotals]:
@@ -250,16 +248,11 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
     maps = bottom.subplots(1, count + 1, width_ratios=(*(1.0,) * count, 1.25))
     for number, (axes, name) in enumerate(zip(maps, forward_map.electrodes, strict=False)):
         draw_charge_map(axes, forward_map, number)
-        draw_electrodes(axes, forward_map.sensor, highlight=name)
-        _frame(axes, forward_map, f"isocharge contours of {name} at 1 N, pC")
+        title = f"isocharge contours of {name} at 1 N, pC"
+        draw_layout(axes, forward_map.sensor, forward_map.domain.radius, title, highlight=name)
     _error_against_force(maps[-1], tested[:, 2], np.hypot(*(tested[:, 3:5] - tested[:, :2]).T))
     figure.suptitle(f"isocharge demo: {forward_map.sensor.name}, {forward_map.probe.notation}", fontsize=14)
     save_picture(figure, path)
-
-
-def _frame(axes: Any, forward_map: ForwardMap, title: str) -> None:
-    draw_working_area(axes, forward_map.domain.radius)
-    frame_film(axes, forward_map.sensor, forward_map.domain.radius, title)
 
 
 def _path(axes: Any, forward_map: ForwardMap, followed: Array) -> None:
@@ -269,8 +262,7 @@ def _path(axes: Any, forward_map: ForwardMap, followed: Array) -> None:
         axes.plot(*frames[:, 1:3].T, color=PRESSED, lw=3.0, solid_capstyle="round", label=labels[0])
         axes.plot(*frames[:, 4:6].T, color=FELT, lw=0.7, label=labels[1])
     axes.legend(loc="upper right")
-    draw_electrodes(axes, forward_map.sensor)
-    _frame(axes, forward_map, "live path, through the port")
+    draw_layout(axes, forward_map.sensor, forward_map.domain.radius, "live path, through the port")
 
 
 def _error_against_force(axes: Any, force: Array, error: Array) -> None:
@@ -280,6 +272,5 @@ def _error_against_force(axes: Any, force: Array, error: Array) -> None:
         line = binned_statistic(force, error, partial(np.percentile, q=share), edges).statistic
         axes.plot(np.sqrt(edges[:-1] * edges[1:]), line, style, color=FELT, label=label)
     axes.legend()
-    axes.set(title="position error of test presses", xlabel="force, N", ylabel="error, mm")
-    axes.set_ylim(bottom=2e-3)
+    axes.set(title="position error of test presses", xlabel="force, N", ylabel="error, mm", ylim=(2e-3, None))
     axes.grid(alpha=0.3, which="both")

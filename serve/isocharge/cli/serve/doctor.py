@@ -139,8 +139,7 @@ def port_lines() -> Iterator[str]:
 
 def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
     """Names of the models with as many electrodes; those that cannot be read are left out."""
-    names = dict.fromkeys(name for root in repositories(models) for name in model_names(root))
-    for name in names:
+    for name in dict.fromkeys(name for root in repositories(models) for name in model_names(root)):
         with suppress(IsochargeError):
             if len(Predictor(name, models=models).metadata.electrodes) == electrodes:
                 yield name
@@ -175,10 +174,8 @@ def _write(path: Path, examination: Examination) -> None:
         write_whole(path, device_text(examination).encode())
     except OSError as error:
         raise InputError(f"--write {path}: cannot be written ({error.strerror}); choose another path") from error
-    if examination.works:
-        say(f"{path} written; use it with: isocharge serve stream MODEL --port {examination.url} --device {path}")
-    else:
-        say(f"{path} written; it gives no touches yet: put in what is missing above")
+    use = f"use it with: isocharge serve stream MODEL --port {examination.url} --device {path}"
+    say(f"{path} written; {use if examination.works else 'it gives no touches yet: put in what is missing above'}")
 
 
 def report_lines(examination: Examination) -> Iterator[str]:
@@ -203,7 +200,9 @@ def report_lines(examination: Examination) -> Iterator[str]:
         figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
         digits = (5, 6, 5, 5, 5) if examination.unit == "V" else (2, 3, 2, 2, 2)
         columns = zip(figures, (12, 11, 12, 10, 10), digits, strict=True)
-        yield f"{channel.name:8.8s}" + "".join(_column(*column) for column in columns)
+        yield f"{channel.name:8.8s}" + "".join(
+            f"{'?' if figure is None else f'{figure:.{digits}f}':>{width}s}" for figure, width, digits in columns
+        )
     if examination.held:
         yield examination.held
     yield "missing to get a touch: nothing" if not examination.missing else "missing to get a touch:"
@@ -211,7 +210,3 @@ def report_lines(examination: Examination) -> Iterator[str]:
 
 
 _HEAD = "channel    offset pC   noise pC  drift pC/s  50 Hz pC  60 Hz pC"
-
-
-def _column(figure: float | None, width: int, digits: int) -> str:
-    return f"{'?' if figure is None else f'{figure:.{digits}f}':>{width}s}"

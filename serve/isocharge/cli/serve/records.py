@@ -75,11 +75,14 @@ Lines = Callable[[PredictionRecord, str], None]
 """Called with each record and its line of JSON."""
 
 
-def write_records(records: Iterable[tuple[PredictionRecord, str]], write: Lines, latencies: deque[float]) -> None:
-    """Write records as they come, announce each new tare, and remember the latencies."""
+def write_records(
+    records: Iterable[tuple[PredictionRecord, str]], writers: Iterable[Lines], latencies: deque[float]
+) -> None:
+    """Give records as they come to one writer after the other, announce each new tare, and remember the latencies."""
     tare = None
     for record, line in records:
-        write(record, line)
+        for write in writers:
+            write(record, line)
         if record.tare_pC != tare:
             tare = record.tare_pC
             if tare is not None:
@@ -160,16 +163,6 @@ class McapOutput:
             self._file.give_up(failure)
         if self._queue.lost:
             say(f"{self._file.path}: {self._queue.lost} records not written, the oldest: the disk was too slow")
-
-
-def in_turn(*writers: Lines) -> Lines:
-    """What hands each record, with its line of JSON, to one writer after the other."""
-
-    def write_all(record: PredictionRecord, line: str) -> None:
-        for write in writers:
-            write(record, line)
-
-    return write_all
 
 
 def summary(touch: TouchStream, latencies: deque[float], unwritten: int = 0) -> str:

@@ -20,7 +20,6 @@ from isocharge.cli.serve.records import (
     OutputOption,
     UdpOption,
     WaitOption,
-    in_turn,
     record_writer,
     summary,
     write_records,
@@ -56,7 +55,6 @@ from isocharge.serve.export.record_messages import RecordEncoding
 from isocharge.serve.live.device import with_settings
 from isocharge.serve.live.outputs import LineQueue
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
-from isocharge.serve.port.recording import Marker
 
 LONGEST_NAME = 100
 """Characters of a film's name."""
@@ -127,7 +125,7 @@ def stream_command(
         bool,
         typer.Option(
             "--track",
-            help="Follow contacts in time: records get `tracked` and `event`, as by [track]. (default: off)",
+            help="Follow contacts in time: records get `tracked`, `event` and `other`, as by [track]. (default: off)",
         ),
     ] = False,
     follow: Annotated[
@@ -166,10 +164,11 @@ def stream_command(
         stack.enter_context(until_stopped())
         page = None
         if address is not None:
-            shown = live_page(address, token, path.frame_id, predictor.metadata, find_model(model, models))
-            page = stack.enter_context(shown)
-        opened = open_source(port, baud=baud, reconnect=reconnect, request=board.request, wait=wait)
-        source = stack.enter_context(opened)
+            folder = find_model(model, models)
+            page = stack.enter_context(live_page(address, token, path.frame_id, predictor.metadata, folder))
+        source = stack.enter_context(
+            open_source(port, baud=baud, reconnect=reconnect, request=board.request, wait=wait)
+        )
         stack.enter_context(on_signal(signal.SIGUSR1, recorded.request_tare))
         stack.enter_context(on_signal(signal.SIGUSR2, recorded.request_back))
         renew = partial(recorded.request_model, partial(_load, model, models))
@@ -177,23 +176,23 @@ def stream_command(
         stack.enter_context(stop_after(seconds))
         lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
         put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
-        write = record_writer(stack, output, udp, predictor.metadata.electrodes, put, path.fields)
+        writers = [record_writer(stack, output, udp, predictor.metadata.electrodes, put, path.fields)]
         if page is not None:
             header = None if recorder else (policy.value, board.table, name)
             stack.enter_context(answering(page, recorded, header))
             feed = PageFeed(page, path, recorded)
-            write = in_turn(write, lambda record, _: feed.put(record))
+            writers.append(lambda record, _: feed.put(record))
         mcap_output = None
         if mcap is not None:
             mcap_output = McapOutput(mcap, predictor.metadata.electrodes, mcap_records, source.is_live)
             put_line = stack.enter_context(mcap_output).put
-            write = in_turn(lambda _, line: put_line(line), write)
+            writers.insert(0, lambda _, line: put_line(line))
         if recorder:
             stack.enter_context(recorder)
         records = stack.enter_context(closing(recorded.follow(source)))  # closed before the recorder
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
-            write_records(islice(records, count), write, latencies)
+            write_records(islice(records, count), writers, latencies)
         finally:
             lines.close()
             say(summary(path, latencies, lines.lost))
@@ -245,22 +244,20 @@ def replay_command(
     latencies: deque[float] = deque(maxlen=LATENCIES)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
-        write = record_writer(stack, output, None, predictor.metadata.electrodes, stdout_writer(), path.fields)
+        writers = [record_writer(stack, output, None, predictor.metadata.electrodes, stdout_writer(), path.fields)]
         file_output = stack.enter_context(ExitStack())
         if mcap is not None:
-            write = in_turn(_mcap_writer(file_output, mcap, mcap_records, predictor.metadata.electrodes), write)
+            writers.insert(0, _mcap_writer(file_output, mcap, mcap_records, predictor.metadata.electrodes))
         if address is None:
-            write_records(played(), write, latencies)
+            write_records(played(), writers, latencies)
         else:
             folder = find_model(model or recording.model, models)
-            page = live_page(address, token, file.name, predictor.metadata, folder, is_recording=True)
-            link = stack.enter_context(page)
+            link = stack.enter_context(
+                live_page(address, token, file.name, predictor.metadata, folder, is_recording=True)
+            )
             feed = PageFeed(link, path)
-
-            def mark(marker: Marker) -> None:
-                link.tell(marker=[*marker])
-
-            write_records(played(on_marker=mark), in_turn(write, lambda record, _: feed.put(record)), latencies)
+            writers.append(lambda record, _: feed.put(record))
+            write_records(played(on_marker=lambda marker: link.tell(marker=[*marker])), writers, latencies)
             file_output.close()  # now, as Ctrl-C, the only end of the page, would throw the file away
             link.tell(is_complete=True)
             while link.request() is not None:  # until the page's process ends, or Ctrl-C

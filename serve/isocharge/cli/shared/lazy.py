@@ -20,9 +20,6 @@ def lazy_group(summary: str, commands: Commands) -> typer.Typer:
             for name, (_, sentence) in commands.items():
                 self.add_command(TyperCommand(name, help=sentence, short_help=sentence))
 
-        def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
-            return list(self.commands)
-
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             name, command, rest = super().resolve_command(ctx, args)
             return name, load_command(commands[str(name)][0]) if name in commands else command, rest

@@ -3,6 +3,7 @@
 What cannot be seen from outside, the charge of one count, is asked for and never made up.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -176,11 +177,8 @@ def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str,
 
 def _largest_pC(gain: Mapping[str, Any]) -> float:
     """Largest magnitude of the charge of one unit, pC."""
-    largest = 1.0
-    for setting in gain.values():
-        numbers = setting.values() if isinstance(setting, Mapping) else [setting]
-        largest *= max(abs(float(number)) for number in numbers)
-    return largest
+    each = (setting.values() if isinstance(setting, Mapping) else [setting] for setting in gain.values())
+    return math.prod(max(abs(float(number)) for number in numbers) for numbers in each)
 
 
 def _offset(column: Array) -> float | int:

@@ -182,6 +182,10 @@ FOLLOWED = {
         "The contact by all frames up to now, where contacts are followed.",
         ("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "vx_mm_s", "vy_mm_s", "moving"),
     ),
+    "other": (
+        "Another contact with the same charges, where a film folds and it is not known which touches.",
+        ("x_mm", "y_mm", "force_N", "probability"),
+    ),
     "film": (
         "The film for which the model answered, where it is followed.",
         ("pretension_MPa", "pretension_std_MPa", "touches"),

@@ -135,7 +135,7 @@ def _json(text: str) -> Line:
         content = json.loads(text, parse_int=float)  # hundreds of digits become infinite, as those of other notations
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
-    if isinstance(content, list) and content and all(map(_is_number, content)):
+    if isinstance(content, list) and content and all(isinstance(number, float) for number in content):
         return Line(Notation.csv, (), tuple(content))
     numbers = dict(_numbers("", content))
     if not numbers:
@@ -145,18 +145,13 @@ def _json(text: str) -> Line:
 
 def _numbers(name: str, content: Any, level: int = 0) -> list[tuple[str, float]]:
     """Every number of a JSON value by the path to it, `charge.A` or `charge.0.re`, at most three levels deep."""
-    if _is_number(content):
+    if isinstance(content, float):  # as integers were read, too
         return [(name, content)]
     if level >= DEEPEST_LEVEL or not isinstance(content, dict | list):
         return []
     items = content.items() if isinstance(content, dict) else enumerate(content)
     paths = ((f"{name}.{key}" if level else str(key), value) for key, value in items)
     return [pair for path, value in paths for pair in _numbers(path, value, level + 1)]
-
-
-def _is_number(value: Any) -> bool:
-    """Whether a value of this JSON, whose integers were read as floats too, is a number."""
-    return isinstance(value, float)
 
 
 def _teleplot_lines(frame: Frame) -> str:

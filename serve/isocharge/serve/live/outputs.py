@@ -21,7 +21,7 @@ from typing import Any, Self
 from isocharge.common.errors import InputError
 from isocharge.serve.prediction.record import FIELDS, PredictionRecord
 from isocharge.serve.tracking.film_follower import FollowedFilm
-from isocharge.serve.tracking.tracker import Tracked
+from isocharge.serve.tracking.tracker import Other, Tracked
 
 BY_ELECTRODE = ("charge_pC", "charge_raw_pC", "tare_pC")
 """Fields of a record that have a value for each electrode."""
@@ -39,7 +39,8 @@ def csv_header(electrodes: tuple[str, ...], fields: tuple[str, ...] = FIELDS) ->
 
 def _parts(electrodes: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
     """Fields of a record that have several columns, with the names of their parts."""
-    return dict.fromkeys(BY_ELECTRODE, electrodes) | {"tracked": Tracked._fields, "film": FollowedFilm._fields}
+    followed = {"tracked": Tracked._fields, "other": Other._fields, "film": FollowedFilm._fields}
+    return dict.fromkeys(BY_ELECTRODE, electrodes) | followed
 
 
 def csv_line(record: PredictionRecord, electrodes: tuple[str, ...]) -> str:

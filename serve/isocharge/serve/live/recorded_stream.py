@@ -13,7 +13,7 @@ from functools import partial
 
 from isocharge.common.errors import IsochargeError
 from isocharge.serve.live.stream import TouchStream
-from isocharge.serve.port.recording import Back, Marker, NewModel, RecordedClock, Recorder, Recording
+from isocharge.serve.port.recording import Back, Event, Marker, NewModel, RecordedClock, Recorder, Recording
 from isocharge.serve.port.source import Chunk
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.record import PredictionRecord
@@ -196,23 +196,22 @@ def replay(
     """
     delay_s: float | None = None
     for event in recording.events():
-        if isinstance(event, Marker):
-            on_marker(event)
-            continue
-        if isinstance(event, NewModel):
-            if load is not None:
-                stream.use(load(event.label))
-            continue
-        if isinstance(event, Back):
-            stream.back()
-            continue
-        clock.set(event)
-        if event.chunk is None:
-            stream.tare()
-            continue
-        if real_time:
-            delay_s = time.time() - event.chunk.timestamp if delay_s is None else delay_s
-            time.sleep(max(0.0, event.chunk.timestamp + delay_s - time.time()))
-        for number, record in enumerate(stream.feed(event.chunk)):
-            if number < len(event.latencies_us):
-                yield record, record.to_json()
+        match event:
+            case Marker():
+                on_marker(event)
+            case NewModel(label=label):
+                if load is not None:
+                    stream.use(load(label))
+            case Back():
+                stream.back()
+            case Event(chunk=None):
+                clock.set(event)
+                stream.tare()
+            case Event(chunk=Chunk() as chunk, latencies_us=latencies_us):
+                clock.set(event)
+                if real_time:
+                    delay_s = time.time() - chunk.timestamp if delay_s is None else delay_s
+                    time.sleep(max(0.0, chunk.timestamp + delay_s - time.time()))
+                for number, record in enumerate(stream.feed(chunk)):
+                    if number < len(latencies_us):
+                        yield record, record.to_json()

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from isocharge.serve.prediction.record import (
     PredictionRecord,
 )
 from isocharge.serve.signal_chain.chain import Chain, Reading
+from isocharge.serve.tracking.branches import branches_of
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.serve.tracking.tracker import Tracker
 
@@ -34,6 +35,9 @@ LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
 
 DOUBT = 0.01
 """Share of all touch charges by which it is told how contacts depend on what is not known of the film's memory."""
+
+LARGEST_POWER = 1.5
+"""Growth of the force with all charges together, in powers: that of a film without pretension, the others' is less."""
 
 
 class Policy(StrEnum):
@@ -160,6 +164,10 @@ class TouchStream:
     def _use(self, predictor: Predictor) -> None:
         self._follower = None if self._follow is None else FilmFollower(predictor, self._follow)
         self.predictor, self._validity = predictor, predictor.validity
+        if self._tracker is not None:
+            self._tracker.branches = branches = branches_of(predictor)
+            corners_mm = self._validity.corners_mm if branches is None else branches.charges.corners_mm
+            self._validity_followed = replace(self._validity, corners_mm=corners_mm)
         self._electrodes, self._label = predictor.metadata.electrodes, predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
         self._of_doubt = Sensitivity(DOUBT)
@@ -264,11 +272,15 @@ class TouchStream:
             film = self._follower.film._asdict()
             self._follower.see(reading.charge_pC, contact, flags, when.clock_s)
             flags += (FILM,) * (contact is not None and self._follower.is_lost)
-        tracked, event = None, None
+        tracked, event, other, charge_pC = None, None, None, reading.charge_pC
         if self._tracker is not None:
-            tracked, event = self._tracker.update(contact, when.clock_s, flags)
-        charge_pC = reading.charge_pC
-        if contact is not None and reading.doubt > 0.0 and charge_pC is not None:
+            tracked, event = self._tracker.update(contact, when.clock_s, flags, charge_pC)
+            other = self._tracker.other
+        if self._tracker is not None and (answer := self._tracker.answer) is not None:
+            contact, flags = answer, reading.flags + self._validity_followed.flags(answer)
+            shift = 0.0, 0.0, LARGEST_POWER * reading.doubt * answer.force_N
+            contact, tracked = contact.widened(shift), tracked and tracked.widened(shift)
+        elif contact is not None and reading.doubt > 0.0 and charge_pC is not None:
             shift = self._of_doubt.shift(
                 contact, reading.doubt, lambda: self._answers.predict(charge_pC * (1.0 + DOUBT))
             )
@@ -288,6 +300,7 @@ class TouchStream:
             frame_id=self.frame_id,
             tracked=None if tracked is None else tracked._asdict(),
             event=event,
+            other=None if other is None else other._asdict(),
             follows=self._tracker is not None,
             film=film,
         )

@@ -23,8 +23,8 @@ import onnxruntime as ort
 from numpy.typing import ArrayLike
 
 from isocharge.common.defaults import MAX_BATCH
-from isocharge.common.errors import ModelError, OutputExists
-from isocharge.common.files import new_folder, read_whole, refuse_existing, sha256_of, write_whole
+from isocharge.common.errors import ModelError, OutputExists, told_where
+from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
 from isocharge.serve.model.golden import Golden, check_answers, contact_floors, make_golden, read_golden
 from isocharge.serve.model.metadata import NAME, ModelMetadata
 from isocharge.serve.model.session import (
@@ -151,20 +151,14 @@ def load_model(folder: Path) -> Model:
         ModelError: If a file is missing or damaged, or the model is of another format.
     """
     path = folder / "model.onnx"
-    data, golden = _read(path), read_golden(folder / "golden.json")
+    data = read_needed(path, ModelError, "copy or export the model again")
+    golden = read_golden(folder / "golden.json")
     _check_intact(data, golden, path)
     session = open_session(data, str(path))
     metadata = ModelMetadata.from_props(session.get_modelmeta().custom_metadata_map, str(path))
     check_interface(session, len(metadata.electrodes), str(path))
     _check_fits(golden, metadata, folder)
     return Model(folder, metadata, golden, session, data)
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return read_whole(path)
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be read ({error.strerror}); copy or export the model again") from error
 
 
 def _check_intact(data: bytes, golden: Golden, path: Path) -> None:
@@ -192,10 +186,8 @@ def check_golden(model: Model) -> None:
         ModelError: If an answer differs from that in golden.json.
     """
     where, charge_pC = str(model.folder / "model.onnx"), model.golden.charge_pC
-    try:
+    with told_where(f"{where}: ", ModelError):
         answers = run(model.session, charge_pC)
-    except ModelError as error:
-        raise ModelError(f"{where}: {error}") from error
     check_rows(answers, len(charge_pC), where)
     check_answers(model.golden, answers, where)
 

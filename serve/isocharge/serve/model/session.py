@@ -230,8 +230,7 @@ def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
     charges = _as_numbers(charge_pC, electrodes)
     if charges.shape != (len(electrodes),):
         raise ChargeError(f"expected {_charges(electrodes)}, got an array of shape {charges.shape}")
-    press: Singles = as_singles(charges[np.newaxis], electrodes, one_press=True)[0]
-    return press
+    return np.asarray(as_singles(charges[np.newaxis], electrodes, one_press=True)[0])
 
 
 def as_batch(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:

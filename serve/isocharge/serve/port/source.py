@@ -121,13 +121,13 @@ class Port:
             self._line.reset_input_buffer()  # a tty drops them by itself, a socket does not
         except OPEN_ERRORS as error:
             self._close()
-            speed, hint = "", "check host and number, that the board is on, and that no other program has it"
-            if is_path:
-                speed = f" at {self._baud} baud"
-                hint = (
-                    "check the cable and the name, that no other program has it open, and that you may read it (on "
-                    "Linux, the group 'dialout')"
-                )
+            speed = f" at {self._baud} baud" if is_path else ""
+            hint = (
+                "check the cable and the name, that no other program has it open, and that you may read it (on Linux, "
+                "the group 'dialout')"
+                if is_path
+                else "check host and number, that the board is on, and that no other program has it"
+            )
             raise PortError(f"{self.url}: cannot be opened{speed} ({error}); {hint}") from error
         if self._asker:
             self._asker.forget()

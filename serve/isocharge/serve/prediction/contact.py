@@ -228,5 +228,4 @@ def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
     crosses = (y0 > y) != (y1 > y)
     with np.errstate(divide="ignore", invalid="ignore"):  # horizontal edges never cross
         edge_x = x0 + (y - y0) * (x1 - x0) / (y1 - y0)
-    inside: Booleans = np.count_nonzero(crosses & (x < edge_x), axis=0) % 2 == 1
-    return inside
+    return np.asarray(np.count_nonzero(crosses & (x < edge_x), axis=0) % 2 == 1)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.common.errors import PressError, shown
+from isocharge.common.errors import PressError, shown, told_where
 from isocharge.common.files import bounded_lines, write_whole
 from isocharge.serve.prediction.parquet import SUFFIX, parquet_bytes, parquet_lines
 from isocharge.serve.prediction.table import CHARGE, LARGEST, CsvNumbers
@@ -194,7 +194,7 @@ def read_presses(
     for name in KINDS:
         given, default = column.get(name, np.full(len(lines), np.nan)), defaults.get(name, np.nan)
         column[name] = np.where(np.isnan(given), default, given)
-    try:
+    with told_where(f"{path}, ", PressError):
         return MeasuredPresses(
             np.column_stack([column[name] for name in CONTACT]),
             np.column_stack([column[name] for name in electrodes]),
@@ -205,8 +205,6 @@ def read_presses(
             tuple(name for name in table.header if name not in columns),
             None if np.isnan(column[TEMPERATURE]).all() else column[TEMPERATURE],
         )
-    except PressError as error:
-        raise PressError(f"{path}, {error}") from error
 
 
 def read_press_list(path: Path) -> Array:
@@ -221,10 +219,8 @@ def read_press_list(path: Path) -> Array:
     with _open_table(path, CONTACT, ", ".join(CONTACT)) as table:
         lines, contact = _values(table, table.columns(CONTACT), ())
     known = np.zeros((len(lines), 1)), np.ones(len(lines)), np.ones(len(lines))
-    try:
+    with told_where(f"{path}, ", PressError):
         return MeasuredPresses(contact, *known, ("charge",), lines).contact
-    except PressError as error:
-        raise PressError(f"{path}, {error}") from error
 
 
 def write_presses(path: Path, presses: MeasuredPresses) -> None:

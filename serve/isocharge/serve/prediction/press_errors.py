@@ -128,8 +128,7 @@ def _reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tuple[str, ..
     off |= (force_N < low) | (force_N > high)
     nothing = np.isnan(presses.contact).all(axis=1)
     partial = np.isnan(presses.charge_pC).any(axis=1)
-    chosen = np.select([partial, nothing, off], [NO_CHARGE, NOTHING_KNOWN, NOT_TRAINED], "")
-    return tuple(chosen.tolist())
+    return tuple(np.select([partial, nothing, off], [NO_CHARGE, NOTHING_KNOWN, NOT_TRAINED], "").tolist())
 
 
 SIGNIFICANCE = 0.01

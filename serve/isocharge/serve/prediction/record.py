@@ -40,9 +40,11 @@ class PredictionRecord(NamedTuple):
         frame_id: Name of the sensor.
         tracked: The contact by all frames up to now, where contacts are followed: the fields of a `Tracked`.
         event: What begins with this record: `press`, `hold`, `slide`, `tap` or `release`.
+        other: Where the film folds and it is not known which contact it is, the fields of an `Other`.
         film: Where the film is followed: `pretension_MPa` for which the model answered, `pretension_std_MPa`, and how
             many `touches` have told it; without it the record is written without this field.
-        follows: Whether contacts are followed; without it the record is written without the two fields before.
+        follows: Whether contacts are followed; without it the record is written without `tracked`, `event`
+            and `other`.
     """
 
     timestamp: float | None
@@ -68,6 +70,7 @@ class PredictionRecord(NamedTuple):
     frame_id: str
     tracked: dict[str, float] | None = None
     event: str | None = None
+    other: dict[str, float] | None = None
     film: dict[str, float] | None = None
     follows: bool = False
 
@@ -86,7 +89,7 @@ class PredictionRecord(NamedTuple):
         return _ENCODE({name: _plain(values[name]) for name in self.written})
 
 
-OF_TRACKING = ("tracked", "event")
+OF_TRACKING = ("tracked", "event", "other")
 """Fields that a record has where contacts are followed."""
 
 OF_FILM = ("film",)

@@ -67,8 +67,7 @@ class Windows(NamedTuple):
     def rows(self) -> Bytes:
         """The bytes of each window and as many after it, shape (frames, 2 * length): frames begin anywhere in it."""
         starts = self.starts[self.starts + 2 * self.length <= len(self.stream)]
-        rows: Bytes = self.stream[starts[:, None] + np.arange(2 * self.length)]
-        return rows
+        return np.asarray(self.stream[starts[:, None] + np.arange(2 * self.length)])
 
 
 def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
@@ -119,8 +118,7 @@ def _synchronised(stream: Bytes) -> Iterator[Windows]:
             coverage = len(starts) * length / len(stream) - less
             if coverage > best.get(length, (COVERED_SHARE - less,))[0]:
                 best[length] = coverage, starts
-    ranked = sorted(best, key=lambda length: (-round(best[length][0], 1), length))
-    for length in ranked[:MOST_LENGTHS]:
+    for length in sorted(best, key=lambda length: (-round(best[length][0], 1), length))[:MOST_LENGTHS]:
         yield Windows(SYNC, stream, best[length][1], length)
 
 

@@ -233,10 +233,11 @@ def _charge(
         return None, memory, memory.leak.charge_pC
     if chain.tau_s is None:
         return None, None, output_pC
-    if state.leak is None:
-        leak = Leak.start(output_pC)
-    else:
-        leak = undo_leak(chain.leak, chain.tau_s, state.leak, output_pC, tare.noise_pC, dt_s, contact=contact)
+    leak = (
+        Leak.start(output_pC)
+        if state.leak is None
+        else undo_leak(chain.leak, chain.tau_s, state.leak, output_pC, tare.noise_pC, dt_s, contact=contact)
+    )
     return leak, None, leak.charge_pC
 
 

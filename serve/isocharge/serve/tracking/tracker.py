@@ -4,14 +4,18 @@ Two filters of `modes`, one for the place and one for ln F, take in each frame's
 the model's errors is the same in every frame of a held contact (its own errors, gains): it is kept out of the filters
 and added to what they say, so that the deviations stay true. Frames that are saturated, beyond the model or of a large
 misfit count for less, one that is far from this contact not at all; two of these in a row are another contact.
+
+Where the map from contacts to charges folds, `branches` follow the contact by its charges instead.
 """
 
 import math
 from typing import NamedTuple
 
+from isocharge.common.arrays import Array
 from isocharge.serve.flags import BEYOND, INVALID, MISFIT, SATURATED
 from isocharge.serve.prediction.contact import Contact
 from isocharge.serve.signal_chain.rule import Rule, Share
+from isocharge.serve.tracking.branches import Branch, Branches
 from isocharge.serve.tracking.modes import Modes, Movement
 from isocharge.serve.tracking.noise import LINE, Shape
 
@@ -39,6 +43,10 @@ HOLD_S, TAP_S = 0.2, 0.25
 
 SLIDE_MM, MOVES = 0.3, 0.95
 """Distance from the place of rest, and probability of the moving mode, that make a slide."""
+
+
+KNOWN = 0.97
+"""Probability from which on a contact is known, and no other is said."""
 
 
 class TrackRule(Rule, frozen=True, kw_only=True):
@@ -80,24 +88,48 @@ class Tracked(NamedTuple):
         return Tracked(x, y, force, *stds, *motion)
 
 
-class Tracker:
-    """Follows one contact at a time; belongs to one thread. The same frames give the same answers, bit for bit."""
+class Other(NamedTuple):
+    """Another contact with the same charges, where it is not known which of them touches.
 
-    def __init__(self, rule: TrackRule | None = None) -> None:
-        """Begin without a contact; by default with the settings of an empty section."""
-        self._lasting = (rule or TrackRule()).lasting ** 2
+    Attributes:
+        x_mm, y_mm, force_N: Estimates.
+        probability: That it is this one.
+    """
+
+    x_mm: float
+    y_mm: float
+    force_N: float
+    probability: float
+
+
+class Tracker:
+    """Follows one contact at a time; belongs to one thread. The same frames give the same answers, bit for bit.
+
+    Attributes:
+        branches: What follows the contact by its charges where the map folds; None where it does not.
+        answer: Where the map folds, the contact in the place of the model's, which knows one side alone; else None.
+        other: What the contact may be besides; None where it is known, as it is wherever the map does not fold.
+    """
+
+    def __init__(self, rule: TrackRule | None = None, branches: Branches | None = None) -> None:
+        """Begin without a contact; by default with the settings of an empty section, and of a film without folds."""
+        self._lasting, self.branches = (rule or TrackRule()).lasting ** 2, branches
         self.forget()
 
     def forget(self) -> None:
         """Forget the contact, as after an outage or a new tare."""
         self._of_place, self._of_force = Modes.start(0j, 1.0, PLACE), Modes.start(0.0, 1.0, FORCE)
         self._last: Tracked | None = None
+        self.answer: Contact | None = None
+        self.other: Other | None = None
+        if self.branches is not None:
+            self.branches.forget()
         self._far, self._t_s = 0, 0.0
         self._began_s = self._rest_s = 0.0
         self._rest, self._state = 0j, ""
 
     def update(
-        self, contact: Contact | None, t_s: float, flags: tuple[str, ...] = ()
+        self, contact: Contact | None, t_s: float, flags: tuple[str, ...] = (), charge_pC: Array | None = None
     ) -> tuple[Tracked | None, str | None]:
         """Take the next frame in.
 
@@ -105,21 +137,34 @@ class Tracker:
             contact: The model's answer; None if nothing touches, or nothing was computed.
             t_s: Time of the frame, s, on any clock.
             flags: Of the frame.
+            charge_pC: Its touch charges, shape (n_electrode,), pC: needed where the map folds.
 
         Returns:
-            The contact by now, None if nothing touches; and which of `press`, `hold`, `slide`, `tap` and `release`
-            this frame begins with.
+            The contact by now, None if nothing touches or no contact explains the charges; and which of `press`,
+            `hold`, `slide`, `tap` and `release` this frame begins with.
         """
+        self.answer = None
         if contact is None:
-            if INVALID in flags or self._last is None:
+            if INVALID in flags:
                 return self._last, None
+            if self._last is None:
+                if self.branches is not None:
+                    self.branches.forget()
+                return None, None
             ended = "tap" if self._state == "press" and t_s - self._began_s <= TAP_S else "release"
             self.forget()
             return None, ended
         began = self._last is None
         if began:
             self._began_s = t_s
-        tracked = self._advance(contact, t_s, flags)
+        if self.branches is None or charge_pC is None:
+            tracked = self._advance(contact, t_s, flags)
+        elif SATURATED in flags or not (found := self.branches.update(charge_pC, t_s)):
+            return self._last, None
+        else:
+            self.answer, self.other = found[0].contact, _other(found)
+            vx, vy = found[0].mean[3:5].tolist()
+            tracked = Tracked(*self.answer[:6], vx, vy, found[0].moves)
         event = self._event(tracked, t_s, began=began)
         self._last = tracked
         return tracked, event
@@ -183,3 +228,9 @@ class Tracker:
                 self._state = "hold"
                 return "hold"
         return None
+
+
+def _other(found: list[Branch]) -> Other | None:
+    if found[0].probability > KNOWN or len(found) == 1:
+        return None
+    return Other(*found[1].contact[:3], found[1].probability)

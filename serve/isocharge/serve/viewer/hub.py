@@ -157,10 +157,8 @@ class Playhead:
         if not self.is_playing:
             return False
         self.at_s = min(self.at_s + step_s * self.speed, end_s)
-        if is_complete and self.at_s >= end_s:
-            self.is_playing = False
-            return True
-        return False
+        self.is_playing = not (is_complete and self.at_s >= end_s)
+        return not self.is_playing
 
     def apply(self, request: ReplayRequest, end_s: float) -> None:
         """Do what the page asks for; at the end, playing begins anew."""

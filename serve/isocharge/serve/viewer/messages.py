@@ -13,10 +13,11 @@ A sample is a prediction record of fixed size, with the tracked contact in place
 followed; many are coalesced to as few as a browser can show:
 
     offset 0   timestamp, unix seconds, f64
-           8   x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_std_N, misfit, latency_us, xy_correlation, f32 each
-          44   flags, u32: a bit for each word of `isocharge.serve.flags`, the highest one for contact
-          48   number of records that the sample stands for, u32
-          52   touch charges, pC, f32 for each electrode; zeros up to a multiple of eight bytes
+           8   x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_std_N, misfit, latency_us, xy_correlation, and place of
+               the other contact where it is not known which touches, x and y, mm, f32 each
+          52   flags, u32: a bit for each word of `isocharge.serve.flags`, the highest one for contact
+          56   number of records that the sample stands for, u32
+          60   touch charges, pC, f32 for each electrode; zeros up to a multiple of eight bytes
 
 All little-endian; what is unknown is NaN.
 
@@ -54,6 +55,9 @@ NUMBERS = (
 )
 """Fields of a record that a sample has as numbers."""
 
+OF_OTHER = ("x_mm", "y_mm")
+"""Those of its `other`."""
+
 FLAG_BITS = {word: 1 << position for position, word in enumerate(MEANINGS)}
 """The bit of each word."""
 
@@ -78,8 +82,8 @@ class SampleFormat:
         self.electrodes = electrodes
         count = len(electrodes)
         padding = -4 * (count + 1) % 8
-        self._struct = struct.Struct(f"<d{len(NUMBERS)}fII{count}f{padding}x")
-        numbers = [(name, "<f4") for name in NUMBERS]
+        self._struct = struct.Struct(f"<d{len(NUMBERS) + len(OF_OTHER)}fII{count}f{padding}x")
+        numbers = [(name, "<f4") for name in (*NUMBERS, *(f"other_{name}" for name in OF_OTHER))]
         counts = [("flags", "<u4"), ("records", "<u4")]
         fields: list[Any] = [("timestamp", "<f8"), *numbers, *counts, ("charge_pC", "<f4", (count,))]
         self.dtype = np.dtype([*fields, ("padding", f"V{padding}")] if padding else fields)
@@ -92,6 +96,7 @@ class SampleFormat:
         charges = record.charge_pC or {}
         followed = record.tracked or {}
         values = [followed[name] if name in followed else getattr(record, name) for name in NUMBERS]
+        values += [None if record.other is None else record.other[name] for name in OF_OTHER]
         numbers = [math.nan if value is None else value for value in values]
         charge_pC = [math.nan if (q := charges.get(name)) is None else q for name in self.electrodes]
         timestamp = math.nan if record.timestamp is None else record.timestamp

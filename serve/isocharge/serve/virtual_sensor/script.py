@@ -195,8 +195,7 @@ def _random_path(rng: np.random.Generator, t: Array) -> Complexes:
     turns_per_s = rng.uniform(-0.5, 0.5, size=(3, 1))
     sway = 0.25 * (np.exp(2j * np.pi * turns_per_s * t) - 1.0)
     path = start + (np.exp(2j * np.pi * rng.uniform(size=(3, 1))) * sway).sum(axis=0)
-    squashed: Complexes = path / (1.0 + np.abs(path) ** 8) ** (1 / 8)  # points well inside hardly move
-    return squashed
+    return np.asarray(path / (1.0 + np.abs(path) ** 8) ** (1 / 8))  # points well inside hardly move
 
 
 def _force_level(rng: np.random.Generator, t: Array, duration: float) -> Array:

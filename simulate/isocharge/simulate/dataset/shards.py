@@ -20,8 +20,8 @@ import numpy as np
 from msgspec import Struct
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import DatasetError, SensorError, cut, shown
-from isocharge.common.files import new_folder, read_whole, sha256_of, write_whole
+from isocharge.common.errors import DatasetError, SensorError, cut, shown, told_where
+from isocharge.common.files import new_folder, read_needed, sha256_of, write_whole
 from isocharge.common.npz import npz_arrays
 from isocharge.common.structs import MOST_JSON_BYTES, Text, convert, parse_json
 from isocharge.simulate.sensor.sensor import Sensor
@@ -281,13 +281,11 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
         raise DatasetError(
             f"{folder} is not a dataset: it has no manifest.json; make one with 'isocharge simulate sweep'"
         )
-    data = _bytes_of(path, MOST_JSON_BYTES)
-    try:
+    data = read_needed(path, DatasetError, "make the dataset again", MOST_JSON_BYTES)
+    with told_where(f"{path}: not a manifest of a dataset: ", DatasetError):
         manifest = parse_json(data, "", DatasetError, dict[str, Any])
         if "format_version" not in manifest:
             raise DatasetError("key 'format_version' is missing")
-    except DatasetError as error:
-        raise DatasetError(f"{path}: not a manifest of a dataset: {error}") from error
     if (version := manifest["format_version"]) != FORMAT_VERSION:
         raise DatasetError(
             f"{path}: format version {shown(version)} is not supported (this version reads {FORMAT_VERSION}); "
@@ -296,18 +294,11 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
     return manifest, sha256_of(data)
 
 
-def _bytes_of(path: Path, most: int) -> bytes:
-    try:
-        return read_whole(path, most)
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror}); make the dataset again") from error
-
-
 def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
     path = folder / Path(entry.file).name
     if not path.is_file():
         raise DatasetError(f"{path}: the manifest lists this shard, but the file is missing; make the dataset again")
-    data = _bytes_of(path, MOST_SHARD_BYTES)
+    data = read_needed(path, DatasetError, "make the dataset again", MOST_SHARD_BYTES)
     checksum, expected = sha256_of(data), entry.sha256
     if checksum != expected:
         raise DatasetError(

@@ -106,9 +106,9 @@ class ForwardMap:
         film, domain = sensor.film, Domain(radius, force_range)
         check_family(sensor.coated_film, probe, domain)
         middle = float(np.sqrt(force_range[0] * force_range[1]))
-        theory = settings.theory
-        if theory == "auto":
-            theory = theory_for(sensor, probe, force_range, settings.accuracy)
+        theory = (
+            theory_for(sensor, probe, force_range, settings.accuracy) if settings.theory == "auto" else settings.theory
+        )
         layer = layer_for(film, middle) if settings.layer == "auto" else settings.layer
         settings = replace(settings, theory=theory, layer=layer)
         resolution = needed_resolution(film, probe, (radius, 0.0), middle, settings)

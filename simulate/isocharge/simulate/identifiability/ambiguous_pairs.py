@@ -111,8 +111,7 @@ def _candidates(
 ) -> tuple[Integers, Array]:
     """Numbers of first contacts, and for each a contact (x, y, F) far away that may have the same charges."""
     profile, terms = _tabulate(charge_map, position)
-    near = cKDTree(position)
-    neighbours = near.query(position, min(9, len(position)))[1]
+    neighbours = cKDTree(position).query(position, min(9, len(position)))[1]
     numbers, contacts = [], []
     for i, row in enumerate(charge):
         observed = np.broadcast_to(row, charge.shape)

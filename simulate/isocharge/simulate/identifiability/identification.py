@@ -223,10 +223,11 @@ def identify(
             f"noise: expected white noise above 0 pC, got that of {noise.name!r}: without noise the errors have no "
             "lower limit"
         )
-    if radius is None:
-        forward_map = map_to_search(sensor, probe, force_range, executor)
-    else:
-        forward_map = ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
+    forward_map = (
+        map_to_search(sensor, probe, force_range, executor)
+        if radius is None
+        else ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
+    )
     return Identification.of(forward_map, noise, error=error)
 
 

@@ -221,11 +221,10 @@ class DesignCase:
     def room(self, places: Array) -> Array:
         """Distance to spare of single squares from the rim and the electrodes that stay, (n, 2) to (n,), mm."""
         half = 0.5 * self.square_side
-        spare = [self.sensor.film.radius - self.rim - np.hypot(*(np.abs(places) + half).T)]
-        for electrode in self.stay:
-            for low, high in zip(*electrode.boxes, strict=True):
-                spare.append((np.maximum(low - places, places - high) - half).max(axis=1) - self.gap)
-        return np.asarray(np.min(spare, axis=0))
+        to_rim = self.sensor.film.radius - self.rim - np.hypot(*(np.abs(places) + half).T)
+        boxes = (box for electrode in self.stay for box in zip(*electrode.boxes, strict=True))
+        to_boxes = [(np.maximum(low - places, places - high) - half).max(axis=1) - self.gap for low, high in boxes]
+        return np.asarray(np.min([to_rim, *to_boxes], axis=0))
 
     def apart(self, places: Array, others: Array) -> Array:
         """Distance to spare between squares at `places` (n, 2) and `others` (m, 2), shape (n, m), mm."""

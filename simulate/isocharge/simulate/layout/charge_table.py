@@ -87,9 +87,8 @@ class ChargeTable:
         """
         film = sensor.film
         settings = SolveSettings(theory=theory_for(sensor, probe, (force, force)), layer=layer_for(film, force))
-        resolution = needed_resolution(film, probe, (radius, 0.0), force, settings)
+        settings = replace(settings, resolution=needed_resolution(film, probe, (radius, 0.0), force, settings))
         distance = chebyshev_nodes(DISTANCES[int(radius > 0.25 * film.radius)], 0.0, radius)
-        settings = replace(settings, resolution=resolution)
         solve = partial(_stress_at, film, sensor.surface, probe, force, settings)
         solved = list(track(in_order(executor, solve, distance.tolist()), "solving the film", len(distance)))
         stress = np.stack(solved).transpose(0, 3, 2, 1).reshape(3 * len(distance), -1).astype(np.float32)

@@ -17,12 +17,15 @@ measurements. The memoryless part is `measuring_chain.noise`, and the levels `cl
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import scipy  # loads a part when it is used
+from msgspec import Meta
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
+from isocharge.common.structs import Finite, NotNegative, Positive
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 PVDF_PYRO = -30.0 * 9.0
@@ -41,9 +44,12 @@ CREEP_TIMES = 10.0 ** np.arange(-3.0, 6.1, 0.5)
 """Time constants of creep, s; the ripple of their sum about the logarithm is below 1e-5 of a decade."""
 
 
+PositiveOrInfinite = Annotated[float, Meta(gt=0.0, description="a positive number or inf")]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Amplifier:
-    """A measuring chain of any number of channels.
+    """A measuring chain of any number of channels; the bounds are those of a file (`measuring_chain.noise_file`).
 
     Attributes:
         noise: Memoryless noise of each reading.
@@ -68,26 +74,26 @@ class Amplifier:
     """
 
     noise: NoiseModel
-    tau: float = math.inf
-    tau_mismatch: float = 0.0
-    gain_mismatch: float = 0.0
-    hum: float = 0.0
-    hum_frequency: float = 50.0
-    offset: float = 0.0
-    bias: float = 0.0
-    pyro: float = PVDF_PYRO
-    pyro_mismatch: float = 0.0
-    creep: float = 0.0
-    thermoelastic: float = 0.0
-    temperature_rms: float = 0.0
-    temperature_time: float = 120.0
-    step: float = 0.0
-    step_at: float = 10.0
-    step_time: float = 1.0
-    step_for: float = math.inf
-    film_time: float = FILM_TIME
-    limit: float = math.inf
-    bits: int = 0
+    tau: PositiveOrInfinite = math.inf
+    tau_mismatch: NotNegative = 0.0
+    gain_mismatch: NotNegative = 0.0
+    hum: NotNegative = 0.0
+    hum_frequency: Positive = 50.0
+    offset: NotNegative = 0.0
+    bias: NotNegative = 0.0
+    pyro: Finite = PVDF_PYRO
+    pyro_mismatch: NotNegative = 0.0
+    creep: Annotated[float, Meta(ge=0.0, lt=0.2)] = 0.0
+    thermoelastic: NotNegative = 0.0
+    temperature_rms: NotNegative = 0.0
+    temperature_time: Positive = 120.0
+    step: Finite = 0.0
+    step_at: Finite = 10.0
+    step_time: Positive = 1.0
+    step_for: PositiveOrInfinite = math.inf
+    film_time: Positive = FILM_TIME
+    limit: PositiveOrInfinite = math.inf
+    bits: Annotated[int, Meta(ge=0, le=32)] = 0
 
     def __post_init__(self) -> None:
         if self.bits and not math.isfinite(self.limit):

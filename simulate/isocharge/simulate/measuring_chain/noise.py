@@ -42,8 +42,7 @@ class NoiseModel:
 
     def variance(self, charge: Array) -> Array:
         """Square of `sigma`, pC^2; faster where there are many."""
-        variance: Array = self.white**2 + (self.gain * np.asarray(charge)) ** 2
-        return variance
+        return self.white**2 + (self.gain * np.asarray(charge)) ** 2
 
     def information(self, charge: Array) -> Array:
         """Fisher information of a reading, 1/pC^2: one over the variance of the best unbiased estimate of its charge.
@@ -52,13 +51,11 @@ class NoiseModel:
         (1 + 2 (d sigma / dQ)^2) / sigma^2.
         """
         variance = self.variance(charge)
-        information: Array = (1.0 + 2.0 * (self.gain**2 * np.asarray(charge)) ** 2 / variance) / variance
-        return information
+        return (1.0 + 2.0 * (self.gain**2 * np.asarray(charge)) ** 2 / variance) / variance
 
     def add(self, charge: Array, rng: np.random.Generator) -> Array:
         """Noisy readings of charges of any shape, pC."""
-        noisy: Array = charge + self.sigma(charge) * rng.standard_normal(np.shape(charge))
-        return noisy
+        return charge + self.sigma(charge) * rng.standard_normal(np.shape(charge))
 
     def to_dict(self) -> dict[str, float | str]:
         """For metadata."""

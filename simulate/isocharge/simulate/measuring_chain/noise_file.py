@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal, get_type_hints
 
-from msgspec import Meta, structs
+from msgspec import defstruct, structs
 
-from isocharge.common.errors import InputError
-from isocharge.common.structs import Finite, NotNegative, Positive, Settings, read_toml
+from isocharge.common.errors import InputError, told_where
+from isocharge.common.structs import NotNegative, Settings, read_toml
 from isocharge.simulate.measuring_chain.amplifier import Amplifier
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
@@ -40,8 +40,6 @@ AMPLIFIER_LEVELS = {
 }
 """Amplifiers by the same names."""
 
-PositiveOrInfinite = Annotated[float, Meta(gt=0.0, description="a positive number or inf")]
-
 KEYS = {
     "tau": "tau_s",
     "hum": "hum_pC",
@@ -60,33 +58,23 @@ KEYS = {
 }
 """Keys of the file that are not called as the attributes of `Amplifier`."""
 
-
-class AmplifierFile(Settings, frozen=True, rename=KEYS):
-    """The file: noise, and the attributes of `Amplifier`; what is None is that of the level `like`."""
-
-    like: Literal["clean", "reference", "bench", "surgery"] = "clean"
-    white_pC: NotNegative | None = None
-    proportional: NotNegative | None = None
-    tau: PositiveOrInfinite | None = None
-    tau_mismatch: NotNegative | None = None
-    gain_mismatch: NotNegative | None = None
-    hum: NotNegative | None = None
-    hum_frequency: Positive | None = None
-    offset: NotNegative | None = None
-    bias: NotNegative | None = None
-    pyro: Finite | None = None
-    pyro_mismatch: NotNegative | None = None
-    creep: Annotated[float, Meta(ge=0.0, lt=0.2)] | None = None
-    thermoelastic: NotNegative | None = None
-    temperature_rms: NotNegative | None = None
-    temperature_time: Positive | None = None
-    step: Finite | None = None
-    step_at: Finite | None = None
-    step_time: Positive | None = None
-    step_for: PositiveOrInfinite | None = None
-    film_time: Positive | None = None
-    limit: PositiveOrInfinite | None = None
-    bits: Annotated[int, Meta(ge=0, le=32)] | None = None
+AmplifierFile = defstruct(
+    "AmplifierFile",
+    [
+        ("like", Literal["clean", "reference", "bench", "surgery"], "clean"),
+        ("white_pC", NotNegative | None, None),
+        ("proportional", NotNegative | None, None),
+        *(
+            (name, kind | None, None)
+            for name, kind in get_type_hints(Amplifier, include_extras=True).items()
+            if name != "noise"
+        ),
+    ],
+    bases=(Settings,),
+    frozen=True,
+    rename=KEYS,
+)
+"""The file: noise, and the attributes of `Amplifier` with their bounds; what is None is that of the level `like`."""
 
 
 def load_amplifier(level: str) -> Amplifier:
@@ -108,10 +96,8 @@ def load_amplifier(level: str) -> Amplifier:
     given: dict[str, Any] = {name: value for name, value in structs.asdict(file).items() if value is not None}
     like = AMPLIFIER_LEVELS[given.pop("like")]
     white, gain = given.pop("white_pC", like.noise.white), given.pop("proportional", like.noise.gain)
-    try:
+    with told_where(f"{level}: ", InputError):
         return replace(like, noise=NoiseModel(Path(level).stem, white, gain), **given)
-    except InputError as error:
-        raise InputError(f"{level}: {error}") from error
 
 
 def noise_model(level: str) -> NoiseModel:

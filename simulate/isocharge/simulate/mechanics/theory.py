@@ -118,17 +118,15 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
 def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
     """The cheapest theory whose error stays within half of the accuracy; the full one if no theory does."""
     tense = film.pretension > 0.0
+    full = Theory(stretching=True, bending=True, pretensioned=tense)
     if film.pretension < 0.0 or not film.turns:  # the errors above are those of a film that is alike all round
-        return Theory(stretching=True, bending=True, pretensioned=tense)
+        return full
     cheap_first = (
         Theory(stretching=False, bending=False, pretensioned=tense),
         Theory(stretching=False, bending=True, pretensioned=tense),
         Theory(stretching=True, bending=False, pretensioned=tense),
     )
-    for theory in cheap_first:
-        if modelling_error(film, probe, force, theory) <= 0.5 * accuracy:
-            return theory
-    return Theory(stretching=True, bending=True, pretensioned=tense)
+    return next((each for each in cheap_first if modelling_error(film, probe, force, each) <= 0.5 * accuracy), full)
 
 
 def theory_for(sensor: Sensor, probe: Probe, force_range: tuple[float, float], accuracy: float = ACCURACY) -> Theory:

@@ -31,8 +31,7 @@ def enclosing_circle(corners: Complexes, at: Array) -> tuple[Array, Array]:
 
     def radius(centre: Array) -> Array:
         reach = np.abs(corners - centre[..., None]).max(axis=-1)
-        room = np.minimum(CLEARANCE * reach, INNER_SHARE * gap)
-        return np.asarray(reach + room)
+        return np.asarray(reach + np.minimum(CLEARANCE * reach, INNER_SHARE * gap))
 
     fits = at + radius(at) <= 1.0 - OUTER_SHARE * gap
     if np.all(fits):

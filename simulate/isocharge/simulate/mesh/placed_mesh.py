@@ -106,8 +106,7 @@ class PlacedMesh:
     @cached_property
     def points(self) -> Complexes:
         """Film points of every element's nodes, shape (n_element, n_local), in film radii."""
-        points = to_oval(self.placement.element_points(self.template), self.oval)
-        return self.template.from_base(points)
+        return self.template.from_base(to_oval(self.placement.element_points(self.template), self.oval))
 
     @property
     def node_points(self) -> Complexes:

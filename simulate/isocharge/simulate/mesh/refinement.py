@@ -74,10 +74,9 @@ class RefinedTemplate(Template):
         """Values at the elements' nodes from those at the nodes of the base's, shape (n_base, n_local, ...)."""
         at = self._into_parent(self.xi, self.eta)
         weights = tensor_values(self.resolution.order, at[0].ravel(), at[1].ravel())
-        from_parent: np.ndarray = np.einsum(
-            "enm,em...->en...", weights.reshape(self.n_element, self.xi.size, -1), values[self.parent]
+        return np.asarray(
+            np.einsum("enm,em...->en...", weights.reshape(self.n_element, self.xi.size, -1), values[self.parent])
         )
-        return from_parent
 
     def within(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
         """Element, xi and eta of points that are given by those of the base."""

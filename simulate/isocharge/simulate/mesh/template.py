@@ -54,8 +54,7 @@ def sample_points(blocks: Blocks) -> Complexes:
     turn = np.linspace(0.0, 2.0 * np.pi, max(blocks.corners, 3), endpoint=False)
     outline = SAMPLE_REACH * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     probe: Probe = Polygon.of(outline) if blocks.corners else Circle(SAMPLE_REACH)
-    placement = Placement.of(blocks, probe, np.array(SAMPLE_DISTANCE), 1.0, SAMPLE_LAYER)
-    return placement.element_points(blocks)
+    return Placement.of(blocks, probe, np.array(SAMPLE_DISTANCE), 1.0, SAMPLE_LAYER).element_points(blocks)
 
 
 def corners_of(probe: Probe) -> int:

@@ -55,8 +55,7 @@ def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMa
     reach = identification.area.searched
     title = f"{limit_map.force:g} N; dashed: working area, {identification.area.radius:g} mm"
     title += "; red: folds" if len(folds) else ""
-    axes.set(title=title, xlabel="x, mm", ylabel="y, mm", aspect="equal")
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
+    axes.set(title=title, xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=(-reach, reach), ylim=(-reach, reach))
     return shades
 
 
@@ -73,8 +72,12 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
     axes.axvline(area.radius, ls="--", color=INK, label=f"working area, {area.radius:g} mm")
     if np.isfinite(area.fold_radius):
         axes.axvline(area.fold_radius, color=FELT, label=f"first fold, {area.fold_radius:.1f} mm")
-    axes.set(xlabel="distance from the centre, mm", ylabel="least position error (rms), mm", ylim=(0.005, 20.0))
-    axes.set(xlim=(0.0, area.searched))
+    axes.set(
+        xlabel="distance from the centre, mm",
+        ylabel="least position error (rms), mm",
+        xlim=(0.0, area.searched),
+        ylim=(0.005, 20.0),
+    )
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(ScalarFormatter())
     axes.yaxis.set_minor_formatter(NullFormatter())

@@ -57,9 +57,14 @@ def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> Non
     """Axes in mm, to scale, that show all electrodes and a circle of `radius` (mm) about the centre."""
     corners = np.concatenate([polygon for electrode in sensor.electrodes for polygon in electrode.front])
     reach = max(radius, float(np.hypot(*sensor.calibration.place(corners).T).max())) + 0.7
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x, mm", ylabel="y, mm", aspect="equal")
-    if title:
-        axes.set_title(title)
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x, mm", ylabel="y, mm", aspect="equal", title=title)
+
+
+def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "", highlight: str = "") -> None:
+    """Electrodes and the working area of `radius` (mm), on axes that show both."""
+    draw_electrodes(axes, sensor, highlight)
+    draw_working_area(axes, radius)
+    frame_film(axes, sensor, radius, title)
 
 
 def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float = 1.0, count: int = 81) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, field
 
-from isocharge.common.errors import SensorError
+from isocharge.common.errors import SensorError, told_where
 from isocharge.common.files import refuse_existing, write_whole
 from isocharge.common.structs import (
     Finite,
@@ -146,7 +146,7 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
     """Build a sensor from the tables of its file (units in the keys); `where` opens the error messages."""
     file = convert(table, SensorTable, where, SensorError)
     piezo, calibration, coating = file.piezo, file.calibration, file.electrodes.get(COATING)
-    try:
+    with told_where(f"{where}: ", SensorError):
         return Sensor(
             name=file.name,
             film=_film(file.film),
@@ -162,8 +162,6 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
                 calibration.crosstalk,
             ),
         )
-    except SensorError as error:
-        raise SensorError(f"{where}: {error}") from error
 
 
 def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
@@ -258,10 +256,11 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
         if sides.get(electrode.name) == shared is not None:
             tables[electrode.name] = [tidy(value) for value in electrode.centre]
         else:
-            tables[electrode.name] = {"polygon_mm": _corners(electrode.corners)}
-            for key, polygons in (("more_mm", electrode.more), ("back_mm", electrode.back)):
-                if polygons:
-                    tables[electrode.name][key] = [_corners(polygon) for polygon in polygons]
+            more = {"more_mm": electrode.more, "back_mm": electrode.back}
+            tables[electrode.name] = {
+                "polygon_mm": _corners(electrode.corners),
+                **{key: [_corners(polygon) for polygon in polygons] for key, polygons in more.items() if polygons},
+            }
     return tables
 
 

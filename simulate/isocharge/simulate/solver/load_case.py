@@ -154,12 +154,8 @@ class LoadCase:
         """
         began = process_time()
         check_press(film, probe, at, force)
-        theory = settings.theory
-        if theory == "auto":
-            theory = choose_theory(film, probe, force, settings.accuracy)
-        layer = settings.layer
-        if layer == "auto":
-            layer = _layer(film, force, probe, settings, start)
+        theory = choose_theory(film, probe, force, settings.accuracy) if settings.theory == "auto" else settings.theory
+        layer = _layer(film, force, probe, settings, start) if settings.layer == "auto" else settings.layer
         return cls(film, probe, at, force, theory, layer, settings.accuracy, settings.tolerance, began)
 
     def place(self, resolution: Resolution) -> PlacedMesh:

@@ -191,9 +191,8 @@ def _start_field(start: Equilibrium | None, template: Template, cold: Array) -> 
     if start is None or (start.mesh.template.corners, start.mesh.template.half) != (template.corners, template.half):
         return cold
     before, order = start.mesh.template, template.resolution.order
-    if replace(before.resolution, order=order) != template.resolution:
-        return cold
-    if not np.array_equal(before.splits, template.splits):
+    is_other = replace(before.resolution, order=order) != template.resolution
+    if is_other or not np.array_equal(before.splits, template.splits):
         return cold
     return start.field if before.resolution == template.resolution else resampled(start.field, before, template)
 

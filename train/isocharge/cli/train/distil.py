@@ -6,13 +6,12 @@ import typer
 
 from isocharge.cli.shared.forward_maps import simulated_presses
 from isocharge.cli.shared.options import ConfigOption, FreshOption, JsonOption, ModelArgument, ModelsOption
-from isocharge.cli.shared.terminal import shown_progress, this_command
+from isocharge.cli.shared.terminal import shown_progress
 from isocharge.cli.train.fit import ModelFolderOption, VersionOption, release_resumably
 from isocharge.common.errors import InputError
-from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve import find_model, load_model
 from isocharge.serve.model.model_folder import check_target
-from isocharge.train import Release, StudentCase, fit, load_config, release, student_config, student_data
+from isocharge.train import StudentCase, fit, load_config, release, student_config, student_data
 from isocharge.train.training.fit import fit_identity
 
 
@@ -48,8 +47,5 @@ def distil_command(
     with shown_progress():
         presses = simulated_presses(case.sensor, case.probes, case.domain.radius, case.domain.force_range)
     data = student_data(folder, presses)
-
-    def train(run: ResumableRun) -> Release:
-        return release(fit(data, settings, run=run), output, version=version, command=this_command())
-
-    release_resumably(train, fit_identity(data, settings), target, fresh=fresh, json=json)
+    identity = fit_identity(data, settings)
+    release_resumably(lambda run: fit(data, settings, run=run), identity, target, release, fresh=fresh, json=json)

@@ -2,8 +2,9 @@
 
 import json as json_module
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 
@@ -29,6 +30,7 @@ from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import Circle, FilmPrior, load_sensor, local_workers, parse_probe, read_dataset
 from isocharge.train import (
     FilmsConfig,
+    FilmsModel,
     FitConfig,
     Release,
     Rig,
@@ -44,6 +46,9 @@ from isocharge.train import (
 from isocharge.train.films.fit import films_identity
 from isocharge.train.training.cross_fit import presses_identity, usable_presses
 from isocharge.train.training.fit import fit_identity
+
+Trained = TypeVar("Trained")
+"""What training gives, and a release is made of."""
 
 DEFAULT_TEXT = f"{DEFAULT_RADIUS}"
 """Radius of the working area where no other is asked for, mm."""
@@ -126,12 +131,12 @@ def fit_command(
         target = check_target(output, version, prior.sensor.electrode_names)
         caution_of_stress(prior.sensor.film, [prior.probe], sizes.force_range[1])
 
-        def train_films(run: ResumableRun) -> Release:
+        def train_films(run: ResumableRun) -> FilmsModel:
             with local_workers(most_workers(None)) as executor:
-                network = fit_films(prior, sizes, executor=executor, run=run)
-            return release_films(network, output, version=version, command=this_command())
+                return fit_films(prior, sizes, executor=executor, run=run)
 
-        release_resumably(train_films, films_identity(prior, sizes), target, fresh=fresh, json=json)
+        identity = films_identity(prior, sizes)
+        release_resumably(train_films, identity, target, release_films, fresh=fresh, json=json)
         return
     if sensor:  # before anything is simulated
         check_target(output, version, load_sensor(sensor).electrode_names)
@@ -139,13 +144,10 @@ def fit_command(
     if dataset and dataset.is_file() and not sensor:
         presses = _measured(dataset, radius, (position_std_mm, force_std))
         target = check_target(output, version, presses.electrodes)
-
-        def train_alone(run: ResumableRun) -> Release:
-            name = output.resolve().name
-            fitted = fit_presses(presses, name, settings, probes=tuple(probe or ["unknown"]), run=run)
-            return release(fitted, output, version=version, command=this_command())
-
-        release_resumably(train_alone, presses_identity(presses, settings), target, fresh=fresh, json=json)
+        train = partial(fit_presses, presses, output.resolve().name, settings, probes=tuple(probe or ["unknown"]))
+        release_resumably(
+            lambda run: train(run=run), presses_identity(presses, settings), target, release, fresh=fresh, json=json
+        )
         return
     with shown_progress():
         if dataset and not dataset.is_dir():
@@ -155,11 +157,8 @@ def fit_command(
             data = _presses(dataset, sensor, probes, radius)
     target = check_target(output, version, data.sensor.electrode_names)
     caution_of_stress(data.sensor.film, map(parse_probe, data.probes), data.domain.force_range[1])
-
-    def train(run: ResumableRun) -> Release:
-        return release(fit(data, settings, run=run), output, version=version, command=this_command())
-
-    release_resumably(train, fit_identity(data, settings), target, fresh=fresh, json=json)
+    identity = fit_identity(data, settings)
+    release_resumably(lambda run: fit(data, settings, run=run), identity, target, release, fresh=fresh, json=json)
 
 
 UNSEEN = "that training never saw"
@@ -220,9 +219,10 @@ def _films(
 
 
 def release_resumably(
-    fit_and_release: Callable[[ResumableRun], Release],
+    train: Callable[[ResumableRun], Trained],
     identity: Mapping[str, Any],
     target: Path,
+    release: Callable[..., Release],
     *,
     fresh: bool,
     json: bool,
@@ -230,22 +230,23 @@ def release_resumably(
     """Fit into a version folder and print the errors; stopped, say how to go on.
 
     Args:
-        fit_and_release: The work; it keeps its state in the run.
+        train: The work; it keeps its state in the run.
         identity: All that decides about the weights.
         target: The version folder.
+        release: Writes what `train` gives.
         fresh: Throw away what an earlier run left.
         json: Print the folder and the errors as one JSON object.
     """
     with shown_run(target), resume_parts(target, identity, fresh=fresh) as run:
-        release = fit_and_release(run)
-    errors = release.metadata.errors
+        made = release(train(run), target.parent, version=int(target.name), command=this_command())
+    errors = made.metadata.errors
     if json:
-        typer.echo(json_module.dumps({"folder": str(release.folder), "errors": dict(errors)}))
+        typer.echo(json_module.dumps({"folder": str(made.folder), "errors": dict(errors)}))
     measured = errors.get("measured_presses")
-    unseen = "at places that were left out" if "folds" in release.metadata.made_with.get("measured", {}) else UNSEEN
+    unseen = "at places that were left out" if "folds" in made.metadata.made_with.get("measured", {}) else UNSEEN
     presses = f"on {measured:.0f} measured presses {unseen}, " if measured else ""
     say(
-        f"{release.folder}: {presses}position error {errors['position_median_mm']:g} mm median, "
+        f"{made.folder}: {presses}position error {errors['position_median_mm']:g} mm median, "
         f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "
         f"force {errors['force_rms_percent']:g} % rms"
     )

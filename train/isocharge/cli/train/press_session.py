@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, Screen
-from isocharge.common.errors import InputError, PressError
+from isocharge.common.errors import InputError, PressError, told_where
 from isocharge.common.json_values import plain_values
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress
@@ -67,10 +67,8 @@ def calibrate_at_port(
     contacts = None if port.press_list is None else read_press_list(port.press_list)
     session = _session(port, problem, folder)
     for number, contact in enumerate(() if contacts is None else contacts, start=1):
-        try:
+        with told_where(f"{port.press_list}, press {number}: ", PressError):
             session.check(contact)
-        except PressError as error:
-            raise PressError(f"{port.press_list}, press {number}: {error}") from error
     taken = partial(_print_press, machine=contacts is not None) if json_lines else lambda *_: None
     try:
         with _events(port, problem) as events:

@@ -48,7 +48,8 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
     def fit(self, charge: Array, contact: Array) -> "GaussNewton":
         """Map and starts from clean presses."""
         presses = LabelledPresses(contact, charge)
-        self.map_ = self.charge_map or self._series(presses)
+        names = tuple(map(str, range(charge.shape[1])))
+        self.map_ = self.charge_map or ChargeField.fit(self.domain, names, *split_by_position(presses, HELD, self.seed))
         rows = np.random.default_rng(self.seed).permutation(len(presses))[:STARTS]
         self.features_, self.starts_ = whitening().fit(charge), contact[rows]
         self.tree_ = cKDTree(self.features_.transform(charge[rows]))
@@ -57,10 +58,6 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
     def predict(self, charge: Array) -> Array:
         """Contacts, shape (n, 3)."""
         return np.concatenate([self._search(charge[k : k + BATCH]) for k in range(0, len(charge), BATCH)])
-
-    def _series(self, presses: LabelledPresses) -> ChargeField:
-        names = tuple(map(str, range(presses.charge.shape[1])))
-        return ChargeField.fit(self.domain, names, *split_by_position(presses, HELD, self.seed))
 
     def _search(self, charge: Array) -> Array:
         sigma, features = self.noise.sigma(charge), self.features_.transform(charge)

@@ -16,7 +16,7 @@ from onnx.utils import Extractor
 
 from isocharge.common.arrays import Array
 from isocharge.serve import Predictor
-from isocharge.serve.model.session import INPUT, open_session
+from isocharge.serve.model.session import INPUT, BoundPress, open_session
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.baselines.rivals import GivenMethod
 from isocharge.train.data.presses import LabelledPresses
@@ -46,16 +46,11 @@ class OnnxContact(GivenMethod):
         return np.asarray(self._session.run(["contact"], {INPUT: charge.astype(np.float32)})[0], dtype=float)
 
     def single(self, charge: Array) -> Callable[[], object]:
-        """One press, shape (n_electrode,), ready to be computed: into the bound input, run, out of the bound output."""
-        row, answers, out = charge.astype(np.float32), np.zeros((1, 3), np.float32), np.zeros(3, np.float32)
-        bound, binding = row[None].copy(), self._session.io_binding()
-        binding.bind_input(INPUT, "cpu", 0, np.float32, bound.shape, bound.ctypes.data)
-        binding.bind_output("contact", "cpu", 0, np.float32, answers.shape, answers.ctypes.data)
+        """One press, shape (n_electrode,), ready to be computed: through bound memory, as `Predictor` does it."""
+        press, row, out = BoundPress(self._session, charge.size), charge.astype(np.float32), np.zeros(3, np.float32)
 
         def compute() -> object:
-            bound[0] = row
-            self._session.run_with_iobinding(binding)
-            out[:] = answers[0]
+            press.run_into(row, out)
             return out
 
         return compute

@@ -272,8 +272,7 @@ def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:
 
 def _check_enough_known(presses: MeasuredPresses, problem: CalibrationProblem) -> None:
     """Refuse presses without place and force where charges alone tell nothing of the film."""
-    nothing = np.isnan(presses.contact).all(axis=1)
-    if nothing.all() and len(problem.electrodes) <= 3:
+    if np.isnan(presses.contact).all() and len(problem.electrodes) <= 3:
         raise PressError(
             f"{len(presses)} presses of unknown place and force: three charges are used up by x, y and force, so they "
             "tell nothing of the film; give the place or the force of a press (four electrodes would have one charge "

@@ -84,14 +84,10 @@ def _like(network: FoldedNetwork, other: FoldedNetwork) -> FoldedNetwork:
     """Another network with the correlations of this one: they hardly change with the pretension."""
     if not network.angles:
         return other
-    head = np.s_[..., KNOWN : KNOWN + network.angles]
-
-    def widened(theirs: Array, mine: Array) -> Array:
-        return np.concatenate([theirs[..., :KNOWN], mine[head], theirs[..., KNOWN:]], axis=-1)
-
-    weight, bias = map(widened, other.layers.last, network.layers.last)
-    skip = widened(other.layers.skip, network.layers.skip)
-    return replace(other, layers=replace(other.layers, last=(weight, bias), skip=skip))
+    weight, bias, skip = (
+        values[..., KNOWN : KNOWN + network.angles] for values in (*network.layers.last, network.layers.skip)
+    )
+    return replace(other, layers=other.layers.with_angles(weight, bias, skip))
 
 
 def _arrays(network: FoldedNetwork) -> list[np.ndarray]:

@@ -9,7 +9,7 @@ from matplotlib.ticker import LogLocator
 from matplotlib.tri import Triangulation
 
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
-from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
+from isocharge.simulate.plots.film import draw_layout
 from isocharge.train.calibration.calibrate import CalibrationResult
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.quantities import NORMAL_95
@@ -28,11 +28,13 @@ def calibration_picture(result: CalibrationResult) -> Figure:
     """Maps of the error that the film leaves, quantities in units of what was assumed, residuals of the presses."""
     figure = new_figure(15.0, 9.4)
     (before, after), (identified, residuals) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
-    titles = "before the presses", f"after {len(result.presses)} presses"
-    if result.moved:
-        titles = "before it was moved", "moved to another temperature"
-    _draw_error(before, result, result.left_before, titles[0])
-    shades = _draw_error(after, result, result.left, titles[1])
+    then, now = (
+        ("before it was moved", "moved to another temperature")
+        if result.moved
+        else ("before the presses", f"after {len(result.presses)} presses")
+    )
+    _draw_error(before, result, result.left_before, then)
+    shades = _draw_error(after, result, result.left, now)
     contact, bad = result.posterior.contact, result.posterior.bad
     after.plot(*contact[~bad, :2].T, "o", color="white", mec=INK, ms=6, label="presses")
     if bad.any():
@@ -53,11 +55,8 @@ def _draw_error(axes: Any, result: CalibrationResult, error: ContactError, title
     smooth = np.clip(np.sqrt((error.each_mm[nearest] ** 2).mean(axis=1)), *LEVELS_MM)
     levels = np.geomspace(*LEVELS_MM, 25)
     shades = axes.tricontourf(Triangulation(x, y), smooth, levels, norm=LogNorm(), cmap="viridis")
-    sensor, radius = result.film[0], result.problem.domain.radius
-    draw_electrodes(axes, sensor)
-    draw_working_area(axes, radius)
-    frame_film(axes, sensor, radius)
-    axes.set_title(f"{title}: {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)")
+    title = f"{title}: {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)"
+    draw_layout(axes, result.film[0], result.problem.domain.radius, title)
     return shades
 
 
@@ -77,8 +76,13 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
     for number, quantity in enumerate(quantities):
         text = f"{quantity.value:.3g} ± {quantity.std:.2g}"
         axes.annotate(text, (4.2, number), va="center", fontsize=8, annotation_clip=False)
-    axes.set(yticks=row, yticklabels=[quantity.name for quantity in quantities], xlim=(-4.0, 4.0))
-    axes.set(xlabel="from what was assumed, in its standard deviations", title="what the presses tell")
+    axes.set(
+        title="what the presses tell",
+        xlabel="from what was assumed, in its standard deviations",
+        xlim=(-4.0, 4.0),
+        yticks=row,
+        yticklabels=[quantity.name for quantity in quantities],
+    )
     axes.tick_params(axis="y", labelsize=8)
     axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3)
 
@@ -90,5 +94,10 @@ def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
     axes.bar(np.arange(len(lines)), np.minimum(residual, 10.0), color=colours)
     axes.axhline(1.0, color=INK, lw=0.8, ls="--")
     ticks = np.arange(0, len(lines), max(1, len(lines) // 20))
-    axes.set(xticks=ticks, xticklabels=[lines[tick] for tick in ticks], xlabel="line of the press")
-    axes.set(ylabel="residual over what noise and rig explain", title="how well the film fits")
+    axes.set(
+        title="how well the film fits",
+        xlabel="line of the press",
+        ylabel="residual over what noise and rig explain",
+        xticks=ticks,
+        xticklabels=[lines[tick] for tick in ticks],
+    )

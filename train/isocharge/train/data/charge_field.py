@@ -18,8 +18,9 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy.linalg import cho_factor, cho_solve
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, TrainingError
+from isocharge.serve.model.charge_series import CHUNK, ChargeSeries, Series, plane_terms, terms
 from isocharge.simulate import NoiseModel, working_area
 from isocharge.simulate.forward.charge_map import Domain, within
 from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
@@ -44,9 +45,6 @@ ROWS_PER_TERM = 40
 
 FEWEST_PER_TERM = 8
 """Fewer presses for a coefficient than this leave the slopes at the rim to chance."""
-
-CHUNK = 4096
-"""Presses whose terms are held at once."""
 
 RIDGE = 1e-9
 """Weight of the coefficients' own size in the fit, relative: the square's corners lie outside the disk, where nothing
@@ -123,7 +121,7 @@ class ChargeField:
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Charges and derivatives at once, in half the time; see `ChargeMap`."""
         unit = self.domain.to_unit(contact)
-        values = self.values(unit)
+        values = self._series.values(unit)
         if self.log_size is None:
             charge = np.exp(values[:, 0])
             return charge, charge[:, :, None] * values[:, 1:].swapaxes(1, 2) / self.domain.scale
@@ -132,22 +130,16 @@ class ChargeField:
         slopes[:, 2] += growth * values[:, 0]
         return size * values[:, 0], size[:, :, None] * slopes.swapaxes(1, 2) / self.domain.scale
 
-    def values(self, unit: Array) -> Array:
-        """The series and its derivatives by the unit coordinates: contacts (n, 3) in them to (n, 4, n_electrode)."""
-        degree, _, orders, n_electrode = (size - 1 for size in self.series.shape)
-        parts = []
-        for some in np.array_split(unit, len(unit) // CHUNK + 1):
-            plane, in_force = _terms(some, degree, orders)
-            by_force = (plane @ self._rows).reshape(len(some), in_force.shape[1], -1)
-            parts.append((in_force[:, None, :] @ by_force)[:, 0])
-        return np.concatenate(parts).reshape(len(unit), 4, n_electrode + 1)
-
     @cached_property
-    def _rows(self) -> Array:
-        """The series and its derivatives by term of the plane, shape (n_term, (force_degree + 1) 4 n_electrode)."""
-        all_four = np.stack([self.series, *(_derivative(self.series, axis) for axis in range(3))])
-        of_terms = all_four[:, *_plane_terms(self.series.shape[0] - 1)]  # (4, n_term, force_degree + 1, n_electrode)
-        return np.asarray(of_terms.transpose(1, 2, 0, 3).reshape(of_terms.shape[1], -1))
+    def _series(self) -> Series:
+        return Series(self.series)
+
+    @property
+    def of_positive(self) -> ChargeSeries | None:
+        """The series that follows contacts across folds; None for charges of both signs."""
+        if self.log_size is not None:
+            return None
+        return ChargeSeries(self._series, self.domain.radius, self.domain.force_range)
 
 
 def _log_size(logs: Array, charge: Array) -> Array:
@@ -163,38 +155,19 @@ def _size(coefficients: Array, logs: Array) -> tuple[Array, Array]:
     return np.exp(chebyshev.chebval(inside, coefficients)), np.asarray(slope)
 
 
-def _plane_terms(degree: int) -> tuple[Integers, Integers]:
-    """Degrees in x and y of the terms."""
-    of_x, of_y = np.nonzero(np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) <= degree)
-    return of_x, of_y
-
-
-def _terms(unit: Array, degree: int, force_degree: int) -> tuple[Array, Array]:
-    """Products of the polynomials in x and y, (n, n_term), and the polynomials in the force, (n, force_degree + 1)."""
-    inside = np.clip(unit, -1.0, 1.0)
-    in_x, in_y = (chebyshev.chebvander(inside[:, axis], degree).astype(float) for axis in range(2))
-    of_x, of_y = _plane_terms(degree)
-    return in_x[:, of_x] * in_y[:, of_y], chebyshev.chebvander(inside[:, 2], force_degree).astype(float)
-
-
 def _least_squares(unit: Array, target: Array, degree: int, force_degree: int) -> Array:
     """Series for targets of shape (n, k), by the normal equations: double precision is plenty for these polynomials."""
     count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
     normal, moment = RIDGE * len(unit) * np.eye(count), np.zeros((count, target.shape[1]))
     for some in np.array_split(np.arange(len(unit)), len(unit) // CHUNK + 1):
-        plane, in_force = _terms(unit[some], degree, force_degree)
+        plane, in_force = terms(unit[some], degree, force_degree)
         columns = (plane[:, :, None] * in_force[:, None, :]).reshape(len(some), -1)
         normal += columns.T @ columns
         moment += columns.T @ target[some]
     series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
     solution = cho_solve(cho_factor(normal), moment)
-    series[_plane_terms(degree)] = solution.reshape(-1, force_degree + 1, target.shape[1])
+    series[plane_terms(degree)] = solution.reshape(-1, force_degree + 1, target.shape[1])
     return series
-
-
-def _derivative(series: Array, axis: int) -> Array:
-    """Series of the derivative by one unit coordinate, padded to the same shape."""
-    return np.pad(chebyshev.chebder(series, axis=axis), [(0, int(k == axis)) for k in range(4)])
 
 
 SURE = 3e-4
@@ -255,6 +228,7 @@ def invertible_domain(
             f"the map from contacts to charges folds beyond {fold:g} mm: two contacts give the same charges there; the "
             f"model is trained for {fold:g} mm, not {asked.radius:g} mm, on {len(presses.within(fold))} of "
             f"{len(presses)} presses"
+            + ("" if field.of_positive is None else f"; 'serve stream --track' follows contacts to {asked.radius:g} mm")
         )
     if field.error < SMOOTH:
         inner = within(field, RIM * domain.radius)

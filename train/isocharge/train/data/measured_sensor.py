@@ -98,14 +98,11 @@ def outline(places: Array) -> Array:
         ) from error
     spacing = float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
     sizes = _circumradii(places[triangles])
-    for limit in LEAST_HOLE * spacing * 2.0 ** np.arange(0.0, 20.0, 0.5):
-        ring = _ring(triangles[sizes <= limit], len(places))
-        if ring is not None:
-            break
-    else:
-        ring = _ring(triangles, len(places))
-        if ring is None:
-            raise PressError(f"expected presses over an area, got {len(places)} places that enclose none")
+    limits = [*LEAST_HOLE * spacing * 2.0 ** np.arange(0.0, 20.0, 0.5), np.inf]
+    rings = (_ring(triangles[sizes <= limit], len(places)) for limit in limits)
+    ring = next((ring for ring in rings if ring is not None), None)
+    if ring is None:
+        raise PressError(f"expected presses over an area, got {len(places)} places that enclose none")
     return _grown(places[ring], 0.5 * spacing)
 
 

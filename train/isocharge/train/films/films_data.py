@@ -59,18 +59,9 @@ class FilmPresses:
 
     def charge(self) -> Array:
         """Clean charges of the films as they are, shape (n_film, n_press, n_electrode), pC."""
-        factors = part_factors(self.parameters), gains_of(self.parameters)
-        return np.asarray(np.einsum("fpec,fc,fe->fpe", self.response.astype(float), *factors))
-
-
-def part_factors(parameters: Array) -> Array:
-    """What multiplies each part of the response: (n_film, n_parameter) to (n_film, 3)."""
-    return np.stack([np.exp(parameters[:, D31]), np.exp(parameters[:, D32]), np.ones(len(parameters))], axis=1)
-
-
-def gains_of(parameters: Array) -> Array:
-    """Factors of the electrodes: (n_film, n_parameter) to (n_film, n_electrode)."""
-    return np.asarray(np.exp(parameters[:, len(SHARED) :]))
+        d31, d32, gains = (np.exp(self.parameters[:, which]) for which in (D31, D32, slice(len(SHARED), None)))
+        parts = np.stack([d31, d32, np.ones(len(self))], axis=1)
+        return np.asarray(np.einsum("fpec,fc,fe->fpe", self.response.astype(float), parts, gains))
 
 
 def draw_film_presses(

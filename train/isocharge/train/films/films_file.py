@@ -25,7 +25,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, ModelError
-from isocharge.common.files import read_whole, sha256_of
+from isocharge.common.files import read_needed, sha256_of
 from isocharge.common.npz import npz_arrays
 from isocharge.simulate import Circle, Domain, NoiseModel
 from isocharge.simulate.forward.film_family import FilmFamily
@@ -90,14 +90,8 @@ def read_films(version_folder: Path) -> FilmsModel:
         ModelError: If the file is missing or damaged, or of another format.
     """
     path = version_folder / FILE
-    try:
-        data = read_whole(path)
-    except OSError as error:
-        raise ModelError(
-            f"{path}: cannot be read ({error.strerror}); expected the version folder of a model for all films, as "
-            "`isocharge train fit --films` writes it"
-        ) from error
-    return films_from_bytes(data, str(path))
+    advice = "expected the version folder of a model for all films, as `isocharge train fit --films` writes it"
+    return films_from_bytes(read_needed(path, ModelError, advice), str(path))
 
 
 def films_from_bytes(data: bytes, where: str) -> FilmsModel:

@@ -265,8 +265,7 @@ def release(
     graph = export_onnx(fitted.network, about.to_props())
     golden = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, contact_floors(about))
     text = hub_block(about) + card(about, fitted)
-    written = write_model(folder, graph, about, golden, text, fitted.provenance.files)
-    return Release(written, about)
+    return Release(write_model(folder, graph, about, golden, text, fitted.provenance.files), about)
 
 
 def _yield_force(fitted: Fitted) -> float | None:

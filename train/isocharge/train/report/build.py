@@ -183,8 +183,7 @@ class _Subject:
     def _simulated(self, executor: Executor) -> tuple[dict[str, Any], Drawings]:
         case, settings, released = self.case, self.settings, self.released
         exact = case.forward_maps(further=1.0, accuracy=settings.accuracy, executor=executor)
-        test_maps = exact if settings.quick else case.forward_maps(executor=executor)
-        clean = press_on(test_maps, case.sweep())
+        clean = press_on(exact if settings.quick else case.forward_maps(executor=executor), case.sweep())
         test = replace(clean, charge=clean.noisy(case.noise, case.seed + TEST_NOISE))
         charges = ChargeSpline.of(exact[0])
         limits = ErrorBounds.of(case, charges, clean, test.charge[: settings.limited], executor)

@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from isocharge.simulate import Domain, Sensor
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.plots.figure import FELT, INK, new_axes, new_figure
-from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
+from isocharge.simulate.plots.film import draw_layout
 from isocharge.train.baselines.networks import RELEASED
 from isocharge.train.data.presses import position_error
 from isocharge.train.model_release.evaluate import FALSE_ALARMS
@@ -102,9 +102,7 @@ def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Figure:
         cells.set_clip_path(Circle((0, 0), domain.radius, transform=axes.transData))
         cells.set_clim(*np.percentile(np.ma.compressed(cells.get_array()), (0.5, 99.5)))
         figure.colorbar(cells, ax=axes, shrink=0.85, label=label)
-        draw_electrodes(axes, sensor)
-        draw_working_area(axes, domain.radius)
-        frame_film(axes, sensor, domain.radius)
+        draw_layout(axes, sensor, domain.radius)
     return figure
 
 

@@ -123,16 +123,14 @@ def deviations(
     for level in LEVELS:
         louder = NoiseModel(f"x {level:g}", level * case.noise.white, level * case.noise.gain)
         yield Deviation("noise", louder.name, truth, clean.noisy(louder, seed))
-    for notation in settings.shapes:
-        maps = replace(case, probes=(parse_probe(notation),)).forward_maps(accuracy=rough, executor=executor)
-        presses = press_on(maps, case.sweep())
-        yield Deviation("probe", notation, presses.contact, presses.noisy(case.noise, seed))
+    others = [("probe", each, replace(case, probes=(parse_probe(each),)), rough) for each in settings.shapes]
     if settings.mismatch_cases:
         film = replace(case.sensor.film, pretension=case.sensor.film.pretension + PRETENSION_OFF)
-        maps = replace(case, sensor=replace(case.sensor, film=film)).forward_maps(accuracy=ROUGH, executor=executor)
-        presses = press_on(maps, case.sweep())
-        name = f"+{PRETENSION_OFF:g} MPa"
-        yield Deviation("pretension", name, presses.contact, presses.noisy(case.noise, seed))
+        taut = replace(case, sensor=replace(case.sensor, film=film))
+        others.append(("pretension", f"+{PRETENSION_OFF:g} MPa", taut, ROUGH))
+    for group, name, other, accuracy in others:
+        presses = press_on(other.forward_maps(accuracy=accuracy, executor=executor), case.sweep())
+        yield Deviation(group, name, presses.contact, presses.noisy(case.noise, seed))
     yield from _wrong_gains(case, truth, clean.noisy(case.noise, seed))
 
 

@@ -77,7 +77,7 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
     features = network.layers.features(logs)
     contact, std, *_ = network.of_answers(network.layers.from_features(features, logs))
     errors = np.column_stack([truth[:, :2] - contact[:, :2], np.log(truth[:, 2] / contact[:, 2])])
-    weight, bias = network.layers.last
+    weight, _ = network.layers.last
     of_contact = weight[:, :KNOWN].any(axis=1)
     features = np.hstack([features[:, of_contact], logs])
     deviation = errors / np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]])
@@ -85,13 +85,8 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
         slopes, angles = _fit_angles(features, deviation)
     head = np.zeros((len(weight), 3))
     head[of_contact] = slopes[: -logs.shape[1]]
-
-    def widened(values: Array, added: Array) -> Array:
-        return np.concatenate([values[..., :KNOWN], added @ ANGLE_SUMS, values[..., KNOWN:]], axis=-1)
-
-    last = widened(weight, head), widened(bias, angles)
-    skip = widened(network.layers.skip, slopes[-logs.shape[1] :])
-    return replace(network, layers=replace(network.layers, last=last, skip=skip))
+    sums = (values @ ANGLE_SUMS for values in (head, angles, slopes[-logs.shape[1] :]))
+    return replace(network, layers=network.layers.with_angles(*sums))
 
 
 def _fit_angles(features: Array, deviation: Array) -> tuple[Array, Array]:

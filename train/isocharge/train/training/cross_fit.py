@@ -100,12 +100,11 @@ def fit_presses(
         steps = _train_members(members, known, fold, noise, settings.training, run)
         judged = [_answers(member, known.charge) for member in members]
         contact, std = (np.choose(fold[:, None], [answer[part] for answer in judged]) for part in range(2))
-        factors = deviation_factors(contact, std, known.contact)
+        position, force = deviation_factors(contact, std, known.contact)
         train_part(_taught_stage(network, members, known, noise, settings.training), network.contact, settings, run)
         draw = partial(_misfit_examples, known, domain, noise, settings.training)
         examples = run.keeping("misfit-charges").submit(draw).result() if run else draw()
         train_part(misfit_stage(network, examples, settings.training), network.misfit_vector, settings, run)
-    position, force = factors
     return Fitted(
         network=fold_network(network.eval()).widened(position, force),
         sensor=MeasuredSensor(name, usable.electrodes),
@@ -124,7 +123,7 @@ def fit_presses(
                     "places": len(np.unique(known.contact[:, :2], axis=0)),
                     "folds": FOLDS,
                     "steps": steps,
-                    "std_factors": [float(f"{factor:.4g}") for factor in factors],
+                    "std_factors": [float(f"{factor:.4g}") for factor in (position, force)],
                 },
             },
             files={PRESSES: presses_text(usable).encode()},

@@ -21,6 +21,8 @@ from torch import Tensor
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ConfigError
 from isocharge.common.resumable_run import ResumableRun
+from isocharge.serve.model.charge_series import FILE as CHARGES
+from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import ChargeMap, Dataset, Domain, NoiseModel
 from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.numerics.statistics import rms
@@ -82,6 +84,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
         **({"teacher": taught.label} if taught else {}),
         **data.provenance.made_with,
     }
+    files = {**data.provenance.files, **({CHARGES: split.folded.to_bytes()} if split.folded else {})}
     return Fitted(
         network=network,
         sensor=data.sensor,
@@ -91,7 +94,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
         test=split.held if data.test is None else data.test,
         good=data.presses.within(split.domain.radius) if data.presses.measured else split.held,
         sha256=data.sha256,
-        provenance=replace(data.provenance, made_with=made_with),
+        provenance=replace(data.provenance, made_with=made_with, files=files),
         asked=data.domain,
         cautions=split.cautions,
     )
@@ -121,6 +124,7 @@ class Split:
         field: The map from contacts to charges: fitted to what is left where the map folds, or to all presses if that
             fits better.
         cautions: About folds and ambiguous pairs, a sentence each.
+        folded: The charges of all presses where the map folds among them, so that contacts can be followed across.
     """
 
     domain: Domain
@@ -129,6 +133,7 @@ class Split:
     held: LabelledPresses
     field: ChargeMap
     cautions: tuple[str, ...]
+    folded: ChargeSeries | None
 
     @classmethod
     def of(cls, data: TrainingData, training: TrainingConfig) -> "Split":
@@ -145,7 +150,9 @@ class Split:
         train, watched = split_by_position(trainable, WATCHED * training.hold_out, training.seed + 1)
         field = ChargeField.fit(domain, names, train, watched)
         of_all = domain != data.domain and first.error < field.error
-        return cls(domain, train, watched, held, within(first, domain.radius) if of_all else field, cautions)
+        field_within = within(first, domain.radius) if of_all else field
+        folded = first.of_positive if domain != data.domain else None
+        return cls(domain, train, watched, held, field_within, cautions, folded)
 
     def features(self, noise: NoiseModel) -> Features:
         """Logarithms, unless some charge has none."""

@@ -56,6 +56,12 @@ class FoldedLayers:
     last: Layer
     skip: Array
 
+    def with_angles(self, weight: Array, bias: Array, skip: Array) -> "FoldedLayers":
+        """The layers with further columns for arguments of cosines, which stand before the misfit's."""
+        pairs = zip((*self.last, self.skip), (weight, bias, skip), strict=True)
+        *last, skip = (np.concatenate([own[..., :KNOWN], new, own[..., KNOWN:]], axis=-1) for own, new in pairs)
+        return replace(self, last=(last[0], last[1]), skip=skip)
+
     @classmethod
     def of(cls, perceptrons: Sequence[PlainPerceptron], whitening: Array, mean: Array, units: Layer) -> "FoldedLayers":
         """Fold perceptrons of equally many layers.

@@ -46,9 +46,7 @@ class Perceptron(Trainable):
     def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int) -> None:
         super().__init__()
         widths = (inputs, *hidden)
-        layers: list[nn.Module] = []
-        for before, after in pairwise(widths):
-            layers += [nn.Linear(before, after), nn.Tanh()]
+        layers = [part for sizes in pairwise(widths) for part in (nn.Linear(*sizes), nn.Tanh())]
         self.mlp = nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
         self.skip = nn.Linear(inputs, outputs, bias=False)
         nn.init.zeros_(self.skip.weight)

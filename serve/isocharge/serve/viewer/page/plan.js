@@ -110,8 +110,17 @@ export class Plan {
       circle(g, x, y, Math.max(r, 9 * px)); g.stroke(); g.setLineDash([]);
       if (kind === "misfit") { const d = 0.7 * Math.max(r, 9 * px); segment(g, x - d, y - d, x + d, y + d); segment(g, x - d, y + d, x + d, y - d); }
     }
+    if (sample.otherX !== null) this.drawOther(g, sample, r, px);
     if (sample.xStd !== null) this.drawEllipse(g, x, y, sample, 1, kind === "contact" ? theme.ink : theme.warn, 1.4 * px);
     if (sample.xStd !== null && kind !== "misfit") this.drawLens(g, sample, trail, px);
+  }
+
+  /** The other contact with the same charges, where it is not known which of them touches. */
+  drawOther(g, { otherX, otherY }, r, px) {
+    const { x, y } = this.inView({ x: otherX, y: otherY });
+    g.strokeStyle = theme.touch; g.lineWidth = 2.5 * px; g.setLineDash([3 * px, 3 * px]);
+    circle(g, x, y, r); g.stroke(); g.setLineDash([]);
+    this.text(g, "or here", x, y + r + 9 * px, 11 * px, theme.ink, "center");
   }
 
   /** A place beyond the view is shown at its edge. */
