@@ -61,6 +61,8 @@ def main() -> None:
     asked = options(__doc__, slides=1000, rate_hz=1000.0, force=1.0, noise="reference", gain=0.0)
     touch, rng, noise = Predictor(asked.model), np.random.default_rng(asked.seed), noise_model(asked.noise)
     about, tracker = touch.metadata, Tracker(branches=(branches := branches_of(touch)))
+    if branches is None:
+        raise SystemExit(f"{asked.model}: no charges.npz: its map does not fold; give the model of the lines above")
     radius, forces = branches.charges.radius_mm, about.force_range_N
     sensor = sensor_from_dict(dict(about.sensor))
     film = with_fast_derivatives(ForwardMap.build(sensor, Circle(1.0), radius + BEYOND_MM, forces))
