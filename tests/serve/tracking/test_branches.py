@@ -119,9 +119,10 @@ def test_records_say_the_other_contact_and_repeat_bit_for_bit(model):
     chunks = [
         Chunk(encode_frame(Frame(k, 1000 * k, tuple(row))), 5.0 + 1e-3 * k, 0) for k, row in enumerate(rows.tolist())
     ]
-    device, predictor = device_from_table({"tare": {"frames": 10}, "track": {}}, "b"), Predictor(model)
+    predictor = Predictor(model)
 
-    def lines():
+    def lines(**memory):
+        device = device_from_table({"tare": {"frames": 10}, "track": {}} | memory, "b")
         touch = TouchStream(predictor, device, now_ns=lambda: 0)
         return [record.to_json() for chunk in chunks for record in touch.feed(chunk)]
 
@@ -132,6 +133,9 @@ def test_records_say_the_other_contact_and_repeat_bit_for_bit(model):
     assert [last[name] for name in ("x_mm", "y_mm", "force_N")] == list(last["tracked"].values())[:3]
     assert last["flags"] == []
     assert (released["tracked"], released["other"]) == (None, None)
+    doubted = json.loads(lines(memory={"creep": 0.08, "thermoelastic": 0.06})[45])
+    for contact, sure in ((doubted, last), (doubted["tracked"], last["tracked"])):
+        assert 1.1 < contact["force_std_N"] / sure["force_std_N"] < 3.0
 
 
 @pytest.mark.parametrize(
