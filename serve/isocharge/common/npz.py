@@ -1,7 +1,9 @@
 """Arrays of an npz file that somebody else may have made."""
 
 import io
+import lzma
 import zipfile
+import zlib
 from collections.abc import Iterable
 
 import numpy as np
@@ -15,6 +17,21 @@ LONGEST_HEAD = 4096
 PIECE = 4096
 """Bytes unpacked at a time: from one read, a decompressor may make thousands of times as many."""
 
+DAMAGED = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    EOFError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    lzma.LZMAError,
+    zlib.error,
+    MemoryError,
+)
+"""What NumPy, zipfile and whatever is made of the arrays raise over damaged files."""
+
 
 def npz_arrays(data: bytes, names: Iterable[str] | None = None) -> dict[str, np.ndarray]:
     """Arrays of an npz file; nothing in it is executed.
@@ -25,7 +42,7 @@ def npz_arrays(data: bytes, names: Iterable[str] | None = None) -> dict[str, np.
 
     Raises:
         ValueError: If they unpack to more than `MOST_UNPACKED` bytes, or are not arrays.
-        Exception: What zipfile, its decompressors and NumPy raise over damaged data.
+        Exception: Those of `DAMAGED`, over damaged data.
     """
     arrays, left = {}, MOST_UNPACKED
     with zipfile.ZipFile(io.BytesIO(data)) as packed:

@@ -35,7 +35,7 @@ def step(n=2000, at=200, height=400.0, electrodes=3):
 def test_held_step_decays_by_the_closed_form(part, tau):
     readings, _ = measure(part, step())
     t = np.arange(1800) / RATE
-    np.testing.assert_allclose(readings[200:], 400.0 * np.exp(-t / tau)[:, None] * np.ones(3), rtol=1e-9)
+    np.testing.assert_allclose(readings[200:], 400.0 * np.exp(-t / tau)[:, None] * np.ones(3), rtol=1e-12)
     np.testing.assert_array_equal(readings[:200], 0.0)
 
 

@@ -166,8 +166,8 @@ class TouchStream:
         self.predictor, self._validity = predictor, predictor.validity
         if self._tracker is not None:
             self._tracker.branches = branches = branches_of(predictor)
-            corners_mm = self._validity.corners_mm if branches is None else branches.charges.corners_mm
-            self._validity_followed = replace(self._validity, corners_mm=corners_mm)
+            if branches is not None:
+                self._validity_followed = replace(self._validity, corners_mm=branches.charges.corners_mm)
         self._electrodes, self._label = predictor.metadata.electrodes, predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
         self._of_doubt = Sensitivity(DOUBT)

@@ -13,8 +13,6 @@ with r the radius up to which contacts are known, and l the logarithm of the for
 """
 
 import io
-import zipfile
-import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,16 +23,13 @@ from numpy.polynomial import chebyshev
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import ModelError, cut
 from isocharge.common.files import read_whole
-from isocharge.common.npz import npz_arrays
+from isocharge.common.npz import DAMAGED, npz_arrays
 
 FILE = "charges.npz"
 """Name of the file in a version folder."""
 
 CHUNK = 4096
 """Contacts whose terms are held at once."""
-
-DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-"""What NumPy and zipfile raise over damaged files."""
 
 
 @dataclass(frozen=True)

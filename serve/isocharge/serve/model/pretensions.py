@@ -11,8 +11,6 @@ stays the graph of every film: onnxruntime is handed its constants, so that an a
 
 import io
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +22,7 @@ from msgspec import Meta, Struct
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ModelError, cut
 from isocharge.common.files import read_whole
-from isocharge.common.npz import npz_arrays
+from isocharge.common.npz import DAMAGED, npz_arrays
 from isocharge.common.structs import NotNegative, Positive, Text, parse_json
 
 FILE = "pretensions.npz"
@@ -35,9 +33,6 @@ FORMAT = 1
 
 TINY = 1e-12
 """Length that counts as none."""
-
-DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-"""What NumPy and zipfile raise over damaged files."""
 
 
 @dataclass(frozen=True, kw_only=True)

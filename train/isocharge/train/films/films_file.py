@@ -13,9 +13,7 @@ The last bits of the integers are nearly noise, so that fewer bits make a smalle
 import hashlib
 import io
 import json
-import lzma
 import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -26,7 +24,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, ModelError
 from isocharge.common.files import read_needed, sha256_of
-from isocharge.common.npz import npz_arrays
+from isocharge.common.npz import DAMAGED, npz_arrays
 from isocharge.simulate import Circle, Domain, NoiseModel
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread
@@ -48,21 +46,6 @@ FILE_UNITS = {"pretension": 1e6, "shift": 1e-3, "probe_radius": 1e-3}
 
 FILE_PC = 1e-12
 """Factor to white noise in the file, which is in C."""
-
-DAMAGED = (
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    EOFError,
-    NotImplementedError,
-    zipfile.BadZipFile,
-    lzma.LZMAError,
-    zlib.error,
-    MemoryError,
-)
-"""What NumPy, zipfile and the model's parts raise over damaged files."""
 
 AGAIN = "copy the model's folder again, or train it again (isocharge train fit --films)"
 
