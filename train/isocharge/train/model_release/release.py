@@ -65,8 +65,9 @@ errors.
 """
 
 LIMITS = """\
-- One press at a time. Outside the working area and forces the answer is finite and wrong; the misfit is then large in
-  many cases, not in all.
+- The model assumes one press at a time, inside its working area and its range of forces. The answer to any other press
+  is finite and wrong. If the electrodes lie on one circle, most presses far outside the working area look like a press
+  inside it: the misfit is then small and the answer carries no flag.
 - The deviations hold for the noise named above; gains that are off by 1 % add more than all of it.
 """
 

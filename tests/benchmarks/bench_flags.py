@@ -1,0 +1,68 @@
+"""Which faults the released models flag: the tables of serve/docs/unnoticed.md.
+
+    python tests/benchmarks/bench_flags.py [--models NAME,...] [--presses 4000] [--seed 1] [--json]
+
+Presses of a circle of 1 mm over the whole range of forces, 0.05 to 2 N, with `reference` noise. Each cell gives the
+share of presses with a flag other than `stress`, and the share that is wrong by more than four reported standard
+deviations without such a flag. The benchmark takes about two minutes.
+"""
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from shared import arguments, print_results
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from press_faults import FaultStudy, Shares, film_charges, nominal_map, outside_results
+
+RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial,four-25um-biaxial-15mm,three-25um-biaxial-12mm"
+RING_EDGES_mm = (8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0)
+
+
+def table(results: dict[str, dict[str, Shares]]) -> list[str]:
+    """Return the lines of a Markdown table with a column for each model and a row for each fault."""
+    models = list(results)
+    faults = list(dict.fromkeys(fault for shares in results.values() for fault in shares))
+    lines = ["| fault | " + " | ".join(f"`{model}`" for model in models) + " |", "|---" * (len(models) + 1) + "|"]
+    for fault in faults:
+        cells = [cell(results[model].get(fault)) for model in models]
+        lines.append(f"| {fault} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def cell(shares: Shares | None) -> str:
+    """Return the two shares of a cell as text; empty if the model has no such fault."""
+    if shares is None:
+        return ""
+    return f"{percent(shares.flagged)}; {percent(shares.unnoticed)}"
+
+
+def percent(share: float) -> str:
+    """Return a share in percent as text, with a decimal where it is below one percent."""
+    return f"{share:.1f} %" if share < 1.0 else f"{share:.0f} %"
+
+
+def main() -> None:
+    requested = arguments(__doc__, models=RELEASED, presses=4000, seed=1, json=False)
+    models = requested.models.split(",")
+    charges = film_charges()
+    inside = {model: FaultStudy(model, charges, requested.presses, requested.seed).results() for model in models}
+    wide_map = nominal_map(RING_EDGES_mm[-1])
+    outside = {
+        model: outside_results(model, wide_map, RING_EDGES_mm, requested.presses, requested.seed) for model in models
+    }
+    if requested.json:
+        tables = {"inside": inside, "outside": outside}
+        results = {
+            title: {model: {fault: asdict(shares) for fault, shares in rows.items()} for model, rows in found.items()}
+            for title, found in tables.items()
+        }
+        print_results("flags", requested, results)
+        return
+    print_results("flags", requested, {"inside the working area": table(inside), "outside": table(outside)})
+
+
+if __name__ == "__main__":
+    main()

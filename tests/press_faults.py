@@ -1,0 +1,235 @@
+"""Faulty presses: how often a released model flags them, and how often its answer is wrong without a flag.
+
+A press is wrong without a flag if x, y or the force is more than four reported standard deviations from the truth while
+the answer carries no flag other than `stress`, which says that the film yields and not that the answer is doubtful.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Booleans
+from isocharge.serve import Predictor
+from isocharge.serve.flags import STRESS
+from isocharge.simulate import Circle, ForwardMap, Sensor, load_sensor, noise_model
+
+FILM_SENSOR = "three-25um-biaxial"
+"""Sensor whose film all sensors of the study share; only their electrodes and piezoelectric coefficients differ."""
+
+FILM_RADIUS_mm = 15.001
+"""Distance from the centre up to which faults of presses inside the working area need charges, mm."""
+
+AREA_CLEARANCE_mm = 0.5
+"""Smallest distance of a press outside from the edge of the working area, mm."""
+
+FORCE_RANGE_N = (0.05, 2.0)
+"""Range of forces, N; it is the range of the released models."""
+
+WRONG_STDS = 4.0
+"""Number of reported standard deviations beyond which an answer counts as wrong."""
+
+CLIPPING_pC = 1500.0
+"""Largest charge of an amplifier with 1 nF and 1.5 V, pC."""
+
+HUM_pC = 5.0
+"""Amplitude of the hum, pC; all electrodes see it with the same phase, which is drawn for each press."""
+
+SECOND_FINGER_DISTANCE_mm = 4.0
+"""Smallest distance between two fingers, mm."""
+
+SECOND_FINGER_FORCE_N = (0.1, 1.0)
+"""Range of the force of the second finger, N."""
+
+
+@dataclass(frozen=True)
+class FilmCharges:
+    """Charges of presses on the film that is built in, and on films and with probes that differ from it.
+
+    Attributes:
+        nominal: Forward map of the film and the probe of the released models.
+        variants: Forward maps of another probe or film, by the name of the fault.
+    """
+
+    nominal: ForwardMap
+    variants: dict[str, ForwardMap]
+
+    def for_sensor(self, sensor: Sensor) -> "FilmCharges":
+        """Return the charges that another sensor collects on the same films."""
+
+        def with_electrodes(forward_map: ForwardMap) -> ForwardMap:
+            film = forward_map.sensor.film
+            return replace(forward_map, sensor=replace(sensor, film=film))
+
+        variants = {name: with_electrodes(forward_map) for name, forward_map in self.variants.items()}
+        return FilmCharges(with_electrodes(self.nominal), variants)
+
+
+def nominal_map(radius: float = FILM_RADIUS_mm) -> ForwardMap:
+    """Build the forward map of the built-in film under the probe of the released models."""
+    return ForwardMap.build(load_sensor(FILM_SENSOR), Circle(1.0), radius, FORCE_RANGE_N)
+
+
+def film_charges() -> FilmCharges:
+    """Build the forward maps of the nominal film and of every variant."""
+    sensor = load_sensor(FILM_SENSOR)
+    film = sensor.film
+    thicker = replace(sensor, film=replace(film, thickness=1.1 * film.thickness))
+    taut = replace(sensor, film=replace(film, pretension=0.5))
+    variants = {
+        "probe of 2 mm radius": ForwardMap.build(sensor, Circle(2.0), FILM_RADIUS_mm, FORCE_RANGE_N),
+        "probe of 4 mm radius": ForwardMap.build(sensor, Circle(4.0), FILM_RADIUS_mm, FORCE_RANGE_N),
+        "film 10 % thicker": ForwardMap.build(thicker, Circle(1.0), FILM_RADIUS_mm, FORCE_RANGE_N),
+        "pretension of 0.5 MPa": ForwardMap.build(taut, Circle(1.0), FILM_RADIUS_mm, FORCE_RANGE_N),
+    }
+    return FilmCharges(nominal_map(), variants)
+
+
+@dataclass(frozen=True)
+class Shares:
+    """What happens to presses with a fault.
+
+    Attributes:
+        flagged: Share that carries a flag other than `stress`, %.
+        unnoticed: Share that is wrong and carries no such flag, %.
+    """
+
+    flagged: float
+    unnoticed: float
+
+
+def inscribed_radius(corners_mm: Sequence[Sequence[float]]) -> float:
+    """Return the radius of the largest disk about the origin inside a convex polygon, mm."""
+    corners = np.array(corners_mm)
+    middles = 0.5 * (corners + np.roll(corners, 1, axis=0))
+    return float(np.hypot(middles[:, 0], middles[:, 1]).min())
+
+
+class FaultStudy:
+    """Presses inside the working area of one released model, with every fault in turn.
+
+    Args:
+        model: Name of the released model, which is also the name of its sensor.
+        charges: Charges of the nominal film and of its variants.
+        presses: Number of presses.
+        seed: Seed of the presses, the noise and the faults.
+    """
+
+    def __init__(self, model: str, charges: FilmCharges, presses: int, seed: int) -> None:
+        self.predictor = Predictor(model)
+        self.charges = charges.for_sensor(load_sensor(model))
+        self.rng = np.random.default_rng(seed)
+        self.radius_mm = inscribed_radius(self.predictor.metadata.working_area_mm)
+        self.contact = self.presses_between(0.0, self.radius_mm, presses)
+        self.clean_charge = self.charges.nominal.charges(self.contact)
+
+    def presses_between(self, inner_mm: float, outer_mm: float, count: int) -> Array:
+        """Draw contacts uniform over a ring with log-uniform forces, shape (count, 3), mm and N."""
+        radius = np.sqrt(self.rng.uniform(inner_mm**2, outer_mm**2, count))
+        angle = self.rng.uniform(0.0, 2.0 * np.pi, count)
+        low, high = np.log(FORCE_RANGE_N)
+        force = np.exp(self.rng.uniform(low, high, count))
+        return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force])
+
+    def shares(self, contact: Array, charge: Array) -> Shares:
+        """Add noise, predict, and count.
+
+        Args:
+            contact: True contacts, shape (n, 3), mm and N.
+            charge: Charges with the fault and without noise, shape (n, n_electrode), pC.
+        """
+        noisy_charge = noise_model("reference").add(charge, self.rng)
+        answers = self.predictor.predict_batch(noisy_charge)
+        flags = self.predictor.validity.batch_flags(answers)
+        flagged: Booleans = np.array([bool(set(words) - {STRESS}) for words in flags])
+        numbers = np.stack(answers, axis=1).astype(float)
+        error = np.abs(numbers[:, :3] - contact)
+        wrong = (error > WRONG_STDS * numbers[:, 3:6]).any(axis=1)
+        return Shares(100.0 * float(flagged.mean()), 100.0 * float((wrong & ~flagged).mean()))
+
+    def average(self, faulty_charges: list[Array]) -> Shares:
+        """Return the mean over several forms of a fault, for example over the electrode that has it."""
+        every = [self.shares(self.contact, charge) for charge in faulty_charges]
+        flagged = float(np.mean([shares.flagged for shares in every]))
+        unnoticed = float(np.mean([shares.unnoticed for shares in every]))
+        return Shares(flagged, unnoticed)
+
+    def with_gain(self, *gains: float) -> list[Array]:
+        """Return the charges with one electrode's gain changed, for every gain and every electrode."""
+        count = self.clean_charge.shape[1]
+        return [
+            self.clean_charge * np.where(np.arange(count) == electrode, gain, 1.0)
+            for gain in gains
+            for electrode in range(count)
+        ]
+
+    def swapped(self) -> Iterator[tuple[str, Array]]:
+        """Yield a name and the charges for every pair of electrodes that is swapped."""
+        names = self.predictor.metadata.electrodes
+        for first, second in combinations(range(len(names)), 2):
+            order = np.arange(len(names))
+            order[[first, second]] = order[[second, first]]
+            yield f"{names[first]} and {names[second]} swapped", self.clean_charge[:, order]
+
+    def of_two_fingers(self) -> tuple[Array, Array]:
+        """Return contacts of the first finger and the charges of both.
+
+        The charges of two presses are added, which is exact for a taut film and approximate for a slack one.
+        """
+        second = self.presses_between(0.0, self.radius_mm, len(self.contact))
+        low, high = np.log(SECOND_FINGER_FORCE_N)
+        second[:, 2] = np.exp(self.rng.uniform(low, high, len(second)))
+        distance = np.hypot(second[:, 0] - self.contact[:, 0], second[:, 1] - self.contact[:, 1])
+        apart = distance > SECOND_FINGER_DISTANCE_mm
+        charge = self.clean_charge[apart] + self.charges.nominal.charges(second[apart])
+        return self.contact[apart], charge
+
+    def results(self) -> dict[str, Shares]:
+        """Return the shares of every fault, by its name."""
+        contact = self.contact
+        clean = self.clean_charge
+        results = {"none": self.shares(contact, clean)}
+        for percent in (1, 2, 5, 20):
+            change = 0.01 * percent
+            results[f"one gain {percent} % off"] = self.average(self.with_gain(1.0 - change, 1.0 + change))
+        results["one electrode dead"] = self.average(self.with_gain(0.0))
+        for name, charge in self.swapped():
+            results[name] = self.shares(contact, charge)
+        results["all turned by one place"] = self.average([np.roll(clean, 1, axis=1), np.roll(clean, -1, axis=1)])
+
+        clipped = (clean > CLIPPING_pC).any(axis=1)
+        results["clipped, no `[saturation]`"] = self.shares(contact[clipped], np.minimum(clean, CLIPPING_pC)[clipped])
+        phase = self.rng.uniform(0.0, 2.0 * np.pi, len(clean))
+        results["hum of 5 pC"] = self.shares(contact, clean + HUM_pC * np.sin(phase)[:, None])
+        for offset_pC in (10.0, 30.0):
+            results[f"warmth of {offset_pC:g} pC"] = self.average([clean + offset_pC, clean - offset_pC])
+        results["two fingers"] = self.shares(*self.of_two_fingers())
+        for name, forward_map in self.charges.variants.items():
+            results[name] = self.shares(contact, forward_map.charges(contact))
+        return results
+
+
+def outside_results(
+    model: str, forward_map: ForwardMap, edges_mm: tuple[float, ...], presses: int, seed: int
+) -> dict[str, Shares]:
+    """Return the shares of presses outside the working area, by distance from the centre.
+
+    A ring that the working area covers is left out, and one that it covers in part begins outside the area.
+
+    Args:
+        model: Name of the released model.
+        forward_map: Charges of the nominal film up to the largest distance.
+        edges_mm: Radii that part the rings, ascending, mm.
+        presses: Number of presses in each ring.
+        seed: Seed of the presses and the noise.
+    """
+    study = FaultStudy(model, FilmCharges(forward_map, {}), presses, seed)
+    area_edge_mm = study.radius_mm + AREA_CLEARANCE_mm
+    results = {}
+    for inner, outer in pairwise(edges_mm):
+        if outer <= area_edge_mm:
+            continue
+        contact = study.presses_between(max(inner, area_edge_mm), outer, presses)
+        results[f"{inner:g} to {outer:g} mm"] = study.shares(contact, study.charges.nominal.charges(contact))
+    return results
