@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.common.errors import SceneError
+from isocharge.common.errors import InputError, SceneError
 from isocharge.simulate import press, touch_charge
 from isocharge.simulate.forward import film_modes
 from isocharge.simulate.forward.film_family import FilmFamily
@@ -81,3 +81,13 @@ def test_what_is_not_asked_for_is_not_computed(known):
         family.mode_map(sensor, probe, ["wrinkles"])
     with pytest.raises(SceneError, match="no modes"):
         replace(family, imperfections=None).mode_map(sensor, probe)
+
+
+def test_a_family_file_with_other_fields_is_refused_when_it_is_read(known):
+    """Without the fields of the oval rim, as a version before them would have written it."""
+    arrays = known[0].to_arrays()
+    for name in ("imperfections.parts", "imperfections.node_size"):
+        fields = arrays[name].reshape(*arrays[name].shape[:-1], 7, -1)[..., :5, :]
+        arrays[name] = fields.reshape(*fields.shape[:-2], -1)
+    with pytest.raises(InputError, match="expected those of the 7 fields of tension, stiffness, poisson, oval"):
+        FilmFamily.from_arrays(arrays)

@@ -219,7 +219,7 @@ class FilmFamily:
                 coefficients=coefficients.astype(float),
                 modes=modes * np.asarray(scale, dtype=float),
                 error=float(arrays["error"]),
-                imperfections=FilmModes.from_arrays(more) if more else None,
+                imperfections=FilmModes.from_arrays(more, modes.shape[1]) if more else None,
             )
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise InputError(f"film family: expected the arrays that to_arrays gives ({error})") from error

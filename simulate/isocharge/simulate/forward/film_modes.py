@@ -205,18 +205,29 @@ class FilmModes:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Any]) -> "FilmModes":
-        """The inverse of `to_arrays`, to the resolution of the file.
+    def from_arrays(cls, arrays: Mapping[str, Any], field_size: int) -> "FilmModes":
+        """Return the modes that `to_arrays` gave, to the resolution of the file.
+
+        Args:
+            arrays: The arrays of the file.
+            field_size: Number of values of one field, three for each node of the family's mesh.
 
         Raises:
-            InputError: If something is missing or does not fit together.
+            InputError: If an array is missing, the arrays do not fit together, or they are those of other fields.
         """
         try:
-            shape, parts, scale = tuple(arrays["grid_shape"]), arrays["parts"], arrays["part_scale"]
+            shape = tuple(arrays["grid_shape"])
+            parts = arrays["parts"]
+            scale = arrays["part_scale"]
             if arrays["coefficients"].shape != (*shape, len(parts)) or scale.shape != (len(parts), 1):
                 raise ValueError(f"coefficients {arrays['coefficients'].shape} and parts {parts.shape} do not fit")
+            if parts.shape[1] != ODD.size * field_size:
+                raise ValueError(
+                    f"a part has {parts.shape[1]} values, expected those of the {ODD.size} fields of "
+                    f"{', '.join(FIELDS)}; train the network for all films again"
+                )
             grid = FilmGrid(*np.split(np.asarray(arrays["grid"], dtype=float), np.cumsum(shape)[:-1]))
             size = np.repeat(np.asarray(arrays["node_size"], dtype=float), 3)
             return cls(grid, arrays["coefficients"].astype(float), parts * np.asarray(scale, dtype=float) * size)
-        except (KeyError, ValueError, TypeError, AttributeError) as error:
+        except (KeyError, ValueError, TypeError, AttributeError, IndexError) as error:
             raise InputError(f"film modes: expected the arrays that to_arrays gives ({error})") from error

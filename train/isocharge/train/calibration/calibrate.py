@@ -140,9 +140,9 @@ class CalibrationResult:
         """Lines of the presses that were left out because they fit no film that the others fit."""
         return self.presses[self.posterior.bad].lines
 
-    @property
+    @cached_property
     def summary(self) -> tuple[str, ...]:
-        """The result in sentences."""
+        """The result in sentences; they are computed once, since they contain a plan of further presses."""
         noise, left, before = self.sensitivity.of_noise, self.left, self.left_before
         when = "it was moved" if self.moved else "these presses"
         return (

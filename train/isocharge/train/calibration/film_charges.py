@@ -44,7 +44,6 @@ MODE_STDS = {
     "oval_xy": 0.006,
     "d12": 0.3,
     "crosstalk": 0.01,
-    "stiffening": 0.3,
 }
 """Standard deviations of the modes over films that have imperfections, in their units."""
 
@@ -116,7 +115,7 @@ class FilmCharges:
     @cached_property
     def modes(self) -> tuple[str, ...]:
         """Names of the modes that these films have; none in a family of before they were solved."""
-        return tuple(name for name in MODES if name in MODE_STDS) if self.family.imperfections else ()
+        return tuple(MODES) if self.family.imperfections else ()
 
     @property
     def n_coefficient(self) -> int:
