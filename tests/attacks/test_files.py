@@ -4,6 +4,7 @@ import io
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +27,13 @@ from isocharge.serve import (
 )
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.virtual_sensor.script import load_script
-from isocharge.simulate import Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
+from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
+from isocharge.train import CalibrationProblem, read_earlier
+from isocharge.train.calibration.calibrate import film_without_presses
+from isocharge.train.calibration.calibration_file import film_table
+from isocharge.train.calibration.problem import Warming
 from isocharge.train.training.config import load_config
 from isocharge.train.training.descent import tensors
 
@@ -214,6 +219,39 @@ def dataset(tmp_path):
     samples = Samples(**columns, probe=np.array(["circle:1.0"] * 5), charge_pC=rng.uniform(100, 2000, (5, 3)))
     about = {"probes": ["circle:1.0"], "ranges": {"radius_mm": 8.0}, "seed": 3, "solver": {"order": 4}}
     return write_dataset(tmp_path / "presses", load_sensor("three-25um-biaxial"), [samples], about)
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    """A problem of calibration, and what the file of a film with a discrepancy and no traces holds."""
+    problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
+    warming = Warming(-0.3, 0.1, 21.5, np.zeros(len(problem.prior.names)))
+    film = film_without_presses(problem, replace(problem.expected, warming=warming), "moved")
+    table = film_table(problem.prior, film.posterior)
+    plain = table | {"discrepancy": None}
+    plain["temperature"] = plain["temperature"] | {"correlations": [0.0] * len(problem.prior.names)}
+    return problem, table, plain
+
+
+def test_calibrations_with_faults(calibration, tmp_path, attack):
+    """A film that is taken from a file with faults is finite, and the next calibration can begin with it."""
+    problem, table, plain = calibration
+    path = tmp_path / "calibration.json"
+
+    def read(data):
+        path.write_bytes(data)
+        film = read_earlier(tmp_path, problem, knows_temperature=True)
+        assert np.isfinite(film.unknowns).all()
+        np.linalg.cholesky(film.of_unknowns)
+
+    for kind, good in (("film", plain), ("film with discrepancy", table)):
+        text = json.dumps(good).encode()
+        read(text)
+        attack(f"calibration {kind} bytes", read, lambda rng, text=text: mutated(rng, text[:4000]) + text[4000:], 2_000)
+        attack(f"calibration {kind}", read, lambda rng, good=good: json.dumps(with_junk(rng, good)).encode(), 3_000)
+        attack(
+            f"calibration {kind} numbers", read, lambda rng, text=text: number_bomb(rng, text.decode()).encode(), 500
+        )
 
 
 def test_a_dataset_with_faults(dataset, attack):

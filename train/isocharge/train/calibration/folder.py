@@ -24,11 +24,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from msgspec import Struct
 from threadpoolctl import threadpool_limits
 
-from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, PressError
 from isocharge.common.files import refusals_explained, remove_empty, write_whole
 from isocharge.common.json_values import plain_values
@@ -39,14 +36,13 @@ from isocharge.serve.model.model_folder import check_target, version_folders
 from isocharge.serve.model.pretensions import FILE as PRETENSIONS
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text, read_presses, write_presses
 from isocharge.simulate.plots.figure import picture_bytes
-from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
 from isocharge.train.calibration.calibrate import CalibrationResult, film_without_presses
+from isocharge.train.calibration.calibration_file import film_table, read_film
 from isocharge.train.calibration.contact_error import ContactError
-from isocharge.train.calibration.film_fit import FilmPosterior
 from isocharge.train.calibration.following import pretensions_of
 from isocharge.train.calibration.picture import calibration_picture
-from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate, Warming
+from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.model_release.release import release
 from isocharge.train.training.fitted import Provenance
 
@@ -58,9 +54,6 @@ SESSION = "presses.part.csv"
 
 IDENTITY = ".presses.part.json"
 """Name of the file that says on what these were made."""
-
-FILE_UNITS = {"pretension": 1e6, "shift_x": 1e-3, "shift_y": 1e-3, "probe_radius": 1e-3}
-"""Factors to the parameters in calibration.json, which are in Pa and m."""
 
 
 def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
@@ -187,15 +180,12 @@ def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
 
 
 def result_table(result: CalibrationResult) -> dict[str, Any]:
-    """A result for JSON: parameters with their errors and correlations, quantities, errors left, presses left out."""
-    prior, posterior = result.problem.prior, result.posterior
-    std = np.sqrt(np.diag(posterior.covariance))
-    units = _units(prior)
-    parameters = zip(prior.names, units * posterior.parameters, units * std * prior.std, strict=True)
+    """Return a result for JSON: estimates, quantities, errors of contacts, and the presses that were left out."""
+    film = film_table(result.problem.prior, result.posterior)
     return {
-        "format_version": 1,
-        "sensor": prior.sensor.name,
-        "probe": prior.probe.notation,
+        "format_version": film.pop("format_version"),
+        "sensor": film.pop("sensor"),
+        "probe": result.problem.prior.probe.notation,
         "presses": len(result.presses),
         "left_out_lines": list(result.bad_lines),
         "reduced_chi2": result.reduced_chi2,
@@ -203,69 +193,14 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
         "error_left_before": error_table(result.left_before),
         "error_of_noise": error_table(result.sensitivity.of_noise),
         "quantities": {name: quantity.to_dict() for name, quantity in result.quantities.items()},
-        "parameters": {name: {"value": float(value), "std": float(error)} for name, value, error in parameters},
-        "correlations": np.round(posterior.covariance / np.outer(std, std), 6).tolist(),
-        "discrepancy": _discrepancy(posterior),
-        "temperature": _temperature(posterior),
+        **film,
         "words": list(result.summary),
-    }
-
-
-def _temperature(posterior: FilmPosterior) -> dict[str, Any] | None:
-    """What temperature does to the pretension, in C and Pa/K, correlated with all unknowns, if it is known."""
-    if (known := posterior.warming) is None:
-        return None
-    units, count = FILE_UNITS["pretension"], len(posterior.joint if posterior.imperfect else posterior.covariance)
-    std = known.std * np.sqrt(np.diag(posterior.joint))
-    return {
-        "at_C": known.at_C,
-        "pretension_per_K": {"value": units * known.MPa_per_K, "std": units * known.std},
-        "correlations": np.round(known.covariance[:count] / std[:count], 6).tolist(),
-    }
-
-
-def _discrepancy(posterior: FilmPosterior) -> dict[str, Any] | None:
-    """What no parameter describes, if there is anything: coefficients, errors, and correlations, of all unknowns."""
-    if not posterior.imperfect:
-        return None
-    std = np.sqrt(np.diag(posterior.joint))
-    return {
-        "coefficients": posterior.coefficients.tolist(),
-        "std": std.tolist(),
-        "correlations": np.round(posterior.joint / np.outer(std, std), 6).tolist(),
     }
 
 
 def error_table(error: ContactError) -> dict[str, float]:
     """An error of contacts for JSON."""
     return {"position_mm": error.position_mm, "force_percent": error.force_percent}
-
-
-class _Parameter(Struct, frozen=True):
-    value: float
-    std: float
-
-
-class _Temperature(Struct, frozen=True):
-    at_C: float
-    pretension_per_K: _Parameter
-    correlations: list[float] = []  # older versions wrote none
-
-
-class _Discrepancy(Struct, frozen=True):
-    coefficients: list[float]
-    std: list[float]
-    correlations: list[list[float]]
-
-
-class _Earlier(Struct, frozen=True):
-    """What `read_earlier` takes from calibration.json."""
-
-    sensor: str
-    parameters: dict[str, _Parameter]
-    correlations: list[list[float]]
-    discrepancy: _Discrepancy | None = None
-    temperature: _Temperature | None = None
 
 
 def read_earlier(folder: Path, problem: CalibrationProblem, *, knows_temperature: bool = False) -> FilmEstimate:
@@ -300,46 +235,10 @@ def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> Calibr
 
 
 def _read(folder: Path, problem: CalibrationProblem) -> tuple[Path, FilmEstimate]:
-    """The file of an earlier calibration, and its film."""
+    """Return the path of the file of an earlier calibration, and its film."""
     calibrated = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
-    path, prior = [folder, *calibrated][-1] / RESULT, problem.prior
-    table = read_json(path, "the calibration.json of `train calibrate`", PressError, _Earlier)
-    names = tuple(table.parameters)
-    if names != prior.names or table.sensor != prior.sensor.name:
-        raise PressError(
-            f"{path}: a calibration of {table.sensor!r} with the parameters {', '.join(names)}; expected "
-            f"{prior.sensor.name!r} with {', '.join(prior.names)}"
-        )
-    value, std = np.array([[entry.value, entry.std] for entry in table.parameters.values()]).T / _units(prior)
-    film = FilmEstimate(value, _covariance(path, table.correlations, std / prior.std))
-    if (known := table.discrepancy) is not None:
-        size, count = len(names) + problem.charges.n_coefficient, len(known.coefficients)
-        if len(names) + count != size or len(known.std) != size:
-            raise PressError(
-                f"{path}: discrepancy: expected {size - len(names)} coefficients, got {count}; calibrate anew"
-            )
-        joint = _covariance(path, known.correlations, np.array(known.std))
-        film = replace(film, coefficients=np.array(known.coefficients), joint=joint)
-    return path, film if table.temperature is None else replace(film, warming=_warming(path, table.temperature, film))
-
-
-def _warming(path: Path, known: _Temperature, film: FilmEstimate) -> Warming:
-    std = np.sqrt(np.diag(film.of_unknowns))
-    correlations = np.array(known.correlations or np.zeros(std.size))
-    if correlations.size != std.size:
-        raise PressError(f"{path}: temperature: expected {std.size} correlations, got {correlations.size}")
-    change, change_std = np.array([known.pretension_per_K.value, known.pretension_per_K.std]) / FILE_UNITS["pretension"]
-    return Warming(float(change), float(change_std), known.at_C, correlations * std * change_std)
-
-
-def _covariance(path: Path, correlations: list[list[float]], std: Array) -> Array:
-    if [len(row) for row in correlations] != [std.size] * std.size:
-        raise PressError(f"{path}: correlations: expected {std.size} rows of as many numbers")
-    return np.array(correlations) * np.outer(std, std)
-
-
-def _units(prior: FilmPrior) -> Array:
-    return np.array([FILE_UNITS.get(name, 1.0) for name in prior.names])
+    path = [folder, *calibrated][-1] / RESULT
+    return path, read_film(path, problem)
 
 
 def _card(result: CalibrationResult, about: ModelMetadata) -> str:
