@@ -192,6 +192,31 @@ def node(script):
     return json.loads(done.stdout)
 
 
+@pytest.mark.parametrize(("radius_mm", "middle"), [(None, [30.0, 0.0]), (45.0, [0.0, 0.0])])
+def test_the_plan_shows_an_area_that_begins_at_the_origin(radius_mm, middle):
+    """A pad of x from 0 to 60 mm in the middle of the view, a film with its own centre; (50, 0) is inside both."""
+    film = {
+        "working_area_mm": [[0, -15], [60, -15], [60, 15], [0, 15]],
+        "outlines_mm": {},
+        "force_range_N": [0.2, 5.0],
+        "radius_mm": radius_mm,
+        "electrodes": [],
+    }
+    at, reach, on_pad, beyond = node(
+        f"""globalThis.document = {{ createElement: () => ({{}}), documentElement: {{}} }};
+        globalThis.getComputedStyle = () => ({{ getPropertyValue: () => "" }});
+        globalThis.matchMedia = () => ({{ addEventListener() {{}} }});
+        const {{ Plan }} = await import("{(VIEWER / "page/plan.js").as_uri()}");
+        const plan = new Plan({{ width: 400, height: 400, clientWidth: 400 }}, {json.dumps(film)});
+        const shown = (x, y) => {{ const place = plan.inView({{ x, y }}); return [place.x, place.y]; }};
+        console.log(JSON.stringify([[plan.middle.x, plan.middle.y], plan.reach, shown(50, 0), shown(500, 0)]));"""
+    )
+    assert at == middle
+    assert reach == pytest.approx(1.16 * np.hypot(60.0 - middle[0], 15.0))
+    assert on_pad == [50.0, 0.0]
+    assert middle[0] + 0.9 * reach < beyond[0] < middle[0] + reach
+
+
 def test_the_page_reads_what_the_server_writes(record):
     form = SampleFormat(("A", "B", "C"))
     changes = {

@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 
 from isocharge.cli.train import fit as fit_command
-from isocharge.common.errors import PressError
-from isocharge.serve import MeasuredPresses, Predictor, read_presses
+from isocharge.common.errors import PressError, SceneError
+from isocharge.serve import Contact, MeasuredPresses, Predictor, find_model, load_model, read_presses
 from isocharge.serve.prediction.measured_presses import write_presses
 from isocharge.serve.prediction.press_check import check_presses
+from isocharge.simulate import Domain
 from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit_presses
 from isocharge.train.data.channel_noise import ChannelNoise
 from isocharge.train.data.measured_sensor import PressedArea, outline
 from isocharge.train.data.presses import folds_by_place, held_out
+from isocharge.train.model_release.release import model_domain, release
 from isocharge.train.training.cross_fit import deviation_factors, usable_presses
 from isocharge.train.training.features import Features
 from kept import ROOT, kept
@@ -114,6 +116,70 @@ def test_the_released_model_is_served_and_checked(alone, fresh, tmp_path, comman
     said = re.findall(r"(?:\| \S+ and|intervals \|) (\S+) %", card)
     expected = [*alone.noise.gain, errors["coverage_68"], errors["coverage_95"]]
     np.testing.assert_allclose(np.array(said, float), 100.0 * np.array(expected), rtol=1e-2)
+
+
+def presses_off_the_origin(count, seed):
+    """On a pad with x from 0 to 60 mm and y from -15 to 15 mm, charges linear in place and ln F."""
+    rng = np.random.default_rng(seed)
+    place = rng.uniform((0.0, -15.0), (60.0, 15.0), (count, 2))
+    contact = np.column_stack([place, np.exp(rng.uniform(*np.log([0.2, 5.0]), count))])
+    centred = np.column_stack([place - [30.0, 0.0], np.log(contact[:, 2])])
+    return measured(contact, centred @ SLOPES.T + NOISE * rng.standard_normal((count, 4)))
+
+
+def made_off_the_origin():
+    return fit_presses(presses_off_the_origin(900, 7), "long-pad", QUICK)
+
+
+@pytest.fixture(scope="module")
+def long_pad(tmp_path_factory):
+    """The folder of a model of a pad whose area begins at the origin."""
+    folder = tmp_path_factory.mktemp("models") / "long-pad"
+    release(kept(made_off_the_origin), folder)
+    return folder
+
+
+def test_an_area_that_begins_at_the_origin_holds_its_own_presses():
+    contact = presses_off_the_origin(900, 7).contact
+    area = PressedArea.of(contact)
+    assert area.contains(contact).all()
+    area.check(np.array([[50.0, 0.0, 1.0]]), "pad")
+    beside = np.array([[-20.0, 0.0, 1.0], [50.0, 20.0, 1.0], [50.0, 0.0, 9.0], [np.nan, 0.0, 1.0]])
+    assert not area.contains(beside).any()
+    with pytest.raises(SceneError, match=r"press 0 at \(-20, 0\) mm .* in the pressed area, x from -\d.* to 6\d"):
+        area.check(beside, "pad")
+
+
+def test_the_domain_of_a_released_pad_is_its_area(long_pad):
+    """Not the largest disk about the origin in it, which has 2 mm here."""
+    about = Predictor(long_pad).metadata
+    domain, trained = model_domain(about), kept(made_off_the_origin).domain
+    assert domain == trained
+    contact = presses_off_the_origin(900, 7).contact
+    assert domain.contains(contact).all()
+    disk = load_model(find_model("three-25um-biaxial")).metadata
+    assert model_domain(disk) == Domain(pytest.approx(8.0, abs=0.1), disk.force_range_N)
+
+
+def test_a_pad_that_begins_at_the_origin_is_answered_and_flagged_where_it_lies(long_pad):
+    """(50, 0) is on the pad, (-20, 0) is nearer to the origin and beside it."""
+    predictor = Predictor(long_pad)
+    places = np.array([[50.0, 0.0, 1.0], [5.0, -10.0, 1.0], [-20.0, 0.0, 1.0]])
+    charge = np.column_stack([places[:, :2] - [30.0, 0.0], np.log(places[:, 2])]) @ SLOPES.T
+    answers = predictor.predict_batch(charge)
+    assert np.hypot(answers.x_mm - places[:, 0], answers.y_mm - places[:, 1])[:2].max() < 3.0
+    flags = predictor.validity.batch_flags(answers)
+    assert flags == [predictor.flags(predictor.predict(row)) for row in charge]
+    assert flags[:2] == [(), ()]
+    on_pad = Contact(50.0, 0.0, 1.0, 0.1, 0.1, 0.1, 0.1)
+    assert predictor.flags(on_pad._replace(x_mm=-20.0)) == ("outside",)
+    radius = np.hypot(30.0, 15.0)
+    assert predictor.flags(on_pad._replace(x_mm=30.0 + 2.8 * radius)) == ("outside",)
+    assert predictor.flags(on_pad._replace(x_mm=30.0 + 3.5 * radius)) == ("outside", "beyond")
+    assert predictor.flags(on_pad._replace(x_mm=30.0 - 3.5 * radius)) == ("outside", "beyond")
+    assert "positions from (-" in repr(predictor)
+    check = check_presses(predictor, presses_off_the_origin(200, 8))
+    assert check.fits
 
 
 def test_the_outline_is_that_of_the_area():

@@ -139,7 +139,13 @@ MISFIT_LIMIT = 5.0
 """Smallest limit of the misfit, in standard deviations; a model may state a larger one, that of 0.1 % of presses."""
 
 FAR = 3.0
-"""Multiple of the largest force, and of the working area's reach, beyond which an answer is no measurement."""
+"""Multiple of the largest force, and of the radius of the circle around the working area, beyond which an answer is no
+measurement."""
+
+
+OFF_CENTRE = 0.05
+"""Distance of the working area's middle from the origin, over its reach, up to which its place is given by its reach
+alone."""
 
 
 @dataclass(frozen=True)
@@ -171,9 +177,38 @@ class Validity:
         return float(np.linalg.norm(self.corners_mm, axis=1).max())
 
     @cached_property
+    def middle_mm(self) -> tuple[float, float]:
+        """Middle (x, y) of the box around the working area, mm."""
+        x_mm, y_mm = (0.5 * (self.corners_mm.min(axis=0) + self.corners_mm.max(axis=0))).tolist()
+        return x_mm, y_mm
+
+    @cached_property
     def far(self) -> tuple[float, float]:
-        """Squared distance from the origin, mm^2, and force, N, beyond which an answer is no measurement."""
-        return (FAR * self.reach_mm) ** 2, FAR * self.force_range_N[1]
+        """Squared distance from the middle, mm^2, and force, N, beyond which an answer is no measurement."""
+        radius_mm = np.linalg.norm(self.corners_mm - self.middle_mm, axis=1).max()
+        return float(FAR * radius_mm) ** 2, FAR * self.force_range_N[1]
+
+    @property
+    def is_centred(self) -> bool:
+        """Whether the middle of the working area is the origin, or close to it."""
+        return math.hypot(*self.middle_mm) < OFF_CENTRE * self.reach_mm
+
+    @cached_property
+    def places(self) -> str:
+        """Words that say where the working area lies."""
+        if self.is_centred:
+            return f"up to {self.reach_mm:.3g} mm"
+        left, bottom = self.corners_mm.min(axis=0)
+        right, top = self.corners_mm.max(axis=0)
+        return f"from ({left:.3g}, {bottom:.3g}) to ({right:.3g}, {top:.3g}) mm"
+
+    def is_beyond(self, contact: Contact) -> bool:
+        """Return whether a contact is so far from the working area and the forces that it is no measurement."""
+        middle_x_mm, middle_y_mm = self.middle_mm
+        far_mm2, far_N = self.far
+        x_mm = contact.x_mm - middle_x_mm
+        y_mm = contact.y_mm - middle_y_mm
+        return x_mm * x_mm + y_mm * y_mm > far_mm2 or contact.force_N > far_N
 
     @cached_property
     def safe_mm2(self) -> float:
@@ -188,13 +223,14 @@ class Validity:
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """The flags of one contact; a microsecond, 30 where only the polygon says whether it is inside."""
         x_mm, y_mm, force_N = contact[:3]
-        (low, high), (far_mm2, far_N) = self.force_range_N, self.far
+        low, high = self.force_range_N
         distance_mm2 = x_mm * x_mm + y_mm * y_mm
         inside = distance_mm2 < self.safe_mm2 or (
             distance_mm2 <= self.reach_mm**2 and inside_polygon(np.array([x_mm]), np.array([y_mm]), self.corners_mm)[0]
         )
-        outside, misfit = not inside or force_N < low or force_N > high, contact.misfit > self.misfit_limit
-        return _words(outside, distance_mm2 > far_mm2 or force_N > far_N, misfit, force_N > self.yield_force_N)
+        outside = not inside or force_N < low or force_N > high
+        misfit = contact.misfit > self.misfit_limit
+        return _words(outside, self.is_beyond(contact), misfit, force_N > self.yield_force_N)
 
     def batch_flags(self, contacts: Contacts) -> list[tuple[str, ...]]:
         """The flags of each of n contacts."""
@@ -203,8 +239,10 @@ class Validity:
         outside |= (contacts.force_N < low) | (contacts.force_N > high)
         misfit, yields = contacts.misfit > self.misfit_limit, contacts.force_N > self.yield_force_N
         far_mm2, far_N = self.far
+        middle_x_mm, middle_y_mm = self.middle_mm
         with np.errstate(over="ignore"):  # infinity is far, too
-            beyond = (contacts.x_mm**2 + contacts.y_mm**2 > far_mm2) | (contacts.force_N > far_N)
+            distance_mm2 = (contacts.x_mm - middle_x_mm) ** 2 + (contacts.y_mm - middle_y_mm) ** 2
+        beyond = (distance_mm2 > far_mm2) | (contacts.force_N > far_N)
         if not (outside | misfit | yields).any():
             return [()] * len(outside)
         return [_words(*row) for row in np.stack([outside, beyond, misfit, yields], 1).tolist()]

@@ -59,6 +59,7 @@ class Predictor:
         self._session = loaded.session
         self.validity = Validity.of(loaded.metadata)
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
+        self._middle_x_mm, self._middle_y_mm = self.validity.middle_mm
         self._far_mm2, self._far_N = self.validity.far
         self._warned = False
         self._constants: Mapping[str, Singles] = {}
@@ -92,8 +93,9 @@ class Predictor:
             self._press.write(*as_press(charge_pC, self.metadata.electrodes))
         self._press.run()
         contact = Contact(*self._press.read())
-        x_mm, y_mm, force_N = contact[:3]
-        if force_N > self._far_N or x_mm * x_mm + y_mm * y_mm > self._far_mm2:
+        x_mm = contact.x_mm - self._middle_x_mm
+        y_mm = contact.y_mm - self._middle_y_mm
+        if contact.force_N > self._far_N or x_mm * x_mm + y_mm * y_mm > self._far_mm2:
             self._warn(charge_pC, contact)
         return contact
 
@@ -148,10 +150,11 @@ class Predictor:
 
     def __repr__(self) -> str:
         """Model, electrodes and domain."""
-        metadata, (low, high) = self.metadata, self.validity.force_range_N
+        metadata = self.metadata
+        low, high = self.validity.force_range_N
         return (
             f"Predictor({metadata.label}: sensor {metadata.frame_id}, charges {' '.join(metadata.electrodes)} (pC), "
-            f"positions up to {self.validity.reach_mm:.3g} mm, forces {low:.3g} to {high:.3g} N)"
+            f"positions {self.validity.places}, forces {low:.3g} to {high:.3g} N)"
         )
 
     def _warn(self, charge_pC: object, contact: Contact) -> None:

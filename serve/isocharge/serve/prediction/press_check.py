@@ -16,6 +16,7 @@ from isocharge.common.arrays import Booleans
 from isocharge.common.json_values import plain_values
 from isocharge.serve.flags import MISFIT
 from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.prediction.contact import Validity
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_errors import (
@@ -224,10 +225,11 @@ def _explained(reason: str, metadata: ModelMetadata) -> str:
     if reason != NOT_TRAINED:
         return reason
     low, high = metadata.force_range_N
-    reach = np.linalg.norm(np.array(metadata.working_area_mm), axis=1).max()
+    validity = Validity.of(metadata)
+    places = f"{validity.places} from the centre" if validity.is_centred else validity.places
     return (
-        f"outside the model's working area (up to {reach:.3g} mm from the centre) or forces ({low:.3g} to "
-        f"{high:.3g} N); if these are most, look at the units"
+        f"outside the model's working area ({places}) or forces ({low:.3g} to {high:.3g} N); if these are most, look "
+        "at the units"
     )
 
 

@@ -1,7 +1,7 @@
 """The map from contacts to charges: one protocol that everything speaks that gives or needs charges; its checks."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -51,12 +51,22 @@ class Domain:
         contact[..., 2] = np.exp(contact[..., 2])
         return contact
 
+    @property
+    def places(self) -> str:
+        """Words that say where contacts may lie."""
+        return f"at most {self.radius:g} mm from the centre"
+
     def within(self, radius: float) -> "Domain":
-        """The same forces on a smaller disk."""
-        return replace(self, radius=radius)
+        """Return the domain of the same forces on a disk about the origin of this radius, mm."""
+        return Domain(radius, self.force_range)
+
+    def contains(self, contact: Array) -> Booleans:
+        """Return which contacts (x, y, F), shape (n, 3), mm and N, lie in the domain, shape (n,); NaN does not."""
+        inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.radius * SLACK
+        return np.asarray(inside & _are_within(contact[:, 2], self.force_range))
 
     def check(self, contact: Array, source: str) -> Array:
-        """The contacts as an array of floats; those outside are refused.
+        """Return the contacts as an array of floats, and refuse contacts outside the domain.
 
         Args:
             contact: (x, y, F), shape (n, 3), mm and N.
@@ -66,14 +76,14 @@ class Domain:
             SceneError: If they are of another shape, or with the first contact that lies outside.
         """
         contact = as_contacts(contact, source)
-        inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.radius * SLACK
-        inside &= _are_within(contact[:, 2], self.force_range)
+        inside = self.contains(contact)
         if not inside.all():
-            i, (low, high) = int(np.argmin(inside)), self.force_range
-            x, y, f = contact[i]
+            first_outside = int(np.argmin(inside))
+            x, y, force = contact[first_outside]
+            low, high = self.force_range
             raise SceneError(
-                f"press {i} at ({x:.4g}, {y:.4g}) mm with {f:.4g} N is outside the {source}: expected at most "
-                f"{self.radius:g} mm from the centre and {low:g} to {high:g} N"
+                f"press {first_outside} at ({x:.4g}, {y:.4g}) mm with {force:.4g} N is outside the {source}: expected "
+                f"{self.places} and {low:g} to {high:g} N"
             )
         return contact
 

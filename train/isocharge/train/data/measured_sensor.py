@@ -1,4 +1,4 @@
-"""A sensor that is known by measured presses alone: the names of its channels, and the area that was pressed."""
+"""A sensor of measured presses alone, without a simulator: the names of its channels, and the area that was pressed."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -7,8 +7,9 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError
+from isocharge.serve.prediction.contact import inside_polygon
 from isocharge.simulate import Domain
 from isocharge.simulate.numerics.polygon import area_of, to_complex, to_corners
 
@@ -41,41 +42,60 @@ class MeasuredSensor:
 
 @dataclass(frozen=True)
 class PressedArea(Domain):
-    """Contacts that were pressed: an area of any shape, and a range of forces.
+    """Domain of the contacts that were pressed: an area of any shape in any place, and a range of forces.
 
-    `radius` is the distance of the farthest corner from the middle.
+    `radius` is the distance of the farthest corner from the middle of the area, not from the origin.
 
     Attributes:
-        corners: Of the area, in order, mm.
+        corners: Corners of the area, in order, mm.
     """
 
     corners: tuple[tuple[float, float], ...]
 
     @classmethod
     def of(cls, contact: Array) -> "PressedArea":
-        """The area of contacts (x, y, F), shape (n, 3), mm and N.
+        """Return the area of contacts (x, y, F), shape (n, 3), mm and N.
 
         Raises:
-            PressError: If they lie on a line.
+            PressError: If the places lie on a line.
         """
-        corners = outline(np.unique(contact[:, :2], axis=0))
-        middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-        radius = float(np.linalg.norm(corners - middle, axis=1).max())
+        corners = np.round(outline(np.unique(contact[:, :2], axis=0)), 4)
         low, high = float(contact[:, 2].min()), float(contact[:, 2].max())
         if high < LEAST_RANGE * low:
             low, high = low / LEAST_RANGE**0.5, high * LEAST_RANGE**0.5
-        return cls(radius, (low, high), tuple((x, y) for x, y in np.round(corners, 4).tolist()))
+        return cls.of_corners(corners, (low, high))
+
+    @classmethod
+    def of_corners(cls, corners: Array, force_range: tuple[float, float]) -> "PressedArea":
+        """Return the area with these corners, shape (n, 2), mm, and forces, N."""
+        distance_from_middle = np.linalg.norm(corners - _middle(corners), axis=1)
+        return cls(float(distance_from_middle.max()), force_range, tuple((x, y) for x, y in corners.tolist()))
 
     @cached_property
     def centre(self) -> Array:
         """Middle of (x, y, ln F), shape (3,), mm and logarithm of N."""
-        corners = np.array(self.corners)
-        return np.append(0.5 * (corners.min(axis=0) + corners.max(axis=0)), super().centre[2])
+        return np.append(_middle(np.array(self.corners)), super().centre[2])
 
     @cached_property
     def scale(self) -> Array:
         """Half width of (x, y, ln F), shape (3,), mm and logarithm of N."""
         return np.append(0.5 * np.ptp(np.array(self.corners), axis=0), super().scale[2])
+
+    @property
+    def places(self) -> str:
+        """Words that say where contacts may lie."""
+        (left, bottom), (right, top) = np.min(self.corners, axis=0), np.max(self.corners, axis=0)
+        return f"a place in the pressed area, x from {left:g} to {right:g} mm and y from {bottom:g} to {top:g} mm,"
+
+    def contains(self, contact: Array) -> Booleans:
+        """Return which contacts (x, y, F), shape (n, 3), mm and N, lie in the domain, shape (n,); NaN does not."""
+        has_force = Domain(np.inf, self.force_range).contains(contact)
+        return has_force & inside_polygon(contact[:, 0], contact[:, 1], np.array(self.corners))
+
+
+def _middle(corners: Array) -> Array:
+    """Return the middle of the box around corners, shape (2,), mm."""
+    return np.asarray(0.5 * (corners.min(axis=0) + corners.max(axis=0)))
 
 
 def outline(places: Array) -> Array:

@@ -31,6 +31,9 @@ from isocharge.train.training.fitted import Fitted
 CORNERS = 64
 """Corners of the polygon that stands for a round working area."""
 
+DISK_TOLERANCE_mm = 2e-3
+"""Distance by which the corners of that polygon may differ from their places; they are written to 0.0001 mm."""
+
 Card = Callable[[ModelMetadata, Fitted], str]
 """The text of a card, from what the model says about itself and the network."""
 
@@ -294,8 +297,16 @@ def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
 
 
 def model_domain(about: ModelMetadata) -> Domain:
-    """The contacts that a model knows, from its metadata: the largest disk in its working area, to 0.001 mm."""
+    """Return the contacts that a model was trained for, from its metadata.
+
+    A working area that is the polygon of a disk about the origin, as models of simulated presses have it, gives the
+    largest disk in it, to 0.001 mm. Every other working area gives a `PressedArea` with its corners.
+    """
     corners = np.array(about.working_area_mm)
     along = np.roll(corners, -1, axis=0) - corners
     distances = np.abs(along[:, 0] * corners[:, 1] - along[:, 1] * corners[:, 0]) / np.hypot(*along.T)
-    return Domain(round(float(distances.min()), 3), about.force_range_N)
+    radius = round(float(distances.min()), 3)
+    disk = np.array(_disk_polygon(radius))
+    if corners.shape == disk.shape and np.abs(corners - disk).max() < DISK_TOLERANCE_mm:
+        return Domain(radius, about.force_range_N)
+    return PressedArea.of_corners(corners, about.force_range_N)

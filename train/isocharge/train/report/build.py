@@ -31,7 +31,6 @@ from isocharge.train.baselines.rivals import (
     Rival,
     rivals,
 )
-from isocharge.train.calibration.diagnosis import outside
 from isocharge.train.data.presses import (
     LabelledPresses,
     check_enough,
@@ -339,6 +338,6 @@ def _measured_known_to(model: ModelMetadata, dataset: Dataset) -> Dataset:
             f"{model.electrodes}; choose their own model with --model, or train one"
         )
     presses = LabelledPresses.of(dataset)
-    inside = ~outside(presses.contact, model_domain(model))
+    inside = model_domain(model).contains(presses.contact)
     check_enough(int(inside.sum()), len(presses), dataset.sensor.name)
     return replace(_rows(dataset, inside), manifest={})

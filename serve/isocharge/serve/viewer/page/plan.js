@@ -8,7 +8,9 @@ export class Plan {
   constructor(canvas, film) {
     [this.canvas, this.film] = [canvas, film];
     const corners = [...film.working_area_mm, ...Object.values(film.outlines_mm).flat()];
-    this.reach = 1.16 * Math.max(...corners.map(([x, y]) => Math.hypot(x, y)));
+    // The view is centred on the film; without a film, as for a pad known by presses alone, on the working area.
+    this.middle = film.radius_mm ? { x: 0, y: 0 } : middleOf(corners);
+    this.reach = 1.16 * Math.max(...corners.map(([x, y]) => Math.hypot(x - this.middle.x, y - this.middle.y)));
     this.largest = film.force_range_N[1];
     this.base = document.createElement("canvas");
     this.isStale = true;
@@ -35,6 +37,7 @@ export class Plan {
   toMillimetres(g) {
     const scale = 1 / this.pixel;
     g.setTransform(scale, 0, 0, -scale, this.canvas.width / 2, this.canvas.height / 2);
+    g.translate(-this.middle.x, -this.middle.y);
   }
 
   get css() { return this.pixel * this.canvas.width / (this.canvas.clientWidth || 1); }
@@ -46,12 +49,23 @@ export class Plan {
     g.lineJoin = "round";
     if (film.radius_mm) { g.fillStyle = theme.film; circle(g, 0, 0, film.radius_mm); g.fill(); }
     g.lineWidth = px; g.strokeStyle = theme.line;
-    for (let at = -50; at <= 50; at += 5) { segment(g, at, -50, at, 50); segment(g, -50, at, 50, at); }
+    this.drawGrid(g);
     g.fillStyle = theme.area; path(g, film.working_area_mm); g.fill();
     g.setLineDash([4 * px, 4 * px]); g.lineWidth = 1.5 * px; g.strokeStyle = theme.accent; g.stroke(); g.setLineDash([]);
     film.electrodes.forEach((name, k) => this.drawElectrode(g, name, k, px));
     this.drawScale(g, px);
     if (film.radius_mm) this.drawWhole(g, px);
+  }
+
+  /** Lines every 5 mm: 50 mm from the middle of a film to each side, or over the whole view of a pad. */
+  drawGrid(g) {
+    const { middle, film } = this;
+    const half = film.radius_mm ? 50 : 5 * Math.ceil(this.reach / 5);
+    const x0 = 5 * Math.round(middle.x / 5), y0 = 5 * Math.round(middle.y / 5);
+    for (let at = -half; at <= half; at += 5) {
+      segment(g, x0 + at, y0 - half, x0 + at, y0 + half);
+      segment(g, x0 - half, y0 + at, x0 + half, y0 + at);
+    }
   }
 
   drawElectrode(g, name, k, px) {
@@ -65,7 +79,7 @@ export class Plan {
   }
 
   drawScale(g, px) {
-    const x = -this.reach + 16 * px, y = this.reach - 18 * px;
+    const x = this.middle.x - this.reach + 16 * px, y = this.middle.y + this.reach - 18 * px;
     g.strokeStyle = theme.ink; g.lineWidth = 2 * px; segment(g, x, y, x + 5, y);
     segment(g, x, y - 3 * px, x, y + 3 * px); segment(g, x + 5, y - 3 * px, x + 5, y + 3 * px);
     this.text(g, "5 mm", x + 2.5, y - 11 * px, 12 * px, theme.ink, "center");
@@ -125,8 +139,9 @@ export class Plan {
 
   /** A place beyond the view is shown at its edge. */
   inView({ x, y }) {
-    const most = this.reach - 12 * this.css, clip = (v) => Math.min(Math.max(v, -most), most);
-    return { x: clip(x), y: clip(y) };
+    const most = this.reach - 12 * this.css;
+    const clip = (value, middle) => Math.min(Math.max(value, middle - most), middle + most);
+    return { x: clip(x, this.middle.x), y: clip(y, this.middle.y) };
   }
 
   drawEllipse(g, x, y, sample, scale, colour, width) {
@@ -158,14 +173,16 @@ export class Plan {
 
   /** The corner in which the lens hides neither touch nor electrode. */
   lensPlace(size, px, touch) {
-    const far = this.reach - size - 10 * px, corners = [[far, -far], [far, far], [-far, far]], edges = Object.values(this.film.outlines_mm).flat();
+    const far = this.reach - size - 10 * px;
+    const corners = [[far, -far], [far, far], [-far, far]].map(([x, y]) => [this.middle.x + x, this.middle.y + y]);
+    const edges = Object.values(this.film.outlines_mm).flat();
     const hides = ([x, y]) => Math.hypot(touch.x - x, touch.y - y) < size + 24 * px || edges.some(([u, v]) => Math.hypot(u - x, v - y) < size + 4 * px);
     return corners.find((corner) => !hides(corner)) ?? corners[0];
   }
 
   drawWord(g, word) {
     const px = this.css;
-    this.text(g, word, 0, this.reach - 20 * px, 14 * px, theme.quiet, "center");
+    this.text(g, word, this.middle.x, this.middle.y + this.reach - 20 * px, 14 * px, theme.quiet, "center");
   }
 
   text(g, words, x, y, size, colour, align, weight = "400") {
@@ -183,6 +200,12 @@ export function axes({ xStd, yStd, correlation }) {
 }
 
 function mean(points, axis) { return points.reduce((sum, point) => sum + point[axis], 0) / points.length; }
+
+/** The middle of the box around points. */
+export function middleOf(points) {
+  const [xs, ys] = [points.map(([x]) => x), points.map(([, y]) => y)];
+  return { x: (Math.min(...xs) + Math.max(...xs)) / 2, y: (Math.min(...ys) + Math.max(...ys)) / 2 };
+}
 
 function circle(g, x, y, radius) { g.beginPath(); g.arc(x, y, radius, 0, 2 * Math.PI); }
 
