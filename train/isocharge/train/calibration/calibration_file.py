@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta, Struct
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import PressError, cut, shown
 from isocharge.common.structs import Finite, NotNegative, Text, read_json
 from isocharge.simulate.sensor.film_prior import FilmPrior
@@ -314,7 +314,7 @@ def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Arra
     return matrix
 
 
-def _numbers(path: Path, key: str, rows: list[list[Correlation]], may_be_null: Array) -> Array:
+def _numbers(path: Path, key: str, rows: list[list[Correlation]], may_be_null: Booleans) -> Array:
     """Return rows as an array; null is taken for zero where it may stand, and refused elsewhere."""
     matrix = np.array([[np.nan if value is None else value for value in row] for row in rows])
     wrong = np.isnan(matrix) & ~may_be_null
@@ -324,7 +324,7 @@ def _numbers(path: Path, key: str, rows: list[list[Correlation]], may_be_null: A
             f"{path}: {key}: expected a number from -1 to 1 in row {row + 1}, column {column + 1}, got null; calibrate "
             "anew"
         )
-    return np.nan_to_num(matrix)
+    return np.where(np.isnan(matrix), 0.0, matrix)
 
 
 def _possible(path: Path, correlations: Array) -> Array:
