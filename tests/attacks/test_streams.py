@@ -91,7 +91,7 @@ def test_frames_with_faults(name, attack):
             for frame in parser.feed(piece):
                 assert frame.seq is None or isinstance(frame.seq, int)
                 assert all(isinstance(value, float) for value in frame.values)
-        parser.forget()
+        parser.reset()
         assert parser.counts.bytes_dropped <= size
 
     def pieces(rng):
@@ -140,7 +140,7 @@ def test_bombs(attack):
         for make_parser, _ in FORMATS.values():
             parser = make_parser()
             parser.feed(data)
-            parser.forget()
+            parser.reset()
 
     attack("frames bombs", read, lambda rng: rng.choice(bombs)(rng.choice((600, 700, 900, 5000, 50_000))), 2_000)
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame, device_from_table
-from isocharge.serve.frames.frame_layout import DescribedParser
+from isocharge.serve.frames.frame_layout import SyncParser
 
 FOLDER = Path(__file__).parents[2] / "data" / "frames"
 
@@ -45,21 +45,21 @@ def modbus_crc(data):
 
 def test_robotiq():
     data = bytes.fromhex("20 4E") + struct.pack("<6h", 1234, -567, 89, 1000, -2000, 3)
-    (frame,) = DescribedParser(LAYOUTS["robotiq_ft300"]).feed(data + modbus_crc(data))
+    (frame,) = SyncParser(LAYOUTS["robotiq_ft300"]).feed(data + modbus_crc(data))
     assert frame.values == pytest.approx((12.34, -5.67, 0.89, 1.0, -2.0, 0.003))
     assert (frame.names, frame.seq, frame.t_us) == (("Fx", "Fy", "Fz", "Mx", "My", "Mz"), None, None)
 
 
 def test_optoforce():
     data = bytes((170, 7, 8, 10)) + struct.pack(">HHhhh", 65535, 0, 100, -200, 16037)
-    (frame,) = DescribedParser(LAYOUTS["optoforce_omd"]).feed(data + struct.pack(">H", sum(data) & 0xFFFF))
+    (frame,) = SyncParser(LAYOUTS["optoforce_omd"]).feed(data + struct.pack(">H", sum(data) & 0xFFFF))
     assert (frame.seq, frame.values) == (65535, (100.0, -200.0, 16037.0))
 
 
 def test_bota():
     body = struct.pack("<H6fIf", 0, 1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 123456, 23.5)
     reflected = int(f"{binary_crc_of_reflected(body):016b}"[::-1], 2) ^ 0xFFFF
-    (frame,) = DescribedParser(LAYOUTS["bota_sensone"]).feed(b"\xaa" + body + struct.pack("<H", reflected))
+    (frame,) = SyncParser(LAYOUTS["bota_sensone"]).feed(b"\xaa" + body + struct.pack("<H", reflected))
     assert (frame.t_us, frame.values) == (123456, (1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 23.5))
 
 
@@ -86,8 +86,8 @@ def test_every_flipped_bit_is_noticed(name, counts, data):
     if name == "bota_sensone" and at == 0:
         return  # its header is not covered by the checksum, but without it there is no frame
     bad = good[:at] + bytes([good[at] ^ 1 << bit]) + good[at + 1 :]
-    parser = DescribedParser(LAYOUTS[name])
-    assert parser.feed(bad + good + bytes(len(good))) == DescribedParser(LAYOUTS[name]).feed(good)
+    parser = SyncParser(LAYOUTS[name])
+    assert parser.feed(bad + good + bytes(len(good))) == SyncParser(LAYOUTS[name]).feed(good)
 
 
 @settings(derandomize=True)
@@ -96,9 +96,9 @@ def test_every_byte_is_a_part_of_a_frame_or_counted_as_dropped(parts, step):
     """Nothing is held after the connection, and nothing is counted twice."""
     layout = LAYOUTS["optoforce_omd"]
     stream = b"".join(part if isinstance(part, bytes) else encoded("optoforce_omd", part) for part in parts)
-    parser = DescribedParser(layout)
+    parser = SyncParser(layout)
     frames = [frame for at in range(0, len(stream), step) for frame in parser.feed(stream[at : at + step])]
-    parser.forget()
+    parser.reset()
     assert parser.counts.bytes_dropped == len(stream) - layout.length * len(frames)
     assert parser.counts.frames == len(frames)
 
@@ -110,7 +110,7 @@ def test_a_number_or_clock_that_is_no_number_costs_its_frame_only(name, value):
     fields = f'fields = [{{name = "{name}", type = "f32"}}, {{name = "A", type = "f32"}}]'
     described = layout(f'sync = "20 4E"\nlength = 10\n{fields}')
     good, bad = (b"\x20\x4e" + struct.pack("<ff", number, 1.0) for number in (2.0, value))
-    parser = DescribedParser(described)
+    parser = SyncParser(described)
     assert [frame.values for frame in parser.feed(good + bad + good)] == [(1.0,), (1.0,)]
     assert (parser.counts.frames, parser.counts.malformed, parser.counts.bytes_dropped) == (2, 1, 10)
 
@@ -138,7 +138,7 @@ def test_three_bytes(a, b, c, order):
     described = layout(TRIPLES.format(order=order))
     body = a.to_bytes(3, order, signed=True) + b.to_bytes(3, order) + c.to_bytes(3, order, signed=True)
     data = b"\xa5\x5a" + body + struct.pack("<H", mkPredefinedCrcFun("xmodem")(body))
-    (frame,) = DescribedParser(described).feed(data)
+    (frame,) = SyncParser(described).feed(data)
     assert frame.values == (a, b / 2, c)
     assert described.encode(frame) == data
 
@@ -187,7 +187,7 @@ length = 5
 fields = [{name = "seq", type = "u8"}, {type = "pad", value = "02"}, {name = "A", type = "i16"}]
 """
     described = layout(text)
-    frames = DescribedParser(described).feed(bytes.fromhex("7E 01 02 10 00  7E 02 09 11 22  7E 03 02 20 00"))
+    frames = SyncParser(described).feed(bytes.fromhex("7E 01 02 10 00  7E 02 09 11 22  7E 03 02 20 00"))
     assert [(frame.seq, frame.values) for frame in frames] == [(1, (16.0,)), (3, (32.0,))]
     assert described.encode(Frame(1, 0, (16.0,))) == bytes.fromhex("7E 01 02 10 00")
 
@@ -198,7 +198,7 @@ def test_check_of_given_parameters():
     fields = [{"name": "A", "type": "u8"}]
     described = layout({"sync": "55", "length": 4, "byte_order": "big", "checksum": check, "fields": fields})
     data = b"\x55\x07"
-    assert described.checked(data) == mkPredefinedCrcFun("crc-16-genibus")(data).to_bytes(2, "big")
+    assert described.checksum_of(data) == mkPredefinedCrcFun("crc-16-genibus")(data).to_bytes(2, "big")
 
 
 ROBOTIQ = (Path(__file__).parents[2] / "data" / "frames" / "robotiq_ft300.toml").read_text("utf-8")
@@ -211,7 +211,7 @@ length = 5
 fields = [{name = "seq", type = "u8"}, {name = "t_ms", type = "u8"}, {name = "A", type = "i16", scale = 0.5}]
 """
     described = layout(text)
-    parser = DescribedParser(described)
+    parser = SyncParser(described)
     assert parser.feed(described.encode(Frame(257, 300_000, (1e6,)))) == [Frame(1, 44_000, (16383.5,), names=("A",))]
     assert (parser.seq_modulus, parser.t_us_modulus) == (256, 256_000)
 

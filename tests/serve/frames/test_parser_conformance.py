@@ -183,7 +183,7 @@ def test_unfinished_frame_is_forgotten_with_its_connection(name):
     parser = form.parser()
     parser.feed(form.lead + form.encode(frame)[:-3])
     before = parser.counts.frames
-    parser.forget()
+    parser.reset()
     assert parser.feed(form.encode(frame)[-3:]) == []
     assert parser.counts.frames == before
     assert parser.feed(form.encode(frame) * 4 + form.tail)[-1].values == alone(form, frame)[0].values
@@ -231,5 +231,5 @@ def test_sequence_gaps_repeats_and_restarts(numbers, modulus, counts, flags):
 def test_a_new_connection_is_no_gap():
     gaps = SequenceGaps()
     gaps.update(5)
-    gaps.forget()
+    gaps.reset()
     assert gaps.update(900) == ()

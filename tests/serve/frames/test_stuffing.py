@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.serve import BinaryParser, Frame, encode_frame
-from isocharge.serve.frames.binary import LONGEST_PIECE
+from isocharge.serve.frames.binary import MAX_STUFFED_LENGTH
 from isocharge.serve.frames.checksums import CHECKSUMS
 from isocharge.serve.frames.stuffing import STUFFINGS, cobs_decode, cobs_encode
 
@@ -115,7 +115,7 @@ def test_layout_of_a_frame():
 @pytest.mark.parametrize("n", [0, 1, 60, 61, 62, 255])
 def test_round_trip_of_any_number_of_charges(n):
     frame = Frame(0x0101, 0x01010101, struct.unpack("<f", b"long") * n, flags=1)  # no zeros
-    assert len(encode_frame(frame)) <= LONGEST_PIECE + 1
+    assert len(encode_frame(frame)) <= MAX_STUFFED_LENGTH + 1
     assert BinaryParser().feed(encode_frame(frame)) == [frame]
 
 
@@ -135,7 +135,7 @@ def test_piece_that_is_no_frame_is_counted(data, counter):
     assert (getattr(parser.counts, counter), parser.counts.bytes_dropped) == (1, len(data))
 
 
-@pytest.mark.parametrize("size", [2 * LONGEST_PIECE, 1_000_000])
+@pytest.mark.parametrize("size", [2 * MAX_STUFFED_LENGTH, 1_000_000])
 @pytest.mark.parametrize("step", [1, 700, 5000])
 def test_an_overlong_piece_is_counted_once_however_it_is_cut_and_the_next_frame_found(size, step):
     data = b"\x01" * size + b"\0"  # sound stuffing of zeros, so that only its length is wrong

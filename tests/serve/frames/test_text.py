@@ -161,7 +161,7 @@ def test_number_cut_by_joining_late_is_not_taken():
     frames = parser.feed(b"01.2,799,803\n801.2,799,803\n801.2,799,803\n801.2,799,803\n")
     assert [frame.values[0] for frame in frames] == [801.2] * 3
     parser.feed(b"801.2,799,8")
-    parser.forget()
+    parser.reset()
     assert parser.feed(b"3,9,8\n801.2,799,803\n")[0].values[0] == 801.2
 
 

@@ -14,7 +14,7 @@ from isocharge.serve import (
     encode_frame,
     load_device,
 )
-from isocharge.serve.frames.frame_layout import DescribedParser
+from isocharge.serve.frames.frame_layout import SyncParser
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import ANY_BOARD, with_settings
 from isocharge.serve.live.reading_stream import ChannelPicker
@@ -93,7 +93,7 @@ def test_setting_may_be_one_number_for_all_channels(device):
 def test_format_decides_the_parser(device):
     assert isinstance(device('[frames]\nformat = "binary"').parser(), BinaryParser)
     described = '[frames]\nformat = "described"\nsync = "55"\nlength = 5\nfields = [{name = "A", type = "f32"}]'
-    assert isinstance(device(described).parser(), DescribedParser)
+    assert isinstance(device(described).parser(), SyncParser)
 
 
 def test_offset_is_subtracted_before_the_gain(device):

@@ -1,7 +1,7 @@
-"""From bytes to frames: every wire format, knowing no port.
+"""Parsers from bytes to frames, one module for each wire format. They do not depend on a port.
 
 May import: flags.
 
-A format is a parser (`frame.Parser`) in a module here. The device file (`live.device_file`) names it, or `autodetect`
-recognises it.
+Each format has a parser class derived from `frame.Parser` and a section class in `formats`, by which a device file
+names it.
 """

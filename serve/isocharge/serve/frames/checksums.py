@@ -1,8 +1,8 @@
 """Checksums of frames, by the names that catalogues and manuals use.
 
-The parameters of a cyclic redundancy check are those of Williams's model ("A painless guide to CRC error detection
-algorithms", 1993), the names and values those of Cook's catalogue. CRC-16/CCITT-FALSE is IBM-3740 there. A check that
-has no name is described by its parameters.
+A cyclic redundancy check (CRC) has the parameters of Williams's model ("A painless guide to CRC error detection
+algorithms", 1993). Names and values are those of Cook's catalogue of parametrised CRC algorithms, where
+CRC-16/CCITT-FALSE is called CRC-16/IBM-3740. A check without a name is described by its parameters.
 """
 
 from collections.abc import Callable
@@ -16,11 +16,11 @@ class Crc:
     """A cyclic redundancy check.
 
     Attributes:
-        width: Bits; 8, 16, 24 or 32.
-        polynomial: Without its highest bit, highest power first.
-        start: Register before the first byte, highest power first.
-        reflected: Whether bytes and register go lowest bit first.
-        final: What the register is xored with at the end.
+        width: Number of bits: 8, 16, 24 or 32.
+        polynomial: Polynomial without its highest power; the highest bit is the highest power.
+        start: Initial value of the register; the highest bit is the highest power.
+        reflected: Whether bytes and register are processed from the lowest bit.
+        final: Value that is combined with the register by exclusive or at the end.
     """
 
     width: int
@@ -31,43 +31,62 @@ class Crc:
 
     @cached_property
     def table(self) -> tuple[int, ...]:
-        """What each byte does to the register."""
-        return tuple(map(self._row, range(256)))
+        """Change of the register by each byte."""
+        return tuple(map(self._table_entry, range(256)))
 
     @cached_property
-    def first(self) -> int:
-        """The register before the first byte, as it is held."""
-        return self._held(self.start)
+    def initial_register(self) -> int:
+        """Initial value of the register, in the bit order in which the register is held."""
+        return self._in_register_order(self.start)
 
-    def _held(self, number: int) -> int:
-        """A number as the register holds it: lowest power first if reflected."""
-        return int(f"{number:0{self.width}b}"[::-1], 2) if self.reflected else number
+    def _in_register_order(self, number: int) -> int:
+        """Return a number in the bit order of the register: reversed if the check is reflected."""
+        if not self.reflected:
+            return number
+        bits = f"{number:0{self.width}b}"
+        return int(bits[::-1], 2)
 
-    def _row(self, byte: int) -> int:
-        register = byte if self.reflected else byte << (self.width - 8)
-        polynomial = self._held(self.polynomial)
-        top = 1 if self.reflected else 1 << (self.width - 1)
+    def _table_entry(self, byte: int) -> int:
+        """Return the register after one byte, starting from a register of zero."""
+        polynomial = self._in_register_order(self.polynomial)
+        if self.reflected:
+            register = byte
+            for _ in range(8):
+                carry = register & 1
+                register >>= 1
+                if carry:
+                    register ^= polynomial
+            return register
+
+        highest_bit = 1 << (self.width - 1)
+        register = byte << (self.width - 8)
         for _ in range(8):
-            shifted = register >> 1 if self.reflected else register << 1
-            register = shifted ^ polynomial if register & top else shifted
+            carry = register & highest_bit
+            register <<= 1
+            if carry:
+                register ^= polynomial
         return register & ((1 << self.width) - 1)
 
     def __call__(self, data: bytes) -> int:
-        """The check value of some bytes."""
-        table, register, high = self.table, self.first, self.width - 8
+        """Compute the check value of some bytes."""
+        table = self.table
+        register = self.initial_register
         if self.reflected:
             for byte in data:
                 register = (register >> 8) ^ table[(register ^ byte) & 0xFF]
             return register ^ self.final
+
+        shift = self.width - 8
         mask = (1 << self.width) - 1
         for byte in data:
-            register = ((register << 8) & mask) ^ table[(register >> high) ^ byte]
+            register = ((register << 8) & mask) ^ table[(register >> shift) ^ byte]
         return register ^ self.final
 
 
-def _fletcher(data: bytes) -> int:
-    """Fletcher's checksum (1982): the sum in the low byte, the sum of the sums in the high one, both modulo 255."""
-    low = high = 0
+def _fletcher_16(data: bytes) -> int:
+    """Compute Fletcher's checksum (1982): a sum in the low byte, the sum of the sums in the high byte, modulo 255."""
+    low = 0
+    high = 0
     for byte in data:
         low = (low + byte) % 255
         high = (high + low) % 255
@@ -76,7 +95,12 @@ def _fletcher(data: bytes) -> int:
 
 @dataclass(frozen=True)
 class Checksum:
-    """How to compute a checksum, and how many bytes it takes: 0 for a frame without one."""
+    """A checksum.
+
+    Attributes:
+        compute: Function from the covered bytes to the checksum.
+        size: Number of bytes that the checksum takes in a frame; 0 for a frame without one.
+    """
 
     compute: Callable[[bytes], int]
     size: int
@@ -96,7 +120,7 @@ CRCS = {
     "crc-32/mpeg-2": Crc(32, 0x04C11DB7, 0xFFFFFFFF, False, 0x00000000),
     "crc-32/iscsi": Crc(32, 0x1EDC6F41, 0xFFFFFFFF, True, 0xFFFFFFFF),
 }
-"""Cyclic redundancy checks by name."""
+"""Cyclic redundancy checks, by name."""
 
 CHECKSUMS = {
     "none": Checksum(lambda _: 0, 0),
@@ -105,7 +129,11 @@ CHECKSUMS = {
     "sum-8/inverted": Checksum(lambda data: ~sum(data) & 0xFF, 1),
     "xor-8": Checksum(lambda data: reduce(xor, data, 0), 1),
     "sum-16": Checksum(lambda data: sum(data) & 0xFFFF, 2),
-    "fletcher-16": Checksum(_fletcher, 2),
+    "fletcher-16": Checksum(_fletcher_16, 2),
     **{name: Checksum(crc, crc.width // 8) for name, crc in CRCS.items()},
 }
-"""All checksums by name. Negative: sum and checksum add up to 0; inverted: all bits turned round."""
+"""All checksums, by name.
+
+The checksum `sum-8/negative` makes the sum of all bytes zero. The checksum `sum-8/inverted` is the sum with every bit
+inverted.
+"""

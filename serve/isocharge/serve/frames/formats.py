@@ -1,4 +1,4 @@
-"""The formats of frames that a device file can name in `[frames] format`, each with its keys and its parser."""
+"""The frame formats that a device file can name in `[frames] format`, each with its keys and its parser."""
 
 import re
 from collections.abc import Mapping
@@ -8,42 +8,50 @@ from isocharge.serve.frames.frame import Frame, Parser
 from isocharge.serve.frames.frame_layout import FrameLayout, FrameSection
 from isocharge.serve.frames.text import TextParser
 
-_STEP = re.compile(rb"[^\0\n]*[\0\n]|[^\0\n]+")
+_PIECE = re.compile(rb"[^\0\n]*[\0\n]|[^\0\n]+")
+"""Bytes up to and including the end of a binary frame or of a line."""
 
 
 class AutoParser(Parser):
-    """Bytes in, frames out, from the frames on by which the format was recognised; until then all bytes are dropped."""
+    """Parser that recognises whether a board sends our binary frames or lines of text.
+
+    Bytes that come before the format is recognised are dropped.
+
+    Args:
+        columns: Names for the columns of a CSV; see `TextParser`.
+        meanings: Names that the board has for its counter and its clock; see `TextParser`.
+    """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
-        """Set up both parsers.
-
-        Args:
-            columns, meanings: As `TextParser` takes them.
-        """
         super().__init__("nothing recognised yet")
         self._candidates: tuple[Parser, ...] = (BinaryParser(), TextParser(columns, meanings))
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end within `data`."""
+        """Return the frames that end within `data`."""
         if len(self._candidates) == 1:
-            return self._feed(self._candidates[0], data)
-        for step in _STEP.finditer(data):
-            self.counts.drop(len(step.group()))
+            return self._feed_recognised(self._candidates[0], data)
+        for match in _PIECE.finditer(data):
+            piece = match.group()
+            self.counts.count_dropped(len(piece))
             for candidate in self._candidates:
-                if frames := candidate.feed(step.group()):
-                    self._candidates, self.counts = (candidate,), candidate.counts
-                    return frames + self._feed(candidate, data[step.end() :])
+                frames = candidate.feed(piece)
+                if frames:
+                    self._candidates = (candidate,)
+                    self.counts = candidate.counts
+                    return frames + self._feed_recognised(candidate, data[match.end() :])
         return []
 
-    def forget(self) -> None:
-        """Drop what is unfinished: what comes next is from another connection."""
+    def reset(self) -> None:
+        """Drop the bytes of an unfinished frame, because the next bytes come from another connection."""
         for candidate in self._candidates:
-            candidate.forget()
+            candidate.reset()
 
-    def _feed(self, chosen: Parser, data: bytes) -> list[Frame]:
-        """What the chosen parser reads; it also knows format and moduli, and text learns them as it comes."""
-        frames = chosen.feed(data)
-        self.format, self.seq_modulus, self.t_us_modulus = chosen.format, chosen.seq_modulus, chosen.t_us_modulus
+    def _feed_recognised(self, parser: Parser, data: bytes) -> list[Frame]:
+        """Feed the parser that recognised the format, and take over its format and moduli, which it may learn late."""
+        frames = parser.feed(data)
+        self.format = parser.format
+        self.seq_modulus = parser.seq_modulus
+        self.t_us_modulus = parser.t_us_modulus
         return frames
 
 
@@ -52,7 +60,8 @@ class TextFrames(FrameSection, tag="text", frozen=True):
 
     Attributes:
         columns: Names of the columns of a CSV.
-        seq, t_us, t_ms, t_s: The names that the board has for its number and its clock.
+        seq: Name that the board has for its frame counter.
+        t_us, t_ms, t_s: Name that the board has for its clock in us, ms or s.
     """
 
     columns: tuple[str, ...] = ()
@@ -63,20 +72,20 @@ class TextFrames(FrameSection, tag="text", frozen=True):
 
     @property
     def meanings(self) -> Mapping[str, str]:
-        """`seq`, `t_us`, `t_ms` or `t_s` by the name that the board has for it."""
-        names = {self.seq: "seq", self.t_us: "t_us", self.t_ms: "t_ms", self.t_s: "t_s"}
-        return {name: meaning for name, meaning in names.items() if name}
+        """Map the board's own names to `seq`, `t_us`, `t_ms` and `t_s`."""
+        meanings = {self.seq: "seq", self.t_us: "t_us", self.t_ms: "t_ms", self.t_s: "t_s"}
+        return {name: meaning for name, meaning in meanings.items() if name}
 
     def parser(self) -> Parser:
-        """A new parser."""
+        """Create a parser."""
         return TextParser(self.columns, self.meanings)
 
 
 class AutoFrames(TextFrames, tag="auto", frozen=True):
-    """Our binary frames or lines of text, whichever come."""
+    """Our binary frames or lines of text, whichever the board sends."""
 
     def parser(self) -> Parser:
-        """A new parser."""
+        """Create a parser."""
         return AutoParser(self.columns, self.meanings)
 
 
@@ -84,7 +93,7 @@ class BinaryFrames(FrameSection, tag="binary", frozen=True):
     """Our binary frames."""
 
     def parser(self) -> Parser:
-        """A new parser."""
+        """Create a parser."""
         return BinaryParser()
 
 

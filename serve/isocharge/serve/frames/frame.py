@@ -1,8 +1,7 @@
-"""What all frame formats share: the frame, the parser with its counters, rows of numbers, the numbers of frames.
+"""What all frame formats share: the frame, the base classes of parsers, counters, and the columns of a row of numbers.
 
-Parsers know no port: bytes in, frames and counters out. However the bytes are cut into chunks, the frames and counters
-are the same, and memory is bounded whatever comes. `SequenceGaps` finds gaps, repeats and restarts in the numbers of
-frames, `CounterWrap` where a counter in text wraps.
+A parser does not know where its bytes come from: it takes bytes and returns frames. The frames and counters do not
+depend on how the bytes are cut into chunks, and memory is bounded for any input.
 """
 
 from abc import ABC, abstractmethod
@@ -13,39 +12,61 @@ from typing import Any, TypeVar
 from isocharge.serve.flags import GAP, REPEAT, RESTART
 
 SEQ_MODULUS = 1 << 16
-"""Number at which a counter of 16 bits wraps to 0."""
+"""Value at which a 16-bit frame counter wraps to 0."""
+
+T_US_MODULUS = 1 << 32
+"""Time at which a 32-bit clock in microseconds wraps to 0, us."""
+
+SATURATED_BIT = 0x01
+"""Bit in the flags of a frame that reports an amplifier at its limit. The other bits are reserved and sent as zero."""
+
+SEQ = "seq"
+"""Name under which a device sends its frame counter."""
+
+FLAGS = "flags"
+"""Name under which a device sends the flags of a frame."""
+
+TIMES_US = {"t_us": 1.0, "t_ms": 1e3, "t_s": 1e6}
+"""Names under which a device sends its clock, with the unit of each name, us."""
+
+Raw = TypeVar("Raw")
+"""What a frame is decoded from: its bytes, or the numbers of a row."""
 
 
 class SequenceGaps:
-    """Follows the frame numbers.
+    """Detects missing frames, repeated frames and restarts in the sequence of frame counters.
 
     Attributes:
-        lost: Frames missing between those that came.
-        repeated: Frames with the number of the one before.
-        restarts: Times that the numbers went back, as after a reset of the device; frames lost then are not counted.
+        lost: Number of frames that are missing between received frames.
+        repeated: Number of frames with the same counter as the frame before.
+        restarts: Number of times that the counter went back, for example after a reset of the device. Frames that were
+            lost during a restart are not counted.
     """
 
     def __init__(self) -> None:
         self.lost = 0
         self.repeated = 0
         self.restarts = 0
-        self._last: int | None = None
+        self._last_seq: int | None = None
 
-    def forget(self) -> None:
-        """Start over: the next number is the first one of a new connection, and no gap."""
-        self._last = None
+    def reset(self) -> None:
+        """Treat the next frame as the first one of a new connection, so that it is no gap. The counters are kept."""
+        self._last_seq = None
 
     def update(self, seq: int | None, modulus: int = SEQ_MODULUS) -> tuple[str, ...]:
-        """Count the next frame, and give its flags (see `isocharge.serve.flags`).
+        """Count the next frame.
 
         Args:
-            seq: Its number; None if the format has none.
-            modulus: The number at which `seq` wraps to 0.
+            seq: Counter of the frame; None if the format has no counter.
+            modulus: Value at which the counter wraps to 0.
+
+        Returns:
+            Flags of the frame: empty, or one of `gap`, `repeat` and `restart` (see `isocharge.serve.flags`).
         """
         if seq is None:
             return ()
-        step = 1 if self._last is None else (seq - self._last) % modulus
-        self._last = seq
+        step = 1 if self._last_seq is None else (seq - self._last_seq) % modulus
+        self._last_seq = seq
         if step == 1:
             return ()
         if step == 0:
@@ -59,53 +80,52 @@ class SequenceGaps:
 
 
 class CounterWrap:
-    """The number at which a counter in text wraps to 0: text does not say how wide a counter is.
+    """Learns the value at which a counter in text wraps to 0, because text does not show the width of a counter.
 
-    A counter that falls has wrapped if all it ever showed is below a usual modulus, and the step modulo that is no
-    larger than its steps before. Otherwise it has begun anew.
+    When the counter falls, it either wrapped or started again. It is taken to have wrapped if there is a usual modulus
+    that is larger than every value so far and modulo which the step is not much larger than the steps before.
+
+    Args:
+        usual_moduli: Moduli that boards use, in ascending order.
+        initial_modulus: Modulus to assume until the counter wraps.
+        max_steps: Largest step across a wrap, as a multiple of the step before it.
     """
 
-    def __init__(self, usual: Iterable[int], modulus: int, most_steps: int) -> None:
-        """Set up the watch.
-
-        Args:
-            usual: Moduli that boards use, smallest first.
-            modulus: That of a counter which has not wrapped yet.
-            most_steps: Largest step over a wrap, in steps before.
-        """
-        self._usual, self._modulus, self._most_steps = tuple(usual), modulus, most_steps
-        self._last: int | None = None
-        self._step, self._largest = 1, 0
+    def __init__(self, usual_moduli: Iterable[int], initial_modulus: int, max_steps: int) -> None:
+        self._usual_moduli = tuple(usual_moduli)
+        self._modulus = initial_modulus
+        self._max_steps = max_steps
+        self._last_value: int | None = None
+        self._last_step = 1
+        self._largest_value = 0
 
     def update(self, value: int | None) -> int:
-        """Take the next value, None where a connection ends, and give the modulus as far as it is known."""
-        last, self._last = self._last, value
-        if value is None or last is None:
+        """Take the next value of the counter.
+
+        Args:
+            value: The value; None where a connection ends.
+
+        Returns:
+            The modulus, as far as it is known.
+        """
+        last_value = self._last_value
+        self._last_value = value
+        if value is None or last_value is None:
             return self._modulus
-        if value < last:
-            most = self._most_steps * self._step
-            fits = (m for m in self._usual if self._largest < m and (value - last) % m <= min(most, m // 2))
-            self._modulus = next(fits, self._modulus)
-        elif value > last:
-            self._step = value - last
-        self._largest = max(self._largest, value)
+        if value < last_value:
+            self._modulus = self._modulus_after_fall(value - last_value)
+        elif value > last_value:
+            self._last_step = value - last_value
+        self._largest_value = max(self._largest_value, value)
         return self._modulus
 
-
-SATURATED_BIT = 0x01
-"""In a frame's flags: an amplifier is at its limit. The other bits are reserved and sent as zero."""
-
-T_US_MODULUS = 1 << 32
-"""Time at which a clock of 32 bits wraps to 0, us."""
-
-SEQ, FLAGS = "seq", "flags"
-"""Names under which a device sends the number of a frame, and its flags."""
-
-TIMES_US = {"t_us": 1.0, "t_ms": 1e3, "t_s": 1e6}
-"""Names under which a device sends its clock, with their units, us."""
-
-Raw = TypeVar("Raw")
-"""What a frame is decoded from: its bytes, or the numbers of a row."""
+    def _modulus_after_fall(self, step: int) -> int:
+        """Return the smallest usual modulus that explains a negative step, or the present modulus if none does."""
+        max_step = self._max_steps * self._last_step
+        for modulus in self._usual_moduli:
+            if self._largest_value < modulus and step % modulus <= min(max_step, modulus // 2):
+                return modulus
+        return self._modulus
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,11 +133,11 @@ class Frame:
     """One reading of a sensor.
 
     Attributes:
-        seq: Counter of frames, modulo the parser's `seq_modulus`; None if the format has none.
-        t_us: The device's clock, us, modulo the parser's `t_us_modulus`; None if the format has none.
-        values: One value for each channel, in the device's unit; our binary frame has pC.
+        seq: Frame counter, modulo the parser's `seq_modulus`; None if the format has no counter.
+        t_us: Clock of the device, us, modulo the parser's `t_us_modulus`; None if the format has no clock.
+        values: One value for each channel, in the unit of the device. In our binary frame the unit is pC.
         flags: Bits; see `SATURATED_BIT`.
-        names: Names of the channels; empty if the format has none.
+        names: Names of the channels; empty if the format has no names.
     """
 
     seq: int | None
@@ -129,15 +149,15 @@ class Frame:
 
 @dataclass(slots=True)
 class FrameCounts:
-    """Counters of a parser.
+    """Counters of a parser. A piece is what should have been a frame: the bytes between two delimiters, or a line.
 
     Attributes:
-        frames: Intact frames.
-        crc_errors: Pieces whose checksum did not fit.
-        malformed: Pieces that were no frame for another reason: stuffing, length, version, not a number.
-        bytes_dropped: Bytes of those pieces, with their delimiters.
-        resyncs: Intact frames that came right after dropped bytes.
-        astray: Whether bytes were dropped since the last intact frame.
+        frames: Number of intact frames.
+        crc_errors: Number of pieces with a wrong checksum.
+        malformed: Number of pieces that were rejected for another reason: stuffing, length, version, not a number.
+        bytes_dropped: Number of bytes in the rejected pieces, including their delimiters.
+        resyncs: Number of intact frames that followed dropped bytes.
+        is_out_of_sync: Whether bytes were dropped since the last intact frame.
     """
 
     frames: int = 0
@@ -145,155 +165,191 @@ class FrameCounts:
     malformed: int = 0
     bytes_dropped: int = 0
     resyncs: int = 0
-    astray: bool = False
+    is_out_of_sync: bool = False
 
-    def accept(self) -> None:
+    def count_frame(self) -> None:
         """Count an intact frame."""
         self.frames += 1
-        self.resyncs += self.astray
-        self.astray = False
+        if self.is_out_of_sync:
+            self.resyncs += 1
+        self.is_out_of_sync = False
 
-    def refuse(self, size: int, *, damaged: bool = False) -> None:
-        """Count a dropped piece of `size` bytes; `damaged` if its checksum did not fit."""
-        self.crc_errors += damaged
-        self.malformed += not damaged
-        self.drop(size)
+    def count_rejected(self, size: int, *, wrong_checksum: bool = False) -> None:
+        """Count a rejected piece.
 
-    def drop(self, size: int) -> None:
+        Args:
+            size: Length of the piece with its delimiter, bytes.
+            wrong_checksum: Whether it was rejected because of its checksum.
+        """
+        if wrong_checksum:
+            self.crc_errors += 1
+        else:
+            self.malformed += 1
+        self.count_dropped(size)
+
+    def count_dropped(self, size: int) -> None:
         """Count dropped bytes."""
         self.bytes_dropped += size
-        self.astray |= size > 0
+        if size > 0:
+            self.is_out_of_sync = True
 
 
 class ChecksumError(ValueError):
-    """The checksum of a piece does not fit; the parser counts it."""
+    """The checksum of a piece is wrong. The parser counts it."""
 
 
 class Columns:
-    """What the numbers of a row are: frame number, clock and flags by their names, channels all others.
+    """Meaning of the numbers of a row: frame counter, clock, flags, or channel.
+
+    Args:
+        names: Names of all numbers; an empty text for a number without a name.
+        scales: Value of one count of each number.
+        flags: Position of the flags; None if there are none.
 
     Attributes:
-        seq, time: Positions of number and clock; None without them.
-        us: Unit of the clock, us.
-        channels: Positions of the channels, with the value of one count.
-        names: Names of the channels; empty if they have none.
+        seq: Position of the frame counter; None if there is none.
+        time: Position of the clock; None if there is none.
+        time_unit_us: Unit of the clock, us.
+        channels: Positions of the channels, each with the value of one count.
+        names: Names of the channels; empty if they have no names.
     """
 
     def __init__(self, names: Sequence[str], scales: Sequence[float], flags: int | None = None) -> None:
-        """Look up the names.
-
-        Args:
-            names: Of all numbers; empty texts for numbers without names.
-            scales: Value of one count of each.
-            flags: Position of the flags; None without them.
-        """
-        times = [names.index(name) for name in TIMES_US if name in names]
+        clocks = [names.index(name) for name in TIMES_US if name in names]
         self.seq = names.index(SEQ) if SEQ in names else None
-        self.time = times[0] if times else None
-        self.us = TIMES_US[names[times[0]]] * scales[times[0]] if times else 1.0
-        self.channels = [(at, scale) for at, scale in enumerate(scales) if at not in (self.seq, flags, *times)]
-        self.names = tuple(names[at] for at, _ in self.channels) if any(names) else ()
+        self.time = clocks[0] if clocks else None
+        self.time_unit_us = 1.0
+        if self.time is not None:
+            self.time_unit_us = TIMES_US[names[self.time]] * scales[self.time]
+
+        not_channels = {self.seq, flags, *clocks}
+        self.channels = [(position, scale) for position, scale in enumerate(scales) if position not in not_channels]
+        self.names: tuple[str, ...] = ()
+        if any(names):
+            self.names = tuple(names[position] for position, _ in self.channels)
         self._flags = flags
 
     def frame(self, numbers: Sequence[Any]) -> Frame:
-        """The frame of a row.
+        """Return the frame of a row of numbers.
 
         Raises:
-            ValueError, OverflowError: If number or clock is not finite.
+            ValueError, OverflowError: If the frame counter or the clock is not finite.
         """
         return Frame(
-            None if self.seq is None else round(numbers[self.seq]),
-            None if self.time is None else round(numbers[self.time] * self.us),
-            tuple([numbers[at] * scale for at, scale in self.channels]),
-            0 if self._flags is None else int(numbers[self._flags]),
-            self.names,
+            seq=None if self.seq is None else round(numbers[self.seq]),
+            t_us=None if self.time is None else round(numbers[self.time] * self.time_unit_us),
+            values=tuple([numbers[position] * scale for position, scale in self.channels]),
+            flags=0 if self._flags is None else int(numbers[self._flags]),
+            names=self.names,
         )
 
 
 class Parser(ABC):
-    """Bytes in, frames out.
+    """Base class of all parsers: takes bytes and returns frames.
+
+    Args:
+        format: Description of the format, for people.
+        seq_modulus: Value at which the `seq` of a frame wraps to 0.
+        t_us_modulus: Time at which the `t_us` of a frame wraps to 0, us.
 
     Attributes:
-        format: The format, for people.
-        seq_modulus: The number at which a frame's `seq` wraps to 0.
-        t_us_modulus: The time at which a frame's `t_us` wraps to 0, us.
-        counts: The counters so far.
+        counts: Counters since the parser was created.
     """
 
     def __init__(self, format: str, seq_modulus: int = SEQ_MODULUS, t_us_modulus: int = T_US_MODULUS) -> None:
-        """Begin without bytes."""
-        self.format, self.seq_modulus, self.t_us_modulus = format, seq_modulus, t_us_modulus
+        self.format = format
+        self.seq_modulus = seq_modulus
+        self.t_us_modulus = t_us_modulus
         self.counts = FrameCounts()
         self._tail = b""
 
     @abstractmethod
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end within `data`; the bytes after them wait for the next call."""
+        """Return the frames that end within `data`. Bytes of an unfinished frame are kept for the next call."""
 
-    def forget(self) -> None:
-        """Drop what is unfinished: what comes next is from another connection."""
-        self.counts.drop(len(self._tail))
+    def reset(self) -> None:
+        """Drop the bytes of an unfinished frame, because the next bytes come from another connection."""
+        self.counts.count_dropped(len(self._tail))
         self._tail = b""
 
     def _attempt(self, decode: Callable[[Raw], Frame], raw: Raw, size: int) -> list[Frame]:
-        """The frame that is decoded; one that is wrong is counted, with the bytes that it costs."""
+        """Decode one frame and count it.
+
+        Args:
+            decode: Function that raises ValueError or OverflowError if `raw` is no frame.
+            raw: What it decodes.
+            size: Number of bytes that are dropped if `raw` is no frame.
+
+        Returns:
+            The frame, or an empty list.
+        """
         try:
             frame = decode(raw)
         except (ValueError, OverflowError) as error:
-            self.counts.refuse(size, damaged=isinstance(error, ChecksumError))
+            self.counts.count_rejected(size, wrong_checksum=isinstance(error, ChecksumError))
             return []
-        self.counts.accept()
+        self.counts.count_frame()
         return [frame]
 
 
 class DelimitedParser(Parser):
-    """A parser of pieces between delimiters of one byte; a piece longer than any frame is dropped and counted."""
+    """Base class of parsers for pieces between one-byte delimiters. It drops pieces that are longer than any frame.
 
-    def __init__(self, delimiter: bytes, longest: int, *about: Any) -> None:
-        """Begin without bytes.
+    Args:
+        delimiter: The byte after each piece.
+        max_length: Length of the longest piece that is decoded, bytes.
+        parser_arguments: Arguments of `Parser`.
+    """
 
-        Args:
-            delimiter: The byte after a piece.
-            longest: Length of the longest piece that is read, bytes.
-            about: As `Parser` takes it.
-        """
-        super().__init__(*about)
-        self._delimiter, self._longest = delimiter, longest
+    def __init__(self, delimiter: bytes, max_length: int, *parser_arguments: Any) -> None:
+        super().__init__(*parser_arguments)
+        self._delimiter = delimiter
+        self._max_length = max_length
         self._is_overlong = False
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end within `data`; the bytes after the last delimiter wait for the next call."""
+        """Return the frames that end within `data`. Bytes after the last delimiter are kept for the next call."""
         *pieces, tail = (self._tail + data).split(self._delimiter)
         frames = []
         for piece in pieces:
-            if self._is_overlong or len(piece) > self._longest:
+            if self._is_overlong or len(piece) > self._max_length:
                 self._is_overlong = False
-                self.counts.refuse(len(piece) + 1)
+                self.counts.count_rejected(len(piece) + 1)
             else:
-                frames += self._take(piece)
+                frames += self._parse_piece(piece)
         self._tail = tail
-        if self._is_overlong or len(tail) > self._longest:
+        if self._is_overlong or len(tail) > self._max_length:
             self._is_overlong = True
-            super().forget()
+            super().reset()
         return frames
 
-    def forget(self) -> None:
-        """Drop what is unfinished: what comes next is from another connection."""
-        super().forget()
+    def reset(self) -> None:
+        """Drop the bytes of an unfinished piece, because the next bytes come from another connection."""
+        super().reset()
         self._is_overlong = False
 
     @abstractmethod
-    def _take(self, piece: bytes) -> list[Frame]:
-        """The frames that a piece completes; what is none is counted."""
+    def _parse_piece(self, piece: bytes) -> list[Frame]:
+        """Return the frames that a piece completes. A piece that is rejected must be counted."""
 
 
 class StuffedParser(DelimitedParser):
-    """A parser of frames with byte stuffing: each piece is a frame, and an empty one an idle line."""
+    """Parser of frames with byte stuffing: every piece is a frame, and an empty piece is an idle line.
 
-    def __init__(self, delimiter: bytes, longest: int, decode: Callable[[bytes], Frame], *about: Any) -> None:
-        """Begin without bytes; `decode` turns a piece into its frame, the other arguments are of `DelimitedParser`."""
-        super().__init__(delimiter, longest, *about)
+    Args:
+        delimiter: The byte after each frame.
+        max_length: Length of the longest stuffed frame, bytes.
+        decode: Function from the bytes of a piece to its frame; it raises ValueError if the piece is no frame.
+        parser_arguments: Arguments of `Parser`.
+    """
+
+    def __init__(
+        self, delimiter: bytes, max_length: int, decode: Callable[[bytes], Frame], *parser_arguments: Any
+    ) -> None:
+        super().__init__(delimiter, max_length, *parser_arguments)
         self._decode = decode
 
-    def _take(self, piece: bytes) -> list[Frame]:
-        return self._attempt(self._decode, piece, len(piece) + 1) if piece else []
+    def _parse_piece(self, piece: bytes) -> list[Frame]:
+        if not piece:
+            return []
+        return self._attempt(self._decode, piece, len(piece) + 1)

@@ -1,4 +1,4 @@
-"""The layout of a described frame: a sync pattern, fields of fixed size, a checksum.
+"""Frames whose layout a device file describes: a sync pattern, fields of fixed size, and a checksum.
 
     [frames]
     format = "described"
@@ -9,18 +9,20 @@
     checksum = "crc-16/modbus"     # a name of `isocharge.serve.frames.checksums`, or the parameters of a CRC:
                                    # {width = 16, polynomial = "1021", start = "FFFF", reflected = false, final = "0"}
     checksum_from = 0              # first byte that it covers; optional
-    checksum_order = "little"      # optional; that of the fields
+    checksum_order = "little"      # optional; the default is the byte order of the fields
     fields = [                     # in their order, from after the sync to before the checksum
         {name = "Fx", type = "i16", scale = 0.01},
         ...
     ]
 
-Types are u8, u16, u24, u32, i8, i16, i24, i32, f32, f64, and `pad`: `count` bytes that say nothing, or a `value` in
-hexadecimal that a frame must have, such as its length. A field named `seq` is the frame's number, `t_us`, `t_ms` or
-`t_s` its clock, `flags` the bits of `isocharge.serve.frames.frame`; all others are channels.
+The types are u8, u16, u24, u32, i8, i16, i24, i32, f32, f64 and `pad`. Padding is either `count` bytes without a
+meaning, or a `value` in hexadecimal that every frame must have, such as its length. A field named `seq` is the frame
+counter, `t_us`, `t_ms` or `t_s` is the clock, and `flags` holds the bits of `isocharge.serve.frames.frame`. All other
+fields are channels.
 
-Where a checksum does not fit, the parser goes on by one byte, so a sync pattern inside the data costs no intact frame.
-Stuffed frames end at their delimiter, and datagrams hold whole frames alone; there a wrong piece is dropped whole.
+If the checksum of a frame with a sync pattern is wrong, the parser searches for the pattern again from the next byte
+on, so that a pattern that occurs by chance inside the data does not cost an intact frame. Stuffed frames end at their
+delimiter, and a datagram holds whole frames only; a wrong piece of either is dropped as a whole.
 """
 
 import struct
@@ -45,24 +47,34 @@ from isocharge.serve.frames.frame import (
 )
 from isocharge.serve.frames.stuffing import STUFFINGS
 
-TYPES = {
-    **{"u8": "B", "u16": "H", "u24": "3s", "u32": "I"},
-    **{"i8": "b", "i16": "h", "i24": "3s", "i32": "i"},
-    **{"f32": "f", "f64": "d"},
+STRUCT_FORMATS = {
+    "u8": "B",
+    "u16": "H",
+    "u24": "3s",
+    "u32": "I",
+    "i8": "b",
+    "i16": "h",
+    "i24": "3s",
+    "i32": "i",
+    "f32": "f",
+    "f64": "d",
 }
-"""Types of a field, with the letters of `struct`, which has none for three bytes."""
+"""Format character of the module `struct` for each type of a field. Three bytes have none and are read as bytes."""
 
 PADDING = "pad"
-"""Type of bytes that say nothing."""
+"""Type of bytes that are not read."""
 
-MOST_PADDING = 4096
-"""Largest padding, bytes: what no real frame has, so that a typing error cannot ask for a gigabyte."""
+MAX_PADDING = 4096
+"""Largest padding, bytes. It is more than any real frame has, so that a typing error cannot ask for a gigabyte."""
 
-FASTEST_HZ = 100_000.0
+MAX_REQUEST_RATE_Hz = 100_000.0
 """Highest rate of requests, Hz."""
 
-SYNC, DATAGRAM = "sync", "datagram"
-"""Framings without byte stuffing: a frame begins with its sync pattern, or where a datagram begins."""
+SYNC = "sync"
+"""Framing in which a frame begins with its sync pattern."""
+
+DATAGRAM = "datagram"
+"""Framing in which a datagram holds one or more whole frames."""
 
 Framing = Literal["sync", "cobs", "slip", "hdlc", "datagram"]
 ByteOrder = Literal["little", "big"]
@@ -78,17 +90,17 @@ class Field(Settings, frozen=True):
     """A field of a frame.
 
     Attributes:
-        kind: Its type.
-        name: Its meaning, or the channel's name; empty for padding.
-        scale: Value of one count in the unit of the channel or clock.
-        count: Bytes of padding.
-        value: Bytes that padding must have.
+        kind: Type of the field.
+        name: Meaning of the field, or name of the channel; empty for padding.
+        scale: Value of one count, in the unit of the channel or of the clock.
+        count: Number of bytes of padding.
+        value: Bytes that the padding of every frame must have, in hexadecimal.
     """
 
     kind: Literal["pad", "u8", "u16", "u24", "u32", "i8", "i16", "i24", "i32", "f32", "f64"] = field(name="type")
     name: Annotated[str, Meta(max_length=1000)] = ""
     scale: Finite = 1.0
-    count: Annotated[int, Meta(ge=1, le=MOST_PADDING)] = 1
+    count: Annotated[int, Meta(ge=1, le=MAX_PADDING)] = 1
     value: Hexadecimal | None = None
 
     def __post_init__(self) -> None:
@@ -98,41 +110,52 @@ class Field(Settings, frozen=True):
             return
         if not self.name:
             raise WrongKey("name")
-        for key, value, default in (("count", self.count, 1), ("value", self.value, None)):
-            if value != default:
-                raise WrongKey(key, f"none, because only the type {PADDING} may have one", value)
+        only_padding = f"none, because only the type {PADDING} may have one"
+        if self.count != 1:
+            raise WrongKey("count", only_padding, self.count)
+        if self.value is not None:
+            raise WrongKey("value", only_padding, self.value)
 
     @property
-    def letter(self) -> str:
-        """The type as `struct` writes it."""
-        if self.kind == PADDING:
-            return f"{len(bytes.fromhex(self.value)) if self.value else self.count}x"
-        return TYPES[self.kind]
+    def struct_format(self) -> str:
+        """Format of the field for the module `struct`."""
+        if self.kind != PADDING:
+            return STRUCT_FORMATS[self.kind]
+        if self.value:
+            return f"{len(bytes.fromhex(self.value))}x"
+        return f"{self.count}x"
 
     @property
     def size(self) -> int:
-        """Bytes."""
-        return struct.calcsize(f"<{self.letter}")
+        """Number of bytes."""
+        return struct.calcsize(f"<{self.struct_format}")
 
     @property
     def modulus(self) -> int:
-        """The number at which an unsigned counter of this size begins again."""
+        """Value at which an unsigned counter of this size wraps to 0."""
         return 1 << 8 * self.size
 
-    def packed(self, value: float, order: ByteOrder) -> float | bytes:
-        """A value as `struct` takes it: counters and clocks wrap, a channel at its limit stays there."""
+    def pack(self, value: float, byte_order: ByteOrder) -> float | bytes:
+        """Return a value in the form that `struct` packs.
+
+        A counter or a clock that does not fit its field wraps. A channel that does not fit is set to its limit.
+        """
         count = value / self.scale
-        if self.kind[0] == "f":
+        if self.kind in ("f32", "f64"):
             return count
         if self.name in (SEQ, *TIMES_US):
             count = round(count) % self.modulus
-        low = 0 if self.kind[0] == "u" else -self.modulus // 2
-        count = min(max(round(count), low), low + self.modulus - 1)
-        return count.to_bytes(3, order, signed=low < 0) if self.size == 3 else count
+        is_signed = self.kind.startswith("i")
+        lowest = -self.modulus // 2 if is_signed else 0
+        highest = lowest + self.modulus - 1
+        count = min(max(round(count), lowest), highest)
+        if self.size == 3:
+            return count.to_bytes(3, byte_order, signed=is_signed)
+        return count
 
 
 class CrcParameters(Settings, frozen=True):
-    """A cyclic redundancy check without a name; see `isocharge.serve.frames.checksums.Crc`."""
+    """Parameters of a cyclic redundancy check that has no name; see `isocharge.serve.frames.checksums.Crc`."""
 
     width: Literal[8, 16, 24, 32]
     polynomial: HexadecimalNumber
@@ -147,41 +170,47 @@ class CrcParameters(Settings, frozen=True):
 
     @property
     def checksum(self) -> Checksum:
-        """How to compute it."""
-        polynomial, start, final = (int(text, 16) for text in (self.polynomial, self.start, self.final))
-        return Checksum(Crc(self.width, polynomial, start, self.reflected, final), self.width // 8)
+        """The checksum with these parameters."""
+        crc = Crc(
+            width=self.width,
+            polynomial=int(self.polynomial, 16),
+            start=int(self.start, 16),
+            reflected=self.reflected,
+            final=int(self.final, 16),
+        )
+        return Checksum(crc, self.width // 8)
 
 
 class FrameSection(Settings, frozen=True, tag_field="format"):
-    """Keys that the section `[frames]` has for every format: what the board has to be asked.
+    """Keys that the section `[frames]` has for every format. They describe requests to the board.
 
     Attributes:
-        request: Bytes in hexadecimal; None for a board that sends unasked.
-        request_Hz: Requests per second, at most.
-        echo: Whether the line brings the request back.
+        request: Bytes to send for each frame, in hexadecimal; None for a board that sends frames by itself.
+        request_Hz: Largest number of requests per second.
+        echo: Whether the line returns every byte that is sent, so that the request has to be removed from the answer.
     """
 
     request: Hexadecimal | None = None
-    request_Hz: Annotated[float, Meta(gt=0, le=FASTEST_HZ)] = 100.0
+    request_Hz: Annotated[float, Meta(gt=0, le=MAX_REQUEST_RATE_Hz)] = 100.0
     echo: bool = False
 
 
 class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only=True):
-    """A described frame; the attributes are keys of the section `[frames]`.
+    """A described frame. The attributes are keys of the section `[frames]`.
 
     Attributes:
-        length: Of the whole frame without stuffing, bytes.
-        entries: Its fields, padding included.
-        framing: How frames are told apart.
-        sync_bytes: With which each begins, hexadecimal.
-        byte_order: Of the fields.
-        checksum: Its name, or its parameters.
-        checksum_from: First byte that it covers.
-        checksum_order: Its byte order; that of the fields if None.
+        length: Length of the whole frame without stuffing, bytes.
+        fields_and_padding: Fields of the frame, including padding.
+        framing: How one frame is separated from the next.
+        sync_bytes: Bytes with which every frame begins, in hexadecimal.
+        byte_order: Byte order of the fields.
+        checksum: Name of the checksum, or parameters of a CRC.
+        checksum_from: First byte that the checksum covers.
+        checksum_order: Byte order of the checksum; None means the byte order of the fields.
     """
 
     length: int
-    entries: tuple[Field, ...] = field(name="fields")
+    fields_and_padding: tuple[Field, ...] = field(name="fields")
     framing: Framing = "sync"
     sync_bytes: Hexadecimal | None = field(name="sync", default=None)
     byte_order: ByteOrder = "little"
@@ -190,7 +219,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     checksum_order: ByteOrder | None = None
 
     def __post_init__(self) -> None:
-        """Refuse fields that do not make a frame, and a length or checksum that does not fit them."""
+        """Check that the fields make a frame, and that length and checksum fit the fields."""
         names = [field.name for field in self.fields]
         if isinstance(self.checksum, str) and self.checksum not in CHECKSUMS:
             raise WrongKey("checksum", f"one of {', '.join(CHECKSUMS)}, or the parameters of a CRC", self.checksum)
@@ -208,151 +237,186 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     @cached_property
     def sync(self) -> bytes:
-        """The bytes with which a frame begins."""
+        """The bytes with which every frame begins."""
         return bytes.fromhex(self.sync_bytes or "")
 
     @cached_property
     def body(self) -> struct.Struct:
-        """The bytes between sync and checksum."""
-        letters = "".join(entry.letter for entry in self.entries)
-        return struct.Struct(("<" if self.byte_order == "little" else ">") + letters)
+        """Format of the bytes between the sync pattern and the checksum."""
+        byte_order = "<" if self.byte_order == "little" else ">"
+        return struct.Struct(byte_order + "".join(field.struct_format for field in self.fields_and_padding))
 
     @cached_property
     def fields(self) -> tuple[Field, ...]:
-        """Fields in their order, padding left out."""
-        return tuple(entry for entry in self.entries if entry.kind != PADDING)
+        """Fields of the frame without padding, in their order."""
+        return tuple(field for field in self.fields_and_padding if field.kind != PADDING)
 
     @cached_property
     def channels(self) -> tuple[Field, ...]:
-        """The fields that are neither number, clock nor flags."""
-        return tuple(self.fields[at] for at, _ in self.columns.channels)
+        """The fields that are neither frame counter, clock nor flags."""
+        return tuple(self.fields[position] for position, _ in self.columns.channels)
 
     @cached_property
     def check(self) -> Checksum:
-        """The checksum."""
-        return CHECKSUMS[self.checksum] if isinstance(self.checksum, str) else self.checksum.checksum
+        """The checksum that the key `checksum` names or describes."""
+        if isinstance(self.checksum, str):
+            return CHECKSUMS[self.checksum]
+        return self.checksum.checksum
 
     @cached_property
     def columns(self) -> Columns:
-        """What the numbers of the fields are."""
-        names, scales = [entry.name for entry in self.fields], [entry.scale for entry in self.fields]
-        return Columns(names, scales, names.index(FLAGS) if FLAGS in names else None)
+        """Meaning of each field: frame counter, clock, flags or channel."""
+        names = [field.name for field in self.fields]
+        scales = [field.scale for field in self.fields]
+        flags = names.index(FLAGS) if FLAGS in names else None
+        return Columns(names, scales, flags)
 
     @property
     def seq_modulus(self) -> int:
-        """The number at which the field `seq` wraps to 0."""
-        at = self.columns.seq
-        return SEQ_MODULUS if at is None else self.fields[at].modulus
+        """Value at which the field `seq` wraps to 0."""
+        position = self.columns.seq
+        return SEQ_MODULUS if position is None else self.fields[position].modulus
 
     @property
     def t_us_modulus(self) -> int:
-        """The time at which the clock's field wraps to 0, us."""
-        at = self.columns.time
-        return T_US_MODULUS if at is None else round(self.fields[at].modulus * self.columns.us)
+        """Time at which the field of the clock wraps to 0, us."""
+        position = self.columns.time
+        if position is None:
+            return T_US_MODULUS
+        return round(self.fields[position].modulus * self.columns.time_unit_us)
 
     @cached_property
-    def triples(self) -> tuple[tuple[int, bool], ...]:
-        """Positions of the fields of three bytes, which `struct` does not read, and whether each has a sign."""
-        return tuple((at, entry.kind == "i24") for at, entry in enumerate(self.fields) if entry.size == 3)
+    def three_byte_fields(self) -> tuple[tuple[int, bool], ...]:
+        """Position of each field of three bytes, which `struct` cannot read, and whether the field is signed."""
+        return tuple((position, field.kind == "i24") for position, field in enumerate(self.fields) if field.size == 3)
 
     @cached_property
     def constants(self) -> tuple[tuple[int, bytes], ...]:
-        """Positions and bytes that every frame has besides the sync."""
-        at, constants = len(self.sync), []
-        for entry in self.entries:
-            constants += [(at, bytes.fromhex(entry.value))] if entry.value else []
-            at += entry.size
+        """Position and value of the bytes that are the same in every frame, except the sync pattern."""
+        position = len(self.sync)
+        constants = []
+        for part in self.fields_and_padding:
+            if part.value:
+                constants.append((position, bytes.fromhex(part.value)))
+            position += part.size
         return tuple(constants)
 
-    def checked(self, data: bytes) -> bytes:
-        """What follows `data`, a frame without its checksum: the checksum."""
+    def checksum_of(self, data: bytes) -> bytes:
+        """Compute the checksum that follows `data`, which is a frame without its checksum."""
         value = self.check.compute(data[self.checksum_from :])
         return value.to_bytes(self.check.size, self.checksum_order or self.byte_order)
 
     def decode(self, data: bytes) -> Frame:
-        """The frame in exactly these bytes, without stuffing.
+        """Decode one frame.
+
+        Args:
+            data: Exactly the bytes of the frame, without stuffing.
 
         Raises:
-            ChecksumError: If its checksum does not fit.
-            ValueError: If length, sync or a constant byte is another one, or number or clock is none.
-            OverflowError: If number or clock is infinite.
+            ChecksumError: If the checksum is wrong.
+            ValueError: If the length, the sync pattern or a constant byte is wrong, or the frame counter or the clock
+                is not a number.
+            OverflowError: If the frame counter or the clock is infinite.
         """
         if len(data) != self.length or not data.startswith(self.sync):
-            raise ValueError("another length or sync")
+            raise ValueError("the length or the sync pattern is wrong")
         end = self.length - self.check.size
-        if self.check.size and self.checked(data[:end]) != data[end:]:
-            raise ChecksumError("another checksum")
-        if self.constants and any(not data.startswith(constant, at) for at, constant in self.constants):
-            raise ValueError("other constant bytes than the layout's")
-        counts = self.body.unpack_from(data, len(self.sync))
-        return self.columns.frame(self._with_triples(counts) if self.triples else counts)
+        if self.check.size and self.checksum_of(data[:end]) != data[end:]:
+            raise ChecksumError("the checksum is wrong")
+        for position, constant in self.constants:
+            if not data.startswith(constant, position):
+                raise ValueError(f"the constant at byte {position} is wrong")
+        numbers = self.body.unpack_from(data, len(self.sync))
+        if self.three_byte_fields:
+            return self.columns.frame(self._convert_three_byte_fields(numbers))
+        return self.columns.frame(numbers)
 
-    def _with_triples(self, counts: tuple[Any, ...]) -> list[Any]:
-        numbers = list(counts)
-        for at, is_signed in self.triples:
-            numbers[at] = int.from_bytes(numbers[at], self.byte_order, signed=is_signed)
-        return numbers
+    def _convert_three_byte_fields(self, numbers: tuple[Any, ...]) -> list[Any]:
+        converted = list(numbers)
+        for position, is_signed in self.three_byte_fields:
+            converted[position] = int.from_bytes(numbers[position], self.byte_order, signed=is_signed)
+        return converted
 
     def encode(self, frame: Frame) -> bytes:
-        """The bytes of a frame without stuffing; its values go into the channels in their order.
+        """Return the bytes of a frame without stuffing. The values go into the channels in their order.
 
         Raises:
             struct.error: If a number does not fit its field.
         """
         values: dict[str, float] = {SEQ: frame.seq or 0, FLAGS: frame.flags}
-        values |= {name: (frame.t_us or 0) / us for name, us in TIMES_US.items()}
-        values |= {entry.name: value for entry, value in zip(self.channels, frame.values, strict=True)}
-        data = self.sync + self.body.pack(*(entry.packed(values[entry.name], self.byte_order) for entry in self.fields))
-        for at, constant in self.constants:
-            data = data[:at] + constant + data[at + len(constant) :]
-        return data + self.checked(data)
+        for name, unit_us in TIMES_US.items():
+            values[name] = (frame.t_us or 0) / unit_us
+        for channel, value in zip(self.channels, frame.values, strict=True):
+            values[channel.name] = value
+        packed = [field.pack(values[field.name], self.byte_order) for field in self.fields]
+        data = bytearray(self.sync + self.body.pack(*packed))
+        for position, constant in self.constants:
+            data[position : position + len(constant)] = constant
+        return bytes(data) + self.checksum_of(bytes(data))
 
     def parser(self) -> Parser:
-        """A new parser."""
-        if self.framing in STUFFINGS:
-            delimiter, unstuffed = STUFFINGS[self.framing]
-            longest = 2 * self.length + 2
-            return StuffedParser(delimiter, longest, lambda piece: self.decode(unstuffed(piece)), *_about(self))
-        return DatagramParser(self) if self.framing == DATAGRAM else DescribedParser(self)
+        """Create a parser."""
+        if self.framing == SYNC:
+            return SyncParser(self)
+        if self.framing == DATAGRAM:
+            return DatagramParser(self)
+        stuffing = STUFFINGS[self.framing]
+        max_length = 2 * self.length + 2
+        return StuffedParser(
+            stuffing.delimiter, max_length, lambda piece: self.decode(stuffing.decode(piece)), *_parser_arguments(self)
+        )
 
 
-def _about(layout: FrameLayout) -> tuple[str, int, int]:
-    """The format for people, and where number and clock wrap."""
+def _parser_arguments(layout: FrameLayout) -> tuple[str, int, int]:
+    """Return the arguments of `Parser` for a layout."""
     names = ", ".join(field.name for field in layout.fields)
     return f"described frames of {layout.length} bytes: {names}", layout.seq_modulus, layout.t_us_modulus
 
 
-class DescribedParser(Parser):
-    """Bytes in, frames out, for a layout whose frames begin with a sync pattern."""
+class SyncParser(Parser):
+    """Parser for a layout whose frames begin with a sync pattern."""
 
     def __init__(self, layout: FrameLayout) -> None:
-        super().__init__(*_about(layout))
+        super().__init__(*_parser_arguments(layout))
         self.layout = layout
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that end within `data`; an unfinished one waits for the next call."""
-        sync, length, decode = self.layout.sync, self.layout.length, self.layout.decode
-        data, at, frames = self._tail + data, 0, []
-        while (start := data.find(sync, at)) >= 0 and start + length <= len(data):
-            if start > at:
-                self.counts.drop(start - at)
-            read = self._attempt(decode, data[start : start + length], 1)
-            at = start + (length if read else 1)
-            frames += read
-        unfinished = start if start >= 0 else max(at, len(data) - len(sync) + 1)
-        self.counts.drop(unfinished - at)
+        """Return the frames that end within `data`. Bytes of an unfinished frame are kept for the next call."""
+        sync = self.layout.sync
+        length = self.layout.length
+        data = self._tail + data
+        frames = []
+        position = 0
+        start = data.find(sync)
+        while 0 <= start <= len(data) - length:
+            if start > position:
+                self.counts.count_dropped(start - position)
+            decoded = self._attempt(self.layout.decode, data[start : start + length], 1)
+            frames += decoded
+            position = start + length if decoded else start + 1
+            start = data.find(sync, position)
+
+        # A sync pattern may be cut by the end of the data.
+        unfinished = start if start >= 0 else max(position, len(data) - len(sync) + 1)
+        self.counts.count_dropped(unfinished - position)
         self._tail = data[unfinished:]
         return frames
 
 
-class DatagramParser(DescribedParser):
-    """Datagrams in, frames out: each chunk is a datagram, which holds one or more whole frames."""
+class DatagramParser(Parser):
+    """Parser for datagrams, each of which holds one or more whole frames."""
+
+    def __init__(self, layout: FrameLayout) -> None:
+        super().__init__(*_parser_arguments(layout))
+        self.layout = layout
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames of a datagram."""
+        """Return the frames of one datagram."""
         length = self.layout.length
         if len(data) % length:
-            self.counts.refuse(len(data))
+            self.counts.count_rejected(len(data))
             return []
-        pieces = [data[at : at + length] for at in range(0, len(data), length)]
-        return [frame for piece in pieces for frame in self._attempt(self.layout.decode, piece, length)]
+        frames = []
+        for start in range(0, len(data), length):
+            frames += self._attempt(self.layout.decode, data[start : start + length], length)
+        return frames

@@ -1,16 +1,17 @@
-"""Byte stuffing: how frames are parted by a byte that occurs nowhere in them.
+"""Byte stuffing: encodings in which the byte that separates frames never occurs inside a frame.
 
-Consistent Overhead Byte Stuffing (Cheshire and Baker 1999) ends a frame with a zero: each zero in the data is replaced
-by the distance to the next one, the first byte is the distance to the first, and a distance of 255 means 254 bytes
-without a zero after them. SLIP (RFC 1055) and HDLC's asynchronous framing (RFC 1662) part frames by a byte of their
-own, and send another two for it where it stands in the data.
+- COBS, Consistent Overhead Byte Stuffing (Cheshire and Baker 1999), ends a frame with a zero. Each zero in the data is
+  replaced by the distance to the next zero, and the first byte is the distance to the first one. A distance of 255
+  stands for 254 bytes that no zero follows.
+- SLIP (RFC 1055) and the asynchronous framing of HDLC (RFC 1662) separate frames by a byte of their own. Where this
+  byte occurs in the data, they send two other bytes instead.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
-LONGEST_BLOCK = 254
-"""Largest number of bytes without a zero after one distance of COBS."""
+MAX_BLOCK = 254
+"""Largest number of bytes without a zero that one distance of COBS can cover."""
 
 
 class Stuffing(NamedTuple):
@@ -18,7 +19,8 @@ class Stuffing(NamedTuple):
 
     Attributes:
         delimiter: The byte between frames.
-        decode: From the bytes between two delimiters to those of the frame; raises ValueError.
+        decode: Function from the bytes between two delimiters to the bytes of the frame. It raises ValueError for bytes
+            that no encoder produces.
     """
 
     delimiter: bytes
@@ -26,48 +28,51 @@ class Stuffing(NamedTuple):
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """Bytes without zeros, longer than `data` by 1 + len(data) // 254 at most."""
+    """Encode bytes so that the result holds no zero. It is at most 1 + len(data) // 254 bytes longer than `data`."""
     *blocks, last = data.split(b"\0")
-    return b"".join(_stuff(block, ends_in_zero=True) for block in blocks) + _stuff(last, ends_in_zero=False)
+    encoded = [_encode_block(block, ends_in_zero=True) for block in blocks]
+    return b"".join([*encoded, _encode_block(last, ends_in_zero=False)])
 
 
-def _stuff(block: bytes, *, ends_in_zero: bool) -> bytes:
-    stuffed = bytearray()
-    while len(block) > LONGEST_BLOCK or (len(block) == LONGEST_BLOCK and ends_in_zero):
-        stuffed.append(LONGEST_BLOCK + 1)
-        stuffed += block[:LONGEST_BLOCK]
-        block = block[LONGEST_BLOCK:]
-    stuffed.append(len(block) + 1)
-    return bytes(stuffed + block)
+def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
+    """Encode bytes without zeros, and the zero that follows them if there is one."""
+    encoded = bytearray()
+    while len(block) > MAX_BLOCK or (len(block) == MAX_BLOCK and ends_in_zero):
+        encoded.append(MAX_BLOCK + 1)
+        encoded += block[:MAX_BLOCK]
+        block = block[MAX_BLOCK:]
+    encoded.append(len(block) + 1)
+    return bytes(encoded + block)
 
 
 def cobs_decode(data: bytes) -> bytes:
-    """The bytes that `cobs_encode` was given.
+    """Return the bytes from which `cobs_encode` made `data`.
 
     Raises:
-        ValueError: If a distance points beyond the end, or there is a zero in `data`.
+        ValueError: If a distance points beyond the end, or `data` contains a zero.
     """
-    decoded, at = bytearray(), 0
-    while at < len(data):
-        code = data[at]
-        block = data[at + 1 : at + code]
-        if len(block) != code - 1 or 0 in block:
-            raise ValueError(f"byte {at} is {code}, but {len(data) - at - 1} bytes or a zero follow")
+    decoded = bytearray()
+    position = 0
+    while position < len(data):
+        distance = data[position]
+        block = data[position + 1 : position + distance]
+        if len(block) != distance - 1 or 0 in block:
+            raise ValueError(f"byte {position} is {distance}, but {len(data) - position - 1} bytes or a zero follow")
         decoded += block
-        at += code
-        if code <= LONGEST_BLOCK and at < len(data):
+        position += distance
+        if distance <= MAX_BLOCK and position < len(data):
             decoded.append(0)
     return bytes(decoded)
 
 
-def _slip(piece: bytes) -> bytes:
+def _slip_decode(piece: bytes) -> bytes:
     decoded = piece.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
     if piece.count(b"\xdb") != piece.count(b"\xdb\xdc") + piece.count(b"\xdb\xdd"):
-        raise ValueError("the byte DB stands alone: expected DC or DD after it")
+        raise ValueError("expected DC or DD after the byte DB")
     return decoded
 
 
-def _hdlc(piece: bytes) -> bytes:
+def _hdlc_decode(piece: bytes) -> bytes:
     first, *escaped = piece.split(b"\x7d")
     if not all(escaped):
         raise ValueError("expected a byte after 7D")
@@ -76,7 +81,7 @@ def _hdlc(piece: bytes) -> bytes:
 
 STUFFINGS = {
     "cobs": Stuffing(b"\x00", cobs_decode),
-    "slip": Stuffing(b"\xc0", _slip),
-    "hdlc": Stuffing(b"\x7e", _hdlc),
+    "slip": Stuffing(b"\xc0", _slip_decode),
+    "hdlc": Stuffing(b"\x7e", _hdlc_decode),
 }
-"""By name."""
+"""Every kind of byte stuffing, by its name in a device file."""

@@ -1,14 +1,17 @@
 """Frames from lines of text, whose layout is recognised from the first good lines.
 
-A layout is recognised when it has come three times in a row: three rows of the same width or names, or three times the
-same cycle of lines with one name each. A reader may start in the middle of a cycle, so a cycle begins with the name
-that sorts first, number and clock before channels; for the same reason a first line of bare numbers is dropped. After
-recognition a line of another layout is dropped and counted. Text has no checksum, but for sentences in the manner of
-NMEA: a damaged digit in an otherwise whole line cannot be noticed. A line that is no reading and comes again and again,
-such as the echo of a request, is dropped and hinders no recognition.
+A layout is recognised when it has occurred three times in a row: either three rows of the same width or with the same
+names, or three times the same cycle of lines with one name each. Reading may start in the middle of a cycle, so a cycle
+is taken to begin with the name that sorts first; frame counter and clock sort before the channels. Reading may also
+start in the middle of a line, so a first line of bare numbers is dropped. After recognition, lines of another layout
+are dropped and counted.
 
-Some names mean something: `seq` counts frames; `t_us`, `t_ms` or `t_s` is the device's clock. All others are channels.
-Where number or clock wrap is learned when they do.
+Text has no checksum, except for sentences in the style of NMEA 0183, so a damaged digit in an otherwise intact line
+goes unnoticed. A line that is no reading but occurs again and again, such as the echo of a request, is dropped and does
+not prevent recognition.
+
+The name `seq` means the frame counter, and `t_us`, `t_ms` or `t_s` the clock of the device. All other names are
+channels. The values at which counter and clock wrap are learned when they wrap for the first time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,176 +28,215 @@ from isocharge.serve.frames.frame import (
 )
 from isocharge.serve.frames.text_lines import Line, Notation, parse_line
 
-LONGEST_LINE = 4096
-"""Longest line of a frame, bytes."""
+MAX_LINE_LENGTH = 4096
+"""Length of the longest line that is read, bytes."""
 
-LONGEST_CYCLE = 64
-"""Largest number of lines that make a frame."""
+MAX_CYCLE_LINES = 64
+"""Largest number of lines that make one frame."""
 
-TIMES_TO_RECOGNISE = 3
-"""Number of times that a layout must come in a row to be recognised."""
+RECOGNITION_REPEATS = 3
+"""Number of times that a layout must occur in a row to be recognised."""
 
-MOST_VALUES = 256
+MAX_VALUES = 256
 """Largest number of values in a line."""
 
 SEQ_MODULI = (100, 256, 1000, 10_000, SEQ_MODULUS, 1 << 32)
-"""Numbers at which counters of frames wrap."""
+"""Values at which frame counters usually wrap."""
 
-MOST_SEQ_STEPS, MOST_TIME_STEPS = 2, 16
-"""Largest step of number and clock over a wrap, in steps before it."""
+MAX_SEQ_STEPS = 2
+"""Largest step of the frame counter across a wrap, as a multiple of the step before."""
+
+MAX_TIME_STEPS = 16
+"""Largest step of the clock across a wrap, as a multiple of the step before."""
 
 
 class Layout:
-    """The layout of a row, or of a cycle of lines.
+    """Layout of a row, or of a cycle of lines.
 
-    Attributes:
-        notation: How it is written.
-        names: Names of all values; empty for CSV without header.
+    Args:
+        notation: Notation of the lines.
+        names: Names of all values; empty for a CSV without a header.
         width: Number of values.
         lines: Number of lines in a cycle; 1 for rows.
-        columns: What the values are.
+
+    Attributes:
+        columns: Meaning of each value.
     """
 
     def __init__(self, notation: Notation, names: tuple[str, ...], width: int, lines: int = 1) -> None:
-        self.notation, self.names, self.width, self.lines = notation, names, width, lines
+        self.notation = notation
+        self.names = names
+        self.width = width
+        self.lines = lines
         self.columns = Columns(names or ("",) * width, (1.0,) * width)
 
 
 class TextParser(DelimitedParser):
-    """Bytes in, frames out; the layout is recognised, and where number and clock wrap is learned.
+    """Parser of lines of text, which recognises their layout.
+
+    Args:
+        columns: Names for the columns of a CSV.
+        meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the device has for it.
 
     Attributes:
-        layout: The layout; None before it is recognised.
+        layout: The layout; None until it is recognised.
     """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
-        """Set up the parser.
-
-        Args:
-            columns: Names for the columns of a CSV.
-            meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the device has for it.
-        """
-        super().__init__(b"\n", LONGEST_LINE, "text of a layout that is not clear yet")
+        super().__init__(b"\n", MAX_LINE_LENGTH, "text of a layout that is not clear yet")
         self.layout: Layout | None = None
-        self._columns, self._meanings = columns, dict(meanings or {})
-        self._seq_wrap = CounterWrap(SEQ_MODULI, SEQ_MODULUS, MOST_SEQ_STEPS)
+        self._columns = columns
+        self._meanings = dict(meanings or {})
+        self._seq_wrap = CounterWrap(SEQ_MODULI, SEQ_MODULUS, MAX_SEQ_STEPS)
         self._clock_wrap = clock_wrap(1.0)
-        self._noise = b""
-        self._gathered: list[tuple[Line, int]] = []
-        self._cycle: dict[str, float] = {}
+        self._last_unreadable_line = b""
+        self._unrecognised: list[tuple[Line, int]] = []
+        self._cycle_values: dict[str, float] = {}
         self._cycle_bytes = 0
-        self._is_first = True
+        self._is_first_line = True
 
-    def forget(self) -> None:
-        """Drop what is unfinished: what comes next is from another connection."""
-        super().forget()
+    def reset(self) -> None:
+        """Drop the bytes of an unfinished frame, because the next bytes come from another connection."""
+        super().reset()
         self._drop_cycle()
-        self._is_first = True
+        self._is_first_line = True
         self._seq_wrap.update(None)
         self._clock_wrap.update(None)
 
-    def _take(self, piece: bytes) -> list[Frame]:
-        size, is_first, self._is_first = len(piece) + 1, self._is_first, False
+    def _parse_piece(self, piece: bytes) -> list[Frame]:
+        size = len(piece) + 1
+        is_first_line = self._is_first_line
+        self._is_first_line = False
         try:
             line = parse_line(piece)
         except ValueError:
-            if piece != self._noise:  # one that comes again is an echo: the lines around it stay gathered
-                self._refuse_gathered()
-            self._noise = piece
-            return self._refuse(size)
+            return self._reject_unreadable(piece, size)
         if self._meanings and line.names:
             line = line._replace(names=tuple(self._meanings.get(name, name) for name in line.names))
-        if is_first and line.notation is Notation.csv:  # "801.2" may have been cut to "1.2": nothing would show it
-            self._refuse_gathered()
-            return self._refuse(size)
+
+        # A first line may have lost its beginning: "801.2" cut to "1.2" is still a number.
+        if is_first_line and line.notation is Notation.csv:
+            self._reject_unrecognised()
+            return self._reject(size)
         if line.notation is Notation.nothing:
             return []
         if line.notation is Notation.header:
             return self._name_columns(line, size)
-        return self._recognise(line, size) if self.layout is None else self._read(self.layout, line, size)
+        if self.layout is None:
+            return self._recognise(line, size)
+        return self._read(self.layout, line, size)
 
-    def _refuse(self, size: int) -> list[Frame]:
-        """Count a bad line."""
-        self.counts.refuse(size)
+    def _reject(self, size: int) -> list[Frame]:
+        """Count a rejected line."""
+        self.counts.count_rejected(size)
         return []
 
-    def _refuse_gathered(self) -> None:
-        """Count the lines that were gathered to recognise a layout."""
-        for _, size in self._gathered:
-            self.counts.refuse(size)
-        self._gathered = []
+    def _reject_unreadable(self, piece: bytes, size: int) -> list[Frame]:
+        """Count a line that is no reading.
+
+        A line that occurs again is the echo of a request. The lines around it are kept for recognition.
+        """
+        if piece != self._last_unreadable_line:
+            self._reject_unrecognised()
+        self._last_unreadable_line = piece
+        return self._reject(size)
+
+    def _reject_unrecognised(self) -> None:
+        """Count the lines that were collected to recognise a layout, and drop them."""
+        for _, size in self._unrecognised:
+            self.counts.count_rejected(size)
+        self._unrecognised = []
 
     def _name_columns(self, header: Line, size: int) -> list[Frame]:
-        """Name the columns by a header; it comes again after a reset of the board."""
-        layout = self.layout
-        if layout is None:
-            self._columns = self._columns or header.names
-        elif layout.notation is Notation.csv and not self._columns and layout.width == len(header.names):
-            self._adopt(Layout(Notation.csv, header.names, layout.width))
-        else:
-            return self._refuse(size)
-        return []
+        """Take the names of the columns from a header. A header also follows a reset of the board."""
+        if self.layout is None:
+            if not self._columns:
+                self._columns = header.names
+            return []
+        can_be_named = self.layout.notation is Notation.csv and not self._columns
+        if can_be_named and self.layout.width == len(header.names):
+            self._set_layout(Layout(Notation.csv, header.names, self.layout.width))
+            return []
+        return self._reject(size)
 
-    def _adopt(self, layout: Layout) -> None:
-        self.layout, self._clock_wrap = layout, clock_wrap(layout.columns.us)
+    def _set_layout(self, layout: Layout) -> None:
+        self.layout = layout
+        self._clock_wrap = clock_wrap(layout.columns.time_unit_us)
         names = ", ".join(layout.names) or f"{layout.width} columns without names"
         self.format = f"text, {layout.notation}: {names}"
 
     def _recognise(self, line: Line, size: int) -> list[Frame]:
-        """Gather lines until they repeat; then read the gathered ones."""
-        self._gathered.append((line, size))
-        period = _period([gathered for gathered, _ in self._gathered])
-        if not period or len(line.values) > MOST_VALUES:
-            while len(self._gathered) > TIMES_TO_RECOGNISE * LONGEST_CYCLE:
-                self._refuse(self._gathered.pop(0)[1])
+        """Collect lines until their layout repeats, then read the lines that repeat it."""
+        self._unrecognised.append((line, size))
+        period = _period([collected for collected, _ in self._unrecognised])
+        if not period or len(line.values) > MAX_VALUES:
+            while len(self._unrecognised) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
+                _, oldest_size = self._unrecognised.pop(0)
+                self._reject(oldest_size)
             return []
-        layout = self._layout([gathered for gathered, _ in self._gathered[-period:]])
-        repeating = self._gathered[-TIMES_TO_RECOGNISE * period :]
-        del self._gathered[-TIMES_TO_RECOGNISE * period :]
-        self._refuse_gathered()
-        self._adopt(layout)
-        return [frame for gathered, length in repeating for frame in self._read(layout, gathered, length)]
 
-    def _layout(self, lines: list[Line]) -> Layout:
-        first, width = lines[0], len(lines[0].values)
+        first_repeating = len(self._unrecognised) - RECOGNITION_REPEATS * period
+        repeating = self._unrecognised[first_repeating:]
+        self._unrecognised = self._unrecognised[:first_repeating]
+        self._reject_unrecognised()
+        layout = self._layout_of([collected for collected, _ in repeating[:period]])
+        self._set_layout(layout)
+        frames = []
+        for collected, collected_size in repeating:
+            frames += self._read(layout, collected, collected_size)
+        return frames
+
+    def _layout_of(self, lines: list[Line]) -> Layout:
+        """Return the layout of a row, or of the lines of one cycle."""
+        first = lines[0]
         if len(lines) > 1:
-            names = sorted({name for line in lines for name in line.names}, key=_before)
+            names = sorted({name for line in lines for name in line.names}, key=_sort_key)
             return Layout(first.notation, tuple(names), len(names), len(lines))
-        names_of_csv = self._columns if len(self._columns) == width else ()
-        return Layout(first.notation, first.names or names_of_csv, width)
+        width = len(first.values)
+        if first.names or len(self._columns) != width:
+            return Layout(first.notation, first.names, width)
+        return Layout(first.notation, self._columns, width)
 
     def _read(self, layout: Layout, line: Line, size: int) -> list[Frame]:
+        """Return the frame that a line completes."""
         if line.notation is not layout.notation:
-            return self._refuse(size)
+            return self._reject(size)
         if layout.lines > 1:
-            return self._gather(layout, line, size)
+            return self._read_cycle_line(layout, line, size)
         if len(line.values) != layout.width or (line.names and line.names != layout.names):
-            return self._refuse(size)
+            return self._reject(size)
         return self._frame(layout, line.values, size)
 
-    def _gather(self, layout: Layout, line: Line, size: int) -> list[Frame]:
-        """Take a line of a cycle; the last one completes a frame. A clock may come with every value of a cycle."""
-        new = [name for name in line.names if name not in TIMES_US]
-        if not new or not set(line.names) <= set(layout.names):
-            return self._refuse(size)
-        begin = next(name for name in layout.names if name not in TIMES_US)
-        if new[0] == begin or new[0] in self._cycle:
+    def _read_cycle_line(self, layout: Layout, line: Line, size: int) -> list[Frame]:
+        """Take a line of a cycle. The last line completes a frame. A clock may accompany every value of a cycle."""
+        names = [name for name in line.names if name not in TIMES_US]
+        if not names or not set(line.names) <= set(layout.names):
+            return self._reject(size)
+        first_name = next(name for name in layout.names if name not in TIMES_US)
+        if names[0] == first_name or names[0] in self._cycle_values:
             self._drop_cycle()
-        self._cycle |= dict(zip(line.names, line.values, strict=True))
+        self._cycle_values |= dict(zip(line.names, line.values, strict=True))
         self._cycle_bytes += size
-        if len(self._cycle) < layout.width:
+        if len(self._cycle_values) < layout.width:
             return []
-        values, size = [self._cycle[name] for name in layout.names], self._cycle_bytes
-        self._cycle, self._cycle_bytes = {}, 0
-        return self._frame(layout, values, size)
+
+        values = [self._cycle_values[name] for name in layout.names]
+        cycle_bytes = self._cycle_bytes
+        self._clear_cycle()
+        return self._frame(layout, values, cycle_bytes)
 
     def _drop_cycle(self) -> None:
         """Count the lines of an unfinished cycle as dropped."""
-        if self._cycle:
-            self.counts.refuse(self._cycle_bytes)
-        self._cycle, self._cycle_bytes = {}, 0
+        if self._cycle_values:
+            self.counts.count_rejected(self._cycle_bytes)
+        self._clear_cycle()
+
+    def _clear_cycle(self) -> None:
+        self._cycle_values = {}
+        self._cycle_bytes = 0
 
     def _frame(self, layout: Layout, values: Sequence[float], size: int) -> list[Frame]:
+        """Return the frame with some values, and learn where its counter and its clock wrap."""
         frames = self._attempt(layout.columns.frame, values, size)
         for frame in frames:
             self.seq_modulus = self._seq_wrap.update(frame.seq)
@@ -202,25 +244,41 @@ class TextParser(DelimitedParser):
         return frames
 
 
-def clock_wrap(us: float) -> CounterWrap:
-    """The watch over a clock in a unit, us: of 16, 24 or 32 bits, or computed from one of 32 bits in us or ms."""
-    usual = {(1 << bits) * round(us) for bits in (16, 24, 32)} | {T_US_MODULUS, 1000 * T_US_MODULUS}
-    return CounterWrap(sorted(usual), T_US_MODULUS * round(us), MOST_TIME_STEPS)
+def clock_wrap(unit_us: float) -> CounterWrap:
+    """Return the object that learns where a clock wraps.
+
+    The clock may have 16, 24 or 32 bits, or may be computed from a 32-bit clock in us or ms.
+
+    Args:
+        unit_us: Unit of the clock, us.
+    """
+    unit = round(unit_us)
+    usual_moduli = {T_US_MODULUS, 1000 * T_US_MODULUS}
+    for bits in (16, 24, 32):
+        usual_moduli.add((1 << bits) * unit)
+    return CounterWrap(sorted(usual_moduli), T_US_MODULUS * unit, MAX_TIME_STEPS)
 
 
-def _before(name: str) -> tuple[bool, str]:
-    """Sort key: number and clock before the channels."""
-    return name != SEQ and name not in TIMES_US, name
+def _sort_key(name: str) -> tuple[bool, str]:
+    """Return a key that sorts frame counter and clock before the channels."""
+    is_channel = name != SEQ and name not in TIMES_US
+    return is_channel, name
 
 
 def _period(lines: list[Line]) -> int:
-    """Number of lines in the cycle that has just come three times in a row, or 0; only named values make cycles."""
+    """Return the number of lines in the cycle that has just occurred three times in a row, or 0 if there is none.
+
+    Only lines with names form cycles of several lines.
+    """
     signatures = [(line.notation, line.names, len(line.values)) for line in lines]
     last = signatures[-1]
-    back = signatures[-2::-1]
-    period = back.index(last) + 1 if last in back else 0
+    earlier = signatures[-2::-1]
+    if last not in earlier:
+        return 0
+    period = earlier.index(last) + 1
     if period > 1 and last[0] not in (Notation.pairs, Notation.teleplot):
         return 0
-    tail = signatures[-TIMES_TO_RECOGNISE * period :] if period else []
-    repeats = len(tail) == TIMES_TO_RECOGNISE * period and tail == tail[:period] * TIMES_TO_RECOGNISE
-    return period if repeats else 0
+    recent = signatures[-RECOGNITION_REPEATS * period :]
+    if recent != recent[:period] * RECOGNITION_REPEATS:
+        return 0
+    return period

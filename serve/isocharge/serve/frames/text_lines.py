@@ -1,4 +1,4 @@
-"""One line of text from a board: which of the usual notations it is, and its names and numbers; and lines from frames.
+"""Lines of text from boards: their notation, names and numbers. Also writes frames as such lines.
 
 | notation | example |
 |---|---|
@@ -8,7 +8,7 @@
 | JSON object or list | `{"seq": 12, "A": 801.2}` |
 | sentence in the manner of NMEA 0183, checksum or not | `$PZT,801.2,799.5,803.3*5D` |
 
-Blank lines and lines that begin with # hold no values. A number is what `isocharge.common.number_text` reads.
+Blank lines and lines that begin with # hold no values. Numbers are read by `isocharge.common.number_text`.
 """
 
 import json
@@ -23,12 +23,12 @@ from isocharge.common.number_text import number_of
 from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame
 
 TELEPLOT_TIME = "t_ms"
-"""Name of the clock in Teleplot's lines."""
+"""Name under which the time of a Teleplot line is reported; Teleplot itself gives it no name."""
 
-DEEPEST_LEVEL = 3
-"""Levels of a JSON object in which numbers are looked for."""
+MAX_JSON_LEVEL = 3
+"""Depth of a JSON object down to which numbers are looked for."""
 
-_CELL = re.compile(r"\s*[,;\t]\s*|\s+")
+_SEPARATOR = re.compile(r"\s*[,;\t]\s*|\s+")
 
 _PAIR = re.compile(r"\s*([^\s:=,;]+)\s*[:=]\s*([^\s:=,;]+)\s*(?:[,;]\s*|\s|$)")
 
@@ -36,7 +36,7 @@ _NAME = re.compile(r"[^\W\d][\w.\[\]/-]*")
 
 
 class Notation(StrEnum):
-    """How a line is written."""
+    """Notation of a line of text."""
 
     csv = "CSV"
     header = "CSV header"
@@ -48,12 +48,12 @@ class Notation(StrEnum):
 
 
 class Line(NamedTuple):
-    """The content of a line.
+    """Content of a line.
 
     Attributes:
-        notation: How it is written.
+        notation: Notation of the line.
         names: Names of the values, or of the columns in a header; empty for CSV.
-        values: Numbers; empty for a header.
+        values: The numbers; empty for a header.
     """
 
     notation: Notation
@@ -61,78 +61,94 @@ class Line(NamedTuple):
     values: tuple[float, ...] = ()
 
 
-NOTHING = Line(Notation.nothing)
+NO_READING = Line(Notation.nothing)
+"""Content of a line without values, such as a comment."""
 
 
 def parse_line(data: bytes) -> Line:
-    """Read a line without its end.
+    """Read a line, without the characters that end it.
 
     Raises:
-        ValueError: If it is written in no known notation.
+        ValueError: If the line has no notation that is known.
     """
     text = data.decode("utf-8").strip()
     if not text or text[0] == "#":
-        return NOTHING
+        return NO_READING
     if text[0] in "{[":
         return _json(text)
     if text[0] == ">":
         return _teleplot(text)
     if text[0] == "$":
         return _sentence(text)
-    return _pairs(text) if ":" in text or "=" in text else _csv(text)
+    if ":" in text or "=" in text:
+        return _pairs(text)
+    return _csv(text)
 
 
 def _csv(text: str) -> Line:
-    cells = _CELL.split(text.rstrip(",; \t"))
+    """Read numbers between separators, or the header of such columns."""
+    cells = _SEPARATOR.split(text.rstrip(",; \t"))
     try:
         return Line(Notation.csv, (), tuple(map(number_of, cells)))
     except ValueError:
-        if all(map(_NAME.fullmatch, cells)) and len(set(cells)) == len(cells):
+        are_names = all(map(_NAME.fullmatch, cells))
+        if are_names and len(set(cells)) == len(cells):
             return Line(Notation.header, tuple(cells))
         raise
 
 
 def _sentence(text: str) -> Line:
-    """The numbers after the first word, which says what they are; `*` and the xor of all bytes may end a sentence."""
-    content, star, check = text[1:].partition("*")
-    if star and (len(check) != 2 or int(check, 16) != reduce(xor, content.encode(), 0)):
+    """Read the numbers of a sentence, which follow a word that says what they are.
+
+    The sentence may end in `*` and a checksum, the exclusive or of all bytes between `$` and `*`.
+    """
+    content, star, checksum = text[1:].partition("*")
+    if star and (len(checksum) != 2 or int(checksum, 16) != reduce(xor, content.encode(), 0)):
         raise ValueError(f"expected the checksum of the sentence, got {text[-100:]!r}")
-    _, *cells = _CELL.split(content.rstrip(",; \t"))
+    _, *cells = _SEPARATOR.split(content.rstrip(",; \t"))
     if not cells:
         raise ValueError(f"expected numbers after the first word, got {text[:100]!r}")
     return Line(Notation.sentence, (), tuple(map(number_of, cells)))
 
 
 def _pairs(text: str) -> Line:
-    pairs, at = {}, 0
-    while at < len(text):
-        match = _PAIR.match(text, at)
+    """Read one or several name:value."""
+    pairs: dict[str, float] = {}
+    position = 0
+    while position < len(text):
+        match = _PAIR.match(text, position)
         if match is None or match[1] in pairs:
-            raise ValueError(f"expected name:value, got {text[at:]!r}")
+            raise ValueError(f"expected name:value, got {text[position:]!r}")
         pairs[match[1]] = number_of(match[2])
-        at = match.end()
+        position = match.end()
     return Line(Notation.pairs, tuple(pairs), tuple(pairs.values()))
 
 
 def _teleplot(text: str) -> Line:
-    """The latest value of a line; texts and points of x-y plots are no readings."""
+    """Read the latest value of a Teleplot line. Lines with texts or points of x-y plots are no readings."""
     content, _, flags = text[1:].partition("|")
     name, _, values = content.partition(":")
     if not name.strip() or not values:
         raise ValueError(f"expected >name:value, got {text!r}")
     if "t" in flags or "xy" in flags:
-        return NOTHING
-    *stamp, value = values.rstrip("; ").rpartition(";")[2].partition("§")[0].split(":")
-    if len(stamp) > 1:
+        return NO_READING
+    _, _, latest = values.rstrip("; ").rpartition(";")
+    reading, _, _unit = latest.partition("§")
+    *time, value = reading.split(":")
+    if len(time) > 1:
         raise ValueError(f"expected >name:time:value, got {text!r}")
-    pairs = {TELEPLOT_TIME: number_of(stamp[0])} if stamp else {}
+    pairs = {}
+    if time:
+        pairs[TELEPLOT_TIME] = number_of(time[0])
     pairs[name.strip()] = number_of(value)
     return Line(Notation.teleplot, tuple(pairs), tuple(pairs.values()))
 
 
 def _json(text: str) -> Line:
+    """Read a JSON object, or a list of numbers."""
     try:
-        content = json.loads(text, parse_int=float)  # hundreds of digits become infinite, as those of other notations
+        # As floats, integers with hundreds of digits become infinite, as they do in the other notations.
+        content = json.loads(text, parse_int=float)
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
     if isinstance(content, list) and content and all(isinstance(number, float) for number in content):
@@ -143,39 +159,74 @@ def _json(text: str) -> Line:
     return Line(Notation.json, tuple(numbers), tuple(numbers.values()))
 
 
-def _numbers(name: str, content: Any, level: int = 0) -> list[tuple[str, float]]:
-    """Every number of a JSON value by the path to it, `charge.A` or `charge.0.re`, at most three levels deep."""
-    if isinstance(content, float):  # as integers were read, too
-        return [(name, content)]
-    if level >= DEEPEST_LEVEL or not isinstance(content, dict | list):
+def _numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, float]]:
+    """Return every number of a JSON value with the path to it, such as `charge.A` or `charge.0.re`.
+
+    Numbers more than `MAX_JSON_LEVEL` levels deep are left out.
+    """
+    if isinstance(content, float):  # Integers were read as floats.
+        return [(path, content)]
+    if level >= MAX_JSON_LEVEL:
         return []
-    items = content.items() if isinstance(content, dict) else enumerate(content)
-    paths = ((f"{name}.{key}" if level else str(key), value) for key, value in items)
-    return [pair for path, value in paths for pair in _numbers(path, value, level + 1)]
+    if isinstance(content, dict):
+        items = [(str(key), value) for key, value in content.items()]
+    elif isinstance(content, list):
+        items = [(str(index), value) for index, value in enumerate(content)]
+    else:
+        return []
 
-
-def _teleplot_lines(frame: Frame) -> str:
-    stamp = "" if frame.t_us is None else f"{frame.t_us / 1e3:.3f}:"
-    return "\n".join(f">{name}:{stamp}{value}" for name, value in _fields(frame) if name not in TIMES_US)
+    numbers = []
+    for key, value in items:
+        numbers += _numbers(f"{path}.{key}" if level else key, value, level + 1)
+    return numbers
 
 
 def _fields(frame: Frame) -> list[tuple[str, str]]:
-    """Number, clock and channels with their names, as text; channels without names are A, B, C, ..."""
-    names = frame.names or tuple(chr(ord("A") + k) for k in range(len(frame.values)))
-    values = [(name, f"{value:.7g}") for name, value in zip(names, frame.values, strict=True)]
-    head = [(SEQ, frame.seq), ("t_us", frame.t_us)]
-    return [(name, str(number)) for name, number in head if number is not None] + values
+    """Return names and texts of frame counter, clock and channels. Channels without names are called A, B, C, ..."""
+    fields = []
+    if frame.seq is not None:
+        fields.append((SEQ, str(frame.seq)))
+    if frame.t_us is not None:
+        fields.append(("t_us", str(frame.t_us)))
+    names = frame.names or tuple(chr(ord("A") + channel) for channel in range(len(frame.values)))
+    for name, value in zip(names, frame.values, strict=True):
+        fields.append((name, f"{value:.7g}"))
+    return fields
+
+
+def _write_csv(frame: Frame) -> str:
+    return ",".join(f"{value:.7g}" for value in frame.values)
+
+
+def _write_pairs(frame: Frame) -> str:
+    return ",".join(f"{name}:{value}" for name, value in _fields(frame))
+
+
+def _write_teleplot(frame: Frame) -> str:
+    time = "" if frame.t_us is None else f"{frame.t_us / 1e3:.3f}:"
+    return "\n".join(f">{name}:{time}{value}" for name, value in _fields(frame) if name not in TIMES_US)
+
+
+def _write_json(frame: Frame) -> str:
+    fields = ", ".join(f"{json.dumps(name)}: {value}" for name, value in _fields(frame))
+    return "{" + fields + "}"
 
 
 TEXT_FORMATS: dict[str, Callable[[Frame], str]] = {
-    "csv": lambda frame: ",".join(f"{value:.7g}" for value in frame.values),
-    "pairs": lambda frame: ",".join(f"{name}:{value}" for name, value in _fields(frame)),
-    "teleplot": _teleplot_lines,
-    "json": lambda frame: "{" + ", ".join(f"{json.dumps(name)}: {value}" for name, value in _fields(frame)) + "}",
+    "csv": _write_csv,
+    "pairs": _write_pairs,
+    "teleplot": _write_teleplot,
+    "json": _write_json,
 }
-"""Notations by name, with their writers. CSV has only the channels and no header, as the simplest boards send it."""
+"""Function that writes a frame, for each notation. CSV has only the channels and no header, like the simplest boards.
+"""
 
 
 def encode_text(frame: Frame, notation: str) -> bytes:
-    """A frame as a line of text, or as several for Teleplot, line ends included; numbers to seven digits."""
+    """Return a frame as a line of text, or as several lines for Teleplot. Numbers have seven digits.
+
+    Args:
+        frame: The frame.
+        notation: A key of `TEXT_FORMATS`.
+    """
     return (TEXT_FORMATS[notation](frame) + "\n").encode()

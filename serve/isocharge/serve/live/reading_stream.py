@@ -230,8 +230,8 @@ class ReadingStream:
 
     def _reconnect(self) -> None:
         """Start over after an outage: frames are missing, and the film may have been touched meanwhile."""
-        self.parser.forget()
-        self.gaps.forget()
+        self.parser.reset()
+        self.gaps.reset()
         self.clock.forget()
         self.tare()
         self._pending_flags = (RECONNECTED,)
