@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import InputError, PortError, PortLost
 from isocharge.serve import Port, open_source
-from isocharge.serve.port.serial_line import QUIET_S, UNANSWERED_S, Asker, Request
+from isocharge.serve.port.serial_line import QUIET_TIME_s, REPEAT_TIME_s, Request, Requester
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
 
 
@@ -54,7 +54,7 @@ def test_chunk_has_the_bytes_unchanged_and_the_time_of_arrival(board):
     [
         ("/dev/ttyNone", "there is no such port: plug the board in"),
         ("/etc/hostname", r"cannot be opened at 115200 baud .*check the cable"),
-        ("socket://127.0.0.1:1", r"cannot be opened \(.*refused\); check host and number"),
+        ("socket://127.0.0.1:1", r"cannot be opened \(.*refused\); check the host and the port number"),
         ("telepathy://x", r"cannot be opened \(invalid URL"),
         *(
             (f"udp://{place}", "cannot be opened")
@@ -99,7 +99,7 @@ def test_port_that_vanishes():
     board = PseudoPort()
     with Port(board.url) as port:
         board.close()
-        with pytest.raises(PortLost, match=f"{board.url}: went away while it was read"):
+        with pytest.raises(PortLost, match=f"{board.url}: the port disappeared while it was read"):
             next(iter(port))
 
 
@@ -238,46 +238,46 @@ class Clock:
         return self.now_s
 
 
-def asker_at(clock, **settings):
-    return Asker(Request(b"?\n", **settings), clock)
+def requester_at(clock, **settings):
+    return Requester(Request(b"?\n", **settings), clock)
 
 
 def test_the_next_request_waits_for_the_answer_and_for_the_rate():
     clock = Clock()
-    asker = asker_at(clock, rate_Hz=100.0)
-    assert asker.wait_s() == 0.0
-    assert asker.asked() == b"?\n"
-    assert asker.wait_s() == pytest.approx(UNANSWERED_S)
+    requester = requester_at(clock, rate_Hz=100.0)
+    assert requester.wait_s() == 0.0
+    assert requester.next_request() == b"?\n"
+    assert requester.wait_s() == pytest.approx(REPEAT_TIME_s)
     clock.now_s += 0.003
-    assert asker.heard(b"1,2\n") == b"1,2\n"
-    assert asker.wait_s() == pytest.approx(0.007)
+    assert requester.remove_echo(b"1,2\n") == b"1,2\n"
+    assert requester.wait_s() == pytest.approx(0.007)
     clock.now_s += 0.0069
-    asker.heard(b"3\n")
-    assert asker.wait_s() == pytest.approx(QUIET_S)
+    requester.remove_echo(b"3\n")
+    assert requester.wait_s() == pytest.approx(QUIET_TIME_s)
 
 
 def test_a_request_without_an_answer_is_repeated():
     clock = Clock()
-    asker = asker_at(clock)
-    asker.asked()
-    clock.now_s += 0.5 * UNANSWERED_S
-    assert asker.wait_s() == pytest.approx(0.5 * UNANSWERED_S)
-    clock.now_s += 0.5 * UNANSWERED_S
-    assert asker.wait_s() == pytest.approx(0.0)
-    asker.asked()
-    asker.forget()
-    assert asker.wait_s() == 0.0
+    requester = requester_at(clock)
+    requester.next_request()
+    clock.now_s += 0.5 * REPEAT_TIME_s
+    assert requester.wait_s() == pytest.approx(0.5 * REPEAT_TIME_s)
+    clock.now_s += 0.5 * REPEAT_TIME_s
+    assert requester.wait_s() == pytest.approx(0.0)
+    requester.next_request()
+    requester.reset()
+    assert requester.wait_s() == 0.0
 
 
 @settings(derandomize=True)
 @given(st.binary(min_size=1, max_size=8), st.binary(max_size=20), st.lists(st.integers(0, 28), max_size=5))
 def test_the_echo_is_taken_out_however_it_is_cut(request_bytes, answer, cuts):
-    asker = Asker(Request(request_bytes, echo=True))
-    asker.asked()
+    requester = Requester(Request(request_bytes, echo=True))
+    requester.next_request()
     stream = request_bytes + answer
     at = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
-    assert b"".join(asker.heard(stream[a:b]) for a, b in pairwise(at)) == answer
-    assert asker.echo_share == 1.0
+    assert b"".join(requester.remove_echo(stream[a:b]) for a, b in pairwise(at)) == answer
+    assert requester.echo_share == 1.0
 
 
 @pytest.mark.parametrize(
@@ -285,9 +285,9 @@ def test_the_echo_is_taken_out_however_it_is_cut(request_bytes, answer, cuts):
     [(b"\x01\x04\x00", True, b"\x02\x04\x00\x10", 0.0), (b"?", False, b"?1\n", 1.0)],
 )
 def test_an_echo_is_counted_and_stays_where_it_is_not_expected(request_bytes, echo, answer, share):
-    asker = Asker(Request(request_bytes, echo=echo))
-    asker.asked()
-    assert (asker.heard(answer), asker.echo_share) == (answer, share)
+    requester = Requester(Request(request_bytes, echo=echo))
+    requester.next_request()
+    assert (requester.remove_echo(answer), requester.echo_share) == (answer, share)
 
 
 def test_a_port_asks():

@@ -12,7 +12,7 @@ from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
 from isocharge.serve.live.device import Device
 from isocharge.serve.live.reading_stream import channel_names
 from isocharge.serve.port.device_clock import DeviceClock
-from isocharge.serve.port.serial_line import SCHEME, Request
+from isocharge.serve.port.serial_line import UDP_SCHEME, Request
 from isocharge.serve.port.source import Chunk, Port, has_speed
 
 BAUDS = (115200, 921600, 1000000, 2000000, 460800, 230400, 57600, 38400, 19200, 9600)
@@ -68,7 +68,7 @@ class Heard:
     @property
     def are_datagrams(self) -> bool:
         """Whether each chunk is a datagram."""
-        return self.url.startswith(SCHEME)
+        return self.url.startswith(UDP_SCHEME)
 
 
 def listen(

@@ -232,7 +232,7 @@ class ReadingStream:
         """Start over after an outage: frames are missing, and the film may have been touched meanwhile."""
         self.parser.reset()
         self.gaps.reset()
-        self.clock.forget()
+        self.clock.reset()
         self.tare()
         self._pending_flags = (RECONNECTED,)
 

@@ -1,32 +1,36 @@
-"""The device's clock: unwrapped, and fitted to the host's.
+"""The clock of a device: its wraps are removed, and it is fitted to the clock of the host.
 
-Arrival times jitter with the delays of kernel, cable and reader. The device's clock does not jitter, but its rate
-differs from the host's. A delay-locked loop of second order (Adriaensen, "Using a DLL to filter time", 2005) follows
-the arrivals with a small bandwidth and gives each reading a smooth host time. The bandwidth is larger in the first
-seconds, so that the loop locks soon.
+Arrival times jitter with the delays of the kernel, the cable and the reading program. The clock of the device does not
+jitter, but its rate differs from the rate of the host's clock. A delay-locked loop of second order (Adriaensen, "Using
+a DLL to filter time", 2005) follows the arrivals with a small bandwidth and gives each reading a smooth host time. The
+bandwidth is larger in the first seconds, so that the loop locks soon.
 """
 
 import math
 from typing import NamedTuple
 
-BANDWIDTH_HZ = 0.05
-"""Bandwidth of the loop, Hz: a jitter of 1 ms leaves 0.2 ms."""
+BANDWIDTH_Hz = 0.05
+"""Bandwidth of the loop, Hz. A jitter of 1 ms is reduced to 0.2 ms."""
 
-FIRST_BANDWIDTH_HZ = 1.0
+FIRST_BANDWIDTH_Hz = 1.0
 """Bandwidth at the start, Hz; it falls as the inverse of the time."""
 
-LOST_S = 1.0
-"""Difference of arrival and prediction, s, from which the fit starts over: a clock was set or the device restarted."""
+MAX_LOOP_GAIN = 0.5
+"""Largest phase of the loop per update, dimensionless, so that it stays stable when readings are rare."""
+
+MAX_DEVIATION_s = 1.0
+"""Difference between arrival and prediction beyond which the fit starts again, s: a clock was set or the device reset.
+"""
 
 
 class ReadingTime(NamedTuple):
-    """When a reading was taken.
+    """Time at which a reading was taken.
 
     Attributes:
-        host_s: Unix seconds: the device's clock fitted to the arrivals, or the arrival if the device sends no clock.
-            It falls only where a new fit begins, because a clock was set.
-        device_us: The device's clock without its wraps, us; None if the device sends none.
-        step_s: Since the reading before, s; 0 for the first one after a start.
+        host_s: Unix seconds: the clock of the device fitted to the arrivals, or the arrival if the device sends no
+            clock. It decreases only where a new fit begins, because a clock was set.
+        device_us: Clock of the device without its wraps, us; None if the device sends none.
+        step_s: Time since the reading before, s; 0 for the first reading after a start.
     """
 
     host_s: float
@@ -35,86 +39,113 @@ class ReadingTime(NamedTuple):
 
     @property
     def clock_s(self) -> float:
-        """The device's clock if it sends one, or else the arrival, s: times of one stream on one clock."""
+        """Clock of the device if it sends one, otherwise the arrival, s. All readings of a stream use the same one."""
         return self.host_s if self.device_us is None else self.device_us * 1e-6
 
 
 class DeviceClock:
-    """Clock of one device; it must see every reading, in order.
+    """Clock of one device. It must be given every reading, in order.
 
     Attributes:
-        rate: Host seconds per device second.
-        restarts: Times that the device's clock jumped back, or ahead to what has not come yet.
+        rate: Seconds of the host per second of the device.
+        restarts: Number of times that the clock of the device jumped back, or ahead of the arrival.
     """
 
     def __init__(self) -> None:
         self.rate = 1.0
         self.restarts = 0
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
-        """The next reading is the first one of a new connection."""
+    def reset(self) -> None:
+        """Treat the next reading as the first one of a new connection."""
         self._raw_us: int | None = None
         self._device_us = 0
-        self._host_s = 0.0
+        self._last_arrival_s: float | None = None
+        self._chunk_arrival_s: float | None = None
+        # The fit: the device's clock at `_fitted_us` is the host time `_fitted_host_s`.
         self._fitted_us: int | None = None
-        self._age_s = 0.0
-        self._last_s: float | None = None
-        self._is_first, self._latest_s = True, -math.inf
-        self._arrived_s: float | None = None
+        self._fitted_host_s = 0.0
+        self._fit_age_s = 0.0
+        self._is_first_fit = True
+        self._latest_host_s = -math.inf
 
     def read(self, t_us: int | None, modulus: int, arrived_s: float) -> ReadingTime:
-        """The time of the next reading.
+        """Return the time of the next reading.
 
         Args:
-            t_us: The device's clock as sent, us; None if it sends none.
-            modulus: The time at which it wraps to 0, us.
-            arrived_s: When the reading's chunk arrived, unix s.
+            t_us: Clock of the device as it was sent, us; None if the device sends none.
+            modulus: Time at which the clock wraps to 0, us.
+            arrived_s: Arrival of the chunk that held the reading, unix seconds.
         """
         if t_us is None:
-            step_s = 0.0 if self._last_s is None else max(0.0, arrived_s - self._last_s)
-            self._last_s = arrived_s
+            step_s = 0.0 if self._last_arrival_s is None else max(0.0, arrived_s - self._last_arrival_s)
+            self._last_arrival_s = arrived_s
             return ReadingTime(arrived_s, None, step_s)
+
         step_us = self._unwrap(t_us, modulus)
-        is_later = self._arrived_s not in (None, arrived_s)  # not a chunk of a file
-        if self._fitted_us is not None and is_later and self._predict(self._device_us) - arrived_s > LOST_S:
-            self.restarts, self._fitted_us, step_us = self.restarts + 1, None, 0
+        # The chunks of a file all arrive at the same time, which says nothing about the clock.
+        is_new_arrival = self._chunk_arrival_s not in (None, arrived_s)
+        if self._fitted_us is not None and is_new_arrival:
+            lead_s = self._predict(self._device_us) - arrived_s
+            if lead_s > MAX_DEVIATION_s:
+                self.restarts += 1
+                self._fitted_us = None
+                step_us = 0
         if self._fitted_us is None:
-            self._host_s, self._fitted_us, self._is_first = max(arrived_s, self._latest_s), self._device_us, True
-        self._latest_s = max(self._latest_s, self._predict(self._device_us))
-        return ReadingTime(self._latest_s, self._device_us, step_us * 1e-6)
+            self._fitted_us = self._device_us
+            self._fitted_host_s = max(arrived_s, self._latest_host_s)
+            self._is_first_fit = True
+        self._latest_host_s = max(self._latest_host_s, self._predict(self._device_us))
+        return ReadingTime(self._latest_host_s, self._device_us, step_us * 1e-6)
 
-    def arrived(self, at_s: float) -> None:
-        """Fit the clock to the arrival (unix s) of the chunk whose last reading was the latest one.
+    def arrived(self, arrival_s: float) -> None:
+        """Fit the clock to the arrival of a chunk, whose last reading must be the latest reading.
 
-        The chunks of a file arrive all at once, which says nothing; so the first one alone says nothing either.
+        The chunks of a file all arrive at the same time, so an arrival is used only if it differs from the one before.
+
+        Args:
+            arrival_s: Arrival of the chunk, unix seconds.
         """
-        before_s, self._arrived_s = self._arrived_s, at_s
-        if self._fitted_us is None or before_s in (None, at_s):
+        previous_arrival_s = self._chunk_arrival_s
+        self._chunk_arrival_s = arrival_s
+        if self._fitted_us is None or previous_arrival_s in (None, arrival_s):
             return
-        late_s = at_s - self._predict(self._device_us)
-        is_lost = abs(late_s) > LOST_S
-        if is_lost or self._is_first:
-            self._host_s, self._fitted_us, self._age_s, self.rate = at_s, self._device_us, 0.0, 1.0
-            self._latest_s, self._is_first = -math.inf if is_lost else self._latest_s, False
+
+        delay_s = arrival_s - self._predict(self._device_us)
+        is_lost = abs(delay_s) > MAX_DEVIATION_s
+        if is_lost or self._is_first_fit:
+            self._fitted_us = self._device_us
+            self._fitted_host_s = arrival_s
+            self._fit_age_s = 0.0
+            self.rate = 1.0
+            self._is_first_fit = False
+            if is_lost:
+                self._latest_host_s = -math.inf
             return
+
         step_s = (self._device_us - self._fitted_us) * 1e-6
-        self._age_s += step_s
-        turn = min(0.5, 2.0 * math.pi * max(BANDWIDTH_HZ, FIRST_BANDWIDTH_HZ / (1.0 + self._age_s)) * step_s)
-        self._host_s = self._predict(self._device_us) + math.sqrt(2.0) * turn * late_s
-        self.rate += turn * turn * late_s / step_s if step_s > 0.0 else 0.0
+        self._fit_age_s += step_s
+        bandwidth_Hz = max(BANDWIDTH_Hz, FIRST_BANDWIDTH_Hz / (1.0 + self._fit_age_s))
+        gain = min(MAX_LOOP_GAIN, 2.0 * math.pi * bandwidth_Hz * step_s)
+        self._fitted_host_s = self._predict(self._device_us) + math.sqrt(2.0) * gain * delay_s
+        if step_s > 0.0:
+            self.rate += gain * gain * delay_s / step_s
         self._fitted_us = self._device_us
 
     def _predict(self, device_us: int) -> float:
-        return self._host_s + self.rate * (device_us - (self._fitted_us or 0)) * 1e-6
+        """Return the host time of a time of the device, s."""
+        return self._fitted_host_s + self.rate * (device_us - (self._fitted_us or 0)) * 1e-6
 
     def _unwrap(self, t_us: int, modulus: int) -> int:
-        """Step since the reading before, us; 0 where the clock jumped back or ahead by half its range."""
-        last, self._raw_us = self._raw_us, t_us
-        step = 0 if last is None else (t_us - last) % modulus
-        if last is None or step >= modulus // 2:
-            self.restarts += last is not None
-            self._device_us, self._fitted_us = t_us, None
-            return 0
-        self._device_us += step
-        return step
+        """Return the step since the reading before, us; 0 where the clock jumped back, or ahead by half its range."""
+        last_us = self._raw_us
+        self._raw_us = t_us
+        if last_us is not None:
+            step_us = (t_us - last_us) % modulus
+            if step_us < modulus // 2:
+                self._device_us += step_us
+                return step_us
+            self.restarts += 1
+        self._device_us = t_us
+        self._fitted_us = None
+        return 0

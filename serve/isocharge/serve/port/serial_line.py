@@ -1,11 +1,12 @@
-"""An open line: a serial one as pyserial opens it, or a UDP socket; and what a board on it has to be asked.
+"""Open lines to a board, and the requests that some boards need.
 
-A serial line is read in two system calls where the system has file descriptors for ports. Each datagram is a chunk. A
-board may send one line of text in each, without a line end. It gets one, because a reader of lines waits for it; from
-the first datagram on that ends with a line end, the board ends its lines itself.
+A line is a serial port, opened by pyserial, or a UDP socket. Where the system has file descriptors for ports, a serial
+port is read with two system calls. Each datagram of a socket is one chunk. A board may send one line of text in each
+datagram without an end of line; one is then added, because parsers of lines wait for it. Nothing is added any more once
+a datagram of the board has ended with an end of line.
 
-On a line with two wires both ends hear everything: what the host sends comes back before the answer, and has to be
-taken out of it. The next request waits until the answer has come and the line is quiet.
+On a line with two wires, both ends receive everything that is sent: the request returns before the answer and has to be
+removed from it. The next request waits until the answer has arrived and the line is quiet.
 """
 
 import importlib
@@ -21,21 +22,21 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
-QUIET_S = 0.002
-"""Silence after which an answer counts as complete, s: two bytes at 9600 baud."""
+QUIET_TIME_s = 0.002
+"""Silence after which an answer counts as complete, s. Two bytes take this long at 9600 baud."""
 
-UNANSWERED_S = 0.2
+REPEAT_TIME_s = 0.2
 """Time after which a request without an answer is repeated, s."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What a board is asked.
+    """Request that a board needs for each frame.
 
     Attributes:
         data: The bytes to send.
-        rate_Hz: Requests per second, at most.
-        echo: Whether the line brings them back.
+        rate_Hz: Largest number of requests per second.
+        echo: Whether the line returns the bytes of the request before the answer.
     """
 
     data: bytes
@@ -43,59 +44,69 @@ class Request:
     echo: bool = False
 
 
-class Asker:
-    """Says when a request is due, and takes its echo out of what comes."""
+class Requester:
+    """Computes when a request is due, and removes the echo of requests from received bytes.
+
+    Args:
+        request: The request.
+        now_s: Clock, s.
+    """
 
     def __init__(self, request: Request, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._request, self._now_s = request, now_s
-        self._requests = self._echoes = 0
-        self.forget()
+        self._request = request
+        self._now_s = now_s
+        self._requests = 0
+        self._echoes = 0
+        self.reset()
 
     @property
     def echo_share(self) -> float:
-        """Share of the requests that came back, dimensionless, whether they are taken out or not."""
+        """Share of the requests that the line returned, whether or not the echo was removed."""
         return self._echoes / max(1, self._requests)
 
-    def forget(self) -> None:
-        """The line was opened anew: ask at once."""
-        self._asked_s = self._heard_s = -float("inf")
-        self._echo = b""
+    def reset(self) -> None:
+        """Make a request due at once, because the line was opened again."""
+        self._requested_s = -float("inf")
+        self._received_s = -float("inf")
+        self._expected_echo = b""
 
     def wait_s(self) -> float:
-        """Time until the next request is due, s; 0 if it is."""
+        """Return the time until the next request is due, s; 0 if it is due now."""
         now_s = self._now_s()
-        due_s = self._asked_s + 1.0 / self._request.rate_Hz
-        if self._heard_s < self._asked_s:
-            due_s = max(due_s, self._asked_s + UNANSWERED_S)
-        return max(0.0, due_s - now_s, self._heard_s + QUIET_S - now_s)
+        due_s = self._requested_s + 1.0 / self._request.rate_Hz
+        is_unanswered = self._received_s < self._requested_s
+        if is_unanswered:
+            due_s = max(due_s, self._requested_s + REPEAT_TIME_s)
+        return max(0.0, due_s - now_s, self._received_s + QUIET_TIME_s - now_s)
 
-    def asked(self) -> bytes:
-        """The bytes to send now."""
-        self._asked_s = self._now_s()
+    def next_request(self) -> bytes:
+        """Return the bytes to send now, and note that they are sent."""
+        self._requested_s = self._now_s()
         self._requests += 1
-        self._echo = self._request.data
+        self._expected_echo = self._request.data
         return self._request.data
 
-    def heard(self, data: bytes) -> bytes:
-        """What of the bytes that came is not the echo of the request."""
-        if not data:
+    def remove_echo(self, received: bytes) -> bytes:
+        """Return the received bytes without the echo of the request."""
+        if not received:
             return b""
-        self._heard_s = self._now_s()
-        common = min(len(data), len(self._echo))
-        if not common or data[:common] != self._echo[:common]:
-            self._echo = b""
-            return data
-        self._echo = self._echo[common:]
-        self._echoes += not self._echo
-        return data[common:] if self._request.echo else data
+        self._received_s = self._now_s()
+        echo_length = min(len(received), len(self._expected_echo))
+        if not echo_length or received[:echo_length] != self._expected_echo[:echo_length]:
+            self._expected_echo = b""
+            return received
+        self._expected_echo = self._expected_echo[echo_length:]
+        if not self._expected_echo:
+            self._echoes += 1
+        return received[echo_length:] if self._request.echo else received
 
 
-MOST_BYTES = 65536
-"""Largest number of bytes that are read at once; no datagram is larger."""
+MAX_READ_BYTES = 65536
+"""Largest number of bytes that are read at once. No datagram is larger."""
 
 
 def _terminal_errors() -> tuple[type[Exception], ...]:
-    """What pyserial lets through besides OSError; empty on systems without POSIX terminals."""
+    """Return the exceptions other than OSError that pyserial raises; none on systems without POSIX terminals."""
     try:
         return (importlib.import_module("termios").error,)
     except ImportError:
@@ -103,37 +114,47 @@ def _terminal_errors() -> tuple[type[Exception], ...]:
 
 
 HAS_POSIX_PORTS = bool(_terminal_errors())
-"""Whether ports are file descriptors for which `select` can wait; where not, pyserial reads them."""
+"""Whether ports have file descriptors for which `select` can wait. Where they have none, pyserial reads them."""
 
 READ_ERRORS: tuple[type[Exception], ...] = (OSError, *_terminal_errors())
+"""Exceptions that reading a line can raise."""
+
 OPEN_ERRORS: tuple[type[Exception], ...] = (ValueError, *READ_ERRORS)
-"""What reading a line, and opening it, raises."""
+"""Exceptions that opening a line can raise."""
 
 
 class SerialLine:
-    """An open line: a device, or another URL that pyserial knows."""
+    """An open line that pyserial provides.
+
+    Args:
+        url: Device path, or a URL that pyserial accepts.
+        baud: Bits per second.
+
+    Raises:
+        OSError, ValueError: If the line cannot be opened.
+    """
 
     def __init__(self, url: str, baud: int) -> None:
-        """Open it.
-
-        Raises:
-            OSError, ValueError: If it cannot be opened.
-        """
-        serial = importlib.import_module("serial")  # late: who only predicts does not wait for it
-        url = url.replace("tcp://", "socket://", 1) if url.startswith("tcp://") else url
+        # pyserial is imported only here, so that programs that only predict need not wait for the import.
+        serial = importlib.import_module("serial")
+        if url.startswith("tcp://"):
+            url = url.replace("tcp://", "socket://", 1)
         self._serial: Any = serial.serial_for_url(url, baudrate=baud, exclusive=True)
+        # Without this mode, USB adapters collect bytes for 16 ms.
         with suppress(AttributeError, NotImplementedError, OSError, ValueError):
-            self._serial.set_low_latency_mode(True)  # USB adapters collect bytes for 16 ms otherwise
-        self._descriptor: int | None = None  # of none that exists only inside pyserial
-        with suppress(AttributeError, io.UnsupportedOperation):
-            self._descriptor = int(self._serial.fileno()) if HAS_POSIX_PORTS else None
+            self._serial.set_low_latency_mode(True)
+        # Lines that exist only inside pyserial have no file descriptor.
+        self._descriptor: int | None = None
+        if HAS_POSIX_PORTS:
+            with suppress(AttributeError, io.UnsupportedOperation):
+                self._descriptor = int(self._serial.fileno())
 
     def reset_input_buffer(self) -> None:
-        """Drop what has come."""
+        """Drop the bytes that have arrived."""
         self._serial.reset_input_buffer()
 
     def write(self, data: bytes) -> None:
-        """Send."""
+        """Send bytes."""
         self._serial.write(data)
 
     def close(self) -> None:
@@ -141,49 +162,58 @@ class SerialLine:
         self._serial.close()
 
     def receive(self, timeout_s: float) -> bytes:
-        """The bytes that come within a time, s: at least one, and all that are there with it; nothing if none come.
+        """Wait for a byte, and return all bytes that have arrived.
+
+        Args:
+            timeout_s: Longest time to wait, s.
+
+        Returns:
+            The bytes; empty if none arrive in time.
 
         Raises:
-            READ_ERRORS: If the line goes away.
+            READ_ERRORS: If the line disappears.
         """
         if self._descriptor is None:
             return self._receive_by_pyserial(timeout_s)
-        if not select.select([self._descriptor], [], [], timeout_s)[0]:
+        readable, _, _ = select.select([self._descriptor], [], [], timeout_s)
+        if not readable:
             return b""
-        data = os.read(self._descriptor, MOST_BYTES)  # pyserial takes five system calls, and one a byte of a socket
+        # pyserial would need five system calls, and one for each byte of a socket.
+        data = os.read(self._descriptor, MAX_READ_BYTES)
         if not data:
             raise OSError("it is readable and has no data: it was unplugged, or the other end has closed")
         return data
 
     def _receive_by_pyserial(self, timeout_s: float) -> bytes:
-        if timeout_s != self._serial.timeout:  # to set it costs pyserial a system call
+        if timeout_s != self._serial.timeout:  # Setting the timeout costs a system call.
             self._serial.timeout = timeout_s
-        first: bytes = self._serial.read(1)
-        return first + self._serial.read(self._serial.in_waiting) if first else first
+        data: bytes = self._serial.read(1)
+        if data:
+            data += self._serial.read(self._serial.in_waiting)
+        return data
 
 
-SCHEME = "udp://"
-"""How the name of such a port begins: udp://HOST:PORT, the address on which datagrams are received."""
+UDP_SCHEME = "udp://"
+"""First characters of the URL of a UDP socket, udp://HOST:PORT, which names the address on which it receives."""
 
-_CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+_CONTROL_CHARACTER = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
 class UdpSocket:
-    """An open socket on which datagrams come."""
+    """An open socket that receives datagrams.
+
+    Args:
+        url: udp://HOST:PORT. Without a host, the socket receives on every address of the machine.
+
+    Raises:
+        OSError: If the address cannot be bound.
+        ValueError: If the URL holds no address.
+    """
 
     def __init__(self, url: str) -> None:
-        """Bind a socket.
-
-        Args:
-            url: udp://HOST:PORT; without a host, datagrams may come from anywhere.
-
-        Raises:
-            OSError: If the address cannot be bound.
-            ValueError: If it is none.
-        """
         parts = urlsplit(url)
         if parts.port is None or parts.path or parts.query:
-            raise ValueError(f"expected {SCHEME}HOST:PORT, got {url!r}")
+            raise ValueError(f"expected {UDP_SCHEME}HOST:PORT, got {url!r}")
         family, kind, protocol, _, address = socket.getaddrinfo(
             parts.hostname or "", parts.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
         )[0]
@@ -193,25 +223,25 @@ class UdpSocket:
         except OSError:
             self._socket.close()
             raise
-        self._ends_lines = False
+        self._board_ends_lines = False
         self._peer: tuple[str, int] | None = None
 
     def reset_input_buffer(self) -> None:
-        """Drop what has come."""
+        """Drop the datagrams that have arrived."""
         while self._is_ready(0.0):
-            self._socket.recv(MOST_BYTES)
+            self._socket.recv(MAX_READ_BYTES)
 
     def receive(self, timeout_s: float) -> bytes:
-        """The next datagram that is not empty; nothing if none comes in time."""
-        end_s = time.monotonic() + timeout_s
-        while self._is_ready(max(0.0, end_s - time.monotonic())):
-            data, self._peer = self._socket.recvfrom(MOST_BYTES)
+        """Return the next datagram that is not empty; empty if none arrives in time, s."""
+        deadline_s = time.monotonic() + timeout_s
+        while self._is_ready(max(0.0, deadline_s - time.monotonic())):
+            data, self._peer = self._socket.recvfrom(MAX_READ_BYTES)
             if data:
-                return self._with_line_end(data)
+                return self._end_line(data)
         return b""
 
     def write(self, data: bytes) -> None:
-        """Send to the board whose datagram came last; nowhere if none has come."""
+        """Send bytes to the board that sent the latest datagram. Without such a board, nothing is sent."""
         if self._peer is not None:
             self._socket.sendto(data, self._peer)
 
@@ -220,9 +250,14 @@ class UdpSocket:
         self._socket.close()
 
     def _is_ready(self, timeout_s: float) -> bool:
-        return bool(select.select([self._socket], [], [], timeout_s)[0])
+        readable, _, _ = select.select([self._socket], [], [], timeout_s)
+        return bool(readable)
 
-    def _with_line_end(self, data: bytes) -> bytes:
-        self._ends_lines |= data.endswith(b"\n")
-        is_text = not _CONTROL.search(data) and data.decode("utf-8", "replace").encode() == data
-        return data + b"\n" if is_text and not self._ends_lines else data
+    def _end_line(self, data: bytes) -> bytes:
+        """Add an end of line to a datagram of text, unless the board sends ends of lines itself."""
+        if data.endswith(b"\n"):
+            self._board_ends_lines = True
+        if self._board_ends_lines or _CONTROL_CHARACTER.search(data):
+            return data
+        is_utf8 = data.decode("utf-8", "replace").encode() == data
+        return data + b"\n" if is_utf8 else data

@@ -1,9 +1,9 @@
-"""Where bytes come from: a port, a file, or stdin, as a context manager and an iterator of chunks with their arrival.
+"""Sources of bytes: ports, files and the standard input. Each is a context manager and an iterator of chunks.
 
-A port is any URL that pyserial knows: `/dev/ttyACM0`, a pseudo-terminal, `socket://host:port`, `rfc2217://host:port`,
-`loop://`; and `tcp://host:port`, the same as `socket://`, and `udp://host:port`, where datagrams are received. On
-request, a port that goes away or falls silent is opened again until it is back; the first chunk after an outage says
-how long it was. A board that has to be asked is asked.
+A port is any URL that pyserial accepts: `/dev/ttyACM0`, a pseudo-terminal, `socket://host:port`, `rfc2217://host:port`
+or `loop://`. In addition, `tcp://host:port` means the same as `socket://`, and `udp://host:port` receives datagrams. On
+request, a port that disappears or falls silent is opened again until it is back, and the first chunk afterwards states
+the length of the outage. Boards that send frames only on request are sent the request.
 """
 
 import contextlib
@@ -21,30 +21,30 @@ from isocharge.serve.port.serial_line import (
     HAS_POSIX_PORTS,
     OPEN_ERRORS,
     READ_ERRORS,
-    SCHEME,
-    Asker,
+    UDP_SCHEME,
     Request,
+    Requester,
     SerialLine,
     UdpSocket,
 )
 
-RETRY_S = 0.1
-"""First pause before a lost port is opened again, s; each pause is twice as long as the one before."""
+FIRST_RETRY_PAUSE_s = 0.1
+"""First pause before a lost port is opened again, s. Each pause is twice as long as the one before."""
 
-LONGEST_RETRY_S = 2.0
-"""Longest pause, s."""
+MAX_RETRY_PAUSE_s = 2.0
+"""Longest pause before a lost port is opened again, s."""
 
 log = logging.getLogger(__name__)
 
 
 class Chunk(NamedTuple):
-    """Bytes as they came.
+    """Bytes that arrived together.
 
     Attributes:
-        data: At least one byte.
+        data: The bytes; at least one.
         timestamp: Host time of arrival, unix seconds.
-        clock_ns: The same moment on `time.perf_counter_ns`, for latencies.
-        outage_s: Length of the outage just before, s; 0 if there was none.
+        clock_ns: Value of `time.perf_counter_ns` at arrival, from which latencies are computed.
+        outage_s: Length of the outage just before the bytes, s; 0 if there was none.
     """
 
     data: bytes
@@ -54,12 +54,21 @@ class Chunk(NamedTuple):
 
 
 class Port:
-    """A port; iterate over it to get `Chunk`s without end.
+    """A port. Iterating over it yields `Chunk`s without end.
+
+    The port is opened when its context is entered.
+
+    Args:
+        url: Device path or URL.
+        baud: Bits per second; USB ports and pseudo-terminals ignore it.
+        silence_s: Time without a byte after which the port counts as lost, s.
+        reconnect: Whether to open a lost port again until it is back, instead of raising an error.
+        request: Request that the board needs for each frame; None for a board that sends frames by itself.
+        wait: Time to wait until the port can be opened, s.
 
     Attributes:
-        url: Device path or pyserial URL.
-        outages: Times that it came back.
-        is_live: Bytes come whether they are read or not, and are lost if they are not.
+        outages: Number of times that the port was lost and came back.
+        is_live: True, because the bytes arrive whether or not they are read, and are lost if they are not read.
 
     Example:
         >>> with Port("/dev/ttyACM0") as port:  # doctest: +SKIP
@@ -79,58 +88,56 @@ class Port:
         request: Request | None = None,
         wait: float = 0.0,
     ) -> None:
-        """Describe a port; it is opened on entering the context.
-
-        Args:
-            url: Device path or pyserial URL.
-            baud: Bits per second; ignored by USB and pseudo-terminals.
-            silence_s: Time without a byte after which the port counts as lost, s.
-            reconnect: Whether to open a lost port again until it is back, instead of raising.
-            request: What the board has to be asked; None for a board that sends unasked.
-            wait: Time to wait until it can be opened, s.
-        """
-        self.url, self._wait = url, wait
+        self.url = url
         self.outages = 0
-        self._baud, self._silence_s, self._reconnect = baud, silence_s, reconnect
-        self._asker = Asker(request) if request else None
+        self._baud = baud
+        self._silence_s = silence_s
+        self._reconnect = reconnect
+        self._requester = Requester(request) if request else None
+        self._wait = wait
         self._line: SerialLine | UdpSocket | None = None
 
     def __enter__(self) -> Self:
         """Open the port and drop the bytes that it has buffered.
 
         Raises:
-            PortError: If it cannot be opened, or not in time.
+            PortError: If the port cannot be opened, or not in time.
         """
-        end_s = time.monotonic() + self._wait
+        deadline_s = time.monotonic() + self._wait
         while True:
             try:
                 self._open()
                 return self
             except PortError as error:
-                if time.monotonic() >= end_s or isinstance(error.__cause__, ValueError):
+                is_wrong_url = isinstance(error.__cause__, ValueError)
+                if is_wrong_url or time.monotonic() >= deadline_s:
                     raise
-                time.sleep(RETRY_S)
+                time.sleep(FIRST_RETRY_PAUSE_s)
 
     def _open(self) -> None:
         is_path = "://" not in self.url
         if is_path and HAS_POSIX_PORTS and not Path(self.url).exists():
             raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
         try:
-            is_udp = self.url.startswith(SCHEME)
-            self._line = UdpSocket(self.url) if is_udp else SerialLine(self.url, self._baud)
-            self._line.reset_input_buffer()  # a tty drops them by itself, a socket does not
+            if self.url.startswith(UDP_SCHEME):
+                self._line = UdpSocket(self.url)
+            else:
+                self._line = SerialLine(self.url, self._baud)
+            self._line.reset_input_buffer()  # A terminal drops its buffer by itself, a socket does not.
         except OPEN_ERRORS as error:
             self._close()
-            speed = f" at {self._baud} baud" if is_path else ""
-            hint = (
-                "check the cable and the name, that no other program has it open, and that you may read it (on Linux, "
-                "the group 'dialout')"
-                if is_path
-                else "check host and number, that the board is on, and that no other program has it"
-            )
+            if is_path:
+                speed = f" at {self._baud} baud"
+                hint = (
+                    "check the cable and the name, that no other program has it open, and that you may read it (on "
+                    "Linux, the group 'dialout')"
+                )
+            else:
+                speed = ""
+                hint = "check the host and the port number, that the board is on, and that no other program uses it"
             raise PortError(f"{self.url}: cannot be opened{speed} ({error}); {hint}") from error
-        if self._asker:
-            self._asker.forget()
+        if self._requester:
+            self._requester.reset()
 
     def __exit__(self, *_: object) -> None:
         """Close the port."""
@@ -143,46 +150,49 @@ class Port:
 
     @property
     def echo_share(self) -> float:
-        """Share of the requests that the line brought back, dimensionless; 0 for a board that sends unasked."""
-        return self._asker.echo_share if self._asker else 0.0
+        """Share of the requests that the line returned; 0 for a board that sends frames by itself."""
+        return self._requester.echo_share if self._requester else 0.0
 
     def __iter__(self) -> Iterator[Chunk]:
-        """Chunks as they arrive.
+        """Yield chunks as they arrive.
 
         Raises:
-            PortLost: If the port goes away or stays silent for `silence_s`, and is not to be opened again.
+            PortLost: If the port disappears or stays silent for `silence_s`, and `reconnect` is false.
             PortError: If the port is not open.
         """
         while True:
-            outage_s, lost_s = 0.0, time.monotonic()
+            started_s = time.monotonic()
+            outage_s = 0.0
             try:
                 data = self._read()
             except PortLost as error:
-                data = self._come_back(error)
-                outage_s = time.monotonic() - lost_s
+                data = self._read_after_reconnecting(error)
+                outage_s = time.monotonic() - started_s
                 self.outages += 1
             yield Chunk(data, time.time(), time.perf_counter_ns(), outage_s)
 
     def read(self, timeout_s: float) -> Chunk | None:
-        """The bytes that come within a time, s; None if none do.
+        """Return the bytes that arrive within a time, s; None if there are none.
 
         Raises:
-            PortLost: If the port goes away.
+            PortLost: If the port disappears.
             PortError: If the port is not open.
         """
         data = self._receive(timeout_s)
-        return Chunk(data, time.time(), time.perf_counter_ns()) if data else None
+        if not data:
+            return None
+        return Chunk(data, time.time(), time.perf_counter_ns())
 
-    def _come_back(self, reason: PortLost) -> bytes:
-        """Open the port again and again until bytes come: these bytes."""
+    def _read_after_reconnecting(self, reason: PortLost) -> bytes:
+        """Open the port repeatedly until bytes arrive, and return these bytes."""
         if not self._reconnect:
             raise reason
         log.warning("%s; trying again until it is back", reason)
-        pause_s = RETRY_S
+        pause_s = FIRST_RETRY_PAUSE_s
         while True:
             self._close()
             time.sleep(pause_s)
-            pause_s = min(2.0 * pause_s, LONGEST_RETRY_S)
+            pause_s = min(2.0 * pause_s, MAX_RETRY_PAUSE_s)
             try:
                 self._open()
                 return self._read()
@@ -190,10 +200,10 @@ class Port:
                 continue
 
     def _read(self) -> bytes:
-        """Wait for a byte, and read all bytes that came with it.
+        """Wait for a byte, and return all bytes that arrived with it.
 
         Raises:
-            PortLost: If the port went away, or nothing came in time.
+            PortLost: If the port disappears, or nothing arrives in time.
         """
         data = self._receive(self._silence_s)
         if not data:
@@ -204,32 +214,35 @@ class Port:
         return data
 
     def _receive(self, timeout_s: float) -> bytes:
-        """The bytes that come within a time, s; nothing if none come."""
+        """Return the bytes that arrive within a time, s; empty if there are none."""
         if self._line is None:
-            raise PortError(f"{self.url}: not open; use `with Port(...) as port`")
+            raise PortError(f"{self.url}: the port is not open; use `with Port(...) as port`")
         try:
-            if self._asker is None:
+            if self._requester is None:
                 return self._line.receive(timeout_s)
-            return self._ask(self._line, self._asker, timeout_s)
+            return self._receive_answer(self._line, self._requester, timeout_s)
         except READ_ERRORS as error:
             raise PortLost(
-                f"{self.url}: went away while it was read ({error}); check the plug and the cable"
+                f"{self.url}: the port disappeared while it was read ({error}); check the plug and the cable"
             ) from error
 
-    def _ask(self, line: SerialLine | UdpSocket, asker: Asker, timeout_s: float) -> bytes:
-        """Ask whenever it is time, until an answer comes."""
-        end_s = time.monotonic() + timeout_s
-        while (left_s := end_s - time.monotonic()) > 0.0:
-            if not (wait_s := asker.wait_s()):
-                line.write(asker.asked())
-                wait_s = asker.wait_s()
-            if answer := asker.heard(line.receive(min(wait_s, left_s))):
+    def _receive_answer(self, line: SerialLine | UdpSocket, requester: Requester, timeout_s: float) -> bytes:
+        """Send requests when they are due, until an answer arrives or the time is over."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            remaining_s = deadline_s - time.monotonic()
+            if remaining_s <= 0.0:
+                return b""
+            if requester.wait_s() == 0.0:
+                line.write(requester.next_request())
+            received = line.receive(min(requester.wait_s(), remaining_s))
+            answer = requester.remove_echo(received)
+            if answer:
                 return answer
-        return b""
 
 
 def has_speed(url: str) -> bool:
-    """Whether a port has a baud rate: sockets and pseudo-terminals have none."""
+    """Return whether a port has a baud rate. Sockets and pseudo-terminals have none."""
     return "://" not in url and not os.path.realpath(url).startswith("/dev/pts/")
 
 
@@ -243,7 +256,15 @@ Chunks = contextlib.AbstractContextManager["Port | FileSource"]
 
 
 class FileSource:
-    """Chunks of a file, a pipe or stdin, up to its end; they wait until somebody reads them."""
+    """Source of the chunks of a file, a pipe or the standard input, up to its end.
+
+    Args:
+        descriptor: File descriptor, open for reading.
+
+    Attributes:
+        outages: Always 0.
+        is_live: False, because bytes are kept until they are read.
+    """
 
     outages = 0
     is_live = False
@@ -252,11 +273,12 @@ class FileSource:
         self._descriptor = descriptor
 
     def __iter__(self) -> Iterator[Chunk]:
-        """Chunks until the file ends; what is on a disk arrives at once, when it is opened."""
+        """Yield chunks until the file ends. All bytes of a file on a disk arrive at the time at which it is opened."""
         opened_s = time.time()
-        at_once = stat.S_ISREG(os.fstat(self._descriptor).st_mode)
+        is_on_disk = stat.S_ISREG(os.fstat(self._descriptor).st_mode)
         while data := os.read(self._descriptor, CHUNK_BYTES):
-            yield Chunk(data, opened_s if at_once else time.time(), time.perf_counter_ns())
+            arrival_s = opened_s if is_on_disk else time.time()
+            yield Chunk(data, arrival_s, time.perf_counter_ns())
 
 
 def open_source(
@@ -268,27 +290,29 @@ def open_source(
     request: Request | None = None,
     wait: float = 0.0,
 ) -> Chunks:
-    """The source of chunks behind a name, as a context manager.
+    """Return the source with a name, as a context manager.
 
     Args:
-        url: A device path or URL, the path of a file or named pipe, or - for stdin.
-        baud, silence_s, reconnect, request, wait: As `Port` takes them; a file is waited for, too, until it exists.
+        url: A device path or URL, the path of a file or a named pipe, or - for the standard input.
+        baud, silence_s, reconnect, request: See `Port`.
+        wait: Time to wait until the port can be opened or the file exists, s.
 
     Raises:
         InputError: If the file cannot be read.
     """
     if url == STDIN:
         return contextlib.nullcontext(FileSource(sys.stdin.fileno()))
-    end_s = time.monotonic() + wait
-    while "://" not in url and not Path(url).exists() and time.monotonic() < end_s:
-        time.sleep(RETRY_S)
-    if "://" not in url and _is_file(Path(url)):
-        return _file(Path(url))
-    left_s = max(0.0, end_s - time.monotonic())
-    return Port(url, baud=baud, silence_s=silence_s, reconnect=reconnect, request=request, wait=left_s)
+    deadline_s = time.monotonic() + wait
+    is_path = "://" not in url
+    while is_path and not Path(url).exists() and time.monotonic() < deadline_s:
+        time.sleep(FIRST_RETRY_PAUSE_s)
+    if is_path and _is_file_or_pipe(Path(url)):
+        return _open_file(Path(url))
+    remaining_s = max(0.0, deadline_s - time.monotonic())
+    return Port(url, baud=baud, silence_s=silence_s, reconnect=reconnect, request=request, wait=remaining_s)
 
 
-def _is_file(path: Path) -> bool:
+def _is_file_or_pipe(path: Path) -> bool:
     with contextlib.suppress(OSError):
         mode = path.stat().st_mode
         return stat.S_ISREG(mode) or stat.S_ISFIFO(mode)
@@ -296,7 +320,7 @@ def _is_file(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _file(path: Path) -> Iterator[FileSource]:
+def _open_file(path: Path) -> Iterator[FileSource]:
     try:
         file = path.open("rb", buffering=0)
     except OSError as error:
