@@ -18,6 +18,7 @@ from isocharge.serve.live.outputs import LineQueue
 from isocharge.serve.network.address import Address, Tls, Token, check_exposure
 
 with require("http"):
+    from isocharge.serve.network.browser_check import BrowserCheck
     from isocharge.serve.network.http import HttpServer
     from isocharge.serve.network.model_store import open_model_store
     from isocharge.serve.network.protocol import Handler
@@ -50,6 +51,15 @@ def http_command(
         int | None,
         typer.Option("--grpc-port", min=0, max=65535, help="TCP port for gRPC; 0 takes a free one. (default: no gRPC)"),
     ] = None,
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--allow-host",
+            metavar="NAME",
+            help="Further host name by which browsers reach the server, for example through a reverse proxy; repeat "
+            "it for more. (default: IP addresses, localhost and --host)",
+        ),
+    ] = None,
     token: TokenOption = None,
     tls_cert: Annotated[
         Path | None,
@@ -76,12 +86,13 @@ def http_command(
     if tls_key is not None and tls_cert is None:
         raise InputError("--tls-key: expected --tls-cert too, got the key alone")
     secret = None if token is None else Token(token)
+    browser_check = BrowserCheck(host, allow_host or (), any_host=secret is not None or uds is not None)
     tls = None if tls_cert is None else Tls(tls_cert, tls_key)
     with suppress(KeyboardInterrupt), _traffic(log, token) as traffic:
         store = open_model_store(models)
         for reason in store.refusals():
             _tell(traffic, "warning", "refused", reason)
-        handler = Handler(store, traffic=traffic, token=secret)
+        handler = Handler(store, traffic=traffic, token=secret, browser_check=browser_check)
         server = HttpServer(handler, address, tls=tls)
         with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:
             _tell(traffic, "info", "serving", ", ".join(served.metadata.label for served in store.all()))

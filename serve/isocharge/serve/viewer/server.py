@@ -5,10 +5,8 @@ The server is that of the package `websockets`, one request of HTTP for each con
 bounded here: how many viewers there are, how much they send, and how long they take nothing.
 
 A browser sends no Authorization header with a WebSocket, so the page sends its token as a subprotocol, `bearer.TOKEN`
-in base64url; other clients send the header. Any page in the world may try to open a WebSocket to this machine; the
-browser says from which page. A page of a name that somebody else has made point here (DNS rebinding) is of the same
-name as the server it asks: without a token, only names that nobody else can give count: addresses, localhost, and the
-host that this server was told to listen on.
+in base64url; other clients send the header. Any page in the world may try to open a WebSocket to this machine;
+`isocharge.serve.network.browser_check` refuses pages of other sites.
 """
 
 import asyncio
@@ -21,10 +19,8 @@ import secrets
 import socket
 import time
 from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from websockets import http11
 from websockets.asyncio.server import ServerConnection, serve
@@ -32,10 +28,11 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
-from isocharge.common.errors import OriginError, RequestError, TooMany, UnknownPath
+from isocharge.common.errors import RequestError, TooMany, UnknownPath
 from isocharge.common.structs import parse_json
 from isocharge.serve.flags import MEANINGS
-from isocharge.serve.network.address import Token, ip_address
+from isocharge.serve.network.address import Token
+from isocharge.serve.network.browser_check import BrowserCheck
 from isocharge.serve.network.protocol import Response
 from isocharge.serve.network.protocol.describe import PAGE_HEADERS
 from isocharge.serve.network.protocol.response import error_response, json_response, response_of
@@ -48,48 +45,32 @@ PROTOCOL = "isocharge.live.1"
 BEARER = "bearer."
 
 
-@dataclass(frozen=True)
 class Access:
-    """What a request must show.
+    """Checks whether a request for data may be answered.
 
-    Attributes:
-        token: The secret; None for no secret.
-        host: Where the server listens.
+    Args:
+        token: Token that requests must carry; None answers everybody.
+        host: Name or address on which the page is served.
     """
 
-    token: Token | None = None
-    host: str = "127.0.0.1"
+    def __init__(self, token: Token | None = None, host: str = "127.0.0.1") -> None:
+        self._token = token
+        self._browser_check = BrowserCheck(host, any_host=token is not None)
 
     def check(self, headers: Mapping[bytes, bytes], subprotocols: Iterable[str] = ()) -> None:
         """Check a request for data.
 
         Args:
-            headers: Names in lower case.
-            subprotocols: That a WebSocket offers.
+            headers: Values by name in lower case.
+            subprotocols: Subprotocols that a WebSocket offers.
 
         Raises:
-            OriginError: If it comes from a page of another site.
+            OriginError: If a page of another site sent the request.
             TokenError: If it does not carry the token.
         """
-        self._check_origin(headers)
-        if self.token is not None:
-            self.token.check(headers.get(b"authorization", b"") or _bearer(subprotocols))
-
-    def _check_origin(self, headers: Mapping[bytes, bytes]) -> None:
-        host = headers.get(b"host", b"").decode("latin-1").lower()
-        name = _name(f"//{host}")
-        if self.token is None and not (ip_address(name) or name in ("localhost", self.host.lower(), "")):
-            raise OriginError(f"expected a request to this machine's address, got one to {host!r}; open the address")
-        origin = headers.get(b"origin")
-        if origin is not None and origin.decode("latin-1").lower().partition("://")[2] != host:
-            raise OriginError(f"expected a page of this server, got one of {origin.decode('latin-1')!r}; open {host}")
-
-
-def _name(url: str) -> str:
-    try:
-        return urlsplit(url).hostname or ""
-    except ValueError:
-        return "?"
+        self._browser_check.check("GET", headers)
+        if self._token is not None:
+            self._token.check(headers.get(b"authorization", b"") or _bearer(subprotocols))
 
 
 def _bearer(subprotocols: Iterable[str]) -> bytes:

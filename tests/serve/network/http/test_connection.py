@@ -10,9 +10,9 @@ from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.http.connection import Connection
 from isocharge.serve.network.protocol.response import response_of
 
-INNER = b"POST /one HTTP/1.1\r\nHost: x\r\nContent-Length: 3\r\n\r\nabc"
+INNER = b"POST /one HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3\r\n\r\nabc"
 
-TRAILED = b"POST /one HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n3\r\nabc\r\n"
+TRAILED = b"POST /one HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n3\r\nabc\r\n"
 
 
 class Echo:
@@ -63,7 +63,7 @@ def request(method, path, header, body, *, chunked):
         body = (b"%x\r\n%s\r\n" % (len(body), body) if body else b"") + b"0\r\n\r\n"
     else:
         framing = b"Content-Length: %d\r\n" % len(body)
-    return b"%s %s HTTP/1.1\r\nHost: x\r\n%s%s\r\n%s" % (method, path, header, framing, body)
+    return b"%s %s HTTP/1.1\r\nHost: localhost\r\n%s%s\r\n%s" % (method, path, header, framing, body)
 
 
 REQUESTS = st.builds(

@@ -19,12 +19,12 @@ from isocharge.serve.network.protocol import Handler
 INFER = "/v2/models/linear/infer"
 TENSOR = {"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}
 BODY = json.dumps({"inputs": [TENSOR]}).encode()
-LOAD = b"POST /v2/repository/models/linear/load HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n\r\n"
+LOAD = b"POST /v2/repository/models/linear/load HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\n\r\n"
 LAST = b"Connection: close\r\n"
 
 
 def infer(headers=b"", body=BODY):
-    head = b"POST %s HTTP/1.1\r\nHost: x\r\n%sContent-Length: %d\r\n\r\n"
+    head = b"POST %s HTTP/1.1\r\nHost: localhost\r\n%sContent-Length: %d\r\n\r\n"
     return head % (INFER.encode(), headers, len(body)) + body
 
 
@@ -210,7 +210,7 @@ def test_a_client_that_does_not_read(limited):
 def test_an_upgrade_is_ignored(server, protocol, piece):
     """As HTTP lets a server do (RFC 9110, 7.8): the request is answered, and so is the next one."""
     upgrade = f"Connection: Upgrade, HTTP2-Settings\r\nUpgrade: {protocol}\r\nHTTP2-Settings: AAMAAABkAAQAAP__\r\n"
-    bodiless = b"GET /v2 HTTP/1.1\r\nHost: x\r\n%s\r\n" % upgrade.encode()
+    bodiless = b"GET /v2 HTTP/1.1\r\nHost: localhost\r\n%s\r\n" % upgrade.encode()
     requests = infer(upgrade.encode()) + bodiless + infer(b"Connection: close, upgrade\r\nUpgrade: h2c\r\n")
     assert statuses(exchange(server, requests, piece)) == [200] * 3
 

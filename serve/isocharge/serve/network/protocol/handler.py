@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from isocharge.common.errors import RequestError, UnknownPath, WrongMethod
 from isocharge.serve.network.address import ServerLimits, Token
+from isocharge.serve.network.browser_check import BrowserCheck
 from isocharge.serve.network.metrics import CONTENT_TYPE, Metrics
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol import describe
@@ -71,10 +72,22 @@ class Handler:
         limits: ServerLimits | None = None,
         traffic: Traffic | None = None,
         token: Token | None = None,
+        browser_check: BrowserCheck | None = None,
     ) -> None:
-        """`limits` bound body and batch, the others are for transports; without a token, everybody is answered."""
-        self.store, self.token = store, token
+        """Set up the routes.
+
+        Args:
+            store: The models.
+            limits: Bounds of body and batch, and of the connections, which the transport observes.
+            traffic: Counters and log of the requests.
+            token: Token that requests must carry; None answers everybody.
+            browser_check: Refuses requests by pages of other sites; None accepts the host names that always lead to
+                this machine.
+        """
+        self.store = store
+        self.token = token
         self.limits = limits or ServerLimits()
+        self._browser_check = browser_check or BrowserCheck(any_host=token is not None)
         self.traffic = traffic or Traffic()
         metrics = Metrics(store, self.traffic, describe.server_metadata()["version"])
         self._fixed: dict[str, Route] = {
@@ -136,6 +149,7 @@ class Handler:
         self.traffic.note(Exchange("http", "none", response.status, None, response.error, 0, 0, size, client))
 
     def _answer(self, method: str, path: str, found: Found, fields: dict[bytes, bytes], body: bytes) -> Response:
+        self._browser_check.check(method, fields)
         if self.token is not None and path not in OPEN:
             self.token.check(fields.get(b"authorization", b""))
         route, _, name, version = found

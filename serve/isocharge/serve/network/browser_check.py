@@ -1,0 +1,147 @@
+"""Protection against requests that a web page of another site makes a browser send.
+
+A browser lets every page send requests to every address that the browser can reach, the loopback address included. A
+form or a `fetch` with `mode: "no-cors"` cannot read the answer, but the request is carried out. With DNS rebinding, the
+owner of a name lets it point to this machine after the page was loaded; the page then counts as a page of this server
+and can read the answers too. Three headers that pages cannot change reveal such requests:
+
+- `Host` is the name that the browser asked for. A rebound name is neither an IP address nor a name of this server.
+- `Origin` names the site of the page that sent the request.
+- `Sec-Fetch-Site` says whether the page belongs to the same site. Browsers send it with requests without `Origin`, too.
+
+Programs other than browsers send neither `Origin` nor `Sec-Fetch-Site`, so only their `Host` is checked.
+"""
+
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from urllib.parse import urlsplit
+
+from isocharge.common.errors import InputError, OriginError
+from isocharge.serve.network.address import ip_address
+
+CACHED_REQUESTS = 256
+"""Number of combinations of the headers whose result is cached. Clients send the same headers again and again."""
+
+LOCALHOST = "localhost"
+
+TRUSTED_FETCH_SITES = (b"same-origin", b"none")
+"""Values of `Sec-Fetch-Site` of a request by a page of the server itself, and of an address that a user typed in."""
+
+
+class BrowserCheck:
+    """Checks that a request was not sent by a page of another site.
+
+    Args:
+        host: Name or address on which the server listens.
+        allowed_hosts: Further names by which the server is reached, for example through a reverse proxy. Pages of these
+            names may send requests, too.
+        any_host: Whether to accept every `Host`. Rebinding does no harm if requests need a token, which a page of
+            another site does not have, or if the server listens on a Unix socket.
+    """
+
+    def __init__(self, host: str = LOCALHOST, allowed_hosts: Iterable[str] = (), *, any_host: bool = False) -> None:
+        self._allowed_names = frozenset(map(host_name, allowed_hosts))
+        self._host_names = self._allowed_names | {LOCALHOST, host.lower()}
+        self._any_host = any_host
+        self._problem = lru_cache(CACHED_REQUESTS)(self._find_problem)
+
+    def check(self, method: str, headers: Mapping[bytes, bytes]) -> None:
+        """Check the headers of a request.
+
+        Args:
+            method: Method in capitals.
+            headers: Values by name in lower case.
+
+        Raises:
+            OriginError: If a page of another site sent the request, or `Host` is not a name of this server.
+        """
+        get = headers.get
+        problem = self._problem(
+            method,
+            get(b"host", b""),
+            get(b"origin"),
+            get(b"sec-fetch-site"),
+            get(b"sec-fetch-mode"),
+            get(b"sec-fetch-dest"),
+        )
+        if problem is not None:
+            raise OriginError(problem)
+
+    def _find_problem(
+        self,
+        method: str,
+        host: bytes,
+        origin: bytes | None,
+        fetch_site: bytes | None,
+        fetch_mode: bytes | None,
+        fetch_dest: bytes | None,
+    ) -> str | None:
+        """Return what is wrong with the headers of a request; None if it is to be answered."""
+        if not (self._any_host or self._is_served(host)):
+            return (
+                f"Host: expected an IP address or one of {self._served_names()}, got {_shown(host)}; use the server's "
+                "address, or name the host by --allow-host of `isocharge serve http`"
+            )
+        if origin is not None:
+            if self._is_own_page(origin, host):
+                return None
+            return (
+                f"Origin: expected a page of this server, got a page of {_shown(origin)}; open {_shown(host)} itself, "
+                "or name the page's host by --allow-host of `isocharge serve http`"
+            )
+        if fetch_site is None or fetch_site.lower() in TRUSTED_FETCH_SITES:
+            return None
+        is_link = method in ("GET", "HEAD") and fetch_mode == b"navigate" and fetch_dest == b"document"
+        if is_link:
+            return None
+        return (
+            f"Sec-Fetch-Site: expected a request by a page of this server, got {_shown(fetch_site)}; open the page of "
+            f"{_shown(host)}"
+        )
+
+    def _is_served(self, host: bytes) -> bool:
+        """Return whether a `Host` is an address, or a name by which this server is reached."""
+        if not host:  # HTTP/1.0 does not require the header, and every browser sends it.
+            return True
+        name = _name_in(f"//{host.decode('latin-1')}")
+        return ip_address(name) is not None or name in self._host_names
+
+    def _is_own_page(self, origin: bytes, host: bytes) -> bool:
+        """Return whether an `Origin` is the server itself, or one of the allowed names."""
+        scheme, _, authority = origin.decode("latin-1").lower().partition("://")
+        if scheme not in ("http", "https"):
+            return False
+        return authority == host.decode("latin-1").lower() or _name_in(f"//{authority}") in self._allowed_names
+
+    def _served_names(self) -> str:
+        return ", ".join(sorted(self._host_names))
+
+
+def host_name(text: str) -> str:
+    """Return a host name in lower case.
+
+    Raises:
+        InputError: If the text is not a plain host name or address; a scheme, a port or a path is refused.
+    """
+    name = text.strip().lower()
+    is_plain = name.isascii() and name.isprintable() and not set(name) & set("/@?#%* ,\\")
+    is_bracketed = name.startswith("[") and name.endswith("]")
+    if is_bracketed:
+        name = name[1:-1]
+    if not name or not is_plain or (":" in name and ip_address(name) is None):
+        raise InputError(f"--allow-host: expected a host name without scheme, port and path, got {text!r:.100}")
+    return name.removesuffix(".")
+
+
+def _name_in(url: str) -> str:
+    """Return the host name in a URL in lower case; "?" if there is none."""
+    try:
+        name = urlsplit(url).hostname or "?"
+    except ValueError:
+        return "?"
+    return name.removesuffix(".")
+
+
+def _shown(value: bytes) -> str:
+    """Return the value of a header for a message."""
+    return repr(value[:100].decode("latin-1"))

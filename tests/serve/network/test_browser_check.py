@@ -1,0 +1,218 @@
+"""Requests that a page of another site makes a browser send are refused: Host, Origin and Sec-Fetch-Site."""
+
+import contextlib
+import http.server
+import json
+import shutil
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from isocharge.common.errors import InputError, OriginError
+from isocharge.serve.network.address import Token
+from isocharge.serve.network.browser_check import BrowserCheck, host_name
+from isocharge.serve.network.protocol import Handler
+
+CHROMIUM = "/usr/bin/chromium"
+ARGUMENTS = [
+    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"),
+    *("--disable-component-update", "--disable-gpu", "--host-resolver-rules=MAP evil.example 127.0.0.1"),
+    # The browser's own protection of local addresses must not hide what the server does.
+    "--disable-features=LocalNetworkAccessChecks,BlockInsecurePrivateNetworkRequests,PrivateNetworkAccessSendPreflights",
+]
+INFER = "/v2/models/linear/infer"
+UNLOAD = "/v2/repository/models/linear/unload"
+
+
+def headers_of(**headers):
+    return {name.replace("_", "-").encode(): value.encode() for name, value in headers.items()}
+
+
+SERVED = {
+    "curl by address": {"host": "127.0.0.1:8000"},
+    "client by IPv6": {"host": "[::1]:8000"},
+    "client by another address": {"host": "192.168.1.7:8000"},
+    "client by localhost": {"host": "LocalHost:8000"},
+    "fully qualified localhost": {"host": "localhost.:8000"},
+    "HTTP/1.0 without Host": {},
+    "own page": {"host": "localhost:8000", "origin": "http://localhost:8000", "sec_fetch_site": "same-origin"},
+    "address typed in": {"host": "localhost:8000", "sec_fetch_site": "none", "sec_fetch_mode": "navigate"},
+}
+
+REFUSED = {
+    "rebound name": ({"host": "evil.example:8000"}, "Host"),
+    "rebound name as its own origin": ({"host": "evil.example", "origin": "http://evil.example"}, "Host"),
+    "name with localhost before it": ({"host": "localhost.evil.example"}, "Host"),
+    "user name before the host": ({"host": "localhost@evil.example"}, "Host"),
+    "short form of an address": ({"host": "127.1:8000"}, "Host"),
+    "broken address": ({"host": "[::1"}, "Host"),
+    "form of another site": ({"host": "127.0.0.1:8000", "origin": "https://evil.example"}, "Origin"),
+    "page of another port": ({"host": "127.0.0.1:8000", "origin": "http://127.0.0.1:3000"}, "Origin"),
+    "sandboxed page": ({"host": "127.0.0.1:8000", "origin": "null"}, "Origin"),
+    "file on the disk": ({"host": "127.0.0.1:8000", "origin": "file://"}, "Origin"),
+    "no-cors fetch": ({"host": "127.0.0.1:8000", "sec_fetch_site": "cross-site"}, "Sec-Fetch-Site"),
+    "page of the same site": ({"host": "127.0.0.1:8000", "sec_fetch_site": "same-site"}, "Sec-Fetch-Site"),
+    "unknown relation": ({"host": "127.0.0.1:8000", "sec_fetch_site": "new-value"}, "Sec-Fetch-Site"),
+}
+
+
+@pytest.mark.parametrize("headers", SERVED.values(), ids=SERVED)
+def test_clients_and_own_pages_are_served(headers):
+    BrowserCheck().check("POST", headers_of(**headers))
+
+
+@pytest.mark.parametrize(("headers", "header"), REFUSED.values(), ids=REFUSED)
+def test_pages_of_other_sites_are_refused(headers, header):
+    for method in ("GET", "POST"):
+        with pytest.raises(OriginError, match=f"^{header}: expected"):
+            BrowserCheck().check(method, headers_of(**headers))
+
+
+def test_a_link_on_another_site_may_lead_here():
+    link = headers_of(
+        host="127.0.0.1:8000", sec_fetch_site="cross-site", sec_fetch_mode="navigate", sec_fetch_dest="document"
+    )
+    BrowserCheck().check("GET", link)
+    with pytest.raises(OriginError, match="Sec-Fetch-Site"):
+        BrowserCheck().check("POST", link)
+    with pytest.raises(OriginError, match="Sec-Fetch-Site"):
+        BrowserCheck().check("GET", link | {b"sec-fetch-dest": b"iframe"})
+
+
+def test_allow_host_names_a_proxy():
+    check = BrowserCheck("0.0.0.0", ["Robot.Example"])
+    check.check("POST", headers_of(host="robot.example", origin="https://robot.example"))
+    check.check("POST", headers_of(host="127.0.0.1:8000", origin="https://robot.example:8443"))
+    with pytest.raises(OriginError, match=r"one of 0\.0\.0\.0, localhost, robot\.example"):
+        check.check("GET", headers_of(host="other.example"))
+
+
+@pytest.mark.parametrize("name", ["", " ", "http://robot", "robot:8000", "robot/path", "*", "a b", "ro\nbot", "roböt"])
+def test_allow_host_expects_a_plain_name(name):
+    with pytest.raises(InputError, match="--allow-host: expected a host name without scheme, port and path"):
+        host_name(name)
+
+
+@given(st.text(st.characters(codec="latin-1"), max_size=30))
+def test_any_host_and_origin_are_accepted_or_refused(text):
+    for headers in ({b"host": text.encode("latin-1")}, {b"host": b"localhost", b"origin": text.encode("latin-1")}):
+        with contextlib.suppress(OriginError):
+            BrowserCheck().check("POST", headers)
+
+
+@given(st.from_regex(r"[a-z]{1,10}(\.[a-z]{1,10}){1,3}(:[0-9]{1,5})?", fullmatch=True))
+def test_no_name_but_localhost_is_served(name):
+    if name.partition(":")[0] != "localhost":
+        with pytest.raises(OriginError, match="Host"):
+            BrowserCheck().check("GET", {b"host": name.encode()})
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/metrics", "/openapi.json", "/v2", "/v2/health/live", INFER, UNLOAD, "/unknown"]
+)
+def test_every_route_is_checked(handler, path):
+    method = "POST" if path in (INFER, UNLOAD) else "GET"
+    answer = handler.answer(method, path, [(b"host", b"127.0.0.1"), (b"origin", b"http://evil.example")], b"")
+    assert (answer.status, answer.error) == (403, "OriginError")
+    assert handler.answer(method, path, [(b"host", b"evil.example")], b"").status == 403
+
+
+def test_with_a_token_any_host_name_is_served(store):
+    handler = Handler(store, token=Token("sesame"))
+    headers = [(b"host", b"inference.cluster.local"), (b"authorization", b"Bearer sesame")]
+    assert handler.answer("GET", "/v2", headers, b"").status == 200
+    assert handler.answer("GET", "/v2", [*headers, (b"origin", b"http://evil.example")], b"").status == 403
+
+
+ATTACK = """<!doctype html><title>attack</title><iframe name="result"></iframe>
+<form id="form" method="post" enctype="text/plain" target="result" action="{target}{unload}"><input name="x"></form>
+<script>
+async function attack() {{
+  const tensor = {{ name: "charge_pC", datatype: "FP32", shape: [1, 3], data: [1, 2, 3] }};
+  const body = JSON.stringify({{ inputs: [tensor] }});
+  const answers = [];
+  for (const [path, options] of [
+    ["{infer}", {{ method: "POST", mode: "no-cors", body }}], ["{unload}", {{ method: "POST", mode: "no-cors" }}],
+    ["/v2", {{ mode: "no-cors" }}], ["/metrics", {{}}],
+  ]) {{
+    try {{
+      const answer = await fetch("{target}" + path, options);
+      answers.push(answer.type === "opaque" ? "opaque" : answer.status);
+    }} catch (error) {{ answers.push("blocked"); }}
+  }}
+  return answers;
+}}
+</script>"""
+
+
+@pytest.fixture
+def attacking_page():
+    """Serve a page of another origin that sends requests to `target`; yield the port and the page's settings."""
+    page = {"target": ""}
+
+    class Page(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            body = ATTACK.format(infer=INFER, unload=UNLOAD, **page).encode()
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_arguments):
+            """Write nothing."""
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Page) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server.server_address[1], page
+        server.shutdown()
+        thread.join()
+
+
+def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_http, attacking_page):
+    if shutil.which(CHROMIUM) is None:
+        pytest.skip(f"needs {CHROMIUM} (apt-get install chromium)")
+    playwright = pytest.importorskip("playwright.sync_api")
+    handler = Handler(store)
+    url = start_http(handler).url
+    port = url.rpartition(":")[2]
+    page_port, settings = attacking_page
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        page = browser.new_page()
+
+        # A page of another origin: a form, and fetches that may not read the answers.
+        settings["target"] = url
+        page.goto(f"http://evil.example:{page_port}/")
+        page.evaluate("attack()")
+        page.evaluate("document.getElementById('form').submit()")
+        page.wait_for_timeout(500)
+
+        # A rebound name: the page and the server have the same origin, and the page could read the answers.
+        answer = page.goto(f"http://evil.example:{port}/v2")
+        assert answer.status == 403
+        content = page.evaluate("fetch('/v2/models/linear').then((answer) => answer.text())")
+        assert "Host: expected an IP address" in json.loads(content)["error"]
+
+        # The server's own page, which a user opens by its address, still works.
+        assert page.goto(url).status == 200
+        assert page.goto(f"{url}/v2").status == 200
+        statuses = (
+            "fetch('/v2/models/linear/infer', { method: 'POST', body: arguments }).then((answer) => answer.status)"
+        )
+        tensor = {"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [1.0, 2.0, 3.0]}
+        body = json.dumps(json.dumps({"inputs": [tensor]}))
+        assert page.evaluate(statuses.replace("arguments", body)) == 200
+        browser.close()
+
+    requests = handler.traffic.requests()
+    refused = sum(count for (_, _, status), count in requests.items() if status == "403")
+    assert refused >= 5
+    assert not any("unload" in route and status == "200" for _, route, status in requests)
+    statistics = store.get("linear", "").statistics.snapshot()
+    assert statistics.presses == 1  # the press of the server's own page
+    np.testing.assert_equal(len(store.all()), 2)
