@@ -8,6 +8,7 @@ import logging
 import os
 import shutil
 import socket
+import threading
 from datetime import UTC, datetime
 
 import grpc
@@ -308,3 +309,63 @@ def test_what_could_not_be_read_is_a_line_too(app, lines, start_http):
     said = [(line["route"], line["status"], line["client"][:10]) for line in map(json.loads, lines)]
     assert said == [("none", 400, "127.0.0.1:"), ("none", 431, "127.0.0.1:")]
     assert not any("rubbish" in line for line in lines)
+
+
+def test_a_half_copied_version_does_not_end_the_version_that_it_replaces(film, store, folder, tmp_path):
+    """The old version folders are gone when the new one is loaded, and the new one is not complete yet."""
+    served = store.get("linear")
+    film.write(tmp_path / "new", version=3)
+    shutil.rmtree(folder / "1")
+    shutil.rmtree(folder / "2")
+    shutil.copytree(tmp_path / "new/linear/3", folder / "3", ignore=shutil.ignore_patterns("golden.json"))
+    with pytest.raises(ModelError, match=r"golden\.json: missing"):
+        store.load("linear")
+    assert store.get("linear") is served
+    assert labels(store) == ["linear/1", "linear/2"]
+
+    shutil.copy(tmp_path / "new/linear/3/golden.json", folder / "3")
+    store.load("linear")
+    assert labels(store) == ["linear/3"]  # now the versions whose folders are gone end
+
+
+def test_a_model_folder_without_versions_ends_nothing(store, folder, monkeypatch):
+    served = store.get("linear")
+    monkeypatch.setattr(store, "_folders", lambda: {"linear": folder})  # found before its versions were moved away
+    shutil.rmtree(folder / "1")
+    shutil.rmtree(folder / "2")
+    with pytest.raises(ModelError, match="expected folders of versions, found none"):
+        store.load("linear")
+    assert store.get("linear") is served
+
+
+def test_no_inference_is_lost_while_folders_are_moved_and_loaded(film, store, folder, tmp_path):
+    film.write(tmp_path / "other")
+    handler = Handler(store)
+    body = json.dumps(
+        {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [100.0, 200.0, 300.0]}]}
+    ).encode()
+    has_ended = threading.Event()
+
+    def move_folders():
+        while not has_ended.is_set():
+            (folder / "2").rename(tmp_path / "away")
+            (folder / "1").rename(tmp_path / "old")
+            (tmp_path / "old").rename(folder / "1")
+            (tmp_path / "away").rename(folder / "2")
+            folder.rename(tmp_path / "models/.linear")
+            (tmp_path / "models/.linear").rename(folder)
+
+    def load():
+        while not has_ended.is_set():
+            handler.answer("POST", "/v2/repository/models/linear/load", [], b"")
+
+    threads = [threading.Thread(target=target) for target in (move_folders, load)]
+    for thread in threads:
+        thread.start()
+    try:
+        statuses = {handler.answer("POST", "/v2/models/linear/infer", [], body).status for _ in range(3_000)}
+    finally:
+        has_ended.set()
+        for thread in threads:
+            thread.join()
+    assert statuses == {200}

@@ -161,11 +161,15 @@ class ModelStore:
         return {(name, str(version)): statistics.snapshot() for (name, version), statistics in counters}
 
     def load(self, name: str) -> None:
-        """Read a model's files again and put all its versions in place of the old ones.
+        """Read a model's files again and replace its versions.
+
+        A version that served before is removed only if its folder is gone and every version that was found is valid. So
+        no model disappears while its folders are being copied or moved.
 
         Raises:
             ModelNotFound: If the folders hold no such model.
-            ModelError: If a version is refused; the others serve, and the old files of the refused one go on serving.
+            ModelError: If a version is refused, or no version is found. Every version that served before goes on
+                serving, with its new files if these are valid.
         """
         with self._turn:
             folder = self._folders().get(name)
@@ -174,6 +178,11 @@ class ModelStore:
             refused = self._load(name, folder)
         if refused:
             raise ModelError("; ".join(refused.values()))
+        if not version_folders(folder):
+            raise ModelError(
+                f"{folder}: expected folders of versions, found none; what served before goes on serving, and unload "
+                "stops it"
+            )
 
     def unload(self, name: str) -> None:
         """Stop serving a model; requests that have begun finish.
@@ -185,18 +194,28 @@ class ModelStore:
             self._put(name, [], {(name, loaded.metadata.version): UNLOADED for loaded in self.named(name)})
 
     def _load(self, name: str, folder: Path) -> dict[tuple[str, int], str]:
-        """Load every version; in place of a refused one, the old one stays. Why versions were refused."""
-        versions, refused = [], {}
+        """Load every version of a model.
+
+        Returns:
+            Reasons why versions were refused, by name and version.
+        """
+        loaded: dict[int, LoadedVersion] = {}
+        refused: dict[tuple[str, int], str] = {}
         for version, path in version_folders(folder).items():
-            # counters go on when files are loaded again, as a counter never falls
+            # The counters continue when files are loaded again, because a counter must never fall.
             statistics = self._statistics.setdefault((name, version), Statistics())
             try:
-                versions.append(_load_version(name, version, path, statistics))
-            except Exception as error:  # a folder may be broken in any way, and must take no other model with it
+                loaded[version] = _load_version(name, version, path, statistics)
+            except Exception as error:  # A folder may be broken in any way, and must not affect other models.
                 refused[name, version] = _reason(path, error)
-                versions += filter(None, [self._serving.get((name, str(version)))])
-        self._put(name, versions, refused)
+        if refused or not loaded:
+            loaded = self._versions_of(name) | loaded
+        self._put(name, [loaded[version] for version in sorted(loaded)], refused)
         return refused
+
+    def _versions_of(self, name: str) -> dict[int, LoadedVersion]:
+        """Return the versions of a model that serve now; empty if there are none."""
+        return {int(version): loaded for (of, version), loaded in self._serving.items() if of == name and version != ""}
 
     def _put(self, name: str, versions: list[LoadedVersion], refused: dict[tuple[str, int], str]) -> None:
         """Change what serves in one assignment, so that a reader sees each change whole."""
