@@ -7,6 +7,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+import tomllib
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -130,6 +131,38 @@ def unit(tmp_path):
 def test_systemd_finds_nothing_wrong_with_the_unit(unit):
     done = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+# Images
+
+VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+
+
+def test_every_image_is_pinned():
+    """Our own image has the version as its tag; other images have a digest."""
+    images = re.findall(r"^FROM (\S+)", (DEPLOY / "Containerfile").read_text(), re.MULTILINE)
+    for path in DEPLOY.rglob("*.y*ml"):
+        images += re.findall(r"^\s*image: (\S+)", path.read_text(), re.MULTILINE)
+    ours = [image for image in images if image.startswith("isocharge")]
+    assert set(ours) == {f"isocharge:{VERSION}"}
+    assert len(ours) < len(images)
+    for image in set(images) - set(ours):
+        assert re.fullmatch(r"[\w./-]+:[\w.-]+@sha256:[0-9a-f]{64}", image), image
+
+
+def test_nobody_logs_in_to_grafana_with_a_default_password():
+    services = yaml.safe_load((DEPLOY / "monitoring/compose.yaml").read_text())["services"]
+    environment = services["grafana"]["environment"]
+    assert environment["GF_SECURITY_DISABLE_INITIAL_ADMIN_CREATION"] == "true"
+    assert environment["GF_AUTH_DISABLE_LOGIN_FORM"] == "true"
+    assert environment["GF_AUTH_BASIC_ENABLED"] == "false"
+
+
+def test_git_ignores_the_token():
+    done = subprocess.run(["git", "check-ignore", "--quiet", "serve/deploy/monitoring/token"], cwd=ROOT, check=False)
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout")
+    assert done.returncode == 0
 
 
 # Prometheus
