@@ -192,7 +192,7 @@ def _faults_inside(value: object, kind: Any, path: str) -> Iterator[str]:
         kinds = [item for item in get_args(kind) if item is not Ellipsis]
         if len(kinds) in (1, len(value)):
             for number, item in enumerate(value[:MOST_EXAMINED]):
-                yield from _faults(item, kinds[number % len(kinds)], f"{path}[{number + 1}]")
+                yield from _faults(item, kinds[number % len(kinds)], f"{path}[{number}]")
 
 
 def _faults_of_keys(table: Mapping[str, Any], kind: type[Struct], path: str) -> Iterator[str]:

@@ -231,22 +231,22 @@ WRONG = [
         'cheksum = "crc-16/modbus"',
         r"cheksum'; did you mean 'checksum'\? Known are format, request",
     ),
-    ('type = "i16"', 'type = "i48"', r"fields\[1\]\.type: expected one of pad, u8.*, got 'i48'"),
+    ('type = "i16"', 'type = "i48"', r"fields\[0\]\.type: expected one of pad, u8.*, got 'i48'"),
     (
         'type = "i16"',
         'type = "i16", count = 2',
-        r"fields\[1\]\.count: expected none, because only .* pad .*, got 2",
+        r"fields\[0\]\.count: expected none, because only .* pad .*, got 2",
     ),
     (
         'type = "i16"',
         'type = "pad", count = 5000',
-        r"fields\[1\]\.count: expected a whole number from 1 to 4096",
+        r"fields\[0\]\.count: expected a whole number from 1 to 4096",
     ),
     ('name = "Fy"', 'name = "Fx"', r"fields: expected names that differ, got \['Fx', 'Fx'"),
-    ('name = "Fy"', 'label = "Fy"', r"fields\[2\]\.label'"),
-    ('name = "Fy", ', "", r"fields\[2\]\.name' is missing"),
-    ("scale = 0.01", "scale = 0", r"fields\[1\]\.scale: expected a finite number that is not 0, got 0"),
-    ("scale = 0.01", "scale = nan", r"fields\[1\]\.scale: expected a finite number, got nan"),
+    ('name = "Fy"', 'label = "Fy"', r"fields\[1\]\.label'"),
+    ('name = "Fy", ', "", r"fields\[1\]\.name' is missing"),
+    ("scale = 0.01", "scale = 0", r"fields\[0\]\.scale: expected a finite number that is not 0, got 0"),
+    ("scale = 0.01", "scale = nan", r"fields\[0\]\.scale: expected a finite number, got nan"),
     ("length = 16", 'length = 16\nbyte_order = "middle"', r"byte_order: expected one of little, big, got 'middle'"),
     (
         "length = 16",
@@ -279,7 +279,7 @@ def test_wrong_descriptions(good, bad, said):
         ("[]", r"fields: expected one or more that are channels, got \[\]"),
         ('[{name = "seq", type = "u8"}]', r"fields: expected one or more that are channels, got \['seq'\]"),
         ("3", r"fields: expected a list of tables, got 3"),
-        ("[3]", r"fields\[1\]: expected a table, got 3"),
+        ("[3]", r"fields\[0\]: expected a table, got 3"),
     ],
 )
 def test_fields_that_make_no_frame(fields, said):

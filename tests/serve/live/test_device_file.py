@@ -155,7 +155,7 @@ WRONG = [
     ("[saturation]\n", "key 'saturation.limit_pC' is missing"),
     ('[frames]\nformat = "morse"\n', r"frames\.format: expected one of auto, text, binary, described, got 'morse'"),
     ('[frames]\nformat = "binary"\ncolumns = ["A"]\n', r"unknown key 'frames\.columns'; known are format"),
-    ('[frames]\nformat = "text"\ncolumns = ["A", 2]\n', r"frames\.columns\[2\]: expected a text, got 2"),
+    ('[frames]\nformat = "text"\ncolumns = ["A", 2]\n', r"frames\.columns\[1\]: expected a text, got 2"),
     ('[frames]\nformat = "described"\nsync = "55"\n', r"key 'frames\.length' is missing"),
     ("[common_mode]\nevery = 1\n", r"unknown key 'common_mode.every'; did you mean 'every_s'\? Known are on, every_s"),
     ("[channels]\nA = 0\n", r"channels\.A: expected a text, got 0"),

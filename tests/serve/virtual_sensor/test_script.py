@@ -79,8 +79,8 @@ def test_script_from_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("presses = [[0, 1, 2]]", r"presses\[1\]: expected \[seconds, x_mm, y_mm, force_N\] with a force from 0, got"),
-        ("presses = [[0, 1, 2, 1], [1, 1, 2, -1]]", r"presses\[2\]\[4\]: expected a number from 0, got -1"),
+        ("presses = [[0, 1, 2]]", r"presses\[0\]: expected \[seconds, x_mm, y_mm, force_N\] with a force from 0, got"),
+        ("presses = [[0, 1, 2, 1], [1, 1, 2, -1]]", r"presses\[1\]\[3\]: expected a number from 0, got -1"),
         ("presses = [[0, 1, 2, 1]]", "presses: expected two rows or more with growing seconds, got"),
         ("presses = [[1, 1, 2, 1], [0, 1, 2, 1]]", "presses: expected two rows or more with growing seconds, got"),
         ("[faults]\nlose_share = 1.1", r"faults.lose_share: expected a number from 0 to 1, got 1\.1"),

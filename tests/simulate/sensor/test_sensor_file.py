@@ -192,7 +192,7 @@ def test_wrong_type_is_named(path):
         (
             ("electrodes", "A"),
             {"polygon_mm": [3]},
-            r"electrodes\.A\.polygon_mm\[1\]: expected \[x, y\] in mm",
+            r"electrodes\.A\.polygon_mm\[0\]: expected \[x, y\] in mm",
         ),
         (("electrodes", "A"), {"polygon_mm": []}, "electrode 'A': expected 3 to 256 corners"),
         (
@@ -203,7 +203,7 @@ def test_wrong_type_is_named(path):
         (
             ("electrodes", "A"),
             {"polygon_mm": [[0, 0], [1, 0], [0, 1]], "back_mm": [[0, 0]]},
-            r"electrodes\.A\.back_mm\[1\]\[1\]: expected \[x, y\] in mm",
+            r"electrodes\.A\.back_mm\[0\]\[0\]: expected \[x, y\] in mm",
         ),
         (
             ("electrodes", "B"),

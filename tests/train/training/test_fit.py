@@ -271,7 +271,7 @@ def test_noise_of_ones_own():
         ("[training]\nlearning_rate = nan\n", "training.learning_rate: expected a number between 0 and 1, got nan"),
         ("[training]\nhold_out = 0.95\n", "training.hold_out: expected a number between 0 and 0.6, got 0.95"),
         ("[training]\nnoise = 3\n", "training.noise: expected a text, got 3"),
-        ("[network]\nhidden = [true]\n", "network.hidden[1]: expected a whole number from 1 to 4096, got True"),
+        ("[network]\nhidden = [true]\n", "network.hidden[0]: expected a whole number from 1 to 4096, got True"),
         ("[network]\nhidden = []\n", "network.hidden: expected widths"),
         ("[network]\nhidden = [64]\n", "as many layers as network.hidden"),
         ("[network]\nelectrodes = 2\n", "network.electrodes: expected 0 (as the dataset) or 3 to 64, got 2"),

@@ -28,8 +28,15 @@ CORRELATION = "contact_correlation"
 """Name of the output that older models have not."""
 
 OUTPUTS = {"contact": 3, "contact_std": 3, CORRELATION: 3, "misfit": 1}
-"""Names and widths of the outputs: x_mm, y_mm, force_N; their standard deviations; their correlations xy, xF and yF;
-the misfit."""
+"""Names and widths of the outputs; see `OUTPUT_MEANINGS`."""
+
+OUTPUT_MEANINGS = {
+    "contact": "x_mm, y_mm, force_N: position (mm) and force (N, positive when the probe pushes)",
+    "contact_std": "one standard deviation of x (mm), y (mm) and the force (N)",
+    CORRELATION: "correlations of the errors, from -1 to 1: x with y, x with the force, y with the force",
+    "misfit": "distance of the charges from the nearest single contact, in standard deviations of the noise",
+}
+"""Numbers of each output in their order, with their units. The first dimension of each output is the press."""
 
 
 def outputs_of(session: ort.InferenceSession) -> dict[str, int]:

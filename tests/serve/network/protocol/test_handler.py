@@ -251,13 +251,13 @@ BAD = {
     "no inputs": (b'{"inputs": []}', 400, "inputs: expected a list with one tensor"),
     "two inputs": (orjson.dumps({"inputs": request(PRESS)["inputs"] * 2}), 400, "a list with one tensor"),
     "inputs no list": (b'{"inputs": {}}', 400, "inputs: expected a list"),
-    "other name": (changed(name="charges"), 400, r"inputs\[1\].name: expected one of charge_pC, got 'charges'"),
+    "other name": (changed(name="charges"), 400, r"inputs\[0\].name: expected one of charge_pC, got 'charges'"),
     "other type": (changed(datatype="INT64"), 400, "expected one of FP32, FP64, got 'INT64'"),
     "type no text": (changed(datatype=["FP32"]), 400, "expected one of FP32, FP64"),
     "wrong width": (changed(shape=[1, 4]), 400, r"shape \[n, 3\] with n > 0, a column for each of \('A', 'B', 'C'\)"),
     "no rows": (changed(shape=[0, 3], data=[]), 400, "with n > 0"),
     "negative": (changed(shape=[-1, 3]), 400, "with n > 0"),
-    "a fraction": (changed(shape=[1.5, 3]), 400, r"shape\[1\]: expected a whole number, got 1.5"),
+    "a fraction": (changed(shape=[1.5, 3]), 400, r"shape\[0\]: expected a whole number, got 1.5"),
     "yes rows": (changed(shape=[True, 3]), 400, "expected a whole number, got True"),
     "three dimensions": (changed(shape=[1, 3, 1]), 400, "with n > 0"),
     "too many": (changed(shape=[10**12, 3]), 413, "at most 4096 presses in one request, got 1000000000000"),
@@ -454,3 +454,17 @@ def test_the_server_does_what_its_document_says(operations, mode):
 
         conforms()
     assert answered & ({200} if mode is GenerationMode.POSITIVE else {400, 404})
+
+
+def test_the_page_shows_how_to_send_a_press_before_anything_else(ask):
+    _, _, body = ask("GET", "/")
+    html = body.decode()
+    assert html.index("curl $SERVER/v2/models/linear/infer") < html.index("<article>")
+    assert html.index("x_mm, y_mm, force_N: position (mm) and force (N") < html.index("<article>")
+
+
+def test_the_openapi_document_says_what_each_output_holds(ask):
+    _, _, body = ask("GET", "/openapi.json")
+    schema = orjson.loads(body)["components"]["schemas"]["answer"]["properties"]["outputs"]["items"]
+    for name in ("contact", "contact_std", "contact_correlation", "misfit", "flags"):
+        assert f"`{name}`: " in schema["properties"]["name"]["description"]

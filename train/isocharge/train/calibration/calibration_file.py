@@ -255,7 +255,7 @@ def _read_coefficients(
         number = int(np.abs(values).argmax())
         if abs(values[number]) > largest:
             raise PressError(
-                f"{path}: discrepancy.{key}[{number + 1}]: expected at most {largest:g}, got {values[number]:g}"
+                f"{path}: discrepancy.{key}[{number}]: expected at most {largest:g}, got {values[number]:g}"
             )
     if not np.allclose(std[: parameter_std.size], parameter_std, rtol=1e-6, atol=1e-12):
         raise PressError(
@@ -300,7 +300,7 @@ def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Arra
     if np.abs(diagonal - 1.0).max() > CORRELATION_TOLERANCE:
         number = int(np.abs(diagonal - 1.0).argmax())
         raise PressError(
-            f"{path}: {key}[{number + 1}][{number + 1}]: expected 1, the correlation of an unknown with itself, "
+            f"{path}: {key}[{number}][{number}]: expected 1, the correlation of an unknown with itself, "
             f"got {diagonal[number]:g}"
         )
     asymmetry = np.abs(matrix - matrix.T)

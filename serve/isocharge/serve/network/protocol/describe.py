@@ -15,7 +15,7 @@ import msgspec
 from isocharge.common.files import read_whole
 from isocharge.common.versions import package_version
 from isocharge.serve.model.model_folder import Model
-from isocharge.serve.model.session import INPUT, OUTPUTS
+from isocharge.serve.model.session import INPUT, OUTPUT_MEANINGS, OUTPUTS
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol.inference import FLAGS, InferBody
@@ -135,9 +135,11 @@ def openapi(store: ModelStore) -> Json:
         "info": {
             "title": "isocharge",
             "version": server_metadata()["version"],
-            "description": "Charges of a piezoelectric tactile film to contacts: the Open Inference Protocol, V2. "
-            "Bodies may be compressed with gzip or deflate, and tensors sent in binary after the JSON, as its "
-            "binary tensor extension says.",
+            "description": "Computes contacts on a piezoelectric tactile film from the charges of its electrodes, with "
+            "the Open Inference Protocol, version 2. The input `charge_pC` has one row for each press and one column "
+            "for each electrode: the charge under load minus the charge without load, in pC. Bodies may be compressed "
+            "with gzip or deflate, and tensors may follow the JSON in binary, as in the binary tensor extension of the "
+            "protocol.",
         },
         "paths": {path: _path(path, *of) for path, of in paths.items()},
         "components": {
@@ -195,9 +197,13 @@ _NUMBER = {"type": ["number", "null"], "description": "null: not finite, which J
 
 _OUTPUT = _object(
     {
-        "name": {"enum": [*OUTPUTS, FLAGS]},
+        "name": {
+            "enum": [*OUTPUTS, FLAGS],
+            "description": "; ".join(f"`{name}`: {meaning}" for name, meaning in OUTPUT_MEANINGS.items())
+            + f"; `{FLAGS}`: reasons not to trust the contact, separated by commas",
+        },
         "datatype": {"enum": ["FP32", "BYTES"]},
-        "shape": _SHAPE,
+        "shape": _SHAPE | {"description": "number of presses, and numbers for each press"},
         "data": {"anyOf": [_list_of(_NUMBER), _list_of(_TEXT)]},
     },
     ["name", "datatype", "shape"],
@@ -231,7 +237,7 @@ ANSWERS: Json = {
 STYLE = """
 :root { color-scheme: light dark; --line: color-mix(in srgb, currentColor 18%, transparent) }
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 52rem; margin: 0 auto; padding: 2rem 1.25rem 4rem }
-h1 { font-size: 1.9rem; margin: 0 } h2 { font-size: 1.3rem; margin: 0 }
+h1 { font-size: 1.9rem; margin: 0 } h2 { font-size: 1.3rem; margin: 1.2rem 0 0 } article h2 { margin: 0 }
 h3 { font-size: 1.05rem; margin: 1.4rem 0 .4rem }
 p { margin: .6rem 0 } a { color: #2563c9 } .quiet { opacity: .7 }
 article { border: 1px solid var(--line); border-radius: 12px; padding: 1.25rem 1.5rem; margin: 1.5rem 0 }
@@ -264,17 +270,42 @@ LONGEST_CARD = 1 << 18
 
 
 def page(store: ModelStore) -> str:
-    """The page as HTML; it loads nothing else."""
+    """Return the page for people as HTML. It loads nothing else.
+
+    It begins with an example of a request, because this is what most visitors look for.
+    """
     refused = "".join(f'<p class="refused">Refused: {escape(reason)}</p>' for reason in store.refusals())
-    articles = "".join(map(_article, store.all())) or "<p>No model is loaded.</p>"
+    served = store.all()
+    articles = "".join(map(_article, served)) or "<p>No model is loaded.</p>"
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>isocharge</title><style>{STYLE}</style></head><body>
 <h1>isocharge</h1>
-<p>Where a piezoelectric tactile film is touched and how hard. This server speaks the Open Inference Protocol, version 2
-(<a href="openapi.json">openapi.json</a>). <span class="quiet">Version {escape(server_metadata()["version"])}</span></p>
+<p>Computes where a piezoelectric tactile film is touched, and how hard, from the charges of its electrodes.
+<span class="quiet">Version {escape(server_metadata()["version"])}</span></p>
+{_first_request(served)}
+<h2>Models</h2>
 {refused}{articles}</body></html>
 """
+
+
+def _first_request(served: list[LoadedVersion]) -> str:
+    """Return how to send a press, and what the answer means."""
+    if not served:
+        return ""
+    loaded = served[0]
+    path = f"v2/models/{quote(loaded.metadata.name, safe='')}"
+    meanings = "".join(
+        f"<dt><code>{name}</code></dt><dd>{escape(OUTPUT_MEANINGS[name])}</dd>" for name in loaded.outputs
+    )
+    return f"""<h2>Send a press</h2>
+<p>The numbers are the charges of the electrodes {escape(", ".join(loaded.metadata.electrodes))} in pC: under load minus
+without load.</p>
+<pre>{escape(_example(loaded, path))}</pre>
+<p>Each output of the answer has one row for each press:</p>
+<dl>{meanings}</dl>
+<p>The server speaks the Open Inference Protocol, version 2, so the clients of Triton and KServe work, too.
+<a href="openapi.json">openapi.json</a> describes every route.</p>"""
 
 
 def _article(loaded: LoadedVersion) -> str:
