@@ -1,21 +1,17 @@
-"""What nobody knows of a real film: its parameters, and how they spread about what a sensor's file says.
+"""The unknown parameters of a real film, and how they spread about what a sensor's file says.
 
 Film, coefficients, gains and the place of the electrodes are known to some percent or tenths of a millimetre before
 anything is measured; the pretension is hardly known at all. A calibration starts from this spread, a virtual film is a
 draw from it, and a network for all films is trained over it.
 
-Parameters are deviations from the sensor's file, so that zero is the film as described, but for the pretension, which
-is the pretension itself:
-
-    pretension                     MPa
-    young, thickness, d31, d32     ln(value / described value), dimensionless
-    shift_x, shift_y, rotation     of the electrodes, added to the described ones, mm and rad
-    probe_radius                   added to the described radius, mm
-    gain A, gain B, ...            ln(gain / described gain), dimensionless, by electrode
+`PARAMETERS` declares each parameter once; the gains of the electrodes follow it, one for each electrode. Parameters are
+deviations from the sensor's file, so that zero is the film as described. Only the pretension is the pretension itself.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,9 +19,6 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
-
-SHARED = ("pretension", "young", "thickness", "d31", "d32", "shift_x", "shift_y", "rotation", "probe_radius")
-"""Parameters that every film has; gains follow, one for each electrode."""
 
 REACH = 2.5
 """Largest deviation that a film or a calibration may have, in standard deviations; the pretension ends at `TAUTEST`."""
@@ -70,6 +63,138 @@ class FilmSpread:
                 raise SceneError(f"spread of {field.name}: expected a positive number, got {value}")
 
 
+Components = Mapping[str, Any]
+"""What parameters change: the `film`, `piezo` and `calibration` of a sensor, and the `probe`."""
+
+
+@dataclass(frozen=True)
+class FilmParameter:
+    """Declaration of one unknown parameter of a film.
+
+    Attributes:
+        name: Name of the parameter.
+        unit: Unit of the parameter.
+        component: Which of `Components` it changes.
+        attribute: The attribute of the component.
+        form: "logarithm" for ln(value / described value), "difference" for value - described value, "value" for the
+            value itself.
+        spread: The field of `FilmSpread` with its standard deviation.
+        derivative: How the derivative of the charges is computed: by a "difference" of films, or by "scaling", from the
+            dimensionless groups.
+        item: Index or key of the value, where the attribute is a tuple or a table.
+        file_factor: Factor from its unit to the unit in files of calibrations, which is Pa or m.
+    """
+
+    name: str
+    unit: str
+    component: Literal["film", "piezo", "calibration", "probe"]
+    attribute: str
+    form: Literal["logarithm", "difference", "value"]
+    spread: str
+    derivative: Literal["difference", "scaling"] = "difference"
+    item: int | str | None = None
+    file_factor: float = 1.0
+
+    def mean(self, prior: "FilmPrior") -> float:
+        """Return the mean over films."""
+        del prior
+        return 0.0
+
+    def std(self, prior: "FilmPrior") -> float:
+        """Return the standard deviation over films."""
+        return float(getattr(prior.spread, self.spread))
+
+    def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
+        """Return the smallest and largest value that a film or a calibration may have."""
+        reach = REACH * self.std(prior)
+        return self.mean(prior) - reach, self.mean(prior) + reach
+
+    def described(self, components: Components) -> float:
+        """Return the value of the quantity that a sensor and a probe have; a gain that is not given is 1."""
+        value = getattr(components[self.component], self.attribute)
+        if isinstance(value, Mapping):
+            return float(value.get(self.item, 1.0))
+        return float(value if self.item is None else value[self.item])
+
+    def changed(self, described: float, parameter: float, factor: float) -> float:
+        """Return the value of the quantity for a parameter; `factor` is the exponential of the parameter."""
+        if self.form == "logarithm":
+            return described * factor
+        if self.form == "difference":
+            return described + parameter
+        return parameter
+
+    def from_values(self, value: float, described: float) -> float:
+        """Return the parameter of a value; the inverse of `changed`.
+
+        Raises:
+            ValueError: If the parameter is a logarithm, and the values have different signs.
+        """
+        if self.form == "logarithm":
+            ratio = _ratio(value, described)
+            if ratio <= 0.0:
+                raise ValueError(f"expected the sign of {described:g}, got {value:g}")
+            return float(np.log(ratio))
+        if self.form == "difference":
+            return value - described
+        return value
+
+
+class PretensionParameter(FilmParameter):
+    """The pretension, which is equally likely between none and the largest of the spread."""
+
+    def mean(self, prior: "FilmPrior") -> float:
+        """Return half of the largest pretension."""
+        return 0.5 * prior.spread.pretension
+
+    def std(self, prior: "FilmPrior") -> float:
+        """Return the standard deviation of the uniform distribution."""
+        return prior.spread.pretension / float(np.sqrt(12.0))
+
+    def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
+        """Return no pretension, and somewhat more than the largest of the spread."""
+        return 0.0, TAUTEST * prior.spread.pretension
+
+
+class ProbeRadiusParameter(FilmParameter):
+    """The radius of the probe, which is neither negative nor far from the described one."""
+
+    def std(self, prior: "FilmPrior") -> float:
+        """Return the spread, or less for a small probe."""
+        return min(prior.spread.probe_radius, 0.3 * prior.probe.radius)
+
+    def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
+        """Return the usual bounds, within `PROBES`."""
+        low, high = super().bounds(prior)
+        smallest, largest = PROBES
+        radius = prior.probe.radius
+        return max(low, (smallest - 1.0) * radius), min(high, (largest - 1.0) * radius)
+
+
+PARAMETERS = (
+    PretensionParameter("pretension", "MPa", "film", "pretension", "value", "pretension", file_factor=1e6),
+    FilmParameter("young", "1", "film", "young", "logarithm", "young", "scaling"),
+    FilmParameter("thickness", "1", "film", "thickness", "logarithm", "thickness"),
+    FilmParameter("d31", "1", "piezo", "d31", "logarithm", "d31", "scaling"),
+    FilmParameter("d32", "1", "piezo", "d32", "logarithm", "d32", "scaling"),
+    FilmParameter("shift_x", "mm", "calibration", "shift", "difference", "shift", item=0, file_factor=1e-3),
+    FilmParameter("shift_y", "mm", "calibration", "shift", "difference", "shift", item=1, file_factor=1e-3),
+    FilmParameter("rotation", "rad", "calibration", "rotation", "difference", "rotation"),
+    ProbeRadiusParameter("probe_radius", "mm", "probe", "radius", "difference", "probe_radius", file_factor=1e-3),
+)
+"""Parameters that every film has; gains follow, one for each electrode."""
+
+SHARED = tuple(parameter.name for parameter in PARAMETERS)
+"""Names of these parameters."""
+
+
+def gain_parameter(electrode: str) -> FilmParameter:
+    """Return the declaration of the gain of an electrode."""
+    return FilmParameter(
+        f"gain {electrode}", "1", "calibration", "gain", "logarithm", "gain", "scaling", item=electrode
+    )
+
+
 @dataclass(frozen=True)
 class FilmPrior:
     """The films that a described sensor may be, under a probe whose radius is not exactly known either.
@@ -96,34 +221,49 @@ class FilmPrior:
                 )
 
     @cached_property
+    def parameters(self) -> tuple[FilmParameter, ...]:
+        """Declarations of the parameters, in their order."""
+        return (*PARAMETERS, *(gain_parameter(name) for name in self.sensor.electrode_names))
+
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, in their order."""
-        return (*SHARED, *(f"gain {name}" for name in self.sensor.electrode_names))
+        return tuple(parameter.name for parameter in self.parameters)
+
+    def index(self, name: str) -> int:
+        """Return the place of a parameter in the vector of parameters."""
+        return self.names.index(name)
+
+    @cached_property
+    def gains(self) -> slice:
+        """Places of the gains in the vector of parameters."""
+        return slice(len(PARAMETERS), len(self.parameters))
 
     @cached_property
     def mean(self) -> Array:
         """Means of the parameters, shape (n_parameter,): the film as described, half of the largest pretension."""
-        mean = np.zeros(len(self.names))
-        mean[0] = 0.5 * self.spread.pretension
-        return mean
+        return np.array([parameter.mean(self) for parameter in self.parameters])
 
     @cached_property
     def std(self) -> Array:
         """Standard deviations of the parameters, shape (n_parameter,)."""
-        spread, count = self.spread, len(self.sensor.electrodes)
-        shared = [spread.pretension / np.sqrt(12.0), spread.young, spread.thickness, spread.d31, spread.d32]
-        placed = [spread.shift, spread.shift, spread.rotation, min(spread.probe_radius, 0.3 * self.probe.radius)]
-        return np.array([*shared, *placed, *[spread.gain] * count])
+        return np.array([parameter.std(self) for parameter in self.parameters])
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
         """Smallest and largest parameters that a film or a calibration may have, each of shape (n_parameter,)."""
-        low, high = self.mean - REACH * self.std, self.mean + REACH * self.std
-        low[0], high[0] = 0.0, TAUTEST * self.spread.pretension
-        radius = self.names.index("probe_radius")
-        low[radius] = max(low[radius], (PROBES[0] - 1.0) * self.probe.radius)
-        high[radius] = min(high[radius], (PROBES[1] - 1.0) * self.probe.radius)
+        low, high = np.array([parameter.bounds(self) for parameter in self.parameters]).T
         return low, high
+
+    @cached_property
+    def file_factors(self) -> Array:
+        """Factors from the parameters' units to those in files of calibrations, shape (n_parameter,)."""
+        return np.array([parameter.file_factor for parameter in self.parameters])
+
+    @cached_property
+    def _components(self) -> Components:
+        """Film, coefficients and calibration of the described sensor, and the described probe."""
+        return _components_of(self.sensor, self.probe)
 
     @property
     def described(self) -> Array:
@@ -131,40 +271,51 @@ class FilmPrior:
         return self.parameters_of(self.sensor, self.probe)
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Films drawn from the spread, shape (count, n_parameter); deviations beyond the bounds are drawn again."""
+        """Return films drawn from the spread, shape (count, n_parameter).
+
+        Deviations beyond the bounds are drawn again. All pretensions up to the largest are equally likely.
+        """
         drawn = self.mean + self.std * rng.standard_normal((count, len(self.names)))
         while (outside := (drawn < self.bounds[0]) | (drawn > self.bounds[1])).any():
             again = self.mean + self.std * rng.standard_normal(drawn.shape)
             drawn = np.where(outside, again, drawn)
-        drawn[:, 0] = self.spread.pretension * rng.random(count)
+        drawn[:, self.index("pretension")] = self.spread.pretension * rng.random(count)
         return drawn
 
     def film(self, parameters: Array) -> tuple[Sensor, Circle]:
-        """The sensor and the probe that parameters, shape (n_parameter,), describe.
+        """Return the sensor and the probe that parameters, shape (n_parameter,), describe.
 
         Raises:
             SensorError: If there can be no such sensor: electrodes moved off the film, or a negative pretension.
         """
-        values = dict(zip(self.names, parameters.tolist(), strict=True))
-        factors = dict(zip(self.names, np.exp(parameters).tolist(), strict=True))
-        film, piezo, before = self.sensor.film, self.sensor.piezo, self.sensor.calibration
-        shift = (before.shift[0] + values["shift_x"], before.shift[1] + values["shift_y"])
-        gains = {name: before.gain.get(name, 1.0) * factors[f"gain {name}"] for name in self.sensor.electrode_names}
+        changes: dict[str, dict[str, Any]] = {component: {} for component in self._components}
+        factors = np.exp(parameters)
+        for declared, described, parameter, factor in zip(
+            self.parameters, self._described_values, parameters.tolist(), factors.tolist(), strict=True
+        ):
+            value = declared.changed(described, parameter, factor)
+            component = changes[declared.component]
+            if declared.item is None:
+                component[declared.attribute] = value
+            else:
+                component.setdefault(declared.attribute, {})[declared.item] = value
+        calibration = changes["calibration"]
+        calibration["shift"] = (calibration["shift"][0], calibration["shift"][1])
         sensor = replace(
             self.sensor,
-            film=replace(
-                film,
-                young=film.young * factors["young"],
-                thickness=film.thickness * factors["thickness"],
-                pretension=values["pretension"],
-            ),
-            piezo=replace(piezo, d31=piezo.d31 * factors["d31"], d32=piezo.d32 * factors["d32"]),
-            calibration=replace(before, gain=gains, shift=shift, rotation=before.rotation + values["rotation"]),
+            film=replace(self.sensor.film, **changes["film"]),
+            piezo=replace(self.sensor.piezo, **changes["piezo"]),
+            calibration=replace(self.sensor.calibration, **calibration),
         )
-        return sensor, Circle(self.probe.radius + values["probe_radius"])
+        return sensor, replace(self.probe, **changes["probe"])
+
+    @cached_property
+    def _described_values(self) -> tuple[float, ...]:
+        """Values of the parameters' quantities that the described sensor and probe have."""
+        return tuple(parameter.described(self._components) for parameter in self.parameters)
 
     def parameters_of(self, sensor: Sensor, probe: Circle) -> Array:
-        """The parameters of a sensor that differs from the described one by them alone: the inverse of `film`.
+        """Return the parameters of a sensor that differs from the described one by them alone: the inverse of `film`.
 
         Raises:
             SensorError: If it differs otherwise: other electrodes, another radius, another readout.
@@ -186,29 +337,22 @@ class FilmPrior:
         ):
             if value != expected:
                 raise SensorError(f"{sensor.name}: {what}: expected those of {described.name}, {expected}, got {value}")
-        film, piezo, calibration = sensor.film, sensor.piezo, sensor.calibration
-        before = described.calibration
-        logs = {
-            "young": film.young / described.film.young,
-            "thickness": film.thickness / described.film.thickness,
-            "d31": _ratio(piezo.d31, described.piezo.d31),
-            "d32": _ratio(piezo.d32, described.piezo.d32),
-            **{
-                f"gain {name}": calibration.gain.get(name, 1.0) / before.gain.get(name, 1.0)
-                for name in sensor.electrode_names
-            },
-        }
-        if min(logs.values()) <= 0.0:
-            raise SensorError(f"{sensor.name}: d31 and d32: expected the signs of {described.name}")
-        differences = {
-            "pretension": film.pretension,
-            "shift_x": calibration.shift[0] - before.shift[0],
-            "shift_y": calibration.shift[1] - before.shift[1],
-            "rotation": calibration.rotation - before.rotation,
-            "probe_radius": probe.radius - self.probe.radius,
-            **{name: float(np.log(ratio)) for name, ratio in logs.items()},
-        }
-        return np.array([differences[name] for name in self.names])
+        components = _components_of(sensor, probe)
+        try:
+            values = [
+                parameter.from_values(parameter.described(components), described_value)
+                for parameter, described_value in zip(self.parameters, self._described_values, strict=True)
+            ]
+        except ValueError as error:
+            raise SensorError(
+                f"{sensor.name}: d31 and d32: expected the signs of {described.name} ({error})"
+            ) from error
+        return np.array(values)
+
+
+def _components_of(sensor: Sensor, probe: Circle) -> Components:
+    """Return what parameters change of a sensor and a probe."""
+    return {"film": sensor.film, "piezo": sensor.piezo, "calibration": sensor.calibration, "probe": probe}
 
 
 def _shapes(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
@@ -222,7 +366,10 @@ def _centres(sensor: Sensor) -> str:
 
 
 def _ratio(value: float, described: float) -> float:
-    return 1.0 if value == described == 0.0 else value / described if described else 0.0
+    """Return value / described; 1 if both are zero, and 0 if only the described value is zero."""
+    if described != 0.0:
+        return value / described
+    return 1.0 if value == 0.0 else 0.0
 
 
 def virtual_film(sensor: Sensor, probe: Circle, seed: int) -> tuple[Sensor, Circle]:
