@@ -21,7 +21,6 @@ from isocharge.train.calibration import discrepancy
 from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
 from isocharge.train.calibration.contacts import PressData, with_force
 from isocharge.train.calibration.diagnosis import OFFSET, PRETENSIONS, find_mistakes, misfit
-from isocharge.train.calibration.film_charges import MODE_STDS
 from isocharge.train.calibration.film_fit import fit_film
 from isocharge.train.data.presses import draw_contacts
 
@@ -148,7 +147,7 @@ def test_an_uneven_tension_acts_as_a_lower_one(problem, pretension, force):
     for share in (0.0, 0.4, -0.4):
         uneven = replace(sensor, film=replace(sensor.film, deviator=(0.0, share * pretension)))
         modes = np.zeros(charges.n_coefficient)
-        modes[charges.modes.index("tension_shear")] = share * pretension / MODE_STDS["tension_shear"]
+        modes[charges.modes.index("tension_shear")] = share * pretension / MODES["tension_shear"].std
         solved.append(np.log(touch_charge(uneven, press(uneven.film, probe, (2.0, 1.0), force))).mean())
         known.append(np.log(charges.charges(np.concatenate([parameters, modes]), at)).mean())
     second = [0.5 * (values[1] + values[2]) - values[0] for values in (solved, known)]

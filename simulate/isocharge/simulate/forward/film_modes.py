@@ -1,16 +1,17 @@
-"""What the imperfections of a film do to its charges, to first order: of every film of a family, for any contact.
+"""Charges of the imperfections of a film, to first order: of every film of a family, for any contact.
 
 A film may pull more in one direction than in another, be stiffer along one axis, have another Poisson's ratio or an
 oval clamp; its coefficients may have turned axes and its wires crosstalk. About the isotropic round film each of these
-is a mode whose charges `ModeMap` gives. Those of the film's mechanics are fields of stress
-(`solver.sensitivity`), solved like the family itself on a grid of distance, load and tension, for the family's middle
-thickness and probe: they are corrections.
+is a mode. `MODES` declares each mode once, and `ModeMap` computes its charges. The modes of the film's mechanics use
+fields of stress (`solver.sensitivity`), which are solved like the family itself on a grid of distance, load and tension
+for the family's middle thickness and probe, since they are corrections.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -18,38 +19,130 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, SceneError
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.family import Family, solve_films
-from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, bits_of, decompose, quantised
+from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, FilmLimits, bits_of, decompose, quantised
 from isocharge.simulate.forward.forward_map import EVEN, ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
+from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.template import template_for
-from isocharge.simulate.sensor.film import Film, Piezo
+from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.sensitivity import FIELDS, ODD, stress_changes
 
-if TYPE_CHECKING:
-    from isocharge.simulate.forward.film_family import FilmFamily
+
+@dataclass(frozen=True)
+class PressedFilm:
+    """Presses on one film as modes take them.
+
+    Attributes:
+        film: Forward map of the film.
+        contact: (x, y, F), shape (n, 3), mm and N.
+        fields: Charges of the solved fields by kind of imperfection, each of shape (n, n_electrode), pC per unit: the
+            even field, and the odd one of a kind with two axes. Only the fields that the modes need are there.
+    """
+
+    film: ForwardMap
+    contact: Array
+    fields: Mapping[str, tuple[Array, ...]]
+
+    @cached_property
+    def twice_angle(self) -> Array:
+        """Twice the angle of each press about the centre, shape (n, 1), rad."""
+        return 2.0 * np.arctan2(self.contact[:, 1], self.contact[:, 0])[:, None]
+
+    @cached_property
+    def tension_scale(self) -> Array:
+        """Tension that one unit of the tension fields stands for, shape (n, 1), MPa."""
+        film = self.film.sensor.film
+        return np.asarray(film.young * amplitude_squared(film, self.contact[:, 2]) + film.pretension)[:, None]
+
+    def even_and_odd(self, kind: str) -> tuple[Array, Array]:
+        """Return the charges of the two fields of an imperfection with two axes, per unit of its modes."""
+        even, odd = self.fields[kind]
+        if kind == "tension":
+            return even / self.tension_scale, odd / self.tension_scale
+        return even, odd
+
+
+def _along(kind: str) -> Callable[[PressedFilm], Array]:
+    """Return the charges of an imperfection with two axes, along x and y."""
+
+    def charges(press: PressedFilm) -> Array:
+        even, odd = press.even_and_odd(kind)
+        return np.cos(press.twice_angle) * even - np.sin(press.twice_angle) * odd
+
+    return charges
+
+
+def _across(kind: str) -> Callable[[PressedFilm], Array]:
+    """Return the charges of an imperfection with two axes, along the diagonals."""
+
+    def charges(press: PressedFilm) -> Array:
+        even, odd = press.even_and_odd(kind)
+        return np.sin(press.twice_angle) * even + np.cos(press.twice_angle) * odd
+
+    return charges
+
+
+def _poisson(press: PressedFilm) -> Array:
+    """Return the charges of another Poisson's ratio."""
+    (even,) = press.fields["poisson"]
+    return even
+
+
+def _d12(press: PressedFilm) -> Array:
+    """Return the charges of shear."""
+    shear_sensor = replace(press.film.sensor, piezo=Piezo(0.0, 0.0, d12=1.0))
+    return np.asarray(replace(press.film, sensor=shear_sensor).by_field(press.contact, EVEN)[..., 0])
+
+
+def _crosstalk(press: PressedFilm) -> Array:
+    """Return the charges of all other electrodes."""
+    own = press.film.by_field(press.contact, EVEN)[..., 0]
+    return np.asarray(own.sum(axis=1, keepdims=True) - own)
+
+
+@dataclass(frozen=True)
+class Mode:
+    """Declaration of one mode of imperfection.
+
+    Attributes:
+        meaning: What the value of the mode is.
+        unit: Unit of the mode.
+        std: Standard deviation over films that have imperfections, in this unit.
+        charges: Function that returns the derivative of the charges by the mode at none of it, shape (n, n_electrode),
+            pC per unit of the mode.
+        field: Kind of imperfection of `sensitivity.FIELDS` whose fields the mode needs; empty if none.
+        is_uneven_tension: Whether the mode lowers the tension of the film to second order.
+    """
+
+    meaning: str
+    unit: str
+    std: float
+    charges: Callable[[PressedFilm], Array]
+    field: str = ""
+    is_uneven_tension: bool = False
+
+
+OVAL = "e of a rim at radius * (1 + e cos 2 (angle - alpha)), times"
+STIFFNESS = "ln(E1 / E2), axis 1 at an angle from x, times"
 
 MODES = {
-    "tension_difference": "MPa",
-    "tension_shear": "MPa",
-    "stiffness_x": "1",
-    "stiffness_xy": "1",
-    "poisson": "1",
-    "oval_x": "1",
-    "oval_xy": "1",
-    "d12": "pC/N",
-    "crosstalk": "1",
+    "tension_difference": Mode(
+        "(T11 - T22) / 2", "MPa", 0.25, _along("tension"), field="tension", is_uneven_tension=True
+    ),
+    "tension_shear": Mode("T12", "MPa", 0.15, _across("tension"), field="tension", is_uneven_tension=True),
+    "stiffness_x": Mode(f"{STIFFNESS} cos of twice the angle", "1", 0.12, _along("stiffness"), field="stiffness"),
+    "stiffness_xy": Mode(f"{STIFFNESS} sin of twice the angle", "1", 0.06, _across("stiffness"), field="stiffness"),
+    "poisson": Mode("added to the family's Poisson's ratio", "1", 0.03, _poisson, field="poisson"),
+    "oval_x": Mode(f"{OVAL} cos 2 alpha", "1", 0.006, _along("oval"), field="oval"),
+    "oval_xy": Mode(f"{OVAL} sin 2 alpha", "1", 0.006, _across("oval"), field="oval"),
+    "d12": Mode(
+        "charge of shear, 2 d12 s12: (d31 - d32) / 2 times sin of twice the angle of the axes", "pC/N", 0.3, _d12
+    ),
+    "crosstalk": Mode("share of every other electrode's charge that an electrode reads", "1", 0.01, _crosstalk),
 }
-"""Names of the modes and their units.
-
-    tension_difference, tension_shear   (T11 - T22) / 2 and T12
-    stiffness_x, stiffness_xy           ln(E1 / E2) times cos and sin of twice the angle of axis 1 from x
-    poisson                             added to the family's Poisson's ratio
-    oval_x, oval_xy                     e of a rim at radius * (1 + e cos 2 (angle - alpha)), by cos and sin of 2 alpha
-    d12                                 charge of shear, 2 d12 s12: (d31 - d32) / 2 times sin of twice the angle of axes
-    crosstalk                           share of every other electrode's charge that an electrode reads
-"""
+"""All modes by name, in the order of their coefficients."""
 
 COUNTS = (5, 8, 7, 1, 1)
 """Nodes along each of `AXES`."""
@@ -92,40 +185,42 @@ class ModeMap:
         """
         contact = np.asarray(contact, dtype=float)
         self.film.domain.check(contact, "film's modes")
-        angle = 2.0 * np.arctan2(contact[:, 1], contact[:, 0])[:, None]
-        columns: dict[str, Array] = {}
-        if self.fields is not None:
-            sensor = self.film.sensor
-            by_field = self.fields.by_field(contact, ODD[list(self.which)])
-            charge = dict(zip(self.which, np.moveaxis(by_field, 2, 0), strict=True))
-            scale = sensor.film.young * amplitude_squared(sensor.film, contact[:, 2]) + sensor.film.pretension
-            for kind, (along, across) in PAIRS.items():
-                first = KINDS.index(kind)
-                if first in charge:
-                    per_unit = scale[:, None] if kind == "tension" else 1.0
-                    even, odd = charge[first] / per_unit, charge[first + 1] / per_unit
-                    columns[along] = np.cos(angle) * even - np.sin(angle) * odd
-                    columns[across] = np.sin(angle) * even + np.cos(angle) * odd
-            if "poisson" in self.names:
-                columns["poisson"] = charge[KINDS.index("poisson")]
-        if "d12" in self.names:
-            shear = replace(self.film, sensor=replace(self.film.sensor, piezo=Piezo(0.0, 0.0, d12=1.0)))
-            columns["d12"] = shear.by_field(contact, EVEN)[..., 0]
-        if "crosstalk" in self.names:
-            own = self.film.by_field(contact, EVEN)[..., 0]
-            columns["crosstalk"] = own.sum(axis=1, keepdims=True) - own
-        return np.stack([columns[name] for name in self.names], axis=2)
+        press = PressedFilm(self.film, contact, self._charges_of_fields(contact))
+        return np.stack([MODES[name].charges(press) for name in self.names], axis=2)
+
+    def _charges_of_fields(self, contact: Array) -> dict[str, tuple[Array, ...]]:
+        """Return the charges of the fields, each of shape (n, n_electrode), by kind of imperfection."""
+        if self.fields is None:
+            return {}
+        by_field = self.fields.by_field(contact, ODD[list(self.which)])
+        charges: dict[str, tuple[Array, ...]] = {}
+        for number, charge in zip(self.which, np.moveaxis(by_field, 2, 0), strict=True):
+            charges[KINDS[number]] = (*charges.get(KINDS[number], ()), charge)
+        return charges
 
 
 KINDS = [kind for kind, fields in FIELDS.items() for _ in fields]
 """Kind of imperfection of each field, in the order of their numbers; of the two of a kind the even one comes first."""
 
-PAIRS = {
-    "tension": ("tension_difference", "tension_shear"),
-    "stiffness": ("stiffness_x", "stiffness_xy"),
-    "oval": ("oval_x", "oval_xy"),
-}
-"""Modes with two axes."""
+
+class SolvedFilms(Protocol):
+    """The films of a family, as far as the fields of their modes depend on them; see `FilmFamily`."""
+
+    @property
+    def surface(self) -> Surface:
+        """Where in the thickness the stress is read."""
+
+    @property
+    def limits(self) -> FilmLimits:
+        """Smallest and largest value along each axis of the grid."""
+
+    @property
+    def resolution(self) -> Resolution:
+        """Mesh of the solves."""
+
+    @property
+    def layer(self) -> float:
+        """Width of the thin rings at the rim over the film's radius."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +238,7 @@ class FilmModes:
     parts: Array
 
     @classmethod
-    def build(cls, family: "FilmFamily", film: Film, executor: Executor | None = None) -> "FilmModes":
+    def build(cls, family: SolvedFilms, film: Film, executor: Executor | None = None) -> "FilmModes":
         """Solve the fields, for some three hundred presses.
 
         Args:
@@ -169,8 +264,7 @@ class FilmModes:
         unknown = sorted(set(names) - set(MODES))
         if unknown:
             raise SceneError(f"modes: expected some of {', '.join(MODES)}, got {', '.join(unknown)}")
-        kinds = [kind for kind, modes in PAIRS.items() if set(modes) & set(names)]
-        kinds += ["poisson"] * ("poisson" in names)
+        kinds = {MODES[name].field for name in names}
         which = tuple(number for number, kind in enumerate(KINDS) if kind in kinds)
         return ModeMap(tuple(names), film, self._table(film, which) if which else None, which)
 

@@ -1,7 +1,7 @@
 """Charges of presses on any film of a prior, with their derivatives by the contact and by what is unknown of the film.
 
 A film is given by the parameters of `FilmPrior`, after which the coefficients of what it has besides may stand: of the
-modes of its imperfections, `MODE_STDS` their units, and of its discrepancy.
+modes of its imperfections in units of their standard deviations, and of its discrepancy.
 """
 
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate import Circle, Film, ForwardMap, Probe, Sensor
 from isocharge.simulate.forward.charge_map import Domain, FunctionMap, differences
 from isocharge.simulate.forward.film_family import FilmFamily
@@ -19,13 +19,13 @@ from isocharge.simulate.forward.forward_map import EVEN
 from isocharge.simulate.forward.readout import ReadoutPoints
 from isocharge.simulate.numerics.disk import onto_disk
 from isocharge.simulate.numerics.polygon import area_of
-from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
+from isocharge.simulate.sensor.film_prior import PARAMETERS, SHARED, FilmPrior
 from isocharge.train.calibration.discrepancy import TRACE_ANGLES, term_count, terms
 
 STEP = 0.005
 """Step of the differences by a parameter, in standard deviations of its prior: the map is smooth on that scale."""
 
-STEPPED = ("pretension", "thickness", "shift_x", "shift_y", "rotation", "probe_radius")
+STEPPED = tuple(parameter.name for parameter in PARAMETERS if parameter.derivative == "difference")
 """Parameters whose derivatives are differences."""
 
 CONTACT_STEPS = (5e-3, 5e-3, 1e-3)
@@ -34,29 +34,18 @@ CONTACT_STEPS = (5e-3, 5e-3, 1e-3)
 REMEMBERED = 8
 """Forward maps that are remembered."""
 
-MODE_STDS = {
-    "tension_difference": 0.25,
-    "tension_shear": 0.15,
-    "stiffness_x": 0.12,
-    "stiffness_xy": 0.06,
-    "poisson": 0.03,
-    "oval_x": 0.006,
-    "oval_xy": 0.006,
-    "d12": 0.3,
-    "crosstalk": 0.01,
-}
-"""Standard deviations of the modes over films that have imperfections, in their units."""
-
 TRACE_STD_MM = 0.5
 """Standard deviation of the width of a trace that is not described, mm."""
 
 TRACE_END = 0.93
 """Distance from the centre at which such traces end, over the film's radius: four millimetres matter little."""
 
-UNEVEN, MOST_UNEVEN = ("tension_difference", "tension_shear"), 0.9
-"""Modes that act on all charges alike to second order, and the largest square of theirs over that of the mean tension:
-a membrane with tensions T +- e along two axes sags as one of sqrt(T^2 - e^2) all round, the less the more the press
-itself stretches it: ln Q grows by (1 - sqrt(1 - (e / T)^2)) x (1 - (1 - x / 2)^SLACKENING), x = -d ln Q / d ln T."""
+LARGEST_UNEVENNESS = 0.9
+"""Largest square of the uneven tension over that of the mean tension.
+
+Modes with `is_uneven_tension` act on all charges alike to second order: a membrane with tensions T +- e along two axes
+sags as one of sqrt(T^2 - e^2) all round, the less the more the press itself stretches it: ln Q grows by
+(1 - sqrt(1 - (e / T)^2)) x (1 - (1 - x / 2)^SLACKENING), x = -d ln Q / d ln T."""
 
 SLACKENING = 1.75
 """Fitted to full solves of 0.6 to 2 MPa, 0.05 to 1.6 N, two places, which it meets to 5 % where x is above 0.1."""
@@ -116,6 +105,16 @@ class FilmCharges:
     def modes(self) -> tuple[str, ...]:
         """Names of the modes that these films have; none in a family of before they were solved."""
         return tuple(MODES) if self.family.imperfections else ()
+
+    @cached_property
+    def _mode_stds(self) -> Array:
+        """Standard deviations of the modes, in their units, shape (n_mode,)."""
+        return np.array([MODES[name].std for name in self.modes])
+
+    @cached_property
+    def _is_uneven_tension(self) -> Booleans:
+        """Which modes lower the tension to second order, shape (n_mode,)."""
+        return np.array([MODES[name].is_uneven_tension for name in self.modes], dtype=bool)
 
     @property
     def n_coefficient(self) -> int:
@@ -226,18 +225,18 @@ class FilmCharges:
             by_mode = replace(known, film=forward_map, fields=fields).by_mode(contact)
             falls = -parameters[0] * self._by_step("pretension", parameters, contact, charge) / charge
             of_uneven = falls * (1.0 - np.clip(1.0 - 0.5 * falls, 0.0, 1.0) ** SLACKENING)
-            last = _Modes(known, sensor, contact, by_mode * [MODE_STDS[name] for name in self.modes], of_uneven)
+            last = _Modes(known, sensor, contact, by_mode * self._mode_stds, of_uneven)
             if key not in self._last_modes and len(self._last_modes) > 1:
                 del self._last_modes[next(iter(self._last_modes))]
             self._last_modes[key] = last
         return last
 
     def _unevenness(self, pretension: float, of_modes: Array) -> tuple[float, Array]:
-        """Share by which an uneven tension acts as a lower one, and its derivatives by the modes over `MODE_STDS`."""
-        share = np.array([MODE_STDS[name] * (name in UNEVEN) for name in self.modes]) / max(pretension, LEAST_TENSION)
+        """Return the share by which an uneven tension acts as a lower one, and its derivatives by the coefficients."""
+        share = np.where(self._is_uneven_tension, self._mode_stds, 0.0) / max(pretension, LEAST_TENSION)
         square = float(((share * of_modes) ** 2).sum())
-        root = np.sqrt(1.0 - min(square, MOST_UNEVEN))
-        return 1.0 - root, share**2 * of_modes / root * (square < MOST_UNEVEN)
+        root = np.sqrt(1.0 - min(square, LARGEST_UNEVENNESS))
+        return 1.0 - root, share**2 * of_modes / root * (square < LARGEST_UNEVENNESS)
 
     @cached_property
     def _last_modes(self) -> dict[tuple[Film, Probe], "_Modes"]:
@@ -297,7 +296,7 @@ class FilmCharges:
         modes = self._by_mode(parameters, contact, charge)
         by_trace = self._by_trace(film, contact)
         by_uneven = self._unevenness(parameters[0], coefficients[: len(self.modes)])[1]
-        of_tension = np.isin(self.modes, UNEVEN)  # as the pretension, they count over E
+        of_tension = self._is_uneven_tension  # as the pretension, they count over E
         of_modes = modes.by_mode + factor * (charge * modes.of_uneven)[:, :, None] * by_uneven
         of_film[:, :, 1] -= of_modes @ (coefficients[: len(self.modes)] * of_tension) * self.prior.std[1]
         of_terms = (factor * own)[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
