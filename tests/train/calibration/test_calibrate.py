@@ -17,11 +17,12 @@ from isocharge.simulate.sensor.film_prior import SHARED
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.simulate.solver.stress_limit import largest_stress
 from isocharge.train import CalibrationProblem, calibrate, next_presses
-from isocharge.train.calibration import discrepancy
+from isocharge.train.calibration import hypotheses
 from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
-from isocharge.train.calibration.contacts import PressData, with_force
+from isocharge.train.calibration.contacts import with_force
 from isocharge.train.calibration.diagnosis import OFFSET, PRETENSIONS, find_mistakes, misfit
 from isocharge.train.calibration.film_fit import fit_film
+from isocharge.train.calibration.press_data import PressData
 from isocharge.train.data.presses import draw_contacts
 
 
@@ -68,7 +69,7 @@ def test_derivatives_contain_what_a_parameter_does_to_the_rest(problem, names, b
 @pytest.mark.parametrize(("count", "seed"), [(4, 11), (6, 2)], ids=["inside", "on a bound"])
 def test_it_is_the_minimum_of_the_joint_problem(count, seed, problem, monkeypatch):
     """SciPy over parameters and contacts together, with differences for derivatives, finds the same film."""
-    monkeypatch.setattr(discrepancy, "hypotheses", lambda: [discrepancy.Hypothesis()])
+    monkeypatch.setattr(hypotheses, "hypotheses", lambda: [hypotheses.Hypothesis()])
     charges, prior = problem.charges, problem.prior
     truth, presses = rig(problem, count, seed=seed)
     data, ours, n = data_of(problem, presses), fit(problem, presses), len(presses)
@@ -97,7 +98,7 @@ def test_hypotheses_are_weighed_by_their_evidence():
     rng = np.random.default_rng(2)
     design, data = rng.normal(size=(12, 5)), rng.normal(size=12)
     before = np.diag([1.0, 0.25, 4.0, 1.0, 0.0])  # the last is excluded
-    mean, covariance = (linearised := discrepancy.Linearised.of(design, data, np.zeros(5))).given(before)
+    mean, covariance = (linearised := hypotheses.Linearised.of(design, data, np.zeros(5))).given(before)
     of_data = np.eye(12) + design @ before @ design.T
     density = multivariate_normal(np.zeros(12), of_data).logpdf(data) + 6.0 * np.log(2.0 * np.pi)
     assert linearised.evidence(before) == pytest.approx(density, rel=1e-9)
@@ -109,16 +110,16 @@ def test_hypotheses_are_weighed_by_their_evidence():
 def test_a_mixture_has_the_moments_of_its_parts():
     """Second moments about zero, weighed by evidence and belief."""
     rng = np.random.default_rng(4)
-    linearised = discrepancy.Linearised.of(rng.normal(size=(12, 3)), rng.normal(size=12), np.zeros(3))
+    linearised = hypotheses.Linearised.of(rng.normal(size=(12, 3)), rng.normal(size=12), np.zeros(3))
     before = {
-        discrepancy.Hypothesis(belief=0.7): np.eye(3),
-        discrepancy.Hypothesis(size=1.0, belief=0.3): np.eye(3) / 4,
+        hypotheses.Hypothesis(belief=0.7): np.eye(3),
+        hypotheses.Hypothesis(size=1.0, belief=0.3): np.eye(3) / 4,
     }
     parts = [(linearised.evidence(each), *linearised.given(each)) for each in before.values()]
     weight = np.exp([logs for logs, *_ in parts]) * [0.7, 0.3]
     weight /= weight.sum()
     second = sum(w * (own + np.outer(mean, mean)) for w, (_, mean, own) in zip(weight, parts, strict=True))
-    found = discrepancy.weigh({0.0: linearised}, before.get, before)
+    found = hypotheses.weigh({0.0: linearised}, before.get, before)
     np.testing.assert_allclose(found.mean, weight @ [mean for _, mean, _ in parts])
     np.testing.assert_allclose(found.covariance + np.outer(found.mean, found.mean), second)
     assert list(found.weights.values()) == pytest.approx(weight)
@@ -131,7 +132,7 @@ def test_scatter_of_forces_is_noise_along_one_direction_of_each_press():
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     variance, none = np.array([0.0, 0.5, 9.0]), np.zeros(2)
     along = np.einsum("nk,nku->nu", direction, design), (direction * data).sum(axis=1)
-    linearised = discrepancy.Linearised.of(design.reshape(12, 2), data.ravel(), none).less(*along, none, variance)
+    linearised = hypotheses.Linearised.of(design.reshape(12, 2), data.ravel(), none).less(*along, none, variance)
     noise = block_diag(*(np.eye(4) + v * np.outer(d, d) for v, d in zip(variance, direction, strict=True)))
     of_data = noise + design.reshape(12, 2) @ design.reshape(12, 2).T
     density = multivariate_normal(np.zeros(12), of_data).logpdf(data.ravel()) + 6.0 * np.log(2.0 * np.pi)

@@ -12,8 +12,8 @@ from isocharge.common.json_values import plain_values
 from isocharge.serve import Predictor, check_presses, read_presses, write_presses
 from isocharge.simulate import Circle, load_sensor, press, touch_charge
 from isocharge.train import calibrate, read_earlier, write_calibration
-from isocharge.train.calibration.contacts import temperatures
 from isocharge.train.calibration.folder import read_moved, result_table
+from isocharge.train.calibration.press_data import temperatures
 from isocharge.train.calibration.problem import DRIFT, THERMOMETER
 from isocharge.train.data.presses import draw_contacts
 from kept import kept

@@ -14,10 +14,10 @@ from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.simulate import Circle, Sensor
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
-from isocharge.train.calibration.contacts import PressData, temperatures
 from isocharge.train.calibration.diagnosis import check_channels, check_places, explain, find_mistakes, misfit, outside
-from isocharge.train.calibration.discrepancy import Hypothesis
 from isocharge.train.calibration.film_fit import MISTAKEN, PROBABLE, FilmPosterior, fit_film
+from isocharge.train.calibration.hypotheses import Hypothesis
+from isocharge.train.calibration.press_data import PressData, temperatures
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity, quantities, summarise
 from isocharge.train.training.fitted import Fitted

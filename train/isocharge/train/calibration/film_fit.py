@@ -20,9 +20,7 @@ from scipy.optimize import least_squares
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 from isocharge.train.calibration.contacts import (
-    NUISANCES,
     AdjustedContacts,
-    PressData,
     adjust_contacts,
     films_of,
     projected,
@@ -30,8 +28,9 @@ from isocharge.train.calibration.contacts import (
     sum_over,
     with_force,
 )
-from isocharge.train.calibration.discrepancy import SCATTERS, Hypothesis, Linearised, Mixture, weigh
 from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.hypotheses import SCATTERS, Hypothesis, Linearised, Mixture, weigh
+from isocharge.train.calibration.press_data import NUISANCES, PressData
 from isocharge.train.calibration.problem import PER_KELVIN, FilmEstimate, Warming
 
 HEAVY_TAILS = 4.0

@@ -14,9 +14,9 @@ from isocharge.common.errors import ModelError, PressError, SceneError, SensorEr
 from isocharge.serve.model.model_folder import find_model, model_names, repositories
 from isocharge.simulate import Circle, Domain, FilmPrior, NoiseModel, Probe, Sensor
 from isocharge.simulate.solver.stress_limit import force_within_stress
-from isocharge.train.calibration.contacts import NUISANCES
-from isocharge.train.calibration.discrepancy import Hypothesis
 from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.hypotheses import Hypothesis
+from isocharge.train.calibration.press_data import NUISANCES
 from isocharge.train.films.films_file import FILE, read_films
 from isocharge.train.films.films_model import FilmsModel
 from isocharge.train.training.fitted import Fitted

@@ -17,8 +17,9 @@ from isocharge.simulate import ForwardMap, NoiseModel
 from isocharge.simulate.forward.charge_map import ChargeMap, Domain, differences
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.calibrate import CalibrationResult, calibrate
-from isocharge.train.calibration.discrepancy import Hypothesis, Linearised, term_count, terms, weigh
+from isocharge.train.calibration.discrepancy import term_count, terms
 from isocharge.train.calibration.film_charges import CONTACT_STEPS
+from isocharge.train.calibration.hypotheses import Hypothesis, Linearised, weigh
 from isocharge.train.calibration.problem import CalibrationProblem
 
 SIZES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
