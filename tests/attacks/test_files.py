@@ -242,7 +242,7 @@ def test_calibrations_with_faults(calibration, tmp_path, attack):
         path.write_bytes(data)
         film = read_earlier(tmp_path, problem, knows_temperature=True)
         assert np.isfinite(film.unknowns).all()
-        np.linalg.cholesky(film.of_unknowns)
+        np.linalg.cholesky(film.unknown_covariance)
 
     for kind, good in (("film", plain), ("film with discrepancy", table)):
         text = json.dumps(good).encode()

@@ -27,7 +27,7 @@ from isocharge.train.data.presses import draw_contacts
 
 
 def data_of(problem, presses) -> PressData:
-    return PressData.of(presses, problem.noise, problem.charges)
+    return PressData.of(presses, problem.noise, problem.charges.domain)
 
 
 def fit(problem, presses):

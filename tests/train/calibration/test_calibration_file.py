@@ -222,7 +222,7 @@ def test_any_change_of_a_calibration_file_is_refused_or_gives_a_film(data, table
         assert len(message) < 2000
         return
     assert np.isfinite(film.unknowns).all()
-    assert np.isfinite(film.of_unknowns).all()
-    np.linalg.cholesky(film.drifted(problem.prior).of_unknowns)
+    assert np.isfinite(film.unknown_covariance).all()
+    np.linalg.cholesky(film.drifted(problem.prior).unknown_covariance)
     if film.warming is not None:
         assert np.isfinite([film.warming.MPa_per_K, film.warming.std, film.warming.at_C]).all()

@@ -17,6 +17,7 @@ from isocharge.train.calibration.contact_error import ContactError, ContactSensi
 from isocharge.train.calibration.diagnosis import check_channels, check_places, explain, find_mistakes, misfit, outside
 from isocharge.train.calibration.film_fit import MISTAKEN, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.hypotheses import Hypothesis
+from isocharge.train.calibration.nuisances import NUISANCES, NuisanceEstimate
 from isocharge.train.calibration.press_data import PressData, temperatures
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity, quantities, summarise
@@ -99,7 +100,7 @@ class CalibrationResult:
         """The same before the presses, or before it was moved."""
         before, covariance = self.problem.before, np.zeros_like(self.posterior.joint)
         known = len(before.unknowns)
-        covariance[:known, :known] = before.of_unknowns
+        covariance[:known, :known] = before.unknown_covariance
         if not self.moved:
             return self.sensitivity.left(covariance)
         unknowns = np.pad(before.unknowns, (0, len(covariance) - known))
@@ -226,7 +227,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
     at_C = float(temperatures(presses).mean()) if presses.knows_temperature else None
     if at_C is not None:
         problem = replace(problem, earlier=problem.before.at_temperature(at_C, problem.prior))
-    data = PressData.of(presses, problem.noise, problem.charges)
+    data = PressData.of(presses, problem.noise, problem.charges.domain)
     with threadpool_limits(1):  # many small matrices: a second thread only waits
         posterior = fit_film(problem.charges, data, problem.before, at_C)
     _refuse_unexplained(presses, problem, posterior)
@@ -242,24 +243,31 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
 
 
 def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved: str) -> CalibrationResult:
-    """What `problem` knows before any press, `moved` to a film at another temperature, as a calibration."""
-    none, known, count = np.empty(0), len(film.unknowns), problem.charges.n_coefficient
-    joint = np.zeros((film.parameters.size + count,) * 2)
-    joint[:known, :known] = film.of_unknowns
+    """Return an estimate of a film as a calibration result without presses.
+
+    Args:
+        problem: The calibration.
+        film: The estimate.
+        moved: How an earlier calibration was moved to another temperature, for people.
+    """
+    layout = problem.charges.layout
+    joint = np.zeros((layout.film_count, layout.film_count))
+    estimated = slice(0, len(film.unknowns))
+    joint[estimated, estimated] = film.unknown_covariance
+    has_coefficients = film.coefficients.size > 0
     posterior = FilmPosterior(
         parameters=film.parameters,
         covariance=film.covariance,
-        coefficients=film.coefficients if film.coefficients.size else np.zeros(count),
+        coefficients=film.coefficients if has_coefficients else np.zeros(layout.coefficient_count),
         joint=joint,
-        warming=film.warming and film.warming.of_unknowns(len(joint)),
+        warming=film.warming and film.warming.with_unknowns(layout.film_count),
         contact=np.empty((0, 3)),
-        chi2=none,
-        freedom=none,
-        bad=none.astype(bool),
-        offset_pC=(0.0, 0.0),
-        drift=(0.0, 0.0),
+        chi2=np.empty(0),
+        freedom=np.empty(0),
+        bad=np.empty(0, dtype=bool),
+        nuisances={nuisance.name: NuisanceEstimate(0.0, 0.0) for nuisance in NUISANCES},
         scatter=0.0,
-        weights={Hypothesis(modes=float(film.coefficients.size > 0)): 1.0},
+        weights={Hypothesis(modes=float(has_coefficients)): 1.0},
     )
     return CalibrationResult(problem, no_presses(problem.electrodes), posterior, moved=moved)
 
@@ -302,7 +310,7 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
     """Allow for wrong presses that so few cannot show: with their chance, no more is known than before."""
     good, left_out = int((~posterior.bad).sum()), int(posterior.bad.sum())
     chance = MISTAKEN * (good if good <= FEW else 0) + min(left_out / (good * good), 0.5)
-    joint, of_before, count = (1.0 - chance) * posterior.joint, before.of_unknowns, len(before.unknowns)
+    joint, of_before, count = (1.0 - chance) * posterior.joint, before.unknown_covariance, len(before.unknowns)
     joint[:count, :count] += chance * of_before
     warming, n = posterior.warming, len(before.parameters)
     warming = warming and warming._replace(covariance=(1.0 - chance) * warming.covariance)
@@ -319,12 +327,9 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
             f"only {len(good)} press{'es' if len(good) > 1 else ''}: a wrong one among so few cannot be seen, and the "
             "errors allow for it; more than three tell far more"
         )
-    for what, (value, std), unit, meaning in (
-        ("offset", posterior.offset_pC, "pC", "too large in all presses and electrodes: is the tare right"),
-        ("drift", tuple(100.0 * number for number in posterior.drift), "%", "larger at the end than at the beginning"),
-    ):
-        if posterior.probability(what) > PROBABLE:
-            yield f"the charges are {value:.2g} +- {std:.2g} {unit} {meaning}? It is taken off"
+    for nuisance in NUISANCES:
+        if posterior.probability(nuisance.name) > PROBABLE:
+            yield nuisance.caution(posterior.nuisances[nuisance.name])
     if posterior.probability("scatter") > PROBABLE:
         yield (
             f"forces scatter {100.0 * posterior.scatter:.2g} % about those of the charges, over what they are said to: "

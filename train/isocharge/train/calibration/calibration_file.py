@@ -19,13 +19,14 @@ from isocharge.common.errors import PressError, cut, shown
 from isocharge.common.structs import Finite, NotNegative, Text, read_json
 from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.train.calibration.film_fit import FilmPosterior
-from isocharge.train.calibration.problem import PER_KELVIN, CalibrationProblem, FilmEstimate, Warming
+from isocharge.train.calibration.nuisances import PRETENSION_PER_KELVIN
+from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate, Warming
 
 FORMAT_VERSION = 1
 """Version of the format, which is written and read."""
 
-FILE_UNITS = {"pretension": 1e6, "shift_x": 1e-3, "shift_y": 1e-3, "probe_radius": 1e-3}
-"""Factors from the parameters' units to those in calibration.json, which are Pa and m; one for all others."""
+PASCAL_FACTOR = 1e6
+"""Factor from MPa to Pa, in which the file has the pretension."""
 
 LARGEST_STD = 100.0
 """Largest standard deviation that the reader accepts, in standard deviations of the prior."""
@@ -91,7 +92,7 @@ def film_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, Any]:
 
 def _parameter_table(prior: FilmPrior, posterior: FilmPosterior) -> dict[str, dict[str, float]]:
     """Return value and standard deviation of each parameter by its name, in the units of the file."""
-    units = _file_units(prior)
+    units = prior.file_factors
     values = units * posterior.parameters
     stds = units * prior.std * np.sqrt(np.diag(posterior.covariance))
     return {
@@ -133,7 +134,7 @@ def _temperature_table(posterior: FilmPosterior) -> dict[str, Any] | None:
     warming = posterior.warming
     if warming is None:
         return None
-    unit = FILE_UNITS["pretension"]
+    unit = PASCAL_FACTOR
     stored_covariance = posterior.joint if posterior.imperfect else posterior.covariance
     std = np.sqrt(np.diag(stored_covariance))
     correlations = _over_std(warming.covariance[: std.size], warming.std * std)
@@ -189,12 +190,12 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
     else:
         correlations = _with_temperature(path, table.temperature, correlations, std)
         change = table.temperature.pretension_per_K
-        change_std = change.std / FILE_UNITS["pretension"]
+        change_std = change.std / PASCAL_FACTOR
         all_std = np.append(std, change_std)
         all_covariance = _possible(path, correlations) * np.outer(all_std, all_std)
         covariance = all_covariance[: std.size, : std.size]
         warming = Warming(
-            MPa_per_K=change.value / FILE_UNITS["pretension"],
+            MPa_per_K=change.value / PASCAL_FACTOR,
             std=change_std,
             at_C=table.temperature.at_C,
             covariance=all_covariance[: std.size, std.size],
@@ -210,7 +211,7 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
 
 def _read_parameters(path: Path, table: _CalibrationFile, prior: FilmPrior) -> tuple[Array, Array]:
     """Return the parameters, and their standard deviations over those of the prior, each of shape (n_parameter,)."""
-    units = _file_units(prior)
+    units = prior.file_factors
     parameters = np.array([estimate.value for estimate in table.parameters.values()]) / units
     lower, upper = prior.bounds
     tolerance = BOUND_TOLERANCE * prior.std
@@ -268,7 +269,7 @@ def _read_coefficients(
 def _with_temperature(path: Path, table: _Temperature, correlations: Array, std: Array) -> Array:
     """Return a matrix of correlations with a last row and column for the change of the pretension with temperature."""
     change = table.pretension_per_K
-    largest_Pa_per_K = LARGEST_STD * PER_KELVIN * FILE_UNITS["pretension"]
+    largest_Pa_per_K = LARGEST_STD * PRETENSION_PER_KELVIN.std_with_temperatures * PASCAL_FACTOR
     for key, number in (("value", change.value), ("std", change.std)):
         if abs(number) > largest_Pa_per_K:
             raise PressError(
@@ -342,8 +343,3 @@ def _possible(path: Path, correlations: Array) -> Array:
     if eigenvalues[0] >= 0.0:
         return correlations
     return np.asarray((vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T)
-
-
-def _file_units(prior: FilmPrior) -> Array:
-    """Return the factors from the parameters' units to those of the file, shape (n_parameter,)."""
-    return np.array([FILE_UNITS.get(name, 1.0) for name in prior.names])

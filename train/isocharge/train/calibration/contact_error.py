@@ -210,7 +210,7 @@ def next_presses(
     avoid_mm = np.empty((0, 2)) if avoid_mm is None else avoid_mm
     candidates = _candidates(problem.domain.radius, problem.proposed_forces, avoid_mm)
     offered = _rows_of(problem, film.unknowns, candidates, position_std_mm, force_std)
-    cost, proposed, covariance = sensitivity.cost(), [], film.of_unknowns
+    cost, proposed, covariance = sensitivity.cost(), [], film.unknown_covariance
     for _ in range(count):
         reached = offered @ covariance  # a press lowers the covariance by reached' (1 + R C R')^-1 reached
         inner = np.eye(offered.shape[1]) + reached @ offered.swapaxes(1, 2)

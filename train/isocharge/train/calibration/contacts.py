@@ -40,93 +40,119 @@ class AdjustedContacts(NamedTuple):
         return np.asarray((self.residual**2).sum(axis=1))
 
 
-def projected(by_parameter: Array, slopes: Array) -> Array:
-    """Derivatives of the residual by the parameters once the contacts follow them (Golub and Pereyra 1973).
+def projected(parameter_slopes: Array, contact_slopes: Array) -> Array:
+    """Return the derivatives of the residual by parameters once the contacts follow them (Golub and Pereyra 1973).
 
     Args:
-        by_parameter: Derivatives at fixed contacts, shape (n, n_electrode + 3, n_parameter).
-        slopes: Derivatives by the contacts, shape (n, n_electrode + 3, 3).
+        parameter_slopes: Derivatives at fixed contacts, shape (n, n_electrode + 3, n_parameter).
+        contact_slopes: Derivatives by the contacts, shape (n, n_electrode + 3, 3).
     """
-    normal = np.einsum("nki,nkj->nij", slopes, slopes)
-    moved = np.linalg.solve(normal, np.einsum("nki,nkp->nip", slopes, by_parameter))
-    return np.asarray(by_parameter - np.einsum("nki,nip->nkp", slopes, moved))
+    normal = np.einsum("nki,nkj->nij", contact_slopes, contact_slopes)
+    contact_change = np.linalg.solve(normal, np.einsum("nki,nkp->nip", contact_slopes, parameter_slopes))
+    return np.asarray(parameter_slopes - np.einsum("nki,nip->nkp", contact_slopes, contact_change))
 
 
 def with_force(contact: Array) -> Array:
-    """(x, y, ln F), shape (n, 3), to (x, y, F)."""
+    """Return (x, y, F) of contacts (x, y, ln F), shape (n, 3)."""
     return np.column_stack([contact[:, :2], np.exp(contact[:, 2])])
 
 
-def adjust_contacts(charges: FilmCharges, parameters: Array, data: PressData, start: Array) -> AdjustedContacts:
-    """The contacts that fit charges and rig best on one film.
+def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> AdjustedContacts:
+    """Return the contacts that fit charges and rig best on one film.
 
     Args:
         charges: The films.
-        parameters: The film, as `FilmCharges.film` takes it.
+        unknowns: The film, as `FilmCharges.film` takes it.
         data: The presses.
         start: Contacts (x, y, ln F), shape (n, 3).
     """
-    count, domain, begin = len(charges.prior.names), charges.domain, with_force(start)
-    films, shares = films_of(charges, parameters, data)
-    maps = [charges.forward_map(film[:count]) for film in films]
-    factor, steeper = np.ones_like(data.charge), np.zeros((*data.charge.shape, 3))
-    if parameters[count:].any():  # what a film has besides its parameters is smooth: linear about the start
-        factor, steeper = _between([_linearised(partial(charges.factor, film), begin) for film in films], shares)
+    layout, domain = charges.layout, charges.domain
+    films, shares = neighbouring_films(charges, unknowns, data)
+    maps = [charges.forward_map(film[layout.parameters]) for film in films]
+    factor = np.ones_like(data.charge)
+    factor_slopes = np.zeros((*data.charge.shape, 3))
+    if unknowns[layout.coefficients].any():  # what a film has besides is smooth, so it is linear about the start
+        parts = [_linearised(partial(charges.factor, film), with_force(start)) for film in films]
+        factor, factor_slopes = _interpolated(parts, shares)
 
     def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
-        contact, presses = unit * domain.scale + domain.centre, data[rows]
-        at, change = with_force(contact), (contact - start[rows])[:, None]
-        share = factor[rows] + (steeper[rows] * change).sum(axis=2)
-        charge, by_contact = _between([_linearised(forward_map.charges, at) for forward_map in maps], shares[rows])
-        slopes = presses.slopes(share[:, :, None] * by_contact + charge[:, :, None] * steeper[rows])
-        return presses.residual(share * charge, contact), (slopes * domain.scale).swapaxes(1, 2)
+        contact = unit * domain.scale + domain.centre
+        presses = data[rows]
+        change = (contact - start[rows])[:, None]
+        row_factor = factor[rows] + (factor_slopes[rows] * change).sum(axis=2)
+        parts = [_linearised(forward_map.charges, with_force(contact)) for forward_map in maps]
+        charge, by_contact = _interpolated(parts, shares[rows])
+        charge_slopes = row_factor[:, :, None] * by_contact + charge[:, :, None] * factor_slopes[rows]
+        slopes = presses.residual_slopes(charge_slopes)
+        return presses.residual(row_factor * charge, contact), (slopes * domain.scale).swapaxes(1, 2)
 
     unit, residual = minimise(residuals, (start - domain.centre) / domain.scale, least=LEAST_CHANGE)
     return AdjustedContacts(unit * domain.scale + domain.centre, residual)
 
 
-def films_of(charges: FilmCharges, parameters: Array, data: PressData) -> tuple[list[Array], Array]:
-    """The films of other pretensions between which every press is, and the shares of each, shape (n, k)."""
+def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -> tuple[list[Array], Array]:
+    """Return films of other pretensions between which every press lies, and the weight of each, shape (n, k)."""
+    pretension = charges.layout.parameter("pretension")
     low, high = charges.prior.bounds
-    nodes, shares = data.of_films(float(parameters[0]), (float(low[0]), float(high[0])))
-    return [np.append(node, parameters[1:]) for node in nodes], shares
+    bounds = float(low[pretension]), float(high[pretension])
+    nodes, shares = data.pretension_nodes(float(unknowns[pretension]), bounds)
+    films = []
+    for node in nodes:
+        film = unknowns.copy()
+        film[pretension] = node
+        films.append(film)
+    return films, shares
 
 
-def _between(of_films: list[tuple[Array, Array]], shares: Array) -> tuple[Array, Array]:
-    """Values (n, n_electrode) and derivatives of presses on their own films from those on the films beside them."""
-    values, slopes = (sum_over(parts, shares) for parts in zip(*of_films, strict=True))
+def _interpolated(parts: list[tuple[Array, Array]], shares: Array) -> tuple[Array, Array]:
+    """Return values and derivatives of presses on their own films, from those on the neighbouring films."""
+    values = weighted_sum([value for value, _ in parts], shares)
+    slopes = weighted_sum([slope for _, slope in parts], shares)
     return values, slopes
 
 
-def sum_over(of_films: Sequence[Array], shares: Array) -> Array:
-    """Weighted sum of arrays (n, ...) with shares (n, k)."""
-    weighted = (
-        part * share.reshape(-1, *(1,) * (part.ndim - 1)) for part, share in zip(of_films, shares.T, strict=True)
-    )
-    return np.asarray(sum(weighted))
+def weighted_sum(parts: Sequence[Array], shares: Array) -> Array:
+    """Return the sum of arrays of shape (n, ...), each times its column of shares, shape (n, k)."""
+    total = np.zeros_like(parts[0])
+    for part, share in zip(parts, shares.T, strict=True):
+        total = total + part * share.reshape(-1, *(1,) * (part.ndim - 1))
+    return total
 
 
 def _linearised(function: Callable[[Array], Array], contact: Array) -> tuple[Array, Array]:
-    """Values at contacts (x, y, F) and derivatives by (x, y, ln F): one-sided differences are enough for a search."""
-    moved = contact + np.zeros((4, 1, 1))
-    moved[1, :, 0] += CONTACT_STEPS[0]
-    moved[2, :, 1] += CONTACT_STEPS[1]
-    moved[3, :, 2] *= np.exp(CONTACT_STEPS[2])
-    values = function(moved.reshape(-1, 3)).reshape(4, len(contact), -1)
-    return values[0], np.stack([(values[i + 1] - values[0]) / CONTACT_STEPS[i] for i in range(3)], axis=2)
+    """Return values at contacts (x, y, F), and derivatives by (x, y, ln F).
 
-
-def search_places(charges: FilmCharges, parameters: Array, data: PressData) -> Array:
-    """Where to start: (x, y, ln F), shape (n, 3); the place whose ratios of charges are nearest where unknown.
-
-    Ratios hardly depend on the film's stiffness and coefficients, which are not known yet.
+    One-sided differences are enough for a search.
     """
-    start, unknown = data.contact.copy(), ~data.known[:, -3:-1].all(axis=1)
-    if unknown.any():
+    x_step, y_step, log_force_step = CONTACT_STEPS
+    stepped = contact + np.zeros((4, 1, 1))
+    stepped[1, :, 0] += x_step
+    stepped[2, :, 1] += y_step
+    stepped[3, :, 2] *= np.exp(log_force_step)
+    at_contact, at_x, at_y, at_force = function(stepped.reshape(-1, 3)).reshape(4, len(contact), -1)
+    slopes = [
+        (at_x - at_contact) / x_step,
+        (at_y - at_contact) / y_step,
+        (at_force - at_contact) / log_force_step,
+    ]
+    return at_contact, np.stack(slopes, axis=2)
+
+
+def search_places(charges: FilmCharges, unknowns: Array, data: PressData) -> Array:
+    """Return where to start the search of the contacts: (x, y, ln F), shape (n, 3).
+
+    A place that was not measured starts where the ratios of the charges are nearest to those of the film. Ratios hardly
+    depend on the film's stiffness and coefficients, which are not known yet.
+    """
+    start = data.contact.copy()
+    unknown_place = ~data.has_place
+    if unknown_place.any():
         lattice = charges.domain.radius * sunflower(PLACES)
-        force = np.exp(np.median(data.contact[unknown, 2]))
-        at = np.column_stack([lattice.real, lattice.imag, np.full(PLACES, force)])
-        measured = np.where(data.known[unknown, :-3], np.log(np.maximum(data.charge[unknown], 1.0)), np.nan)
-        logs = measured[:, None] - np.log(charges.charges(parameters, at))
-        start[unknown, :2] = at[np.nanvar(logs, axis=2).argmin(axis=1), :2]
+        force = np.exp(np.median(data.contact[unknown_place, 2]))
+        candidates = np.column_stack([lattice.real, lattice.imag, np.full(PLACES, force)])
+        log_charge = np.log(np.maximum(data.charge[unknown_place], 1.0))
+        log_measured = np.where(data.has_charge[unknown_place], log_charge, np.nan)
+        log_ratio = log_measured[:, None] - np.log(charges.charges(unknowns, candidates))
+        nearest = np.nanvar(log_ratio, axis=2).argmin(axis=1)
+        start[unknown_place, :2] = candidates[nearest, :2]
     return start

@@ -1,7 +1,8 @@
-"""Charges of presses on any film of a prior, with their derivatives by the contact and by what is unknown of the film.
+"""Charges of presses on any film of a prior, with their derivatives by the contact and by the unknowns of the film.
 
-A film is given by the parameters of `FilmPrior`, after which the coefficients of what it has besides may stand: of the
-modes of its imperfections in units of their standard deviations, and of its discrepancy.
+A film is given by the parameters of `FilmPrior`, after which the coefficients of what it has besides may stand: modes
+of its imperfections in units of their standard deviations, traces, and the terms of its discrepancy. `UnknownLayout`
+gives the places of all of them.
 """
 
 from dataclasses import dataclass, replace
@@ -21,9 +22,13 @@ from isocharge.simulate.numerics.disk import onto_disk
 from isocharge.simulate.numerics.polygon import area_of
 from isocharge.simulate.sensor.film_prior import PARAMETERS, SHARED, FilmPrior
 from isocharge.train.calibration.discrepancy import TRACE_ANGLES, term_count, terms
+from isocharge.train.calibration.unknowns import UnknownLayout
 
 STEP = 0.005
 """Step of the differences by a parameter, in standard deviations of its prior: the map is smooth on that scale."""
+
+LOAD_PARAMETERS = ("pretension", "young", "thickness")
+"""Parameters by which the stress of the film depends on the load; the others move electrodes or scale charges."""
 
 STEPPED = tuple(parameter.name for parameter in PARAMETERS if parameter.derivative == "difference")
 """Parameters whose derivatives are differences."""
@@ -31,8 +36,8 @@ STEPPED = tuple(parameter.name for parameter in PARAMETERS if parameter.derivati
 CONTACT_STEPS = (5e-3, 5e-3, 1e-3)
 """Steps of the differences in x and y (mm) and in ln F: small, so that they cost little of the films' domain."""
 
-REMEMBERED = 8
-"""Forward maps that are remembered."""
+CACHED_MAPS = 8
+"""Number of forward maps that are cached."""
 
 TRACE_STD_MM = 0.5
 """Standard deviation of the width of a trace that is not described, mm."""
@@ -53,8 +58,8 @@ SLACKENING = 1.75
 NEGLIGIBLE = 1e-3
 """Largest coefficient of the modes that counts as none: it changes charges by some 3e-5, and they take long."""
 
-LITTLE = 0.1
-"""Largest coefficient of the modes below which what they do is taken for the same on neighbouring films."""
+LARGEST_LOCAL_COEFFICIENT = 0.1
+"""Largest coefficient of modes and traces whose effect is taken for the same on neighbouring films."""
 
 LEAST_TENSION = 1e-3
 """Least pretension over which the uneven part is taken, MPa."""
@@ -66,14 +71,22 @@ EDGE = 1.0 - 1e-6
 """Share of the family's radius and forces within which presses are evaluated: differences stay inside."""
 
 
-class _Modes(NamedTuple):
-    """The modes of a film, their charges under the last presses, and what an uneven tension adds to ln Q."""
+class _ModeCharges(NamedTuple):
+    """Charges of the modes of a film under the last presses.
+
+    Attributes:
+        modes: The modes of the film; None in a family without modes.
+        sensor: The sensor that they belong to.
+        contact: The presses.
+        by_mode: Derivatives of the charges by the coefficients of the modes, shape (n, n_electrode, n_mode), pC.
+        by_unevenness: What an uneven tension adds to ln Q, for each unit of its share; see `_unevenness`.
+    """
 
     modes: ModeMap | None
     sensor: Sensor
     contact: Array
     by_mode: Array
-    of_uneven: Array
+    by_unevenness: Array
 
 
 @dataclass(frozen=True)
@@ -90,21 +103,26 @@ class FilmCharges:
 
     @cached_property
     def domain(self) -> Domain:
-        """Contacts for which every film of the prior has charges, those a step of the differences away included."""
-        film, names = self.prior.sensor.film, self.prior.names
-        young, thickness = names.index("young"), names.index("thickness")
+        """Contacts for which every film of the prior has charges, including those a step of the differences away."""
+        film = self.prior.sensor.film
+        young, thickness = self.prior.index("young"), self.prior.index("thickness")
         load = film.young * film.thickness * film.radius
-        soft, stiff = (load * np.exp(bound[young] + bound[thickness]) for bound in self.prior.bounds)
-        least, most = self.family.limits["load"]
+        softest, stiffest = (load * np.exp(bound[young] + bound[thickness]) for bound in self.prior.bounds)
+        smallest_load, largest_load = self.family.limits["load"]
         return Domain(
             EDGE * self.family.limits["distance"][1] * film.radius - CONTACT_STEPS[0],
-            (float(least * stiff) * (2.0 - EDGE) * 1.01, float(most * soft) * EDGE / 1.01),
+            (float(smallest_load * stiffest) * (2.0 - EDGE) * 1.01, float(largest_load * softest) * EDGE / 1.01),
         )
 
     @cached_property
     def modes(self) -> tuple[str, ...]:
-        """Names of the modes that these films have; none in a family of before they were solved."""
+        """Names of the modes that these films have; none in a family without solved modes."""
         return tuple(MODES) if self.family.imperfections else ()
+
+    @cached_property
+    def layout(self) -> UnknownLayout:
+        """Places of parameters, coefficients and nuisances in the vector of unknowns."""
+        return UnknownLayout(self.prior.names, self.modes, self.prior.sensor.electrode_names)
 
     @cached_property
     def _mode_stds(self) -> Array:
@@ -119,54 +137,54 @@ class FilmCharges:
     @property
     def n_coefficient(self) -> int:
         """Number of coefficients after the parameters."""
-        return self.n_mode + term_count() * len(self.prior.sensor.electrodes)
-
-    @property
-    def n_mode(self) -> int:
-        """Number of modes and of lines of traces, the first of the coefficients."""
-        return len(self.modes) + len(TRACE_ANGLES) * len(self.prior.sensor.electrodes)
+        return self.layout.coefficient_count
 
     @cached_property
-    def _lines(self) -> Array:
+    def _trace_lines(self) -> Array:
         """Ends of the lines along which traces may lie, shape (n_electrode, n_line, 2, 2), mm."""
-        electrodes, end = self.prior.sensor.electrodes, TRACE_END * self.prior.sensor.film.radius
-        centre = np.array([complex(*e.centre) for e in electrodes])[:, None]
-        reach = np.sqrt([area_of(np.array(e.corners)) / np.pi for e in electrodes])[:, None]
+        electrodes = self.prior.sensor.electrodes
+        end_radius = TRACE_END * self.prior.sensor.film.radius
+        centre = np.array([complex(*electrode.centre) for electrode in electrodes])[:, None]
+        areas = [area_of(np.array(electrode.corners)) for electrode in electrodes]
+        pad_radius = np.sqrt(np.array(areas) / np.pi)[:, None]
         direction = np.exp(1j * (np.angle(centre) + np.deg2rad(TRACE_ANGLES)))
         along = (centre.conj() * direction).real
-        to_rim = np.sqrt(along**2 + end**2 - np.abs(centre) ** 2) - along
-        ends = centre[:, :, None] + np.stack([reach * direction, to_rim * direction], axis=2)
+        to_rim = np.sqrt(along**2 + end_radius**2 - np.abs(centre) ** 2) - along
+        ends = centre[:, :, None] + np.stack([pad_radius * direction, to_rim * direction], axis=2)
         return np.stack([ends.real, ends.imag], axis=3)
 
-    def _by_trace(self, forward_map: ForwardMap, contact: Array) -> Array:
-        """Charges of the lines, `TRACE_STD_MM` wide, shape (n, n_electrode, n_electrode * n_line), pC."""
-        n, count = len(contact), len(self.prior.sensor.electrodes)
-        of_width = forward_map.by_field(contact, EVEN, ReadoutPoints.along(forward_map.sensor, self._lines))
-        own = TRACE_STD_MM * of_width.reshape(n, count, 1, -1) * np.eye(count)[:, :, None]
-        return np.asarray(own.reshape(n, count, -1))
+    def _trace_charges(self, forward_map: ForwardMap, contact: Array) -> Array:
+        """Return the charges of the lines, `TRACE_STD_MM` wide, shape (n, n_electrode, n_electrode * n_line), pC."""
+        n = len(contact)
+        electrode_count = len(self.prior.sensor.electrodes)
+        points = ReadoutPoints.along(forward_map.sensor, self._trace_lines)
+        charge_per_mm = forward_map.by_field(contact, EVEN, points).reshape(n, electrode_count, 1, -1)
+        own_electrode = np.eye(electrode_count)[:, :, None]
+        return np.asarray((TRACE_STD_MM * charge_per_mm * own_electrode).reshape(n, electrode_count, -1))
 
     def trace_widths(self, unknowns: Array, covariance: Array) -> dict[str, tuple[float, float]]:
-        """Width of the trace of each electrode beyond what is described of it, and its standard deviation, mm.
+        """Return the width of each electrode's trace beyond the described one, and its standard deviation, mm.
 
         Args:
-            unknowns: Of a film, shape (n_parameter + n_coefficient,).
-            covariance: Of them, parameters over their prior standard deviations.
+            unknowns: Unknowns of a film, shape (n_parameter + n_coefficient,).
+            covariance: Their covariance, parameters over their prior standard deviations.
         """
-        n, names = len(self.prior.names), self.prior.sensor.electrode_names
-        lines = slice(n + len(self.modes), n + self.n_mode)
-        of_each = TRACE_STD_MM * np.eye(len(names)).repeat(len(TRACE_ANGLES), axis=1)
-        std = np.sqrt(np.diag(of_each @ covariance[lines, lines] @ of_each.T))
-        return dict(zip(names, zip((of_each @ unknowns[lines]).tolist(), std.tolist(), strict=True), strict=True))
+        names = self.prior.sensor.electrode_names
+        traces = self.layout.traces
+        width_of_lines = TRACE_STD_MM * np.eye(len(names)).repeat(len(TRACE_ANGLES), axis=1)
+        widths = width_of_lines @ unknowns[traces]
+        stds = np.sqrt(np.diag(width_of_lines @ covariance[traces, traces] @ width_of_lines.T))
+        return {name: (float(width), float(std)) for name, width, std in zip(names, widths, stds, strict=True)}
 
     def forward_map(self, parameters: Array) -> ForwardMap:
-        """The forward map of one film without a discrepancy, parameters of shape (n_parameter,).
+        """Return the forward map of one film without a discrepancy, parameters of shape (n_parameter,).
 
-        Films that differ in coefficients, gains and electrodes only share their stresses; the last few are remembered.
+        Films that differ in coefficients, gains and electrodes only share their stresses; the last few are cached.
         """
         sensor, probe = self.prior.film(parameters)
         key = (sensor.film, probe)
         if key not in self._maps:
-            if len(self._maps) >= REMEMBERED:
+            if len(self._maps) >= CACHED_MAPS:
                 del self._maps[next(iter(self._maps))]
             self._maps[key] = self.family.forward_map(sensor, probe)
         return replace(self._maps[key], sensor=sensor)
@@ -176,8 +194,8 @@ class FilmCharges:
         return {}
 
     def film(self, unknowns: Array) -> FunctionMap:
-        """The charges of one film, shape (n_parameter,), or (n_parameter + n_coefficient,) with what it has besides."""
-        forward_map = self.forward_map(unknowns[: len(self.prior.names)])
+        """Return the charges of one film, shape (n_parameter,), or (n_parameter + n_coefficient,) with coefficients."""
+        forward_map = self.forward_map(unknowns[self.layout.parameters])
 
         def charges(contact: Array) -> Array:
             charge = forward_map.charges(contact)
@@ -186,80 +204,98 @@ class FilmCharges:
         return FunctionMap(charges, forward_map.electrodes, self.domain)
 
     def factor(self, unknowns: Array, contact: Array, charge: Array | None = None) -> Array:
-        """Factors of modes, traces and discrepancy on a film's charges, shape (n, n_electrode).
+        """Return the factors of modes, traces and discrepancy on a film's charges, shape (n, n_electrode).
 
         Args:
             unknowns: As `film` takes them.
             contact: (x, y, F), shape (n, 3), mm and N.
-            charge: Charges without them, if they are known.
+            charge: Charges without the coefficients; computed if absent.
         """
-        n = len(self.prior.names)
-        of_modes, of_traces, shares = np.split(unknowns[n:], [len(self.modes), self.n_mode])
+        layout = self.layout
+        parameters = unknowns[layout.parameters]
+        mode_coefficients = unknowns[layout.modes]
+        trace_coefficients = unknowns[layout.traces]
+        term_coefficients = unknowns[layout.terms]
         factor = np.ones((len(contact), len(self.prior.sensor.electrodes)))
-        if np.abs(unknowns[n : n + self.n_mode]).max(initial=0.0) > NEGLIGIBLE:
-            forward_map = self.forward_map(unknowns[:n])
+        if np.abs(unknowns[layout.imperfections]).max(initial=0.0) > NEGLIGIBLE:
+            forward_map = self.forward_map(parameters)
             charge = forward_map.charges(contact) if charge is None else charge
-            if np.abs(of_traces).max() > NEGLIGIBLE:
-                factor += self._by_trace(forward_map, contact) @ of_traces / charge
-            if np.abs(of_modes).max(initial=0.0) > NEGLIGIBLE:
-                modes = self._by_mode(unknowns[:n], contact, charge)
-                factor += modes.by_mode @ of_modes / charge
-                factor *= np.exp(self._unevenness(unknowns[0], of_modes)[0] * modes.of_uneven)
-        if shares.any():
-            factor = np.maximum(factor, LEAST_FACTOR) * np.exp(
-                terms(contact, self.domain) @ shares.reshape(term_count(), -1)
-            )
+            if np.abs(trace_coefficients).max() > NEGLIGIBLE:
+                factor += self._trace_charges(forward_map, contact) @ trace_coefficients / charge
+            if np.abs(mode_coefficients).max(initial=0.0) > NEGLIGIBLE:
+                modes = self._mode_charges(parameters, contact, charge)
+                unevenness, _ = self._unevenness(self._pretension(parameters), mode_coefficients)
+                factor += modes.by_mode @ mode_coefficients / charge
+                factor *= np.exp(unevenness * modes.by_unevenness)
+            factor = np.maximum(factor, LEAST_FACTOR)
+        if term_coefficients.any():
+            log_factor = terms(contact, self.domain) @ term_coefficients.reshape(term_count(), -1)
+            factor = factor * np.exp(log_factor)
         return factor
 
-    def _by_mode(self, parameters: Array, contact: Array, charge: Array) -> _Modes:
-        """What the modes do to presses with these charges."""
-        forward_map, family = self.forward_map(parameters), self.family.imperfections
-        sensor, key = forward_map.sensor, (forward_map.sensor.film, forward_map.probe)
-        if family is None:
-            none = np.zeros_like(charge)
-            return _Modes(None, sensor, contact, none[:, :, None][:, :, :0], none)
-        last = self._last_modes.get(key)
-        known = last.modes if last and last.modes else family.mode_map(forward_map, self.modes)
-        if not last or last.sensor != sensor or not np.array_equal(last.contact, contact):
-            fields = known.fields and replace(known.fields, sensor=sensor)
-            by_mode = replace(known, film=forward_map, fields=fields).by_mode(contact)
-            falls = -parameters[0] * self._by_step("pretension", parameters, contact, charge) / charge
-            of_uneven = falls * (1.0 - np.clip(1.0 - 0.5 * falls, 0.0, 1.0) ** SLACKENING)
-            last = _Modes(known, sensor, contact, by_mode * self._mode_stds, of_uneven)
-            if key not in self._last_modes and len(self._last_modes) > 1:
-                del self._last_modes[next(iter(self._last_modes))]
-            self._last_modes[key] = last
-        return last
+    def _pretension(self, unknowns: Array) -> float:
+        """Return the pretension of a film, MPa."""
+        return float(unknowns[self.layout.parameter("pretension")])
 
-    def _unevenness(self, pretension: float, of_modes: Array) -> tuple[float, Array]:
-        """Return the share by which an uneven tension acts as a lower one, and its derivatives by the coefficients."""
-        share = np.where(self._is_uneven_tension, self._mode_stds, 0.0) / max(pretension, LEAST_TENSION)
-        square = float(((share * of_modes) ** 2).sum())
-        root = np.sqrt(1.0 - min(square, LARGEST_UNEVENNESS))
-        return 1.0 - root, share**2 * of_modes / root * (square < LARGEST_UNEVENNESS)
+    def _mode_charges(self, parameters: Array, contact: Array, charge: Array) -> _ModeCharges:
+        """Return what the modes do to presses with these charges."""
+        forward_map = self.forward_map(parameters)
+        sensor = forward_map.sensor
+        family = self.family.imperfections
+        if family is None:
+            zeros = np.zeros_like(charge)
+            return _ModeCharges(None, sensor, contact, by_mode=np.zeros((*charge.shape, 0)), by_unevenness=zeros)
+        key = (sensor.film, forward_map.probe)
+        cached = self._cached_modes.get(key)
+        if cached is not None and cached.sensor == sensor and np.array_equal(cached.contact, contact):
+            return cached
+        modes = cached.modes if cached is not None else None
+        if modes is None:
+            modes = family.mode_map(forward_map, self.modes)
+        fields = replace(modes.fields, sensor=sensor) if modes.fields is not None else None
+        by_mode = replace(modes, film=forward_map, fields=fields).by_mode(contact)
+        by_pretension = self._difference("pretension", parameters, contact, charge)
+        fall = -self._pretension(parameters) * by_pretension / charge
+        by_unevenness = fall * (1.0 - np.clip(1.0 - 0.5 * fall, 0.0, 1.0) ** SLACKENING)
+        computed = _ModeCharges(modes, sensor, contact, by_mode * self._mode_stds, by_unevenness)
+        if key not in self._cached_modes and len(self._cached_modes) > 1:
+            del self._cached_modes[next(iter(self._cached_modes))]
+        self._cached_modes[key] = computed
+        return computed
 
     @cached_property
-    def _last_modes(self) -> dict[tuple[Film, Probe], "_Modes"]:
+    def _cached_modes(self) -> dict[tuple[Film, Probe], _ModeCharges]:
         return {}
 
+    def _unevenness(self, pretension: float, mode_coefficients: Array) -> tuple[float, Array]:
+        """Return the share by which an uneven tension acts as a lower one, and its derivatives by the coefficients."""
+        tension_stds = np.where(self._is_uneven_tension, self._mode_stds, 0.0)
+        relative_stds = tension_stds / max(pretension, LEAST_TENSION)
+        square = float(((relative_stds * mode_coefficients) ** 2).sum())
+        root = np.sqrt(1.0 - min(square, LARGEST_UNEVENNESS))
+        if square >= LARGEST_UNEVENNESS:
+            return 1.0 - root, np.zeros_like(mode_coefficients)
+        return 1.0 - root, relative_stds**2 * mode_coefficients / root
+
     def charges(self, unknowns: Array, contact: Array) -> Array:
-        """Charges of contacts (x, y, F), shape (n, 3), mm and N, on one film: (n, n_electrode), pC."""
+        """Return the charges of contacts (x, y, F), shape (n, 3), mm and N, on one film: (n, n_electrode), pC."""
         return self.film(unknowns).charges(contact)
 
     def by_contact(self, unknowns: Array, contact: Array) -> Array:
-        """Derivatives by (x, y, ln F) on one film, shape (n, n_electrode, 3), pC/mm, pC/mm and pC."""
+        """Return the derivatives by (x, y, ln F) on one film, shape (n, n_electrode, 3), pC/mm, pC/mm and pC."""
         return differences(self.film(unknowns).charges, contact, CONTACT_STEPS)
 
     def into_domain(self, contact: Array) -> Array:
-        """Contacts moved to the nearest of the domain, shape (n, 3)."""
+        """Return contacts moved to the nearest contact of the domain, shape (n, 3)."""
         place = onto_disk(contact[:, :2], self.domain.radius)
         return np.column_stack([place, np.clip(contact[:, 2], *self.domain.force_range)])
 
     def by_parameter(self, unknowns: Array, contact: Array, by_contact: Array) -> Array:
-        """Derivatives by the parameters over their prior standard deviations, and by coefficients if they are given.
+        """Return the derivatives by the parameters over their prior standard deviations, and by given coefficients.
 
         What scales is exact: charges are E q(F / (E h a), T / E, h / a) with T the pretension, and linear in d31 and
-        d32. The others are differences of small steps.
+        d32. The others are differences of small steps. The modes are taken for the same share of the charges where
+        electrodes, coefficients and probe differ a little.
 
         Args:
             unknowns: The film, shape (n_parameter,) or (n_parameter + n_coefficient,).
@@ -267,78 +303,121 @@ class FilmCharges:
             by_contact: Derivatives by the contacts, as `by_contact` gives them.
 
         Returns:
-            Shape (n, n_electrode, n_parameter) or (n, n_electrode, n_parameter + n_coefficient), pC. The modes are
-            taken for the same share of the charges where electrodes, coefficients and probe differ a little.
+            Shape (n, n_electrode, n_parameter) or (n, n_electrode, n_parameter + n_coefficient), pC.
         """
-        parameters, coefficients = np.split(unknowns, [len(self.prior.names)])
-        film, by_force = self.forward_map(parameters), by_contact[:, :, 2]
+        layout = self.layout
+        parameters = unknowns[layout.parameters]
+        coefficients = unknowns[layout.coefficients]
+        film = self.forward_map(parameters)
         charge = film.charges(contact)
-        if coefficients.any():
-            more = np.array([1.0, 1.0, np.exp(CONTACT_STEPS[2])])
-            by_force = (film.charges(contact * more) - film.charges(contact / more)) / (2.0 * CONTACT_STEPS[2])
-        columns = {name: self._by_step(name, parameters, contact, charge) for name in STEPPED}
-        columns["young"] = charge - by_force - parameters[0] * columns["pretension"]
+        by_force = by_contact[:, :, 2]
+        if coefficients.any():  # the derivative of the charges without them
+            force_factor = np.array([1.0, 1.0, np.exp(CONTACT_STEPS[2])])
+            harder = film.charges(contact * force_factor)
+            softer = film.charges(contact / force_factor)
+            by_force = (harder - softer) / (2.0 * CONTACT_STEPS[2])
+        film_jacobian = self._parameter_jacobian(film, parameters, contact, charge, by_force) * self.prior.std
+        if not coefficients.size:
+            return np.asarray(film_jacobian)
+        factor = self.factor(unknowns, contact, charge)[:, :, None]
+        for name, slope in self._load_slopes(unknowns, contact).items():
+            number = layout.parameter(name)
+            film_jacobian[:, :, number] += charge * slope * self.prior.std[number]
+        if np.abs(unknowns[layout.traces]).max() > LARGEST_LOCAL_COEFFICIENT:
+            for name, slope in self._trace_slopes(unknowns, contact).items():
+                film_jacobian[:, :, layout.parameter(name)] += charge * slope
+        film_jacobian *= factor
+        modes = self._mode_charges(parameters, contact, charge)
+        trace_jacobian = self._trace_charges(film, contact)
+        _, unevenness_slopes = self._unevenness(self._pretension(parameters), unknowns[layout.modes])
+        mode_jacobian = modes.by_mode + factor * (charge * modes.by_unevenness)[:, :, None] * unevenness_slopes
+        tension_coefficients = unknowns[layout.modes] * self._is_uneven_tension  # as the pretension, they count over E
+        young = layout.parameter("young")
+        film_jacobian[:, :, young] -= mode_jacobian @ tension_coefficients * self.prior.std[young]
+        own_charge = charge[:, :, None] * np.eye(charge.shape[1])
+        term_jacobian = (factor * own_charge)[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
+        return np.concatenate(
+            [film_jacobian, mode_jacobian, trace_jacobian, term_jacobian.reshape(*charge.shape, -1)], axis=2
+        )
+
+    def _parameter_jacobian(
+        self, film: ForwardMap, parameters: Array, contact: Array, charge: Array, by_force: Array
+    ) -> Array:
+        """Return the derivatives of the charges by the parameters, without coefficients."""
+        columns = {name: self._difference(name, parameters, contact, charge) for name in STEPPED}
+        columns["young"] = charge - by_force - self._pretension(parameters) * columns["pretension"]
         columns["thickness"] = columns["thickness"] - by_force
         piezo = film.sensor.piezo
-        d32_alone = replace(film, sensor=replace(film.sensor, piezo=replace(piezo, d31=0.0)))
-        columns["d32"] = d32_alone.charges(contact) if piezo.d32 != 0.0 else np.zeros_like(charge)
+        columns["d32"] = np.zeros_like(charge)
+        if piezo.d32 != 0.0:
+            d32_alone = replace(film, sensor=replace(film.sensor, piezo=replace(piezo, d31=0.0)))
+            columns["d32"] = d32_alone.charges(contact)
         columns["d31"] = charge - columns["d32"]
         shared = np.stack([columns[name] for name in SHARED], axis=2)
-        own = charge[:, :, None] * np.eye(charge.shape[1])
-        of_film = np.concatenate([shared, own], axis=2) * self.prior.std
-        if not coefficients.size:
-            return np.asarray(of_film)
-        factor = self.factor(unknowns, contact, charge)[:, :, None]
-        of_film[:, :, :3] += charge[:, :, None] * self._by_load(unknowns, contact) * self.prior.std[:3]
-        if np.abs(coefficients[len(self.modes) : self.n_mode]).max() > LITTLE:
-            of_film[:, :, 3 : len(SHARED)] += charge[:, :, None] * self._by_place(unknowns, contact)
-        of_film *= factor
-        modes = self._by_mode(parameters, contact, charge)
-        by_trace = self._by_trace(film, contact)
-        by_uneven = self._unevenness(parameters[0], coefficients[: len(self.modes)])[1]
-        of_tension = self._is_uneven_tension  # as the pretension, they count over E
-        of_modes = modes.by_mode + factor * (charge * modes.of_uneven)[:, :, None] * by_uneven
-        of_film[:, :, 1] -= of_modes @ (coefficients[: len(self.modes)] * of_tension) * self.prior.std[1]
-        of_terms = (factor * own)[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
-        return np.asarray(np.concatenate([of_film, of_modes, by_trace, of_terms.reshape(*charge.shape, -1)], axis=2))
+        gain_jacobian = charge[:, :, None] * np.eye(charge.shape[1])
+        return np.concatenate([shared, gain_jacobian], axis=2)
 
-    def _by_load(self, unknowns: Array, contact: Array) -> Array:
-        """Derivatives of ln Q of what the modes do by pretension, ln E and ln h, shape (n, n_electrode, 3).
+    def _without_terms(self, unknowns: Array) -> Array:
+        """Return a film without the terms of its discrepancy."""
+        film = unknowns.copy()
+        film[self.layout.terms] = 0.0
+        return film
 
-        They are functions of F / (E h a) and T / E, as the charges are.
+    def _stepped(self, unknowns: Array, name: str) -> tuple[Array, float]:
+        """Return a film with a small step of one parameter towards its mean, and the step in standard deviations."""
+        number = self.layout.parameter(name)
+        step = -STEP if unknowns[number] > self.prior.mean[number] else STEP
+        stepped = unknowns.copy()
+        stepped[number] += step * self.prior.std[number]
+        return stepped, step
+
+    def _load_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
+        """Return the derivatives of ln Q of modes and traces by pretension, ln E and ln h, each (n, n_electrode).
+
+        Modes and traces are functions of F / (E h a) and T / E, as the charges are.
         """
-        film = np.where(np.arange(unknowns.size) < len(self.prior.names) + self.n_mode, unknowns, 0.0)
-        if np.abs(film[len(self.prior.names) :]).max() < LITTLE:
-            return np.zeros((len(contact), len(self.prior.sensor.electrodes), 3))
-        change = (-STEP if film[0] > self.prior.mean[0] else STEP) * self.prior.std[0]
+        film = self._without_terms(unknowns)
+        if np.abs(film[self.layout.imperfections]).max() < LARGEST_LOCAL_COEFFICIENT:
+            return {}
+        tauter, step = self._stepped(film, "pretension")
+        tension_change = step * self.prior.std[self.layout.parameter("pretension")]
         factor = self.factor(film, contact)
-        stronger = self.factor(film, contact * [1.0, 1.0, np.exp(CONTACT_STEPS[2])])
-        tauter = self.factor(np.append(film[0] + change, film[1:]), contact)
-        by_force, by_tension = (stronger - factor) / CONTACT_STEPS[2], (tauter - factor) / change
-        columns = [by_tension, -by_force - film[0] * by_tension, -by_force]
-        return np.asarray(np.stack(columns, axis=2) / np.maximum(factor, LEAST_FACTOR)[:, :, None])
+        harder = self.factor(film, contact * [1.0, 1.0, np.exp(CONTACT_STEPS[2])])
+        by_force = (harder - factor) / CONTACT_STEPS[2]
+        by_tension = (self.factor(tauter, contact) - factor) / tension_change
+        slopes = {
+            "pretension": by_tension,
+            "young": -by_force - self._pretension(film) * by_tension,
+            "thickness": -by_force,
+        }
+        return {name: slope / np.maximum(factor, LEAST_FACTOR) for name, slope in slopes.items()}
 
-    def _by_place(self, unknowns: Array, contact: Array) -> Array:
-        """Derivatives of ln Q of what traces do by the coefficients, place and probe over their prior's deviations.
+    def _trace_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
+        """Return the derivatives of ln Q of traces by coefficients, place and probe over their prior's deviations.
 
-        Shape (n, n_electrode, 6). A trace is not where its electrode is, so it answers otherwise.
+        Each has the shape (n, n_electrode). A trace is not where its electrode is, so it answers otherwise.
         """
-        film, n = np.zeros_like(unknowns), len(self.prior.names)
-        film[:n], of_traces = unknowns[:n], slice(n + len(self.modes), n + self.n_mode)
-        film[of_traces] = unknowns[of_traces]
-        factor, columns = self.factor(film, contact), []
-        for number in range(3, len(SHARED)):
-            moved, step = film.copy(), -STEP if film[number] > self.prior.mean[number] else STEP
-            moved[number] += step * self.prior.std[number]
-            columns.append((self.factor(moved, contact) - factor) / step)
-        return np.asarray(np.stack(columns, axis=2) / np.maximum(factor, LEAST_FACTOR)[:, :, None])
+        film = self._without_terms(unknowns)
+        film[self.layout.modes] = 0.0
+        factor = self.factor(film, contact)
+        slopes = {}
+        for name in SHARED:
+            if name in LOAD_PARAMETERS:
+                continue
+            stepped, step = self._stepped(film, name)
+            slopes[name] = (self.factor(stepped, contact) - factor) / step / np.maximum(factor, LEAST_FACTOR)
+        return slopes
 
-    def _by_step(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
-        """Derivative by one parameter; by the thickness at one load F / (E h a), which is bending's part alone."""
-        number = self.prior.names.index(name)
-        step, high = STEP * self.prior.std[number], self.prior.bounds[1]
-        moved = parameters.copy()
-        moved[number] += step if parameters[number] + step <= high[number] else -step
-        change = moved[number] - parameters[number]
+    def _difference(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
+        """Return the derivative by one parameter, by a small step.
+
+        The derivative by the thickness is at one load F / (E h a), which is the part of bending alone.
+        """
+        number = self.prior.index(name)
+        _, upper_bounds = self.prior.bounds
+        step = STEP * self.prior.std[number]
+        stepped = parameters.copy()
+        stepped[number] += step if parameters[number] + step <= upper_bounds[number] else -step
+        change = stepped[number] - parameters[number]
         at = contact * [1.0, 1.0, np.exp(change)] if name == "thickness" else contact
-        return np.asarray((self.forward_map(moved).charges(at) - charge) / change)
+        return np.asarray((self.forward_map(stepped).charges(at) - charge) / change)

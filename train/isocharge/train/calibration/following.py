@@ -1,7 +1,7 @@
-"""What a calibrated model needs to follow the pretension of its film live: the file `pretensions.npz`.
+"""Weights with which a calibrated model follows the pretension of its film live: the file `pretensions.npz`.
 
-The network for all films is folded at some pretensions, all other parameters as the calibration found them; what the
-film has besides its parameters, and what is left of it, are taught to each as to the model itself.
+The network for all films is folded at some pretensions, with all other parameters as the calibration found them. Each
+network learns the film's discrepancy and the remaining uncertainty as the model itself does.
 """
 
 from collections.abc import Sequence
@@ -46,29 +46,40 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
     problem, posterior = result.problem, result.posterior
     if len(problem.electrodes) <= 3:
         return None
-    parameters, own = posterior.parameters, posterior.parameters[0]
-    nodes = _nodes(float(own), problem.prior.bounds[0][0], problem.prior.bounds[1][0])
-    networks = [
-        network if node == own else _like(network, result.fitted_film(np.append(node, parameters[1:])).network)
-        for node in nodes
-    ]
-    std = np.sqrt(np.diag(posterior.drifted(problem.prior).covariance))[0] * problem.prior.std[0]
-    known = Pretensions(
+    prior = problem.prior
+    pretension = prior.index("pretension")
+    calibrated_MPa = float(posterior.parameters[pretension])
+    lower, upper = (float(bound[pretension]) for bound in prior.bounds)
+    nodes = _nodes(calibrated_MPa, lower, upper)
+    networks = []
+    for node in nodes:
+        if node == calibrated_MPa:
+            networks.append(network)
+            continue
+        parameters = posterior.parameters.copy()
+        parameters[pretension] = node
+        networks.append(_like(network, result.fitted_film(parameters).network))
+    drifted_std = np.sqrt(np.diag(posterior.drifted(prior).covariance)) * prior.std
+    weights = [np.stack(arrays) for arrays in zip(*map(_arrays, networks), strict=True)]
+    pretensions = Pretensions(
         node_MPa=nodes,
-        calibrated_MPa=float(own),
-        std_MPa=float(std),
+        calibrated_MPa=calibrated_MPa,
+        std_MPa=float(drifted_std[pretension]),
         floor_MPa=_floor(result),
         misfit_rms=1.0,
         misfit_unit=MISFIT_UNIT,
         limits_pC=(LOWEST_CHARGE, HIGHEST_CHARGE),
         typical_pC=network.typical,
-        weights=dict(zip(_constants(network), map(np.stack, zip(*map(_arrays, networks), strict=True)), strict=True)),
+        weights=dict(zip(_constants(network), weights, strict=True)),
     )
     rng = np.random.default_rng(SEED)
     touches = draw_contacts(rng, problem.domain, TOUCHES)
     charge = problem.noise.add(problem.charges.charges(posterior.unknowns, touches), rng)
-    typical = rms(np.array([known.misfits(row, np.array([own])) for row in charge]))
-    return None if typical > ROUGH else replace(known, misfit_rms=max(typical, 1.0))
+    misfits = [pretensions.misfits(row, np.array([calibrated_MPa])) for row in charge]
+    typical_misfit = rms(np.array(misfits))
+    if typical_misfit > ROUGH:
+        return None
+    return replace(pretensions, misfit_rms=max(typical_misfit, 1.0))
 
 
 def _nodes(own: float, low: float, high: float) -> Array:
@@ -105,11 +116,14 @@ def _constants(network: FoldedNetwork) -> list[str]:
 
 
 def _floor(result: CalibrationResult) -> float:
-    """Standard deviation, MPa, of the change that very many touches tell of a film that has not changed.
+    """Return the standard deviation, MPa, of the change that very many touches show of a film that has not changed.
 
-    Touches give the pretension that goes best with the other parameters, which are not exact, and neither is that of
-    the calibration; their errors go together.
+    Touches give the pretension that goes best with the other parameters. Both these parameters and the pretension of
+    the calibration have errors, which are correlated.
     """
+    prior = result.problem.prior
+    pretension = prior.index("pretension")
     misfit = result.sensitivity.misfit
-    tells = np.einsum("nk,nkp->p", misfit[:, :, 0], misfit) / (misfit[:, :, 0] ** 2).sum()
-    return float(np.sqrt(tells @ result.posterior.joint @ tells) * result.problem.prior.std[0])
+    by_pretension = misfit[:, :, pretension]
+    weights = np.einsum("nk,nkp->p", by_pretension, misfit) / (by_pretension**2).sum()
+    return float(np.sqrt(weights @ result.posterior.joint @ weights) * prior.std[pretension])

@@ -6,17 +6,14 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
-from isocharge.train.calibration.film_charges import FilmCharges
 
-VAGUE_FORCE = 1.5
-"""Standard deviation of the logarithm of a force that nobody knows, about the middle of the forces."""
+UNKNOWN_FORCE_STD = 1.5
+"""Standard deviation of the logarithm of a force that was not measured, about the middle of the forces."""
 
-NUISANCES = 3
-"""What a session has besides a film: change of the pretension with temperature, offset and drift of the charges."""
-
-APART_MPa = 0.5
+NODE_DISTANCE_MPa = 0.5
 """Distance of the pretensions between which charges are interpolated where the film's differs from press to press."""
 
 
@@ -24,43 +21,53 @@ APART_MPa = 0.5
 class PressData:
     """Measured presses as least squares takes them.
 
+    A residual row has one entry for each electrode and then three for the rig: x, y and ln F.
+
     Attributes:
-        charge: Shape (n, n_electrode), pC, 0 where unknown.
+        charge: Charges, shape (n, n_electrode), pC, 0 where unknown.
         weight: One over the standard deviation of each charge, 1/pC, 0 where unknown.
         contact: (x, y, ln F), shape (n, 3); the middle of the domain where unknown.
         contact_weight: One over the standard deviation of each, shape (n, 3); small where unknown.
-        known: Which charges and coordinates were measured, shape (n, n_electrode + 3).
-        turn: When each press was made, from -1/2, the first, to 1/2, the last, shape (n,).
-        warmer: How much warmer each was than their mean, K, shape (n,).
-        tauter: Pretension of each over that of the film, MPa, shape (n,).
+        measured: Which charges and coordinates were measured, shape (n, n_electrode + 3).
+        session_time: When each press was made, from -1/2, the first, to 1/2, the last, shape (n,).
+        warming_K: How much warmer each press was than their mean, shape (n,).
+        tension_change: Pretension under each press over that of the film, MPa, shape (n,).
     """
 
     charge: Array
     weight: Array
     contact: Array
     contact_weight: Array
-    known: Booleans
-    turn: Array
-    warmer: Array
-    tauter: Array
+    measured: Booleans
+    session_time: Array
+    warming_K: Array
+    tension_change: Array
 
     @classmethod
-    def of(cls, presses: MeasuredPresses, noise: NoiseModel, charges: FilmCharges) -> "PressData":
-        """From presses on one of the films."""
-        seen, domain = ~np.isnan(presses.charge_pC), charges.domain
-        charge = np.where(seen, presses.charge_pC, 0.0)
-        logs = np.column_stack([presses.contact[:, :2], np.log(presses.contact[:, 2])])
+    def of(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
+        """Return the data of measured presses.
+
+        Args:
+            presses: The presses.
+            noise: Noise of the charges.
+            domain: Contacts that the films have charges for.
+        """
+        has_charge = ~np.isnan(presses.charge_pC)
+        charge = np.where(has_charge, presses.charge_pC, 0.0)
+        log_contact = np.column_stack([presses.contact[:, :2], np.log(presses.contact[:, 2])])
+        has_coordinate = ~np.isnan(log_contact)
         rig_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
-        known, temperature = ~np.isnan(logs), temperatures(presses)
+        unknown_std = [domain.radius, domain.radius, UNKNOWN_FORCE_STD]
+        temperature_C = temperatures(presses)
         return cls(
             charge=charge,
-            weight=np.where(seen, 1.0 / noise.sigma(charge), 0.0),
-            contact=np.where(known, logs, domain.centre),
-            contact_weight=1.0 / np.where(known, rig_std, [domain.radius, domain.radius, VAGUE_FORCE]),
-            known=np.column_stack([seen, known]),
-            turn=np.linspace(-0.5, 0.5, len(presses)) if len(presses) > 1 else np.zeros(1),
-            warmer=temperature - temperature.mean(),
-            tauter=np.zeros(len(presses)),
+            weight=np.where(has_charge, 1.0 / noise.sigma(charge), 0.0),
+            contact=np.where(has_coordinate, log_contact, domain.centre),
+            contact_weight=1.0 / np.where(has_coordinate, rig_std, unknown_std),
+            measured=np.column_stack([has_charge, has_coordinate]),
+            session_time=np.linspace(-0.5, 0.5, len(presses)) if len(presses) > 1 else np.zeros(1),
+            warming_K=temperature_C - temperature_C.mean(),
+            tension_change=np.zeros(len(presses)),
         )
 
     def __getitem__(self, rows: Integers | Booleans) -> "PressData":
@@ -69,56 +76,74 @@ class PressData:
     def __len__(self) -> int:
         return len(self.contact)
 
-    def without(self, nuisances: Array) -> "PressData":
-        """The presses as on a film of one temperature, without offset and drift of the charges.
+    @property
+    def has_charge(self) -> Booleans:
+        """Which charges were measured, shape (n, n_electrode)."""
+        return self.measured[:, : self.charge.shape[1]]
+
+    @property
+    def has_place(self) -> Booleans:
+        """Which places were measured, shape (n,)."""
+        place = self.measured[:, self.charge.shape[1] :][:, :2]
+        return np.asarray(place.all(axis=1))
+
+    def with_force_scatter(self, share: float) -> "PressData":
+        """Return the presses with forces that are less certain, by this share, than the rig's standard deviation."""
+        x_weight, y_weight, force_weight = self.contact_weight.T
+        scattered_weight = 1.0 / np.hypot(1.0 / force_weight, share)
+        return replace(self, contact_weight=np.column_stack([x_weight, y_weight, scattered_weight]))
+
+    def force_derivative(self) -> Array:
+        """Return the derivative of the residual by the logarithm of the stated force, shape (n, n_electrode + 3)."""
+        by_contact = -self.contact_weight[:, :, None] * np.eye(3)
+        by_force = by_contact[:, :, 2]
+        return np.concatenate([np.zeros_like(self.charge), by_force], axis=1)
+
+    def pretension_nodes(self, pretension: float, bounds: tuple[float, float]) -> tuple[Array, Array]:
+        """Return pretensions between which the charges of the presses are interpolated.
 
         Args:
-            nuisances: Change of the pretension, MPa/K, common offset, pC, drift over the session, a share.
+            pretension: Pretension of the film, MPa.
+            bounds: Smallest and largest pretension that a film may have, MPa.
+
+        Returns:
+            Pretensions, shape (k,), MPa, and the weight of each in each press, shape (n, k).
         """
-        per_kelvin, offset, drift = nuisances
-        charge = self.charge - offset - drift * self.turn[:, None] * self.charge
-        return replace(self, charge=charge, tauter=per_kelvin * self.warmer)
-
-    def scattered(self, share: float) -> "PressData":
-        """The presses with forces that are known less well than they are said to, by a share."""
-        weight = self.contact_weight.copy()
-        weight[:, 2] = 1.0 / np.hypot(1.0 / weight[:, 2], share)
-        return replace(self, contact_weight=weight)
-
-    def by_force(self) -> Array:
-        """Derivative of the residual by the logarithm of the stated force, shape (n, n_electrode + 3)."""
-        rows = np.zeros(self.known.shape)
-        rows[:, -1] = -self.contact_weight[:, 2]
-        return rows
-
-    def of_films(self, pretension: float, bounds: tuple[float, float]) -> tuple[Array, Array]:
-        """Pretensions (k,) between which the charges of presses are interpolated, and the shares of each, (n, k)."""
-        own = np.clip(pretension + self.tauter, *bounds)
-        low, high = float(own.min(initial=np.inf)), float(own.max(initial=-np.inf))
+        pressed = np.clip(pretension + self.tension_change, *bounds)
+        low = float(pressed.min(initial=np.inf))
+        high = float(pressed.max(initial=-np.inf))
         if high <= low:
             return np.array([low]), np.ones((len(self), 1))
-        nodes = chebyshev_nodes(2 + int(np.ceil((high - low) / APART_MPa)), low, high)
-        return nodes, lagrange_values(nodes, barycentric_weights(nodes), own)
-
-    def by_nuisance(self) -> Array:
-        """Derivatives of the residual by offset and drift, shape (n, n_electrode + 3, 2)."""
-        by_charge = np.stack([np.ones_like(self.charge), self.turn[:, None] * self.charge], axis=2)
-        return np.concatenate([self.weight[:, :, None] * by_charge, np.zeros((len(self), 3, 2))], axis=1)
+        nodes = chebyshev_nodes(2 + int(np.ceil((high - low) / NODE_DISTANCE_MPa)), low, high)
+        return nodes, lagrange_values(nodes, barycentric_weights(nodes), pressed)
 
     def residual(self, charge: Array, contact: Array) -> Array:
-        """Residuals of a film's charges and of the rig over their deviations at (x, y, ln F): (n, n_electrode + 3)."""
-        of_charge = self.weight * (charge - self.charge)
-        return np.column_stack([of_charge, self.contact_weight * (contact - self.contact)])
+        """Return the residuals of charges and rig over their standard deviations, shape (n, n_electrode + 3).
 
-    def slopes(self, by_contact: Array) -> Array:
-        """Derivatives of the residual by the contact, from those of the charges, (n, n_electrode, 3)."""
-        of_rig = self.contact_weight[:, :, None] * np.eye(3)
-        return np.concatenate([self.weight[:, :, None] * by_contact, of_rig], axis=1)
+        Args:
+            charge: Charges of a film, shape (n, n_electrode), pC.
+            contact: (x, y, ln F), shape (n, 3).
+        """
+        charge_residual = self.weight * (charge - self.charge)
+        return np.column_stack([charge_residual, self.contact_weight * (contact - self.contact)])
+
+    def residual_slopes(self, charge_slopes: Array) -> Array:
+        """Return the derivatives of the residual by the contact, shape (n, n_electrode + 3, 3).
+
+        Args:
+            charge_slopes: Derivatives of the charges by the contact, shape (n, n_electrode, 3).
+        """
+        rig_slopes = self.contact_weight[:, :, None] * np.eye(3)
+        return np.concatenate([self.weight[:, :, None] * charge_slopes, rig_slopes], axis=1)
 
 
 def temperatures(presses: MeasuredPresses) -> Array:
-    """Of every press, shape (n,), degrees Celsius: between readings in the order of the presses; 0 without any."""
+    """Return the temperature of every press, shape (n,), degrees Celsius; 0 if none was measured.
+
+    Temperatures that were not measured are interpolated in the order of the presses.
+    """
     if presses.temperature_C is None or not presses.knows_temperature:
         return np.zeros(len(presses))
-    number, seen = np.arange(len(presses)), np.isfinite(presses.temperature_C)
-    return np.interp(number, number[seen], presses.temperature_C[seen])
+    number = np.arange(len(presses))
+    measured = np.isfinite(presses.temperature_C)
+    return np.interp(number, number[measured], presses.temperature_C[measured])

@@ -16,7 +16,7 @@ from isocharge.simulate import Circle, Domain, FilmPrior, NoiseModel, Probe, Sen
 from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.hypotheses import Hypothesis
-from isocharge.train.calibration.press_data import NUISANCES
+from isocharge.train.calibration.nuisances import PRETENSION_PER_KELVIN
 from isocharge.train.films.films_file import FILE, read_films
 from isocharge.train.films.films_model import FilmsModel
 from isocharge.train.training.fitted import Fitted
@@ -35,9 +35,6 @@ UNSTEADY = 0.002
 
 THERMOMETER = 0.1
 """Standard deviation of the same for the pretension where the temperatures of both days are known: creep."""
-
-PER_KELVIN = 0.4
-"""Standard deviation of the pretension's change with temperature, MPa/K: E da / (1 - nu), 0.3 to 0.44 on aluminium."""
 
 LIKELY = Hypothesis(modes=0.5, size=0.01)
 """What presses are planned for besides a film of the prior: half of what imperfect films have. Plans for less leave
@@ -67,24 +64,24 @@ class Warming(NamedTuple):
     @property
     def identified(self) -> bool:
         """Whether presses have at least halved its standard deviation."""
-        return self.std <= IDENTIFIED * PER_KELVIN
+        return self.std <= IDENTIFIED * PRETENSION_PER_KELVIN.std_with_temperatures
 
-    def of_unknowns(self, count: int) -> "Warming":
-        """Beside the first unknowns of a film, or beside more, which do not depend on it."""
+    def with_unknowns(self, count: int) -> "Warming":
+        """Return the change beside the first unknowns of a film, or beside more, which do not depend on it."""
         return self._replace(covariance=np.pad(self.covariance, (0, count))[:count])
 
 
 @dataclass(frozen=True)
 class FilmEstimate:
-    """What is known of a film: a Gaussian about its best parameters.
+    """Estimate of a film: a Gaussian about its best parameters.
 
     Attributes:
-        parameters: As in `FilmPrior`, shape (n_parameter,).
-        covariance: Of the parameters over their prior standard deviations, shape (n_parameter, n_parameter).
-        coefficients: Of the discrepancy, shape (n_coefficient,); empty if there is none.
+        parameters: Parameters, as in `FilmPrior`, shape (n_parameter,).
+        covariance: Covariance of the parameters over their prior standard deviations, shape (n_parameter, n_parameter).
+        coefficients: Coefficients of the discrepancy, shape (n_coefficient,); empty if there is none.
         joint: Covariance of parameters and coefficients, shape (n_parameter + n_coefficient,) twice; empty if there is
             no discrepancy.
-        warming: What temperature does to it, if that of its presses is known.
+        warming: Change of the pretension with temperature; None if the temperatures of the presses are not known.
     """
 
     parameters: Array
@@ -99,49 +96,62 @@ class FilmEstimate:
         return np.concatenate([self.parameters, self.coefficients])
 
     @property
-    def of_unknowns(self) -> Array:
-        """Their covariance."""
+    def unknown_covariance(self) -> Array:
+        """Covariance of parameters and coefficients."""
         return self.joint if self.coefficients.size else self.covariance
 
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> "FilmEstimate":
-        """What is left of an earlier estimate after the film may have drifted (`DRIFT`).
+        """Return the estimate after the film may have drifted (`DRIFT`).
 
-        `knows_temperature` says that temperatures are known since as well.
+        Args:
+            prior: The films.
+            knows_temperature: Whether temperatures are known since as well.
         """
-        drift = np.array([DRIFT.get(name.partition(" ")[0], REMOUNTED) for name in prior.names])
-        if knows_temperature and self.warming:
-            drift[0] = THERMOMETER
-        wider, joint = self.covariance + np.diag(drift**2), self.joint
+        drift_std = np.array([DRIFT.get(name.partition(" ")[0], REMOUNTED) for name in prior.names])
+        if knows_temperature and self.warming is not None:
+            drift_std[prior.index("pretension")] = THERMOMETER
+        covariance = self.covariance + np.diag(drift_std**2)
+        joint = self.joint
         if joint.size:
-            joint = joint + np.diag(np.concatenate([drift, np.full(len(joint) - drift.size, UNSTEADY)]) ** 2)
-        return FilmEstimate(np.clip(self.parameters, *prior.bounds), wider, self.coefficients, joint, self.warming)
+            coefficient_std = np.full(self.coefficients.size, UNSTEADY)
+            joint = joint + np.diag(np.concatenate([drift_std, coefficient_std]) ** 2)
+        parameters = np.clip(self.parameters, *prior.bounds)
+        return FilmEstimate(parameters, covariance, self.coefficients, joint, self.warming)
 
     def at_temperature(self, at_C: float, prior: FilmPrior) -> "FilmEstimate":
-        """The film at another temperature, a linear map of what is known: there and back is the same film.
+        """Return the film at another temperature, a linear map of the estimate: there and back is the same film.
 
-        Without `warming` nobody knows at which temperature it is given, and it stays as it is.
+        Without `warming` the temperature of the estimate is unknown, and the estimate stays as it is.
 
         Raises:
             PressError: If the films do not reach so far.
         """
         if self.warming is None:
             return self
-        warmer = (at_C - self.warming.at_C) / prior.std[0]
-        parameters, covariance = self.parameters.copy(), self.of_unknowns.copy()
-        parameters[0] += (at_C - self.warming.at_C) * self.warming.MPa_per_K
-        of_change = self.warming.covariance.copy()
-        covariance[0] += warmer * of_change
-        of_change[0] += warmer * self.warming.std**2
-        covariance[:, 0] += warmer * of_change
-        low, high = (float(bound[0]) for bound in prior.bounds)
-        if not low <= parameters[0] <= high:
+        pretension = prior.index("pretension")
+        change_K = at_C - self.warming.at_C
+        parameters = self.parameters.copy()
+        parameters[pretension] += change_K * self.warming.MPa_per_K
+        lower, upper = (float(bound[pretension]) for bound in prior.bounds)
+        if not lower <= parameters[pretension] <= upper:
             raise PressError(
-                f"at {at_C:g} C the pretension would be {parameters[0]:.2f} MPa; expected {low:g} to {high:g} MPa: a "
-                "temperature nearer to that of the presses"
+                f"at {at_C:g} C the pretension would be {parameters[pretension]:.2f} MPa; expected {lower:g} to "
+                f"{upper:g} MPa: a temperature nearer to that of the presses"
             )
-        n, warming = len(parameters), self.warming._replace(at_C=at_C, covariance=of_change)
-        joint = covariance if self.joint.size else self.joint
-        return FilmEstimate(parameters, covariance[:n, :n], self.coefficients, joint, warming)
+        scaled_change = change_K / prior.std[pretension]
+        covariance = self.unknown_covariance.copy()
+        warming_covariance = self.warming.covariance.copy()
+        covariance[pretension] += scaled_change * warming_covariance
+        warming_covariance[pretension] += scaled_change * self.warming.std**2
+        covariance[:, pretension] += scaled_change * warming_covariance
+        count = len(parameters)
+        return FilmEstimate(
+            parameters=parameters,
+            covariance=covariance[:count, :count],
+            coefficients=self.coefficients,
+            joint=covariance if self.joint.size else self.joint,
+            warming=self.warming._replace(at_C=at_C, covariance=warming_covariance),
+        )
 
 
 @dataclass(frozen=True)
@@ -246,19 +256,20 @@ class CalibrationProblem:
         if self.earlier:
             return self.earlier
         parameters = self.prior.parameters_of(self.sensor, self.probe)
-        if parameters[0] <= 0.0:  # a sensor file that gives no pretension does not say that there is none
-            parameters[0] = self.prior.mean[0]
+        pretension = self.prior.index("pretension")
+        if parameters[pretension] <= 0.0:  # a sensor file that gives no pretension does not say that there is none
+            parameters[pretension] = self.prior.mean[pretension]
         return FilmEstimate(parameters, np.eye(parameters.size))
 
     @cached_property
     def expected(self) -> FilmEstimate:
         """The same for a plan of presses: a film of which no press has told anything may have `LIKELY` besides."""
-        before, charges = self.before, self.charges
         if self.earlier:
-            return before
-        wider = LIKELY.covariance(before.parameters.size, len(charges.modes), len(self.electrodes))
-        joint = wider[:-NUISANCES, :-NUISANCES] + np.pad(before.covariance, (0, charges.n_coefficient))
-        return replace(before, coefficients=np.zeros(charges.n_coefficient), joint=joint)
+            return self.before
+        layout = self.charges.layout
+        joint = LIKELY.covariance(layout)[layout.film, layout.film]
+        joint[layout.parameters, layout.parameters] += self.before.covariance
+        return replace(self.before, coefficients=np.zeros(layout.coefficient_count), joint=joint)
 
 
 def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> FilmsModel:

@@ -1,0 +1,147 @@
+"""Nuisances of a session: what it has besides the film, such as an offset or a drift of the charges.
+
+A nuisance is an unknown of the fit that is not a property of the film. `NUISANCES` declares each one once: its name and
+unit, its standard deviation before the presses, and how it acts on the charges or on the pretension. All nuisances act
+linearly, so that their derivatives follow from what they do at a value of one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.train.calibration.press_data import PressData
+
+
+class NuisanceEstimate(NamedTuple):
+    """Value and standard deviation of a nuisance, in its unit."""
+
+    value: float
+    std: float
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """Declaration of a nuisance; a class for each kind says how it acts.
+
+    Attributes:
+        name: Name of the nuisance.
+        unit: Unit of the nuisance.
+        probabilities: Standard deviations before the presses that are weighed as hypotheses, each with its probability;
+            zero alone for a nuisance that is not weighed.
+        std_with_temperatures: Standard deviation before the presses in every session whose temperatures are known; zero
+            for a nuisance that has nothing to do with temperature.
+        is_stored: Whether the estimate is part of a stored film: it is a property that the next calibration needs.
+    """
+
+    name: str
+    unit: str
+    probabilities: tuple[tuple[float, float], ...] = ((0.0, 1.0),)
+    std_with_temperatures: float = 0.0
+    is_stored: bool = False
+
+    def charge_error(self, data: PressData, value: float) -> Array:
+        """Return what the nuisance adds to the measured charges, shape (n, n_electrode), pC."""
+        del value
+        return np.zeros_like(data.charge)
+
+    def tension_change(self, data: PressData, value: float) -> Array:
+        """Return what the nuisance adds to the pretension under each press, shape (n,), MPa."""
+        del value
+        return np.zeros(len(data))
+
+    def gain_std(self, estimate: NuisanceEstimate) -> float:
+        """Return the standard deviation, a share, that it adds to every gain when the film is used later."""
+        del estimate
+        return 0.0
+
+    def caution(self, estimate: NuisanceEstimate) -> str:
+        """Return the sentence for the user if the session probably has this nuisance."""
+        return f"the session has {self.name}: {estimate.value:.2g} +- {estimate.std:.2g} {self.unit}; it is taken off"
+
+
+class PretensionPerKelvin(Nuisance):
+    """Change of the pretension with temperature: the film grows more than its ring."""
+
+    def tension_change(self, data: PressData, value: float) -> Array:
+        """Return the change by the warming since the mean of the presses."""
+        return value * data.warming_K
+
+
+class ChargeOffset(Nuisance):
+    """Common offset of all charges: the tare was wrong."""
+
+    def charge_error(self, data: PressData, value: float) -> Array:
+        """Return the offset."""
+        return np.full_like(data.charge, value)
+
+    def caution(self, estimate: NuisanceEstimate) -> str:
+        """Return the sentence about the tare."""
+        return (
+            f"the charges are {estimate.value:.2g} +- {estimate.std:.2g} pC too large in all presses and electrodes: "
+            "is the tare right? It is taken off"
+        )
+
+
+class ChargeDrift(Nuisance):
+    """Drift of all charges from the first press to the last."""
+
+    def charge_error(self, data: PressData, value: float) -> Array:
+        """Return a share of each charge, from minus one half of the drift to plus one half."""
+        return value * data.session_time[:, None] * data.charge
+
+    def gain_std(self, estimate: NuisanceEstimate) -> float:
+        """Return the spread of a drift whose value is unknown when the film is used."""
+        return float(np.hypot(estimate.value, estimate.std) / np.sqrt(12.0))
+
+    def caution(self, estimate: NuisanceEstimate) -> str:
+        """Return the sentence about the drift."""
+        return (
+            f"the charges are {100.0 * estimate.value:.2g} +- {100.0 * estimate.std:.2g} % larger at the end than at "
+            "the beginning? It is taken off"
+        )
+
+
+PRETENSION_PER_KELVIN = PretensionPerKelvin("pretension_per_K", "MPa/K", std_with_temperatures=0.4, is_stored=True)
+"""Change of the pretension with temperature. Its standard deviation before the presses is E da / (1 - nu), which is
+0.3 to 0.44 MPa/K on aluminium."""
+
+NUISANCES: tuple[Nuisance, ...] = (
+    PRETENSION_PER_KELVIN,
+    ChargeOffset("offset", "pC", ((0.0, 0.9), (30.0, 0.1))),
+    ChargeDrift("drift", "1", ((0.0, 0.95), (0.15, 0.05))),
+)
+"""All nuisances, in the order of their unknowns."""
+
+
+def without_nuisances(data: PressData, values: Sequence[float] | Array) -> PressData:
+    """Return the presses as on a film of one temperature, without the errors of the charges.
+
+    Args:
+        data: The presses as they were measured.
+        values: Value of each nuisance, in the order of `NUISANCES`.
+    """
+    charge = data.charge
+    tension_change = np.zeros(len(data))
+    for nuisance, value in zip(NUISANCES, values, strict=True):
+        charge = charge - nuisance.charge_error(data, value)
+        tension_change = tension_change + nuisance.tension_change(data, value)
+    return replace(data, charge=charge, tension_change=tension_change)
+
+
+def nuisance_derivatives(data: PressData, pretension_derivative: Array) -> Array:
+    """Return the derivatives of the residual by the nuisances, shape (n, n_electrode + 3, n_nuisance).
+
+    Args:
+        data: The presses as they were measured.
+        pretension_derivative: Derivative of the residual by the pretension, shape (n, n_electrode + 3), 1/MPa.
+    """
+    rig_rows = np.zeros((len(data), 3))
+    columns = []
+    for nuisance in NUISANCES:
+        charge_rows = data.weight * nuisance.charge_error(data, 1.0)
+        tension_rows = pretension_derivative * nuisance.tension_change(data, 1.0)[:, None]
+        columns.append(np.column_stack([charge_rows, rig_rows]) + tension_rows)
+    return np.stack(columns, axis=2)

@@ -1,0 +1,101 @@
+"""Layout of the vector of unknowns of a calibration: a named slice for each kind of unknown.
+
+The unknowns are, in this order: the parameters of the film (`film_prior.PARAMETERS` and the gains), the coefficients of
+what the film has besides (modes of imperfections, traces, terms of the discrepancy), and the nuisances of the session
+(`nuisances.NUISANCES`). Parameters are in units of their standard deviations over films where a fit takes them.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from isocharge.train.calibration.discrepancy import TRACE_ANGLES, term_count
+from isocharge.train.calibration.nuisances import NUISANCES
+
+
+@dataclass(frozen=True)
+class UnknownLayout:
+    """Places of the unknowns in their vector.
+
+    Attributes:
+        parameter_names: Names of the film's parameters.
+        mode_names: Names of the modes of imperfections.
+        electrode_names: Names of the electrodes.
+    """
+
+    parameter_names: tuple[str, ...]
+    mode_names: tuple[str, ...]
+    electrode_names: tuple[str, ...]
+
+    @cached_property
+    def parameters(self) -> slice:
+        """Parameters of the film."""
+        return slice(0, len(self.parameter_names))
+
+    @cached_property
+    def modes(self) -> slice:
+        """Coefficients of the modes of imperfections."""
+        return _after(self.parameters, len(self.mode_names))
+
+    @cached_property
+    def traces(self) -> slice:
+        """Coefficients of traces that are not described: for each electrode those of `TRACE_ANGLES`."""
+        return _after(self.modes, len(TRACE_ANGLES) * len(self.electrode_names))
+
+    @cached_property
+    def terms(self) -> slice:
+        """Coefficients of the discrepancy: for each term those of the electrodes."""
+        return _after(self.traces, term_count() * len(self.electrode_names))
+
+    @cached_property
+    def nuisances(self) -> slice:
+        """Nuisances of the session."""
+        return _after(self.terms, len(NUISANCES))
+
+    @cached_property
+    def coefficients(self) -> slice:
+        """Modes, traces and terms together."""
+        return slice(self.modes.start, self.terms.stop)
+
+    @cached_property
+    def imperfections(self) -> slice:
+        """Modes and traces together: the coefficients that act on the charges as a film does."""
+        return slice(self.modes.start, self.traces.stop)
+
+    @cached_property
+    def film(self) -> slice:
+        """Parameters and coefficients together: all that belongs to the film."""
+        return slice(self.parameters.start, self.terms.stop)
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of parameters."""
+        return self.parameters.stop
+
+    @property
+    def coefficient_count(self) -> int:
+        """Number of coefficients."""
+        return self.coefficients.stop - self.coefficients.start
+
+    @property
+    def film_count(self) -> int:
+        """Number of parameters and coefficients."""
+        return self.film.stop
+
+    @property
+    def count(self) -> int:
+        """Number of all unknowns."""
+        return self.nuisances.stop
+
+    def parameter(self, name: str) -> int:
+        """Return the place of a parameter."""
+        return self.parameters.start + self.parameter_names.index(name)
+
+    def nuisance(self, name: str) -> int:
+        """Return the place of a nuisance."""
+        names = [nuisance.name for nuisance in NUISANCES]
+        return self.nuisances.start + names.index(name)
+
+
+def _after(previous: slice, count: int) -> slice:
+    """Return the slice of the next unknowns behind others."""
+    return slice(previous.stop, previous.stop + count)
