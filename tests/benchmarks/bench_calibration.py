@@ -62,7 +62,7 @@ def as_read(problem: CalibrationProblem, contact: np.ndarray, charge: np.ndarray
 def limit(problem: CalibrationProblem, truth: np.ndarray, contact: np.ndarray) -> tuple[float, float]:
     """The linearised limit of what not knowing the film leaves after presses at `contact`, at the true film."""
     information = np.eye(truth.size) + information_of(problem, truth, contact, POSITION_MM, FORCE).sum(axis=0)
-    left = ContactSensitivity.at(problem, truth).left(np.linalg.inv(information))
+    left = ContactSensitivity.at(problem, truth).contact_error(np.linalg.inv(information))
     return left.position_mm, left.force_percent
 
 

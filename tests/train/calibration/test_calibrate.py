@@ -200,7 +200,7 @@ def test_imperfections_of_a_film_are_taken_for_what_they_are(problem):
 def test_what_no_parameter_describes_is_corrected_and_its_error_is_said(problem):
     truth, result = on_a_film(problem, bent, 20, seed=41)
     corrected, plain = result.fitted, problem.films.fold(result.posterior.parameters)
-    assert 0.5 < result.left.position_mm / error_of(corrected, problem, truth, bent) < 2.0
+    assert 0.5 < result.error_left.position_mm / error_of(corrected, problem, truth, bent) < 2.0
     at = draw_contacts(np.random.default_rng(3), problem.domain.within(6.0), 200)
     charge = bent(at, problem.charges.charges(truth, at))
     errors = [np.hypot(*(network.predict(charge)[0] - at)[:, :2].T).mean() for network in (corrected, plain)]
@@ -234,7 +234,7 @@ def test_what_a_session_had_is_taken_off_and_said(problem, change, caution):
     truth, result = on_a_film(problem, change, 8, seed=42)
     assert any(re.search(caution, sentence) for sentence in result.cautions)
     error = error_of(problem.films.fold(result.posterior.parameters), problem, truth)
-    assert error < 2.0 * result.left.position_mm < 0.4
+    assert error < 2.0 * result.error_left.position_mm < 0.4
 
 
 def test_a_leak_at_random_is_said_and_widens_the_force(problem):
@@ -246,7 +246,7 @@ def test_a_leak_at_random_is_said_and_widens_the_force(problem):
     charge = problem.charges.charges(truth, at)
     force = problem.films.fold(result.posterior.parameters).predict(charge)[0][:, 2]
     error = 100.0 * np.sqrt(np.mean((force / at[:, 2] - 1.0) ** 2))
-    assert 2.0 < error < 2.5 * result.left.force_percent
+    assert 2.0 < error < 2.5 * result.error_left.force_percent
 
 
 @pytest.mark.first_cases(1)
@@ -284,7 +284,7 @@ def test_the_error_left_is_near_the_linearised_limit(layout):
         result = calibrate(presses, layout)
         at_truth = ContactSensitivity.at(layout, truth)
         information = np.eye(truth.size) + information_of(layout, truth, presses.contact).sum(axis=0)
-        limit = at_truth.left(np.linalg.inv(information))
+        limit = at_truth.contact_error(np.linalg.inv(information))
         wrong = at_truth.by_parameter @ ((result.posterior.parameters - truth) / layout.prior.std)
         ratios.append(np.sqrt((wrong[:, :2] ** 2).sum(axis=1).mean()) / limit.position_mm)
     assert np.median(ratios) < 1.25
@@ -319,7 +319,7 @@ def test_little_said_is_said(problem):
     ):
         result = calibrate(few, problem)
         assert any(caution in sentence for sentence in result.cautions)
-        assert result.left.position_mm > 0.2
+        assert result.error_left.position_mm > 0.2
     result = calibrate(replace(presses, contact=far), problem)
     assert result.presses == presses[[0, 1, 3, 4, 5, 6, 7]]
     assert re.search("line 4.*left out|left out.*line 4", result.cautions[0])
@@ -380,7 +380,7 @@ def test_proposed_presses_tell_more_than_random_ones(problem):
 
     def left(at):
         told = information_of(problem, film.unknowns, at).sum(axis=0) @ film.joint
-        return sensitivity.left(film.joint @ np.linalg.inv(nothing + told)).position_mm
+        return sensitivity.contact_error(film.joint @ np.linalg.inv(nothing + told)).position_mm
 
     expected = [press.position_mm for press in proposed]
     assert expected == sorted(expected, reverse=True)
@@ -413,7 +413,7 @@ def test_an_earlier_calibration_is_the_prior_of_the_next(warmed, problem):
     rng = np.random.default_rng(10)
     at = draw_contacts(rng, problem.domain, 3)
     presses = presses_of(problem, at, problem.noise.add(problem.charges.charges(truth, at), rng))
-    assert calibrate(presses, again).left.position_mm < 0.7 * calibrate(presses, problem).left.position_mm
+    assert calibrate(presses, again).error_left.position_mm < 0.7 * calibrate(presses, problem).error_left.position_mm
 
 
 NOBODY_KNOWS = (np.nan, np.nan, np.nan)

@@ -89,7 +89,7 @@ def test_calibrate_from_a_film_with_a_discrepancy_and_no_traces(bent, problem, t
     assert code == 0, err
     later = json.loads(out)
     expected = bent.posterior.drifted(problem.prior)
-    expected_error = bent.sensitivity.left(expected.joint)
+    expected_error = bent.sensitivity.contact_error(expected.joint)
     assert later["error_left_before"]["position_mm"] == pytest.approx(expected_error.position_mm, rel=0.02)
     assert later["error_left"]["position_mm"] < later["error_left_before"]["position_mm"]
     earlier = read_earlier(tmp_path / "mine", problem)

@@ -41,7 +41,7 @@ def test_the_model_is_right_about_the_film(film, problem):
         answer = Predictor(model).predict_batch(charge)
         return float(np.sqrt(np.mean((answer.x_mm - at[:, 0]) ** 2 + (answer.y_mm - at[:, 1]) ** 2)))
 
-    expected = np.hypot(result.left.position_mm, result.sensitivity.of_noise.position_mm)
+    expected = np.hypot(result.error_left.position_mm, result.sensitivity.noise_error.position_mm)
     assert error_mm(folder) < 1.5 * expected
     assert error_mm("four-25um-biaxial") > 3.0 * error_mm(folder)
 
@@ -49,7 +49,7 @@ def test_the_model_is_right_about_the_film(film, problem):
 def test_every_file_is_there_and_reads_back(film, problem):
     _, result, folder = film
     table = json.loads((folder / "calibration.json").read_text("utf-8"))
-    assert table["error_left"]["position_mm"] == pytest.approx(result.left.position_mm)
+    assert table["error_left"]["position_mm"] == pytest.approx(result.error_left.position_mm)
     assert table["parameters"]["pretension"]["value"] == pytest.approx(1e6 * result.posterior.parameters[0])  # Pa
     assert np.shape(table["correlations"]) == (13, 13)
     parameters = problem.prior.parameters_of(load_sensor(folder / "sensor.toml"), result.film[1])
@@ -72,7 +72,7 @@ def test_what_is_read_is_what_was_written_but_for_drift(film, problem):
 def test_deviations_cover_what_is_left_of_the_film(film, problem):
     """At each contact that which is left there, beside the noise; the network follows that within some percent."""
     _, result, folder = film
-    contact, left = result.sensitivity.contact, result.sensitivity.covariance(result.posterior.joint)
+    contact, left = result.sensitivity.contact, result.sensitivity.contact_covariance(result.posterior.joint)
     charge = problem.charges.charges(result.posterior.unknowns, contact)
     plain = problem.films.fold(result.posterior.parameters).predict(charge)[1]
     ratio = Predictor(folder).predict_batch(charge).x_std_mm / np.hypot(plain[:, 0], np.sqrt(left[:, 0, 0]))

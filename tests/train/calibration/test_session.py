@@ -44,12 +44,13 @@ def test_presses_make_a_film_known_as_well_as_their_plan_says(problem, plan):
     bench = Bench(problem, plan)
     bench.press(3)
     result, session = bench.session.result, bench.session
-    assert result.left.position_mm < 2.0 * plan[2].position_mm
+    assert result.error_left.position_mm < 2.0 * plan[2].position_mm
     unit = (result.posterior.parameters - bench.parameters) / problem.prior.std
     assert (
         unit @ np.linalg.solve(result.posterior.covariance, unit) < 40.0
     )  # 13 parameters: one film in 4000 is farther
-    assert f"{result.left.position_mm:.2g} mm and {result.left.force_percent:.2g} % are left" in session.summary[0]
+    left = result.error_left
+    assert f"{left.position_mm:.2g} mm and {left.force_percent:.2g} % are left" in session.summary[0]
     assert [presses.lines for presses in bench.saved] == [(1,), (1, 2), (1, 2, 3)]
     assert not session.enough
     again = PressSession(problem, save=bench.saved.append, presses=bench.saved[2], until=10.0)

@@ -133,7 +133,7 @@ def _print_press(session: PressSession, press: SteadyPress, *, machine: bool) ->
         "held_s": press.held_s,
         "frames": press.frames,
         "flags": list(press.flags),
-        "error_left": error_table(result.left) if result else None,
+        "error_left": error_table(result.error_left) if result else None,
         "left_out": list(result.bad_lines) if result else [],
         "problem": session.refusal or None,
         "enough": session.enough,

@@ -1,4 +1,4 @@
-"""From measured presses to the film they were made on, with what it leaves uncertain."""
+"""Calibration: from measured presses to the film they were made on, with its remaining uncertainty."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -23,49 +23,50 @@ from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity, quantities, summarise
 from isocharge.train.training.fitted import Fitted
 
-UNEXPLAINED = 1e-6
-"""Chance of residuals as large as these, below which no film explains the presses..."""
+UNEXPLAINED_PROBABILITY = 1e-6
+"""Probability of residuals as large as these, below which no film explains the presses, if they are also large; see
+`UNEXPLAINED_CHI2`."""
 
-FAR_OFF = 9.0
-"""...if the mean squared residual is also above this: three times the noise."""
+UNEXPLAINED_CHI2 = 9.0
+"""Mean squared residual above which no film explains the presses: three times the noise."""
 
-UNCERTAIN = 0.01
-"""Chance of residuals as large as these, below which the errors are given larger by their ratio."""
+UNCERTAIN_PROBABILITY = 0.01
+"""Probability of residuals as large as these, below which the errors are scaled up by their ratio."""
 
-STRAINED = 1e-7
-"""Chance of a film as far from the described one as this, below which the presses are taken for wrongly written."""
+STRAINED_PROBABILITY = 1e-7
+"""Probability of a film as far from the described one as this, below which presses are taken for wrongly written."""
 
-ODD = 1e-3
-"""The same, below which presses are tried as what they may be by mistake."""
+ODD_PROBABILITY = 1e-3
+"""Probability of such a film, below which presses are compared with those of common mistakes."""
 
-MISLED = 8.0
+MISLEADING_MISFIT = 8.0
 """Misfit of presses as they are written, as `misfit` gives it, above which mistakes are looked for before a fit."""
 
 FEW = 3
-"""With so few presses a wrong one cannot be seen: said, not refused."""
+"""Largest number of presses among which a wrong one cannot be seen; the user is told."""
 
-EDGE = 0.1
-"""Standard deviations before the presses from its bound, within which a parameter counts as held by it: said."""
+BOUND_DISTANCE = 0.1
+"""Distance from its bound within which a parameter counts as held by the bound, in prior standard deviations."""
 
-MORE = 30
-"""Presses of which it is said what they would reach, where a film has what no parameter describes."""
+PLANNED_PRESSES = 30
+"""Number of further presses whose benefit is given, where a film has what no parameter describes."""
 
-SEEN = 2.0
-"""Standard deviations of a trace's width from which on it is named."""
+VISIBLE_TRACE = 2.0
+"""Width of a trace, in its standard deviations, from which on the trace is named."""
 
 CLOSE_MM = 1.0
-"""Presses that all lie within this distance of each other do not identify places: said."""
+"""Presses that all lie within this distance of each other do not identify places; the user is told."""
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """A film as presses show it.
+    """Calibration of a film: its estimate, and what follows from it.
 
     Attributes:
-        problem: What was asked.
+        problem: The films that were considered.
         presses: The presses that were fitted.
         posterior: Best parameters, covariance, residuals.
-        cautions: What the user should know, a sentence each.
+        cautions: Warnings for the user, a sentence each.
         moved: How an earlier calibration was moved to another temperature, without presses; empty with presses.
     """
 
@@ -82,51 +83,61 @@ class CalibrationResult:
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
-        """What is known of the film, by name, beside what its description alone says."""
+        """Quantities of the film by name, beside what its description alone gives."""
         return quantities(self.problem.prior, self.posterior)
 
     @cached_property
     def sensitivity(self) -> ContactSensitivity:
-        """How contacts answer to noise and to a wrong film, at the calibrated film."""
+        """How contacts respond to noise and to a wrong film, at the calibrated film."""
         return ContactSensitivity.at(self.problem, self.posterior.unknowns)
 
     @cached_property
-    def left(self) -> ContactError:
-        """The error of contacts that is left by not knowing the film."""
-        return self.sensitivity.left(self.posterior.joint)
+    def error_left(self) -> ContactError:
+        """Error of contacts that the remaining uncertainty of the film causes."""
+        return self.sensitivity.contact_error(self.posterior.joint)
 
     @cached_property
-    def left_before(self) -> ContactError:
-        """The same before the presses, or before it was moved."""
-        before, covariance = self.problem.before, np.zeros_like(self.posterior.joint)
-        known = len(before.unknowns)
-        covariance[:known, :known] = before.unknown_covariance
+    def error_left_before(self) -> ContactError:
+        """The same error before the presses, or before the film was moved to another temperature."""
+        before = self.problem.before
+        count = len(self.posterior.joint)
+        estimated = slice(0, len(before.unknowns))
+        covariance = np.zeros((count, count))
+        covariance[estimated, estimated] = before.unknown_covariance
         if not self.moved:
-            return self.sensitivity.left(covariance)
-        unknowns = np.pad(before.unknowns, (0, len(covariance) - known))
-        return ContactSensitivity.at(self.problem, unknowns).left(covariance)
+            return self.sensitivity.contact_error(covariance)
+        unknowns = np.zeros(count)
+        unknowns[estimated] = before.unknowns
+        return ContactSensitivity.at(self.problem, unknowns).contact_error(covariance)
 
     @property
     def fitted(self) -> Fitted:
-        """The network of this film, for `evaluate` and `release`; what the film leaves is in its deviations."""
+        """The network of this film, for `evaluate` and `release`; its deviations contain the film's uncertainty."""
         return self.fitted_film(self.posterior.parameters, release=True)
 
     def fitted_film(self, parameters: Array, *, release: bool = False) -> Fitted:
-        """The network of a film near it, of these parameters; all else that is known of this film holds for it."""
-        left = self.sensitivity.contact, np.einsum("nii->ni", self.sensitivity.covariance(self.posterior.joint))
-        return self.problem.fitted(parameters, left, self._factor, release=release)
+        """Return the network of a film near this one, with the same discrepancy and the same uncertainty.
+
+        Args:
+            parameters: Parameters of the film, shape (n_parameter,).
+            release: Whether the network will be released; see `CalibrationProblem.fitted`.
+        """
+        contact_covariance = self.sensitivity.contact_covariance(self.posterior.joint)
+        variance = np.einsum("nii->ni", contact_covariance)
+        return self.problem.fitted(parameters, (self.sensitivity.contact, variance), self._factor, release=release)
 
     @cached_property
     def _factor(self) -> Callable[[Array], Array]:
-        """What the film has besides its parameters; the answers are remembered, for its networks ask the same."""
-        known: dict[bytes, Array] = {}
+        """Factor of the film's discrepancy; answers are cached, since the networks of a film ask for the same."""
+        cache: dict[bytes, Array] = {}
 
         def factor(contact: Array) -> Array:
             keys = [row.tobytes() for row in contact]
-            if new := [number for number, key in enumerate(keys) if key not in known]:
-                factors = self.problem.charges.factor(self.posterior.unknowns, contact[new])
-                known.update(zip([keys[number] for number in new], factors, strict=True))
-            return np.stack([known[key] for key in keys])
+            missing = [number for number, key in enumerate(keys) if key not in cache]
+            if missing:
+                factors = self.problem.charges.factor(self.posterior.unknowns, contact[missing])
+                cache.update(zip([keys[number] for number in missing], factors, strict=True))
+            return np.stack([cache[key] for key in keys])
 
         return factor
 
@@ -144,102 +155,123 @@ class CalibrationResult:
     @cached_property
     def summary(self) -> tuple[str, ...]:
         """The result in sentences; they are computed once, since they contain a plan of further presses."""
-        noise, left, before = self.sensitivity.of_noise, self.left, self.left_before
+        left, before = self.error_left, self.error_left_before
+        noise = self.sensitivity.noise_error
         when = "it was moved" if self.moved else "these presses"
-        return (
+        errors = (
             f"Not knowing the film leaves {left.position_mm:.2g} mm and {left.force_percent:.2g} % of the "
             f"force (root mean square); before {when} it was {before.position_mm:.2g} mm and "
             f"{before.force_percent:.2g} %. Noise alone leaves {noise.position_mm:.2g} mm and "
-            f"{noise.force_percent:.2g} %.",
-            *((f"The film was {self.moved}, without presses.",) if self.moved else summarise(self.quantities)),
-            *self._of_temperature,
+            f"{noise.force_percent:.2g} %."
+        )
+        film = (f"The film was {self.moved}, without presses.",) if self.moved else summarise(self.quantities)
+        rig = (
             "Forces are as right as the load cell, and places as the origin and the axes of the stage: an error of "
-            "theirs is in every answer, beside these.",
-            *self._unexplained,
-            *self.cautions,
+            "theirs is in every answer, beside these."
+        )
+        return (errors, *film, *self._temperature_sentences(), rig, *self._discrepancy_sentences(), *self.cautions)
+
+    def _temperature_sentences(self) -> Iterator[str]:
+        """Yield what a kelvin does to the film, if the temperatures of the presses are known."""
+        warming = self.posterior.warming
+        if warming is None:
+            return
+        if not warming.identified:
+            yield (
+                f"The presses were made at {warming.at_C:.1f} C; over more degrees they would tell what a kelvin does."
+            )
+            return
+        yield (
+            f"A kelvin more changes the pretension by {warming.MPa_per_K:.3g} +- {warming.std:.2g} MPa. This is the "
+            f"film at {warming.at_C:.1f} C; --from with --temperature gives it at another."
         )
 
-    @property
-    def _of_temperature(self) -> Iterator[str]:
-        """What a kelvin does to the film, if that is known."""
-        if (known := self.posterior.warming) is None:
-            return
-        if not known.identified:
-            yield f"The presses were made at {known.at_C:.1f} C; over more degrees they would tell what a kelvin does."
-        else:
-            yield (
-                f"A kelvin more changes the pretension by {known.MPa_per_K:.3g} +- {known.std:.2g} MPa. This is the "
-                f"film at {known.at_C:.1f} C; --from with --temperature gives it at another."
-            )
-
-    @property
-    def _unexplained(self) -> Iterator[str]:
-        """What no parameter describes, and what more presses would do about it."""
+    def _discrepancy_sentences(self) -> Iterator[str]:
+        """Yield what no parameter describes, and what more presses would do about it."""
         if not self.posterior.imperfect:
             return
-        contact = self.sensitivity.contact
-        share = 100.0 * rms(np.log(self.problem.charges.factor(self.posterior.unknowns, contact)))
-        more = next_presses(self.problem, MORE, self.posterior)
-        places = ", ".join(f"{press.force_N:.2f} N at ({press.x_mm:g}, {press.y_mm:g}) mm" for press in more[:3])
+        factor = self.problem.charges.factor(self.posterior.unknowns, self.sensitivity.contact)
+        percent = 100.0 * rms(np.log(factor))
+        plan = next_presses(self.problem, PLANNED_PRESSES, self.posterior)
+        places = ", ".join(f"{press.force_N:.2f} N at ({press.x_mm:g}, {press.y_mm:g}) mm" for press in plan[:3])
         yield (
-            f"Beyond these parameters, the charges of this film differ by {share:.2g} % (root mean square), "
-            f"smoothly over the film: {self.left.position_mm:.2g} mm are left now. {MORE} more presses would reach "
-            f"{more[-1].position_mm:.2g} mm, the first of them {places}; --next lists more."
+            f"Beyond these parameters, the charges of this film differ by {percent:.2g} % (root mean square), "
+            f"smoothly over the film: {self.error_left.position_mm:.2g} mm are left now. {PLANNED_PRESSES} more "
+            f"presses would reach {plan[-1].position_mm:.2g} mm, the first of them {places}; --next lists more."
         )
         if self.posterior.probability("traces") > PROBABLE:
             widths = self.problem.charges.trace_widths(self.posterior.unknowns, self.posterior.joint)
-            seen = [f"{name} {width:.2g} mm" for name, (width, std) in widths.items() if width > SEEN * std]
+            visible = [f"{name} {width:.2g} mm" for name, (width, std) in widths.items() if width > VISIBLE_TRACE * std]
             yield (
                 f"Most of it is that electrodes collect beyond their pads, as traces to the rim of this width would: "
-                f"{', '.join(seen)}. Described in the sensor file, they leave less."
+                f"{', '.join(visible)}. Described in the sensor file, they leave less."
             )
 
 
 def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
-    """The film on which presses were made.
+    """Find the film on which presses were made.
 
     Args:
-        presses: In the order in which they were made. With place and force, or one of them; presses without both tell
-            how a film has changed since an earlier calibration, if it has more than three electrodes. Uncertain as
-            they say.
+        presses: The presses in the order in which they were made, with place and force, or one of them. Presses without
+            both show how a film has changed since an earlier calibration, if it has more than three electrodes. Their
+            standard deviations count.
         problem: The films that it may be.
 
     Raises:
-        PressError: If the presses cannot be what they say, or no film explains them; with the reason where it is found.
+        PressError: If the presses cannot be as they are written, or no film explains them; the reason is named where it
+            is found.
     """
     presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
     check_places(presses, problem.prior.sensor.film.radius)
     check_channels(presses, problem.charges)
-    _check_enough_known(presses, problem)
-    far, cautions = outside(presses.contact, problem.charges.domain), []
-    if far.any():
-        low, high = problem.charges.domain.force_range
-        too_far = (
-            f"{_lines(presses[far])}: a calibration takes presses within {problem.charges.domain.radius:.3g} mm of the "
-            f"centre and of {low:.2g} to {high:.2g} N"
-        )
-        if far.mean() > 0.5:
-            raise explain(presses, problem.charges, np.inf) if len(presses) > 1 else PressError(too_far)
-        cautions.append(f"{too_far}; left out")
-        presses = presses[~far]
-    if misfit(presses, problem.charges) > MISLED and find_mistakes(presses, problem.charges):
+    _check_enough_measured(presses, problem)
+    presses, domain_cautions = _within_domain(presses, problem)
+    if misfit(presses, problem.charges) > MISLEADING_MISFIT and find_mistakes(presses, problem.charges):
         raise explain(presses, problem.charges, np.nan)
-    at_C = float(temperatures(presses).mean()) if presses.knows_temperature else None
-    if at_C is not None:
+    at_C = None
+    if presses.knows_temperature:
+        at_C = float(temperatures(presses).mean())
         problem = replace(problem, earlier=problem.before.at_temperature(at_C, problem.prior))
     data = PressData.of(presses, problem.noise, problem.charges.domain)
     with threadpool_limits(1):  # many small matrices: a second thread only waits
         posterior = fit_film(problem.charges, data, problem.before, at_C)
     _refuse_unexplained(presses, problem, posterior)
-    chi2, freedom = posterior.total
-    if freedom and scipy.stats.chi2.sf(chi2, freedom) < UNCERTAIN:  # larger errors, by Birge's ratio (1932)
-        posterior = posterior.scaled(chi2 / freedom)
-        cautions.append(
-            f"the presses scatter {np.sqrt(chi2 / freedom):.2g} times as much as noise and rig are said to; the errors "
-            "are given larger by this factor: are places and forces as certain as assumed?"
-        )
+    posterior, scatter_cautions = _scaled_by_scatter(posterior)
     posterior = _with_unseen_mistakes(posterior, problem.before)
-    return CalibrationResult(problem, presses, posterior, (*cautions, *_cautions(presses, problem, posterior)))
+    cautions = (*domain_cautions, *scatter_cautions, *_cautions(presses, problem, posterior))
+    return CalibrationResult(problem, presses, posterior, cautions)
+
+
+def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tuple[MeasuredPresses, list[str]]:
+    """Return the presses whose places and forces the films have charges for, and a caution about the others.
+
+    Raises:
+        PressError: If most presses lie outside.
+    """
+    domain = problem.charges.domain
+    is_outside = outside(presses.contact, domain)
+    if not is_outside.any():
+        return presses, []
+    low, high = domain.force_range
+    sentence = (
+        f"{_lines(presses[is_outside])}: a calibration takes presses within {domain.radius:.3g} mm of the "
+        f"centre and of {low:.2g} to {high:.2g} N"
+    )
+    if is_outside.mean() > 0.5:
+        raise explain(presses, problem.charges, np.inf) if len(presses) > 1 else PressError(sentence)
+    return presses[~is_outside], [f"{sentence}; left out"]
+
+
+def _scaled_by_scatter(posterior: FilmPosterior) -> tuple[FilmPosterior, list[str]]:
+    """Scale the errors up where the presses scatter more than they should, by Birge's ratio (1932)."""
+    chi2, freedom = posterior.total
+    if freedom == 0.0 or scipy.stats.chi2.sf(chi2, freedom) >= UNCERTAIN_PROBABILITY:
+        return posterior, []
+    caution = (
+        f"the presses scatter {np.sqrt(chi2 / freedom):.2g} times as much as noise and rig are said to; the errors "
+        "are given larger by this factor: are places and forces as certain as assumed?"
+    )
+    return posterior.scaled(chi2 / freedom), [caution]
 
 
 def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved: str) -> CalibrationResult:
@@ -278,8 +310,8 @@ def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:
     return MeasuredPresses(np.empty((0, 3)), np.empty((0, len(electrodes))), none, none, electrodes, ())
 
 
-def _check_enough_known(presses: MeasuredPresses, problem: CalibrationProblem) -> None:
-    """Refuse presses without place and force where charges alone tell nothing of the film."""
+def _check_enough_measured(presses: MeasuredPresses, problem: CalibrationProblem) -> None:
+    """Refuse presses without place and force where charges alone say nothing about the film."""
     if np.isnan(presses.contact).all() and len(problem.electrodes) <= 3:
         raise PressError(
             f"{len(presses)} presses of unknown place and force: three charges are used up by x, y and force, so they "
@@ -289,42 +321,62 @@ def _check_enough_known(presses: MeasuredPresses, problem: CalibrationProblem) -
 
 
 def _lines(presses: MeasuredPresses) -> str:
+    """Return the lines of presses in words, ten of them at most."""
+    noun = "line" if len(presses) == 1 else "lines"
     listed = ", ".join(map(str, presses.lines[:10]))
-    return f"{'line' if len(presses) == 1 else 'lines'} {listed}{', ...' if len(presses) > 10 else ''}"
+    more = ", ..." if len(presses) > 10 else ""
+    return f"{noun} {listed}{more}"
 
 
 def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> None:
+    """Raise PressError if no film explains the presses, or only a film that hardly exists."""
     chi2, freedom = posterior.total
+    is_unexplained = (
+        freedom > 0.0
+        and chi2 / freedom > UNEXPLAINED_CHI2
+        and scipy.stats.chi2.sf(chi2, freedom) < UNEXPLAINED_PROBABILITY
+    )
     deviation = (posterior.parameters - problem.before.parameters) / problem.prior.std
     strain = float(deviation @ np.linalg.solve(problem.before.covariance, deviation))
-    unexplained = freedom > 0.0 and chi2 / freedom > FAR_OFF and scipy.stats.chi2.sf(chi2, freedom) < UNEXPLAINED
-    chance = scipy.stats.chi2.sf(strain, deviation.size)
-    strange = posterior.imperfect or posterior.bad.any() or chance < ODD
-    odd = strange and bool(find_mistakes(presses, problem.charges))  # a few wrong presses may find a strange film
-    if unexplained or chance < STRAINED or odd:
+    probability = scipy.stats.chi2.sf(strain, deviation.size)
+    is_strange = posterior.imperfect or posterior.bad.any() or probability < ODD_PROBABILITY
+    # a few presses with a common mistake may find a film that exists, but is strange
+    is_mistaken = is_strange and bool(find_mistakes(presses, problem.charges))
+    if is_unexplained or probability < STRAINED_PROBABILITY or is_mistaken:
         worst = max(chi2 / max(freedom, 1.0), strain / deviation.size)
         raise explain(presses, problem.charges, float(np.sqrt(worst)))
 
 
 def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> FilmPosterior:
-    """Allow for wrong presses that so few cannot show: with their chance, no more is known than before."""
-    good, left_out = int((~posterior.bad).sum()), int(posterior.bad.sum())
-    chance = MISTAKEN * (good if good <= FEW else 0) + min(left_out / (good * good), 0.5)
-    joint, of_before, count = (1.0 - chance) * posterior.joint, before.unknown_covariance, len(before.unknowns)
-    joint[:count, :count] += chance * of_before
-    warming, n = posterior.warming, len(before.parameters)
-    warming = warming and warming._replace(covariance=(1.0 - chance) * warming.covariance)
-    return replace(posterior, joint=joint, covariance=joint[:n, :n], warming=warming)
+    """Allow for wrong presses that so few presses cannot show.
+
+    With the probability of such a press, the film is only known as before the presses.
+    """
+    good_count = int((~posterior.bad).sum())
+    left_out_count = int(posterior.bad.sum())
+    probability = min(left_out_count / (good_count * good_count), 0.5)
+    if good_count <= FEW:
+        probability += MISTAKEN * good_count
+    joint = (1.0 - probability) * posterior.joint
+    estimated = slice(0, len(before.unknowns))
+    joint[estimated, estimated] += probability * before.unknown_covariance
+    warming = posterior.warming
+    if warming is not None:
+        warming = warming._replace(covariance=(1.0 - probability) * warming.covariance)
+    count = len(before.parameters)
+    return replace(posterior, joint=joint, covariance=joint[:count, :count], warming=warming)
 
 
 def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> Iterator[str]:
+    """Yield warnings for the user, a sentence each."""
     if posterior.bad.any():
         lines = _lines(presses[posterior.bad])
         yield f"{lines}: left out, since no film fits them and all others; look at them again"
     good = presses[~posterior.bad]
     if len(good) <= FEW:
+        noun = "presses" if len(good) > 1 else "press"
         yield (
-            f"only {len(good)} press{'es' if len(good) > 1 else ''}: a wrong one among so few cannot be seen, and the "
+            f"only {len(good)} {noun}: a wrong one among so few cannot be seen, and the "
             "errors allow for it; more than three tell far more"
         )
     for nuisance in NUISANCES:
@@ -336,12 +388,10 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
             "are both read at the same moment, or does charge leak in between? What lowers charges at random lowers "
             "them on average as well: the errors allow for as much"
         )
-    prior, parameters = problem.prior, posterior.parameters
-    low, high = prior.bounds
-    held = (parameters < low + EDGE * prior.std) & (low < 0.0) | (parameters > high - EDGE * prior.std)
-    if held.any():
+    held = _parameters_at_bounds(problem, posterior)
+    if held:
         yield (
-            f"as far from their description as a film may be: {', '.join(np.array(prior.names)[held])}; the errors may "
+            f"as far from their description as a film may be: {', '.join(held)}; the errors may "
             "be larger than is said. Are the sensor file, and the origin and axes of the stage, those of this film?"
         )
     places = good.contact[np.isfinite(good.contact[:, 0]), :2]
@@ -355,3 +405,13 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
             "no place is known: positions will be right only up to the shift and the turn of the electrodes "
             "themselves, and if the charges are in the right columns"
         )
+
+
+def _parameters_at_bounds(problem: CalibrationProblem, posterior: FilmPosterior) -> list[str]:
+    """Return the names of the parameters that their bounds hold; no pretension is no such bound."""
+    prior = problem.prior
+    lower, upper = prior.bounds
+    margin = BOUND_DISTANCE * prior.std
+    is_low = (posterior.parameters < lower + margin) & (lower < 0.0)
+    is_high = posterior.parameters > upper - margin
+    return [name for name, is_held in zip(prior.names, is_low | is_high, strict=True) if is_held]

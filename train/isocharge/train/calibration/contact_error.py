@@ -92,16 +92,16 @@ class ContactSensitivity:
         by_parameter = -np.einsum("nij,nkj,nkp->nip", covariance, slopes, by_film)
         return cls(contact, by_parameter, covariance, projected(by_film, slopes))
 
-    def left(self, covariance: Array) -> ContactError:
+    def contact_error(self, covariance: Array) -> ContactError:
         """The error left with a covariance of what is unknown of the film."""
-        return ContactError.of(self.covariance(covariance))
+        return ContactError.of(self.contact_covariance(covariance))
 
-    def covariance(self, covariance: Array) -> Array:
+    def contact_covariance(self, covariance: Array) -> Array:
         """The same as covariances of (x, y, ln F), shape (n, 3, 3)."""
         return np.asarray(self.by_parameter @ covariance @ self.by_parameter.swapaxes(1, 2))
 
     @property
-    def of_noise(self) -> ContactError:
+    def noise_error(self) -> ContactError:
         """The error that noise alone leaves."""
         return ContactError.of(self.noise)
 
@@ -110,7 +110,7 @@ class ContactSensitivity:
 
         Position and force count in units of the error that noise alone leaves.
         """
-        unit = self.of_noise
+        unit = self.noise_error
         scaled = self.by_parameter / np.array([[unit.position_mm], [unit.position_mm], [0.01 * unit.force_percent]])
         return np.asarray(np.einsum("nip,niq->pq", scaled, scaled) / len(scaled))
 
@@ -217,7 +217,7 @@ def next_presses(
         gain = np.einsum("nij,nji->n", np.linalg.inv(inner), reached @ cost @ reached.swapaxes(1, 2))
         best = int(np.argmax(gain))
         covariance = covariance - reached[best].T @ np.linalg.solve(inner[best], reached[best])
-        left = sensitivity.left(covariance)
+        left = sensitivity.contact_error(covariance)
         x, y, force = candidates[best].tolist()
         proposed.append(ProposedPress(x, y, force, left.position_mm, left.force_percent))
     return proposed

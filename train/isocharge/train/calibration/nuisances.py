@@ -3,6 +3,9 @@
 A nuisance is an unknown of the fit that is not a property of the film. `NUISANCES` declares each one once: its name and
 unit, its standard deviation before the presses, and how it acts on the charges or on the pretension. All nuisances act
 linearly, so that their derivatives follow from what they do at a value of one.
+
+A nuisance ends with its session. Only the change of the pretension with temperature is stored with the film, as
+`problem.Warming`, because the next calibration needs it.
 """
 
 from collections.abc import Sequence
@@ -33,14 +36,12 @@ class Nuisance:
             zero alone for a nuisance that is not weighed.
         std_with_temperatures: Standard deviation before the presses in every session whose temperatures are known; zero
             for a nuisance that has nothing to do with temperature.
-        is_stored: Whether the estimate is part of a stored film: it is a property that the next calibration needs.
     """
 
     name: str
     unit: str
     probabilities: tuple[tuple[float, float], ...] = ((0.0, 1.0),)
     std_with_temperatures: float = 0.0
-    is_stored: bool = False
 
     def charge_error(self, data: PressData, value: float) -> Array:
         """Return what the nuisance adds to the measured charges, shape (n, n_electrode), pC."""
@@ -104,7 +105,7 @@ class ChargeDrift(Nuisance):
         )
 
 
-PRETENSION_PER_KELVIN = PretensionPerKelvin("pretension_per_K", "MPa/K", std_with_temperatures=0.4, is_stored=True)
+PRETENSION_PER_KELVIN = PretensionPerKelvin("pretension_per_K", "MPa/K", std_with_temperatures=0.4)
 """Change of the pretension with temperature. Its standard deviation before the presses is E da / (1 - nu), which is
 0.3 to 0.44 MPa/K on aluminium."""
 

@@ -33,8 +33,8 @@ def calibration_picture(result: CalibrationResult) -> Figure:
         if result.moved
         else ("before the presses", f"after {len(result.presses)} presses")
     )
-    _draw_error(before, result, result.left_before, then)
-    shades = _draw_error(after, result, result.left, now)
+    _draw_error(before, result, result.error_left_before, then)
+    shades = _draw_error(after, result, result.error_left, now)
     contact, bad = result.posterior.contact, result.posterior.bad
     after.plot(*contact[~bad, :2].T, "o", color="white", mec=INK, ms=6, label="presses")
     if bad.any():

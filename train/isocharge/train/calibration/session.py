@@ -140,7 +140,7 @@ class PressSession:
         """Whether the error left by the film is below the share of the noise that was asked for."""
         if self.result is None or len(self) < FEW:
             return False
-        return self.result.left.position_mm <= self._until * self.result.sensitivity.of_noise.position_mm
+        return self.result.error_left.position_mm <= self._until * self.result.sensitivity.noise_error.position_mm
 
     def take(self, charge: Array, contact: Array) -> None:
         """Take a press, save all, and fit the film.
@@ -215,7 +215,7 @@ class PressSession:
             return (f"No film explains these presses: {self.refusal}",)
         if self.result is None or len(self) < FEWEST_TO_SAY:
             return ()
-        left, noise = self.result.left, self.result.sensitivity.of_noise
+        left, noise = self.result.error_left, self.result.sensitivity.noise_error
         return (
             f"{left.position_mm:.2g} mm and {left.force_percent:.2g} % are left by not knowing the film; "
             f"noise alone is {noise.position_mm:.2g} mm and {noise.force_percent:.2g} %.",

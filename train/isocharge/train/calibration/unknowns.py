@@ -69,31 +69,36 @@ class UnknownLayout:
     @property
     def parameter_count(self) -> int:
         """Number of parameters."""
-        return self.parameters.stop
+        return _count(self.parameters)
 
     @property
     def coefficient_count(self) -> int:
         """Number of coefficients."""
-        return self.coefficients.stop - self.coefficients.start
+        return _count(self.coefficients)
 
     @property
     def film_count(self) -> int:
         """Number of parameters and coefficients."""
-        return self.film.stop
+        return _count(self.film)
 
     @property
     def count(self) -> int:
         """Number of all unknowns."""
-        return self.nuisances.stop
+        return self.film_count + _count(self.nuisances)
 
     def parameter(self, name: str) -> int:
         """Return the place of a parameter."""
-        return self.parameters.start + self.parameter_names.index(name)
+        return self.parameter_names.index(name)
 
     def nuisance(self, name: str) -> int:
         """Return the place of a nuisance."""
         names = [nuisance.name for nuisance in NUISANCES]
-        return self.nuisances.start + names.index(name)
+        return self.film_count + names.index(name)
+
+
+def _count(places: slice) -> int:
+    """Return the number of places of a slice."""
+    return int(places.stop - places.start)
 
 
 def _after(previous: slice, count: int) -> slice:
