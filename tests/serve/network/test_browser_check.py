@@ -216,3 +216,12 @@ def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_
     statistics = store.get("linear", "").statistics.snapshot()
     assert statistics.presses == 1  # the press of the server's own page
     np.testing.assert_equal(len(store.all()), 2)
+
+
+def test_a_page_on_another_port_of_an_allowed_host_is_refused():
+    """It belongs to another server; behind a proxy that replaces the `Host`, a page of the allowed host is accepted."""
+    check = BrowserCheck("127.0.0.1", ["film.example.org"])
+    page = {b"origin": b"http://film.example.org:3000"}
+    with pytest.raises(OriginError, match="Origin: expected a page of this server"):
+        check.check("POST", {b"host": b"film.example.org:8000"} | page)
+    check.check("POST", {b"host": b"127.0.0.1:8000"} | page)

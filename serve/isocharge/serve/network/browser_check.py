@@ -107,11 +107,18 @@ class BrowserCheck:
         return ip_address(name) is not None or name in self._host_names
 
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
-        """Return whether an `Origin` is the server itself, or one of the allowed names."""
+        """Return whether an `Origin` is the server itself, or an allowed name whose proxy replaced the `Host`.
+
+        A page on another port of the requested host belongs to another server.
+        """
         scheme, _, authority = origin.decode("latin-1").lower().partition("://")
         if scheme not in ("http", "https"):
             return False
-        return authority == host.decode("latin-1").lower() or _name_in(f"//{authority}") in self._allowed_names
+        requested = host.decode("latin-1").lower()
+        if authority == requested:
+            return True
+        page_name = _name_in(f"//{authority}")
+        return page_name in self._allowed_names and page_name != _name_in(f"//{requested}")
 
     def _served_names(self) -> str:
         return ", ".join(sorted(self._host_names))
