@@ -1,7 +1,7 @@
-"""Why presses fit no film: columns swapped, axes turned or mirrored, units mixed up, a dead channel, another layout.
+"""Mistakes by which presses fit no film: swapped columns, turned or mirrored axes, other units, a dead channel.
 
-Presses that no film explains are tried again as what they may be by mistake: other orders of the columns, other axes,
-other units. What then explains them is named; the data are never mended silently.
+Presses that no film explains are compared with films again under each mistake: other orders of the columns, other axes,
+other units. The mistakes that explain them are named. The data are never changed.
 """
 
 from collections.abc import Iterator
@@ -107,51 +107,65 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
                 f"electrode {name!r} is dead: half of its charges are below {np.nanmedian(np.abs(column)):.3g} pC, "
                 f"{100.0 * share:.2g} % of those of the others; check the channel, its cable and its amplifier"
             )
-        negative, known = np.sum(column < 0.0), np.sum(np.isfinite(column))
-        if negative > REVERSED * known and share > REVERSED_SHARE:  # weak ones may be negative, on taut uniaxial films
+        negative = np.sum(column < 0.0)
+        measured = np.sum(np.isfinite(column))
+        if (
+            negative > REVERSED * measured and share > REVERSED_SHARE
+        ):  # weak ones may be negative, on taut uniaxial films
             raise PressError(
-                f"electrode {name!r}: {negative} of its {known} charges are negative; a press gives a positive charge: "
-                "exchange its wires or its sign"
+                f"electrode {name!r}: {negative} of its {measured} charges are negative; a press gives a positive "
+                "charge: exchange its wires or its sign"
             )
 
 
 def _shares(charge: Array) -> Array:
-    """Typical charge of each channel over that of the others, from charges of shape (n, n_electrode)."""
+    """Return the typical charge of each channel over that of the others, from charges of shape (n, n_electrode)."""
     typical = np.nanmedian(np.abs(charge), axis=0)
     others = [np.median(np.delete(typical, number)) for number in range(typical.size)]
     return np.asarray(typical / np.maximum(others, 1e-9))
 
 
 def _expected(charges: FilmCharges, contact: Array) -> Array:
-    """Charges of contacts on the prior's mean film with `PRETENSIONS`, shape (n_pretension, n, n_electrode), pC."""
-    prior, contact = charges.prior, charges.into_domain(contact)
-    shares = np.array(PRETENSIONS)[:, None] * prior.spread.pretension
-    films = np.column_stack([shares, np.tile(prior.mean[1:], (len(shares), 1))])
-    return np.array([charges.charges(parameters, contact) for parameters in films])
+    """Return charges on the prior's mean film with each of `PRETENSIONS`, shape (n_pretension, n, n_electrode), pC."""
+    prior = charges.prior
+    contact = charges.into_domain(contact)
+    expected = []
+    for share in PRETENSIONS:
+        parameters = prior.mean.copy()
+        parameters[prior.index("pretension")] = share * prior.spread.pretension
+        expected.append(charges.charges(parameters, contact))
+    return np.array(expected)
 
 
 def outside(contact: Array, domain: Domain) -> Booleans:
-    """Which contacts, shape (n, 3), lie beyond a radius or a range of forces; what is not known does not."""
+    """Return which contacts, shape (n, 3), lie beyond the radius or the forces of a domain; NaN does not."""
     x, y, force = contact.T
     low, high = domain.force_range
     return np.asarray((np.hypot(x, y) > domain.radius) | (force < low) | (force > high))
 
 
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
-    """The mistakes that would explain presses far better than as they are written, best first; none if nothing does."""
+    """Return the mistakes that explain presses far better than the presses as they are written, best first."""
     placed = presses[presses.placed]
     if not len(placed):
         return []
     sentences, contacts, measured = zip(*_tried(placed, charges), strict=True)
     expected = np.split(_expected(charges, np.concatenate(contacts)), len(contacts), axis=1)
     mistakes = [*zip(map(partial(_misfit, charges), contacts, measured, expected), sentences, strict=True)]
-    clearer = CLEARER * misfit(presses, charges)
-    least = min(tried for tried, _ in mistakes)
-    return [sentence for tried, sentence in sorted(mistakes) if tried < clearer and tried <= AS_GOOD * least]
+    limit = CLEARER * misfit(presses, charges)
+    least_misfit = min(mistake_misfit for mistake_misfit, _ in mistakes)
+    return [
+        sentence
+        for mistake_misfit, sentence in sorted(mistakes)
+        if mistake_misfit < limit and mistake_misfit <= AS_GOOD * least_misfit
+    ]
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
-    """How far presses of known place and force are from those of any film, dimensionless: 1 is common, 20 is not."""
+    """Return the distance of presses with place and force from those of any film, dimensionless.
+
+    A misfit of 1 is common, one of 20 is not.
+    """
     placed = presses[presses.placed]
     if not len(placed):
         return 0.0
@@ -159,18 +173,20 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
 
 
 def _misfit(charges: FilmCharges, contact: Array, charge: Array, expected: Array) -> float:
-    """Mean squared logarithm of measured over expected charges, in units of what films differ by; see `_expected`."""
+    """Return the mean squared logarithm of measured over expected charges, in units of the spread of films."""
     if (charges.into_domain(contact) != contact).any(axis=1).mean() > 0.2:
         return np.inf
-    logs = np.log(np.maximum(charge, 1e-3)) - np.log(np.maximum(expected, 1e-3))
-    common = np.nanmedian(logs, axis=(1, 2))
-    own = np.nanmean(np.minimum((logs - common[:, None, None]) ** 2, 4.0), axis=(1, 2))
-    return float(np.min(own / SCATTER**2 + (common / OFFSET) ** 2))
+    log_ratio = np.log(np.maximum(charge, 1e-3)) - np.log(np.maximum(expected, 1e-3))
+    common = np.nanmedian(log_ratio, axis=(1, 2))
+    scatter = np.nanmean(np.minimum((log_ratio - common[:, None, None]) ** 2, 4.0), axis=(1, 2))
+    return float(np.min(scatter / SCATTER**2 + (common / OFFSET) ** 2))
 
 
 def _tried(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str, Array, Array]]:
-    """Every mistake that is tried, one at a time, in words, with contacts and charges put right."""
-    contact, charge, electrodes = presses.contact, presses.charge_pC, presses.electrodes
+    """Yield every mistake that is tried, in words, with contacts and charges as they are without it."""
+    contact = presses.contact
+    charge = presses.charge_pC
+    electrodes = presses.electrodes
     for order in _orders(presses, charges):
         swapped = ", ".join(electrodes[number] for number in order)
         sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {swapped}"
@@ -183,20 +199,23 @@ def _tried(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str
 
 
 def _orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
-    """The electrodes that columns fit best, in the order of the columns, by films of some pretension, if it is another.
+    """Return other orders of the electrodes that fit the columns best, one for each of `PRETENSIONS` at most.
 
-    The logarithms of every column are compared with those of every electrode; the best assignment is taken.
+    The logarithms of every column are compared with those of every electrode, and the best assignment is taken.
     """
-    orders, measured = set(), np.log(np.maximum(presses.charge_pC, 1e-3))
+    orders = set()
+    log_measured = np.log(np.maximum(presses.charge_pC, 1e-3))
     for expected in _expected(charges, presses.contact):
-        logs = measured[:, :, None] - np.log(np.maximum(expected, 1e-3))[:, None]
-        apart = np.nansum(np.minimum((logs - np.nanmedian(logs)) ** 2, 4.0), axis=0)
-        orders.add(tuple(linear_sum_assignment(apart)[1].tolist()))
-    return orders - {tuple(range(len(presses.electrodes)))}
+        log_ratio = log_measured[:, :, None] - np.log(np.maximum(expected, 1e-3))[:, None]
+        distance = np.nansum(np.minimum((log_ratio - np.nanmedian(log_ratio)) ** 2, 4.0), axis=0)
+        _, electrode_of_column = linear_sum_assignment(distance)
+        orders.add(tuple(electrode_of_column.tolist()))
+    as_written = tuple(range(len(presses.electrodes)))
+    return orders - {as_written}
 
 
 def explain(presses: MeasuredPresses, charges: FilmCharges, times_noise: float) -> PressError:
-    """The error for presses that no film of this sensor explains.
+    """Return the error for presses that no film of this sensor explains.
 
     Args:
         presses: As they are written.

@@ -5,7 +5,7 @@ and O'Hagan 2001), of finite rank: products of Chebyshev polynomials in the plac
 
     ln Q_e = ln Q_e(map) + sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= degree, m <= 2.
 
-The coefficients have the mean zero and the standard deviation s FADING^(i + j + m). Besides, all electrodes share a part
+The coefficients have the mean zero and the standard deviation s FADING^(i + j + m). All electrodes share a further part
 that is COMMON times as large: where a film is stiffer than its parameters say, all charges are smaller. The size s is
 unknown; `hypotheses` weighs several sizes by the presses.
 """

@@ -204,7 +204,7 @@ def error_table(error: ContactError) -> dict[str, float]:
 
 
 def read_earlier(folder: Path, problem: CalibrationProblem, *, knows_temperature: bool = False) -> FilmEstimate:
-    """The film of an earlier calibration, with what may have drifted since.
+    """Return the film of an earlier calibration, with the uncertainty of its drift since.
 
     Args:
         folder: As `write_calibration` made it, or one of its version folders.
@@ -218,10 +218,10 @@ def read_earlier(folder: Path, problem: CalibrationProblem, *, knows_temperature
 
 
 def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> CalibrationResult:
-    """An earlier calibration at another temperature, degrees Celsius, without presses and without drift.
+    """Return an earlier calibration at another temperature, degrees Celsius, without presses and without drift.
 
     Raises:
-        PressError: As `read_earlier`, and if it is not known what temperature does to this film.
+        PressError: As `read_earlier`, and if the change of this film with temperature is unknown.
     """
     path, film = _read(folder, problem)
     if film.warming is None or not film.warming.identified:

@@ -1,9 +1,9 @@
-"""What presses say of a film, in quantities that they can identify: products and ratios beside single parameters.
+"""Quantities of a film that presses can identify: products and ratios beside single parameters.
 
 Charges depend on Young's modulus, on the piezoelectric coefficients and on the gains almost only through their product,
-on modulus and thickness through E h. A single one of them may be as uncertain after the calibration as before while the
-product is known to a thousandth. So combinations are reported, each with its error, and single parameters are called
-unknown where the presses said little.
+on modulus and thickness through E h. A single parameter may be as uncertain after the calibration as before while the
+product has an error of a thousandth. Combinations are therefore reported, each with its error, and single parameters
+are called unknown where the presses hardly reduced their standard deviation.
 """
 
 from collections.abc import Mapping
@@ -17,10 +17,10 @@ from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.train.calibration.problem import IDENTIFIED, FilmEstimate
 
 PERCENT = ", over the described one"
-"""How quantities are given whose size is described, but not known."""
+"""Words behind quantities that are relative to the described value."""
 
 BY_ITSELF = ("young_percent", "thickness_percent", "d31_percent", "d32_percent", "mean_gain_percent")
-"""Quantities of which presses tell products."""
+"""Quantities that presses identify only in products."""
 
 SHOWN = 5
 """Quantities in a sentence, the first; the card has a table of all."""
@@ -67,7 +67,7 @@ class Quantity:
 
 
 def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
-    """The quantities of a film by name, beside what the described sensor alone says."""
+    """Return the quantities of a film by name, beside the standard deviations of the described sensor alone."""
 
     def std(row: Array, covariance: Array) -> float:
         return float(np.sqrt(row @ covariance @ row))
@@ -86,7 +86,7 @@ def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
 
 
 def _rows(prior: FilmPrior) -> dict[str, tuple[str, float, Array]]:
-    """Name to meaning, value at parameters of zero, and weight of each parameter."""
+    """Return meaning, value at parameters of zero, and weight of each parameter, by the name of the quantity."""
     unit = dict(zip(prior.names, np.eye(len(prior.names)), strict=True))
     gains = {name: unit[f"gain {name}"] for name in prior.sensor.electrode_names}
     mean_gain = sum(gains.values(), np.zeros(len(unit))) / len(gains)
@@ -124,21 +124,25 @@ def _rows(prior: FilmPrior) -> dict[str, tuple[str, float, Array]]:
 
 
 def summarise(table: Mapping[str, Quantity]) -> tuple[str, ...]:
-    """What the presses identify and what they cannot, a sentence each."""
-    known = [f"{name} {q.value:.3g} +- {q.std:.2g}" for name, q in table.items() if q.identified]
-    unknown = [name for name, q in table.items() if not q.identified]
-    words = [table[name].meaning.removesuffix(", %").removesuffix(PERCENT) for name in unknown]
-    more = f" and {len(known) - SHOWN} more, on the card" if len(known) > SHOWN else ""
-    sentences = [f"Known now: {', '.join(known[:SHOWN])}{more}."] if known else []
-    if unknown:
+    """Return sentences on the quantities that the presses identify, and on those that they do not identify."""
+    identified = [quantity for quantity in table.values() if quantity.identified]
+    unidentified = [quantity for quantity in table.values() if not quantity.identified]
+    sentences = []
+    if identified:
+        listed = ", ".join(f"{each.name} {each.value:.3g} +- {each.std:.2g}" for each in identified[:SHOWN])
+        more = f" and {len(identified) - SHOWN} more, on the card" if len(identified) > SHOWN else ""
+        sentences.append(f"Known now: {listed}{more}.")
+    if unidentified:
+        meanings = [each.meaning.removesuffix(", %").removesuffix(PERCENT) for each in unidentified]
         sentences.append(
-            f"These presses cannot tell {', '.join(words)}; what is given for them is hardly more than what was "
+            f"These presses cannot tell {', '.join(meanings)}; what is given for them is hardly more than what was "
             "assumed before."
         )
-    alone = [name.removesuffix("_percent") for name in unknown if name in BY_ITSELF]
-    if len(alone) > 1 and table["response_percent"].identified:
+    factors = [each.name.removesuffix("_percent") for each in unidentified if each.name in BY_ITSELF]
+    response = table["response_percent"]
+    if len(factors) > 1 and response.identified:
         sentences.append(
-            f"{', '.join(alone)}: only what they give together, the "
-            f"charge of a press, is known to {table['response_percent'].std:.2g} %, and that is what contacts need."
+            f"{', '.join(factors)}: only what they give together, the "
+            f"charge of a press, is known to {response.std:.2g} %, and that is what contacts need."
         )
     return tuple(sentences)

@@ -1,4 +1,4 @@
-"""Presses taken one after the other: which comes next, what is known by now, undo, and when it is enough.
+"""Session of presses taken one after the other: the next press, the film so far, undo, and when to stop.
 
 No port, no screen and no clock: whoever drives a session shows what it proposes, brings the charges of the press, and
 passes on what a person answers.
@@ -55,13 +55,13 @@ class Answer:
 
 
 def read_answer(text: str) -> Answer:
-    """What a line that a person typed means.
+    """Return the meaning of a line that a person typed.
 
     Args:
         text: Empty, three values with blanks or commas between them, `u`, `u 3`, `s` or `q`.
 
     Raises:
-        PressError: If it is something else; says what is expected.
+        PressError: If it is something else.
     """
     word = text.strip().lower()
     if word in WORDS:
@@ -69,12 +69,12 @@ def read_answer(text: str) -> Answer:
     if undo := re.fullmatch(r"(?:u|undo)\s*(\d*)", word):
         return Answer("undo", number=int(undo[1]) if undo[1] else "last")
     cells = [cell.strip() for cell in (word.split(",") if "," in word else word.split())] * (3 if word == "?" else 1)
-    known = [cell not in ("", "?") for cell in cells]
+    is_given = [cell not in ("", "?") for cell in cells]
     try:
-        contact = np.array([float(cell) if given else np.nan for cell, given in zip(cells, known, strict=True)])
+        contact = np.array([float(cell) if given else np.nan for cell, given in zip(cells, is_given, strict=True)])
     except ValueError:
         contact = np.empty(0)
-    if contact.shape != (3,) or not np.array_equal(np.isfinite(contact), known):
+    if contact.shape != (3,) or not np.array_equal(np.isfinite(contact), is_given):
         raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")
     return Answer("take", contact)
 
@@ -83,7 +83,7 @@ class PressSession:
     """The presses of one film as they are taken, and what they say of it.
 
     Attributes:
-        problem: The films that it may be, and what is known of it before the presses.
+        problem: The films that it may be, and the estimate before the presses.
         presses: Taken so far, numbered from 1 by their lines.
         result: The film by now; None without presses, or where no film explains them.
         refusal: Why no film explains the presses; empty where one does.
@@ -210,7 +210,7 @@ class PressSession:
 
     @property
     def summary(self) -> tuple[str, ...]:
-        """How well the film is known by now, and which presses fit badly, a sentence each."""
+        """The error that the film leaves so far, and the presses that fit badly, a sentence each."""
         if self.refusal:
             return (f"No film explains these presses: {self.refusal}",)
         if self.result is None or len(self) < FEWEST_TO_SAY:
