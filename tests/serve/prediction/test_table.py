@@ -121,6 +121,27 @@ def test_contacts_as_records(film, predictor):
     }  # fmt: skip
 
 
+@pytest.mark.parametrize("charges", [[0.0, 0.0, 0.0], [4.9, -4.9, 0.0]], ids=["zero", "noise"])
+def test_charges_within_the_noise_get_no_position(charges):
+    predictor = Predictor("three-25um-biaxial")
+    rows = np.array([charges, [848.0, 848.0, 848.0]])
+
+    empty, press = (json.loads(record.to_json()) for record in table_records(rows, predictor))
+    assert (empty["contact"], empty["force_N"], empty["flags"]) == (False, 0.0, [])
+    assert [empty[name] for name in ("x_mm", "y_mm", "x_std_mm", "y_std_mm", "force_std_N", "misfit")] == [None] * 6
+    assert press["contact"]
+    assert press["force_N"] == pytest.approx(1.0, rel=0.02)
+
+    out = io.StringIO()
+    write_contacts(predictor.predict_batch(rows), out, predictor.validity, rows)
+    assert out.getvalue().splitlines()[1] == ",,0.000000,,,,,"
+
+
+def test_light_press_that_exceeds_the_noise_has_a_position():
+    charges = np.array([[5.1, 2.0, 2.0]])
+    assert Predictor("three-25um-biaxial").validity.is_touch(charges).all()
+
+
 def test_record_has_the_fields_in_their_order(contract, record):
     assert list(json.loads(record().to_json())) == contract
 

@@ -46,7 +46,7 @@ def predict_command(
             for record in table_records(charge_pC, predictor):
                 print(record.to_json(), flush=True)  # at once: a reader on a pipe waits for it
         else:
-            write_contacts(predictor.predict_batch(charge_pC), sys.stdout, predictor.validity)
+            write_contacts(predictor.predict_batch(charge_pC), sys.stdout, predictor.validity, charge_pC)
             sys.stdout.flush()
 
 

@@ -138,6 +138,9 @@ class Contacts(NamedTuple):
 MISFIT_LIMIT = 5.0
 """Smallest limit of the misfit, in standard deviations; a model may state a larger one, that of 0.1 % of presses."""
 
+TOUCH_LIMIT = 5.0
+"""Charge on at least one electrode, in standard deviations of the white noise, from which something touches."""
+
 FAR = 3.0
 """Multiple of the largest force, and of the radius of the circle around the working area, beyond which an answer is no
 measurement."""
@@ -157,19 +160,22 @@ class Validity:
         force_range_N: Smallest and largest force, N.
         misfit_limit: Largest misfit of a single contact, in standard deviations.
         yield_force_N: Force beyond which the film yields, N.
+        white_pC: Standard deviation of the white noise of each charge, pC.
     """
 
     corners_mm: Array
     force_range_N: tuple[float, float]
     misfit_limit: float = MISFIT_LIMIT
     yield_force_N: float = math.inf
+    white_pC: float = 0.0
 
     @classmethod
     def of(cls, metadata: ModelMetadata) -> "Validity":
         """What a model's metadata state."""
         limit = max(MISFIT_LIMIT, metadata.errors.get("misfit_p999", MISFIT_LIMIT))
         yields_N = math.inf if metadata.yield_force_N is None else metadata.yield_force_N
-        return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit, yields_N)
+        white_pC = metadata.noise.get("white_pC", 0.0)
+        return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit, yields_N, white_pC)
 
     @cached_property
     def reach_mm(self) -> float:
@@ -187,6 +193,13 @@ class Validity:
         """Squared distance from the middle, mm^2, and force, N, beyond which an answer is no measurement."""
         radius_mm = np.linalg.norm(self.corners_mm - self.middle_mm, axis=1).max()
         return float(FAR * radius_mm) ** 2, FAR * self.force_range_N[1]
+
+    def is_touch(self, charge_pC: Array) -> Booleans:
+        """Return whether something touches, for charges of shape (n, electrodes), pC; shape (n,).
+
+        Charges that do not rise out of the noise on any electrode determine no position.
+        """
+        return np.asarray(np.abs(charge_pC).max(axis=1) > TOUCH_LIMIT * self.white_pC)
 
     @property
     def is_centred(self) -> bool:

@@ -5,7 +5,7 @@ begins with # is a comment. Blanks round a name or a number do not matter. A num
 exponent; `nan` and `inf` are none.
 
 The header of the charges names the electrodes, in any order, and may have further columns. The rows are touch charges
-in pC: no tare is subtracted, and every row is a contact.
+in pC: no tare is subtracted. A row whose charges do not exceed the noise is out of contact.
 """
 
 import csv
@@ -22,7 +22,7 @@ from isocharge.common.number_text import number_of
 from isocharge.serve.model.session import SEVEN
 from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 from isocharge.serve.prediction.predictor import Predictor
-from isocharge.serve.prediction.record import PredictionRecord
+from isocharge.serve.prediction.record import OUT_OF_CONTACT, PredictionRecord
 
 MOST_COLUMNS = 1_000
 """Columns of a table."""
@@ -185,21 +185,35 @@ def read_charges(
     return np.frombuffer(charges, dtype=np.float64).reshape(-1, len(electrodes))
 
 
-def write_contacts(contacts: Contacts, out: TextIO, validity: Validity | None = None) -> None:
+def write_contacts(
+    contacts: Contacts, out: TextIO, validity: Validity | None = None, charge_pC: Array | None = None
+) -> None:
     """Write contacts as CSV, a row for each press, columns as in `Contact` up to the misfit, numbers to six decimals.
 
     Args:
-        contacts: The contacts.
+        contacts: The contacts of n presses.
         out: Receives the text.
-        validity: Where their model may be trusted: adds a column `flags`, words with blanks between.
+        validity: Limits of the model's validity. If given, a column `flags` is added: words separated by blanks.
+        charge_pC: The charges of the presses, shape (n, electrodes), pC. If given together with `validity`, a row
+            whose charges do not exceed the noise gets a force of 0 and otherwise empty cells.
     """
+    touches = np.ones(len(contacts.x_mm), dtype=bool)
+    if validity is not None and charge_pC is not None:
+        touches = validity.is_touch(charge_pC)
+    names = Contacts._fields[:SEVEN]
+    no_contact = tuple("0.000000" if name == "force_N" else "" for name in names)
+
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(Contacts._fields[:SEVEN] + ("flags",) * (validity is not None))
-    for block in blocks(np.column_stack(contacts)):
-        flags = [] if validity is None else validity.batch_flags(Contacts(*block.T))
-        words: list[tuple[str, ...]] = [(" ".join(one),) for one in flags] or [()] * len(block)
-        rows = block[:, :SEVEN].tolist()
-        writer.writerows((*map("{:.6f}".format, row), *flags) for row, flags in zip(rows, words, strict=True))
+    writer.writerow(names if validity is None else (*names, "flags"))
+    rows = np.column_stack(contacts)
+    for block, is_touch in zip(blocks(rows), blocks(touches), strict=True):
+        flags = [()] * len(block) if validity is None else validity.batch_flags(Contacts(*block.T))
+        for numbers, row_touches, words in zip(block[:, :SEVEN].tolist(), is_touch.tolist(), flags, strict=True):
+            cells = tuple(map("{:.6f}".format, numbers)) if row_touches else no_contact
+            if validity is None:
+                writer.writerow(cells)
+            else:
+                writer.writerow((*cells, " ".join(words) if row_touches else ""))
 
 
 def blocks(rows: Array) -> Iterator[Array]:
@@ -209,7 +223,9 @@ def blocks(rows: Array) -> Iterator[Array]:
 
 
 def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
-    """A record for each row of charges, shape (n, electrodes), pC; what a table does not have is None.
+    """Yield a record for each row of charges, shape (n, electrodes), pC; what a table does not have is None.
+
+    A row whose charges do not exceed the noise of the model is out of contact: its force is 0, and it has no position.
 
     Raises:
         ChargeError: If the charges do not fit the model.
@@ -218,17 +234,20 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
     for block in blocks(charge_pC):
         contacts = predictor.predict_batch(block)
         flags = predictor.validity.batch_flags(contacts)
-        for charges, contact, its_flags in zip(block.tolist(), np.column_stack(contacts).tolist(), flags, strict=True):
+        touches = predictor.validity.is_touch(block)
+        for row, charges in enumerate(block.tolist()):
+            is_touch = bool(touches[row])
+            contact = Contact(*(float(column[row]) for column in contacts))
             yield PredictionRecord(
                 timestamp=None,
                 t_device_us=None,
                 seq=None,
-                **Contact(*contact).fields(),
-                contact=True,
+                **(contact.fields() if is_touch else OUT_OF_CONTACT),
+                contact=is_touch,
                 charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
                 charge_raw_pC=None,
                 tare_pC=None,
-                flags=its_flags,
+                flags=flags[row] if is_touch else (),
                 latency_us=None,
                 model=metadata.label,
                 frame_id=metadata.frame_id,
