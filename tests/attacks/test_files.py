@@ -20,6 +20,7 @@ from isocharge.serve import (
     Recording,
     check_golden,
     device_from_table,
+    find_labelled_model,
     find_model,
     load_device,
     load_model,
@@ -195,6 +196,27 @@ def model(tmp_path):
     folder = tmp_path / "three-25um-biaxial"
     shutil.copytree(find_model("three-25um-biaxial").parent, folder)
     return folder / "1"
+
+
+LABEL_PARTS = ("three-25um-biaxial", "1", "outside", "..", ".", "/", "//", "~", "\\", "\n", "\0", "%2e", "", "model.onnx")
+
+
+def test_labels_of_recordings_choose_no_path(tmp_path, attack):
+    """Whatever a recording names as its model, a folder outside the repositories is never found."""
+    repository = tmp_path / "models"
+    shutil.copytree(find_model("three-25um-biaxial").parent, repository / "three-25um-biaxial")
+    shutil.copytree(repository / "three-25um-biaxial", tmp_path / "outside")
+    shutil.copytree(repository / "three-25um-biaxial", tmp_path / "outside" / "outside")
+
+    def random_label(rng):
+        parts = [rng.choice(LABEL_PARTS) for _ in range(rng.choice((1, 2, 3, 4)))]
+        return rng.choice(("", "/", f"{tmp_path}/")) + "/".join(parts)
+
+    def find(label):
+        assert find_labelled_model(label, repository).is_relative_to(repository)
+
+    find("three-25um-biaxial/1")
+    attack("labels of recordings", find, random_label, 20_000)
 
 
 def test_a_model_with_faults(model, attack):

@@ -20,7 +20,14 @@ from isocharge.serve.live.reading_stream import ReadingStream
 from isocharge.serve.live.steady_press import PressWatch
 from isocharge.serve.live.stream import Policy, TouchStream, stream
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.model_folder import Model, check_golden, find_model, load_model, write_model
+from isocharge.serve.model.model_folder import (
+    Model,
+    check_golden,
+    find_labelled_model,
+    find_model,
+    load_model,
+    write_model,
+)
 from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
 from isocharge.serve.port.source import Chunk, Port, open_source
 from isocharge.serve.prediction.contact import Contact, Contacts, Validity
@@ -67,6 +74,7 @@ __all__ = [
     "encode_frame",
     "encode_text",
     "examine",
+    "find_labelled_model",
     "find_model",
     "load_device",
     "load_model",

@@ -144,7 +144,7 @@ def test_replay_in_real_time_waits_as_long_as_it_took(tmp_path, film, predictor,
     assert now[0] - 5e9 == pytest.approx(0.0063 * (count - 1) if real_time else 0.0, abs=1e-5)
 
 
-@pytest.mark.parametrize(("asked_for", "taken_since"), [("linear/1", []), ("linear/0", [NewModel("linear/1")])])
+@pytest.mark.parametrize(("asked_for", "taken_since"), [("linear/1", []), ("linear/2", [NewModel("linear/1")])])
 def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, tmp_path, asked_for, taken_since):
     """Begun and ended on request, with a marker: its replay gives its records, and the totals go on."""
     path, device = tmp_path / "later.rec", device_from_table(DEVICE, "test")

@@ -14,7 +14,7 @@ import pytest
 
 from isocharge.common.errors import ChargeError, ModelError, OutputExists
 from isocharge.common.files import sha256_of
-from isocharge.serve import ModelMetadata, check_golden, find_model, load_model, write_model
+from isocharge.serve import ModelMetadata, check_golden, find_labelled_model, find_model, load_model, write_model
 from isocharge.serve.model.golden import contact_floors, make_golden
 
 
@@ -250,6 +250,24 @@ def test_repository_that_was_named_must_be_there(roots):
     put(roots["current"])
     with pytest.raises(ModelError, match="nope: expected a folder of models"):
         find_model("m", roots["given"] / "nope")
+
+
+def test_label_is_found_in_the_repositories_alone(roots):
+    """A recording of somebody else names the model by its label, and must not choose a folder of the file system."""
+    folder = put(roots["given"])
+    put(roots["current"].parent, "mine")
+    assert find_labelled_model("m/1", roots["given"]) == folder
+    with pytest.raises(ModelError, match="no model 'mine/1'; looked in"):
+        find_labelled_model("mine/1", roots["given"])
+
+
+@pytest.mark.parametrize(
+    "label", ["m", "/m/1", "../m/1", "m/../1", "m/1/", "m/01", "m/1\n", ".m/1", "m/model.onnx", ""]
+)
+def test_text_that_is_no_label_is_refused(roots, label):
+    put(roots["given"])
+    with pytest.raises(ModelError, match="expected the label NAME/VERSION"):
+        find_labelled_model(label, roots["given"])
 
 
 WHERE = "models/linear/1/model.onnx"

@@ -1,5 +1,7 @@
 """The file of a recording: what it holds, what ends it, what is refused."""
 
+import json
+
 import pytest
 
 from isocharge.common.errors import OutputError, OutputExists, RecordingError
@@ -82,6 +84,26 @@ def test_a_file_that_is_no_recording(tmp_path, first):
     with pytest.raises(RecordingError, match="expected a recording of `serve stream --record`") as caught:
         Recording(path)
     assert len(str(caught.value)) < 600
+
+
+PATHS = ["/any/path", "../x", "models/m/1", "m/../../x", "m", "m/1\n", "file://m/1", "~/m"]
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_path_in_the_place_of_the_model_is_refused(tmp_path, path):
+    recording = tmp_path / "touch.rec"
+    header = {"isocharge_recording": 1, "model": path, "policy": "every", "device": {}}
+    recording.write_text(json.dumps(header) + "\n")
+    with pytest.raises(RecordingError, match="model: expected the label NAME/VERSION of a model"):
+        Recording(recording)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_path_in_the_place_of_the_next_model_is_refused(recorded, path):
+    with recorded.open("a") as file:
+        file.write(json.dumps({"use": path}) + "\n")
+    with pytest.raises(RecordingError, match="use: expected the label NAME/VERSION of a model"):
+        list(Recording(recorded).events())
 
 
 def test_recording_of_another_version(tmp_path):

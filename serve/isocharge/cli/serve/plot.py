@@ -18,7 +18,7 @@ from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import InputError, RecordingError
 from isocharge.common.extras import require
-from isocharge.serve import Recording, find_model, load_model
+from isocharge.serve import Recording, find_labelled_model, find_model, load_model
 from isocharge.serve.flags import BLIND, INVALID, MEANINGS, MISFIT, OUTSIDE, SATURATED
 
 with require("simulate"):
@@ -77,7 +77,8 @@ def plot_command(
         traces = traces_of(recording.records(RecordFields), str(file))
     sensor = working_area = None
     try:
-        metadata = load_model(find_model(model or recording.model, models)).metadata
+        folder = find_model(model, models) if model else find_labelled_model(recording.model, models)
+        metadata = load_model(folder).metadata
         working_area = np.array(metadata.working_area_mm)
         sensor = sensor_from_dict(metadata.sensor, metadata.label)
     except InputError as error:

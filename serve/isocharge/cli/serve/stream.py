@@ -46,6 +46,7 @@ from isocharge.serve import (
     TouchStream,
     check_golden,
     device_from_table,
+    find_labelled_model,
     find_model,
     load_device,
     load_model,
@@ -210,6 +211,10 @@ def _load(model: str, models: Path | None) -> Predictor:
     return Predictor(folder)
 
 
+def _load_labelled(label: str, models: Path | None) -> Predictor:
+    return Predictor(find_labelled_model(label, models))
+
+
 def replay_command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Recording of `isocharge serve stream --record`.")],
     model: Annotated[
@@ -236,10 +241,11 @@ def replay_command(
     """
     address = None if live is None else page_address(live, token)
     recording, clock = Recording(file), RecordedClock()
-    predictor = Predictor(model or recording.model, models=models)
+    folder = find_model(model, models) if model else find_labelled_model(recording.model, models)
+    predictor = Predictor(folder)
     board = load_device(device) if device else device_from_table(recording.device, str(file))
     path = TouchStream(predictor, board, policy=Policy(recording.policy), now_ns=clock, frame_id=recording.name or None)
-    load = None if model else partial(Predictor, models=models)
+    load = None if model else partial(_load_labelled, models=models)
     played = partial(replay, recording, path, clock, real_time=real_time, load=load)
     latencies: deque[float] = deque(maxlen=LATENCIES)
     with ExitStack() as stack:
@@ -251,7 +257,6 @@ def replay_command(
         if address is None:
             write_records(played(), writers, latencies)
         else:
-            folder = find_model(model or recording.model, models)
             link = stack.enter_context(
                 live_page(address, token, file.name, predictor.metadata, folder, is_recording=True)
             )

@@ -6,17 +6,14 @@ that x and y refer to.
 """
 
 import json
-import re
 from collections.abc import Mapping
 from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
 from isocharge.common.errors import ModelError, shown
+from isocharge.common.model_labels import ModelName
 from isocharge.common.structs import Finite, Positive, Settings, Text, WrongKey, convert, parse_json
-
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
-"""Pattern of model names: safe in paths, URLs, pages and config.pbtxt."""
 
 FORMAT_VERSION = 1
 """Version of the metadata."""
@@ -45,7 +42,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
             the range, or not known.
     """
 
-    name: Annotated[str, Meta(pattern=f"^{NAME.pattern}$", description="letters, digits, '-', '_' and '.'")]
+    name: ModelName
     version: Annotated[int, Meta(ge=1)]
     sensor: dict[str, Any]
     electrodes: Names

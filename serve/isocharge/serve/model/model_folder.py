@@ -23,10 +23,11 @@ import onnxruntime as ort
 from numpy.typing import ArrayLike
 
 from isocharge.common.defaults import MAX_BATCH
-from isocharge.common.errors import ModelError, OutputExists, told_where
+from isocharge.common.errors import ModelError, OutputExists, shown, told_where
 from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
+from isocharge.common.model_labels import NAME, VERSION
 from isocharge.serve.model.golden import Golden, check_answers, contact_floors, make_golden, read_golden
-from isocharge.serve.model.metadata import NAME, ModelMetadata
+from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import (
     CORRELATION,
     INPUT,
@@ -38,9 +39,6 @@ from isocharge.serve.model.session import (
     outputs_of,
     run,
 )
-
-VERSION = re.compile("[1-9][0-9]{0,17}")
-"""Pattern of version folders: whole numbers of 63 bits."""
 
 
 def find_model(model: str | Path, models: Path | None = None) -> Path:
@@ -63,6 +61,30 @@ def find_model(model: str | Path, models: Path | None = None) -> Path:
         if version is not None:
             return version
     raise ModelError(_not_found(model, roots, is_path))
+
+
+def find_labelled_model(label: str, models: Path | None = None) -> Path:
+    """Return the version folder of the model with a label, `NAME/VERSION`, that a file names.
+
+    Unlike `find_model`, this function searches only the repositories and never takes the label as a path, because the
+    file may come from somebody else.
+
+    Args:
+        label: The label, as a recording holds it.
+        models: Repository that is searched first.
+
+    Raises:
+        ModelError: If the text is not a label, or no repository has the model.
+    """
+    name, _, version = label.partition("/")
+    if not (NAME.fullmatch(name) and VERSION.fullmatch(version)):
+        raise ModelError(f"model {shown(label)}: expected the label NAME/VERSION of a model; give the model by --model")
+    roots = repositories(models)
+    for root in roots:
+        folder = root / name / version
+        if (folder / "model.onnx").is_file():
+            return folder
+    raise ModelError(_not_found(label, roots, is_path=False))
 
 
 def repositories(models: Path | None = None) -> list[Path]:

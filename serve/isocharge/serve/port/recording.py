@@ -25,8 +25,9 @@ from msgspec import Meta, Struct
 
 from isocharge.common.errors import RecordingError, cut
 from isocharge.common.files import WholeWrites, bounded_lines
+from isocharge.common.model_labels import ModelLabel
 from isocharge.common.progress import report
-from isocharge.common.structs import Text, WrongKey, parse_json
+from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.port.source import Chunk
 
 VERSION = 1
@@ -242,7 +243,7 @@ class _Header(Struct):
     """The first line."""
 
     isocharge_recording: int
-    model: Text
+    model: ModelLabel
     policy: Literal["every", "latest"]
     device: dict[str, Any]
     name: str = ""
@@ -255,7 +256,7 @@ class _Entry(Struct):
     latency_us: Latency | None = None
     tare: bool | None = None
     back: bool | None = None
-    use: Text | None = None
+    use: ModelLabel | None = None
     marker: tuple[Moment, Annotated[str, Meta(max_length=1000)]] | None = None
     chunk: tuple[Moment, Nanoseconds, Annotated[float, Meta(ge=0.0)], bytes] | None = None
 

@@ -206,7 +206,9 @@ def write_contacts(
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(names if validity is None else (*names, "flags"))
     rows = np.column_stack(contacts)
-    for block, is_touch in zip(blocks(rows), blocks(touches), strict=True):
+    for start in range(0, len(rows), BLOCK):
+        block = rows[start : start + BLOCK]
+        is_touch = touches[start : start + BLOCK]
         flags = [()] * len(block) if validity is None else validity.batch_flags(Contacts(*block.T))
         for numbers, row_touches, words in zip(block[:, :SEVEN].tolist(), is_touch.tolist(), flags, strict=True):
             cells = tuple(map("{:.6f}".format, numbers)) if row_touches else no_contact
