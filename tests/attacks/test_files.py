@@ -198,7 +198,7 @@ def model(tmp_path):
     return folder / "1"
 
 
-LABEL_PARTS = ("three-25um-biaxial", "1", "outside", "..", ".", "/", "//", "~", "\\", "\n", "\0", "%2e", "", "model.onnx")
+LABEL_PARTS = ("three-25um-biaxial", "1", "outside", "..", ".", "/", "//", "~", "\\", "\n", "\0", "%2e", "")
 
 
 def test_labels_of_recordings_choose_no_path(tmp_path, attack):
