@@ -123,9 +123,11 @@ def test_a_replay_is_sought_and_played_fast(film, models, start, command, tmp_pa
     ("live", "said"),
     [
         ("[::]:0", "--token"),  # others are let in on purpose only
-        (":8001", "expected HOST:PORT"),
-        ("127.0.0.1:x", "expected HOST:PORT"),
-        ("127.0.0.1:65536", "expected HOST:PORT"),
+        (":8001", "expected PORT or HOST:PORT"),
+        ("127.0.0.1:x", "expected PORT or HOST:PORT"),
+        ("127.0.0.1:65536", "expected PORT or HOST:PORT"),
+        ("65536", "expected PORT or HOST:PORT"),
+        ("1" * 5000, "expected PORT or HOST:PORT"),
     ],
 )
 def test_addresses_that_no_page_may_have(models, refused, live, said):

@@ -13,8 +13,9 @@ from typing import Annotated, Any
 
 import typer
 
+from isocharge.cli.shared.optional_values import DEFAULT_LIVE_ADDRESS
 from isocharge.cli.shared.terminal import say
-from isocharge.common.errors import InputError, IsochargeError
+from isocharge.common.errors import InputError, IsochargeError, shown
 from isocharge.common.extras import require
 from isocharge.serve import PredictionRecord, Recorder, TouchStream
 from isocharge.serve.live.recorded_stream import RecordedStream
@@ -36,6 +37,12 @@ from isocharge.serve.viewer.messages import (
 RATE_RECORDS = 400
 """Records, the latest, over whose times the rate is taken: that of the board, however fast a recording is read."""
 
+LOOPBACK = "127.0.0.1"
+"""Host of the page if `--live` contains only a port."""
+
+LARGEST_PORT = 65535
+"""Largest number of a TCP port."""
+
 STATE_S = 0.25
 """Time between two messages with the counters, s."""
 
@@ -43,9 +50,10 @@ LiveOption = Annotated[
     str | None,
     typer.Option(
         "--live",
-        metavar="HOST:PORT",
-        help="Show the film on a page for browsers at this address, as 127.0.0.1:8001; port 0 takes a free one. An "
-        "address that other machines can reach needs --token. (default: no page)",
+        metavar="[HOST:PORT]",
+        help=f"Show the film on a page for browsers, at {DEFAULT_LIVE_ADDRESS} or at the given address. A port alone "
+        "is a port of this machine, and port 0 chooses a free port. An address that other machines can reach needs "
+        "--token. (default: no page)",
     ),
 ]
 
@@ -66,14 +74,21 @@ def given_token(token: str | None) -> str | None:
 
 
 def page_address(live: str, token: str | None) -> Address:
-    """Where the page listens.
+    """Return the address at which the page listens.
+
+    Args:
+        live: Value of `--live`: PORT or HOST:PORT.
+        token: Value of `--token`.
 
     Raises:
-        InputError: If it is no HOST:PORT, or others could see the page without a token.
+        InputError: If `live` has another form, or if other machines could see the page without a token.
     """
-    host, _, port = live.rpartition(":")
-    if not (host and port.isdecimal() and int(port) < 1 << 16):
-        raise InputError(f"--live: expected HOST:PORT, as 127.0.0.1:8001, got {live!r}")
+    host, colon, port = live.rpartition(":")
+    if not colon:
+        host = LOOPBACK
+    is_port = port.isascii() and port.isdecimal() and len(port) <= len(str(LARGEST_PORT)) and int(port) <= LARGEST_PORT
+    if not (host and is_port):
+        raise InputError(f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}")
     address = Address(host.removeprefix("[").removesuffix("]"), int(port))
     check_exposure(address, has_token=given_token(token) is not None)
     return address
