@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from pyarrow.parquet import read_table
 
-from isocharge.cli.demo.command import demo_command
+from isocharge.cli.demo.full_demo import run_demo
 from isocharge.cli.shared.terminal import shown_progress
 from isocharge.common.progress import report
 from isocharge.common.toml_text import to_toml
@@ -336,8 +336,8 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
         "save_picture": lambda figure, _: figures.append(figure),
         **dict.fromkeys(("press", "draw_deflection", "draw_section", "draw_charge_map"), lambda *_: None),
     }.items():
-        monkeypatch.setattr(f"isocharge.cli.demo.command.{name}", stub)
-    demo_command(out, 2.0)
+        monkeypatch.setattr(f"isocharge.cli.demo.full_demo.{name}", stub)
+    run_demo(out, 2.0, None)
     table, err = capsys.readouterr()
     assert 400 <= int(re.search(r"(\d+) frames, 0 lost, 0 repeated", err)[1]) < 500  # more came than were followed
     assert re.findall(r"^(\d)\. (\w+): ", err, re.M) == [

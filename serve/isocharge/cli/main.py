@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.serve.app import serve_app
-from isocharge.cli.shared.lazy import lazy_group
+from isocharge.cli.shared.lazy import LazyCommand, lazy_group
 from isocharge.cli.shared.terminal import open_closed_streams, say, warnings_to_stderr
 from isocharge.cli.simulate.app import simulate_app
 from isocharge.cli.train.app import train_app
@@ -20,7 +20,11 @@ from isocharge.common.versions import package_version
 
 app = lazy_group(
     "Find where a piezoelectric tactile film is touched, and how hard, from the charges of three to eight electrodes.",
-    {"demo": ("isocharge.cli.demo.command:demo_command", "Simulate, train, follow a virtual sensor, draw: all once.")},
+    {
+        "demo": LazyCommand(
+            "isocharge.cli.demo.command:demo_command", "Simulate, train, follow a virtual sensor, draw: all once."
+        )
+    },
 )
 app.add_typer(simulate_app, name="simulate")
 app.add_typer(train_app, name="train")

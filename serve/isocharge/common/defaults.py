@@ -10,6 +10,10 @@ there, 10 mm from the centre."""
 DEFAULT_FORCE_RANGE = (0.05, 2.0)
 """Smallest and largest force, N. The released models cover it."""
 
+DEFAULT_PLAYED_FORCE_RANGE = (0.05, 0.8)
+"""Smallest and largest force of the random presses of a virtual sensor, N. A probe of 1 mm radius stresses the film of
+the built-in sensors to the yield point of PVDF at 0.87 N."""
+
 DEFAULT_STRESS_LIMIT = 45.0
 """Largest stress of a film under a probe, MPa: drawn PVDF yields at 45 to 55."""
 

@@ -1,4 +1,4 @@
-"""Optional parts: an import that fails because an extra is not installed says which one, and how to get it."""
+"""Packages of the extras in pyproject.toml, and the error for an extra that is not installed."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,18 +17,18 @@ PACKAGES = {
     "record": frozenset({"mcap", "lz4", "zstandard"}),
     "parquet": frozenset({"pyarrow"}),
 }
-"""Import names that come with an extra of pyproject.toml."""
+"""Import names of the packages of each extra."""
 
 
 @contextmanager
-def require(extra: str) -> Iterator[None]:
-    """Import inside this context what needs an extra.
+def require(*extras: str) -> Iterator[None]:
+    """Import packages of extras inside this context, and name the install command if a package is missing.
 
     Args:
-        extra: Its name in pyproject.toml.
+        extras: Names of the extras in pyproject.toml.
 
     Raises:
-        MissingExtra: If one of its packages is not installed; any other failed import passes through.
+        MissingExtra: If a package of the extras is not installed. Any other failed import is not changed.
 
     Example:
         >>> with require("simulate"):
@@ -38,9 +38,9 @@ def require(extra: str) -> Iterator[None]:
         yield
     except (ModuleNotFoundError, MissingExtra) as error:
         package = (error.name or "").partition(".")[0]
-        if package not in PACKAGES[extra]:
+        if not any(package in PACKAGES[extra] for extra in extras):
             raise
         raise MissingExtra(
-            f"this needs the package {package!r}, which is not installed; pip install 'isocharge[{extra}]'",
+            f"this needs the package {package!r}, which is not installed; pip install 'isocharge[{','.join(extras)}]'",
             name=package,
         ) from error

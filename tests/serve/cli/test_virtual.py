@@ -12,7 +12,7 @@ import pytest
 from boards import interrupt
 from isocharge.cli.shared import virtual_sensor
 from isocharge.common.errors import InputError, OutputExists, SceneError, SensorError
-from isocharge.serve import Port, device_from_table, load_device
+from isocharge.serve import Port, device_from_table, load_device, wander
 from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor, virtual_film
 from kept import kept
 
@@ -125,10 +125,33 @@ def test_a_film_is_solved_as_far_as_it_is_pressed(tmp_path, run, asked):
     assert [round(radius, 3) for _, _, radius, _ in asked] == [8.0, 15.0, 13.0]
 
 
+def test_random_presses_stay_below_the_yield_point_of_the_film_by_default(run, asked, monkeypatch):
+    """A probe of 1 mm radius yields the built-in films at 0.87 N."""
+    run("virtual", "three-25um-biaxial", "--seconds", 0)
+    with suppress(SceneError):  # the small map has a smaller range of forces
+        run("virtual", "three-25um-biaxial", "--seconds", 0, "--force-max", 1.5)
+    assert [force_range for _, _, _, force_range in asked] == [(0.05, 0.8), (0.05, 1.5)]
+    assert wander(seed=1).force_N.max() <= 0.8
+    domain = Domain(8.0, (0.05, 2.0))
+    forward_map = SimpleNamespace(domain=domain, electrodes=("A",), charges=lambda contact: 100.0 * contact[:, 2:])
+    played_scripts = []
+    monkeypatch.setattr(virtual_sensor, "VirtualSensor", lambda _, script, **__: played_scripts.append(script))
+    virtual_sensor.virtual_sensor(forward_map, "clean", seed=1)
+    assert 0.05 < played_scripts[0].force_N.max() <= 0.8
+
+
+def test_a_script_may_press_harder_than_the_random_presses(run, asked, tmp_path):
+    script = tmp_path / "hard.toml"
+    script.write_text("presses = [[0, 0, 0, 0], [1, 0, 0, 0], [2, 1, 1, 1.5], [4, 1, 1, 0]]\n")
+    with suppress(SceneError):  # the small map has a smaller range of forces
+        run("virtual", "three-25um-biaxial", "--seconds", 0, "--script", script)
+    assert asked[0][-1] == pytest.approx((0.05, 1.5), rel=1e-3)
+
+
 def test_below_the_map_charges_are_those_of_a_membrane():
     """An eighth of its smallest force is a quarter of the charge: force to the 2/3."""
     linear = SimpleNamespace(domain=Domain(3.0, (0.2, 1.0)), charges=lambda contact: 100.0 * contact[:, 2:])
-    charges, _ = virtual_sensor.played(linear, 1, 200.0)
+    charges = virtual_sensor.film_charges(linear)
     assert charges(np.array([[1.0, 2.0, 0.025], [1.0, 2.0, 0.5]])) == pytest.approx(np.array([[5.0], [50.0]]))
 
 

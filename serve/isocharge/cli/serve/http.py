@@ -16,13 +16,11 @@ from isocharge.common.errors import InputError
 from isocharge.common.extras import require
 from isocharge.serve.live.outputs import LineQueue
 from isocharge.serve.network.address import Address, Tls, Token, check_exposure
-
-with require("http"):
-    from isocharge.serve.network.browser_check import BrowserCheck
-    from isocharge.serve.network.http import HttpServer
-    from isocharge.serve.network.model_store import open_model_store
-    from isocharge.serve.network.protocol import Handler
-    from isocharge.serve.network.traffic import RequestLog, Traffic
+from isocharge.serve.network.browser_check import BrowserCheck
+from isocharge.serve.network.http import HttpServer
+from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.traffic import RequestLog, Traffic
 
 
 def http_command(

@@ -11,25 +11,21 @@ from typing import Annotated, Any, NamedTuple, cast
 
 import numpy as np
 import typer
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 from msgspec import Struct
 
 from isocharge.cli.shared.options import ModelsOption
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import InputError, RecordingError
-from isocharge.common.extras import require
 from isocharge.serve import Recording, find_labelled_model, find_model, load_model
 from isocharge.serve.flags import BLIND, INVALID, MEANINGS, MISFIT, OUTSIDE, SATURATED
-
-with require("simulate"):
-    from matplotlib.collections import EllipseCollection
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Polygon
-
-    from isocharge.simulate import Sensor
-    from isocharge.simulate.plots.figure import FELT, INK, check_picture, new_figure, save_picture
-    from isocharge.simulate.plots.film import draw_electrodes
-    from isocharge.simulate.sensor.sensor_file import sensor_from_dict
+from isocharge.simulate import Sensor
+from isocharge.simulate.plots.figure import FELT, INK, check_picture, new_figure, save_picture
+from isocharge.simulate.plots.film import draw_electrodes
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 """Colours that eyes of every kind tell apart (Okabe and Ito 2008)."""

@@ -1,4 +1,4 @@
-"""`isocharge serve virtual`: a sensor made of the simulator's forward map and amplifier."""
+"""`isocharge serve virtual`: a virtual sensor, made of the simulator's forward map and amplifier."""
 
 import threading
 from dataclasses import replace
@@ -13,8 +13,8 @@ import typer
 from isocharge.cli.shared.forward_maps import SLACK
 from isocharge.cli.shared.options import ProbeOption, SensorArgument
 from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
-from isocharge.cli.shared.virtual_sensor import measuring, played
-from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.cli.shared.virtual_sensor import film_charges, measuring, random_script
+from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
 from isocharge.serve import Script, VirtualSensor, encode_frame, encode_text, load_device
@@ -22,6 +22,7 @@ from isocharge.serve.frames.frame_layout import FrameLayout
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
 from isocharge.serve.virtual_sensor.sensor import Encode, posix_modules
 from isocharge.simulate import (
+    Amplifier,
     Circle,
     ForwardMap,
     Probe,
@@ -34,7 +35,7 @@ from isocharge.simulate import (
 
 
 class FrameFormat(StrEnum):
-    """Format of the frames; a device file describes others."""
+    """Format of the frames, if no device file describes them."""
 
     binary = "binary"
     csv = "csv"
@@ -54,8 +55,8 @@ def virtual_command(
     ] = 200.0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of presses, noise and offsets.")] = 0,
     force_max: Annotated[
-        float, typer.Option("--force-max", min=0.05, help="Largest force, N; the smallest is 0.05 N.")
-    ] = DEFAULT_FORCE_RANGE[1],
+        float, typer.Option("--force-max", min=0.05, help="Largest force of a random press, N; the smallest is 0.05 N.")
+    ] = DEFAULT_PLAYED_FORCE_RANGE[1],
     radius: Annotated[
         float,
         typer.Option("--radius", metavar="MM", help="Largest distance of a random press from the centre, mm."),
@@ -103,32 +104,37 @@ def virtual_command(
 
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
-    posix_modules()  # no pseudo-terminal: an error before anything is computed
+    posix_modules()  # raises an error before anything is computed if there are no pseudo-terminals
     if link is not None:
         refuse_existing(link)
-    play = load_script(script) if script else VirtualScript()
-    described, pressing = _played(sensor, probe, film)
-    changes: dict[str, Any] = {"step": play.temperature_step_K, "bias": play.drift_pC_per_s, "limit": play.limit_pC}
-    amplifier = replace(load_amplifier(noise), **{key: value for key, value in changes.items() if value is not None})
-    encode, presses = _encoder(frames, device), play.script(rate)
-    forces = (DEFAULT_FORCE_RANGE[0], force_max)
-    nowhere, count = np.full(1, np.nan), len(described.electrodes)
+    settings = load_script(script) if script else VirtualScript()
+    scripted_presses = settings.script(rate)
+    played_sensor, footprint = _sensor_and_probe(sensor, probe, film)
+    amplifier = _amplifier(noise, settings)
+    electrode_count = len(played_sensor.electrodes)
     player = VirtualSensor(
-        lambda _: np.zeros((0, count)),
-        Script(nowhere, nowhere, np.zeros(1), rate),
+        lambda _: np.zeros((0, electrode_count)),
+        _untouched_frame(rate),
         noise=measuring(amplifier, rate),
         seed=seed,
-        encode=encode,
-        faults=play.faults,
+        encode=_encoder(frames, device),
+        faults=settings.faults,
         link=link,
     )
     with until_stopped(), player:
         print(player.port_path, flush=True)
         say("solving the film, which is not touched until then")
         with shown_progress():
-            forward_map = ForwardMap.build(described, pressing, radius=_farthest(radius, presses), force_range=forces)
-        player.use(*played(forward_map, seed, rate, presses))
-        say(f"playing {sensor if film is None else f'film {film} of {sensor}'} at {rate:g} Hz; Ctrl-C stops")
+            forward_map = ForwardMap.build(
+                played_sensor,
+                footprint,
+                radius=_largest_distance_mm(radius, scripted_presses),
+                force_range=(DEFAULT_PLAYED_FORCE_RANGE[0], _largest_force_N(force_max, scripted_presses)),
+            )
+        presses = scripted_presses or random_script(forward_map, seed, rate, force_max)
+        player.use(film_charges(forward_map), presses)
+        played_name = sensor if film is None else f"film {film} of {sensor}"
+        say(f"playing {played_name} at {rate:g} Hz; Ctrl-C stops")
         threading.Event().wait(seconds)
     say(
         f"{player.sent} frames sent, {player.withheld} withheld because no program read them, {player.lost} lost and "
@@ -136,28 +142,65 @@ def virtual_command(
     )
 
 
-def _played(sensor: str, probe: str, film: int | None) -> tuple[Sensor, Probe]:
-    """What is played: sensor and probe as described, or those of a film that a seed draws about them."""
-    described, pressing = load_sensor(sensor), parse_probe(probe)
-    if film is None:
-        return described, pressing
-    if not isinstance(pressing, Circle):
-        raise InputError(f"--film: expected a round --probe like circle:1.0, whose radius is drawn too, got {probe!r}")
-    return virtual_film(described, pressing, film)
+def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) -> tuple[Sensor, Probe]:
+    """Return sensor and probe as described, or a random variation of them if there is a seed.
+
+    Raises:
+        InputError: If there is a seed and the probe is not round, because the radius of the probe is varied, too.
+    """
+    sensor = load_sensor(sensor_name)
+    probe = parse_probe(probe_text)
+    if film_seed is None:
+        return sensor, probe
+    if not isinstance(probe, Circle):
+        raise InputError(
+            f"--film: expected a round --probe like circle:1.0, whose radius is drawn too, got {probe_text!r}"
+        )
+    return virtual_film(sensor, probe, film_seed)
+
+
+def _amplifier(noise: str, settings: VirtualScript) -> Amplifier:
+    """Return the amplifier of a noise level, with the changes that a script makes to it."""
+    changes: dict[str, Any] = {
+        "step": settings.temperature_step_K,
+        "bias": settings.drift_pC_per_s,
+        "limit": settings.limit_pC,
+    }
+    return replace(load_amplifier(noise), **{key: value for key, value in changes.items() if value is not None})
+
+
+def _untouched_frame(rate_Hz: float) -> Script:
+    """Return a script of one frame without a press."""
+    no_position = np.full(1, np.nan)
+    return Script(no_position, no_position, np.zeros(1), rate_Hz)
 
 
 def _encoder(frames: FrameFormat, device: Path | None) -> Encode:
-    """The function that turns a frame into bytes."""
-    if device is None:
-        return encode_frame if frames is FrameFormat.binary else partial(encode_text, notation=frames.value)
-    layout = load_device(device).frames
-    if not isinstance(layout, FrameLayout):
-        raise InputError(f'--device {device}: expected a file with described frames: [frames] format = "described"')
-    return layout.encode
+    """Return the function that encodes a frame as bytes.
+
+    Raises:
+        InputError: If the device file does not describe frames.
+    """
+    if device is not None:
+        layout = load_device(device).frames
+        if not isinstance(layout, FrameLayout):
+            raise InputError(f'--device {device}: expected a file with described frames: [frames] format = "described"')
+        return layout.encode
+    if frames is FrameFormat.binary:
+        return encode_frame
+    return partial(encode_text, notation=frames.value)
 
 
-def _farthest(radius: float, presses: Script | None) -> float:
-    """Distance from the centre up to which charges are needed, mm."""
-    if presses is None or not presses.touching.any():
-        return radius
-    return max(DEFAULT_RADIUS, SLACK * float(np.nanmax(np.hypot(presses.x_mm, presses.y_mm))))
+def _largest_distance_mm(radius_mm: float, scripted_presses: Script | None) -> float:
+    """Return the distance from the centre up to which charges are needed, mm."""
+    if scripted_presses is None or not scripted_presses.touching.any():
+        return radius_mm
+    distance_mm = np.hypot(scripted_presses.x_mm, scripted_presses.y_mm)
+    return max(DEFAULT_RADIUS, SLACK * float(np.nanmax(distance_mm)))
+
+
+def _largest_force_N(force_max_N: float, scripted_presses: Script | None) -> float:
+    """Return the force up to which charges are needed, N."""
+    if scripted_presses is None:
+        return force_max_N
+    return max(force_max_N, SLACK * float(scripted_presses.force_N.max()))

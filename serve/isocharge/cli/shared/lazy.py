@@ -4,32 +4,44 @@ The help of a group therefore does not wait for the imports of its commands.
 """
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from isocharge.cli.shared.optional_values import OptionalValueCommand
-
-Commands = Mapping[str, tuple[str, str]]
-"""For each command its function, "package.module:function", and one sentence for the help of the group."""
+from isocharge.common.extras import require
 
 
-def lazy_group(summary: str, commands: Commands) -> typer.Typer:
+class LazyCommand(NamedTuple):
+    """A command that is imported when it is called.
+
+    Attributes:
+        function_path: Place of its function, "package.module:function".
+        summary: One sentence for the help of the group.
+        extra: Extra of pyproject.toml that the command always needs; None if the base install is enough.
+    """
+
+    function_path: str
+    summary: str
+    extra: str | None = None
+
+
+def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer:
     """Return a group that imports a command when the command is called, completed or asked for its help."""
 
     class LazyGroup(TyperGroup):
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
-            for name, (_, sentence) in commands.items():
-                self.add_command(TyperCommand(name, help=sentence, short_help=sentence))
+            for name, command in commands.items():
+                self.add_command(TyperCommand(name, help=command.summary, short_help=command.summary))
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             name, command, remaining_args = super().resolve_command(ctx, args)
             if name is not None and name in commands:
-                function_path, _ = commands[name]
-                command = load_command(function_path)
+                command = load_command(commands[name])
             return name, command, remaining_args
 
     return typer.Typer(
@@ -42,11 +54,17 @@ def lazy_group(summary: str, commands: Commands) -> typer.Typer:
     )
 
 
-def load_command(function_path: str) -> TyperCommand:
-    """Import a function, "package.module:function", and return the command that Typer makes of it."""
-    module, _, function = function_path.partition(":")
+def load_command(command: LazyCommand) -> TyperCommand:
+    """Import the function of a command, and return the command that Typer makes of it.
+
+    Raises:
+        MissingExtra: If the extra of the command is not installed.
+    """
+    module, _, function = command.function_path.partition(":")
+    with require(command.extra) if command.extra else nullcontext():
+        command_function = getattr(import_module(module), function)
     single_command_app = typer.Typer(add_completion=False, rich_markup_mode=None)
-    single_command_app.command(cls=OptionalValueCommand)(getattr(import_module(module), function))
-    command = typer.main.get_command(single_command_app)
-    command.name = None
-    return command  # type: ignore[return-value]
+    single_command_app.command(cls=OptionalValueCommand)(command_function)
+    typer_command = typer.main.get_command(single_command_app)
+    typer_command.name = None
+    return typer_command  # type: ignore[return-value]

@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any
 
 from isocharge.common.arrays import Array
+from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE
 from isocharge.serve import Script, VirtualSensor, wander
 from isocharge.serve.virtual_sensor.sensor import Charges
 from isocharge.simulate import Amplifier, ForwardMap, load_amplifier
@@ -14,42 +15,64 @@ SCRIPT_S = 60.0
 
 
 def virtual_sensor(forward_map: ForwardMap, noise: str, seed: int, rate_Hz: float = 200.0) -> VirtualSensor:
-    """A sensor that plays wandering presses over the whole domain of a forward map.
+    """Return a sensor that plays random presses of up to 0.8 N over the whole area of a forward map.
 
     Args:
         forward_map: Charges of the presses.
         noise: Level of the noise model.
         seed: Seed of presses, noise and offsets.
-        rate_Hz: Frames per second.
+        rate_Hz: Frames per second, Hz.
     """
-    charges, script = played(forward_map, seed, rate_Hz)
-    return VirtualSensor(charges, script, noise=measuring(load_amplifier(noise), rate_Hz), seed=seed)
+    script = random_script(forward_map, seed, rate_Hz, DEFAULT_PLAYED_FORCE_RANGE[1])
+    return VirtualSensor(film_charges(forward_map), script, noise=measuring(load_amplifier(noise), rate_Hz), seed=seed)
 
 
-def played(forward_map: ForwardMap, seed: int, rate_Hz: float, script: Script | None = None) -> tuple[Charges, Script]:
-    """What a virtual sensor plays: a map with its script, by default presses that wander over its whole domain."""
+def random_script(forward_map: ForwardMap, seed: int, rate_Hz: float, max_force_N: float) -> Script:
+    """Return a script of presses that wander over the whole area of a forward map.
+
+    Args:
+        forward_map: Its domain bounds the presses.
+        seed: Seed of the presses.
+        rate_Hz: Frames per second, Hz.
+        max_force_N: Largest force, N. A smaller largest force of the forward map takes precedence.
+    """
     domain = forward_map.domain
-    presses = script or wander(
+    max_force_N = min(domain.force_range[1], max_force_N)
+    min_force_N = min(domain.force_range[0], max_force_N)
+    return wander(
         seed=seed,
         seconds=SCRIPT_S,
         rate_Hz=rate_Hz,
         radius_mm=domain.radius,
-        force_range_N=domain.force_range,
+        force_range_N=(min_force_N, max_force_N),
     )
-    return partial(_charges, forward_map), presses
+
+
+def film_charges(forward_map: ForwardMap) -> Charges:
+    """Return the function from contacts, shape (n, 3), mm and N, to charges, shape (n, electrodes), pC.
+
+    Below the smallest force of the forward map, the charges of a contact fall with the force to the power of 2/3, as
+    those of a membrane.
+    """
+    return partial(_charges, forward_map)
 
 
 def _charges(forward_map: ForwardMap, contact: Array) -> Array:
-    """Charges of contacts; below the map's smallest force they fall with force to the 2/3, as those of a membrane."""
-    low, force = forward_map.domain.force_range[0], contact[:, 2]
-    share = (force.clip(max=low) / low) ** (2.0 / 3.0)
-    within = contact.copy()
-    within[:, 2] = force.clip(min=low)
-    return forward_map.charges(within) * share[:, None]
+    min_force = forward_map.domain.force_range[0]
+    force = contact[:, 2]
+    share = (force.clip(max=min_force) / min_force) ** (2.0 / 3.0)
+    contact_in_domain = contact.copy()
+    contact_in_domain[:, 2] = force.clip(min=min_force)
+    return forward_map.charges(contact_in_domain) * share[:, None]
 
 
 def measuring(amplifier: Amplifier, rate_Hz: float) -> Callable[..., Any]:
-    """The amplifier as the virtual sensor calls it, in pC; it is switched on with the first block."""
+    """Return the amplifier as the function that the virtual sensor calls, in pC. Its state begins with the first call.
+
+    Args:
+        amplifier: The amplifier.
+        rate_Hz: Frames per second, Hz.
+    """
     states: list[Any] = []
 
     def measure(charge_pC: Any, rng: Any) -> Any:

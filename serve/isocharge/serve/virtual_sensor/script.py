@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Meta
 
 from isocharge.common.arrays import Array, Booleans, Complexes
-from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError
 from isocharge.common.structs import Finite, NotNegative, Settings, WrongKey, read_toml
 
@@ -154,7 +154,7 @@ def wander(
     seconds: float = 60.0,
     rate_Hz: float = 200.0,
     radius_mm: float = DEFAULT_RADIUS,
-    force_range_N: tuple[float, float] = DEFAULT_FORCE_RANGE,
+    force_range_N: tuple[float, float] = DEFAULT_PLAYED_FORCE_RANGE,
 ) -> Script:
     """A script of random presses that wander over the film: a second of rest, then presses of 1 to 3 s with pauses.
 

@@ -1,20 +1,28 @@
 """`isocharge train ...`: its commands, one module each."""
 
-from isocharge.cli.shared.lazy import lazy_group
+from isocharge.cli.shared.lazy import LazyCommand, lazy_group
 
 train_app = lazy_group(
     "Train models on simulated or measured charges; calibrate films; compare methods.",
     {
-        "fit": ("isocharge.cli.train.fit:fit_command", "Train a network and write its model folder."),
-        "calibrate": (
+        "fit": LazyCommand(
+            "isocharge.cli.train.fit:fit_command", "Train a network and write its model folder.", extra="train"
+        ),
+        "calibrate": LazyCommand(
             "isocharge.cli.train.calibrate:calibrate_command",
             "Fit a real film to some presses, and write its model folder.",
+            extra="train",
         ),
-        "report": ("isocharge.cli.train.report:report_command", "Compare methods: speed against error."),
-        "distil": (
+        "report": LazyCommand(
+            "isocharge.cli.train.report:report_command", "Compare methods: speed against error.", extra="train"
+        ),
+        "distil": LazyCommand(
             "isocharge.cli.train.distil:distil_command",
             "Train a small network for microcontrollers on a model's answers.",
+            extra="train",
         ),
-        "export-c": ("isocharge.cli.train.export_c:export_c_command", "Write a model as C source."),
+        "export-c": LazyCommand(
+            "isocharge.cli.train.export_c:export_c_command", "Write a model as C source.", extra="train"
+        ),
     },
 )

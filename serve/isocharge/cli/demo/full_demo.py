@@ -1,0 +1,296 @@
+"""The demo that uses every part once: simulate a film, train a model, follow a virtual sensor, draw the results."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import chain, count, islice
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import typer
+from scipy.stats import binned_statistic
+
+from isocharge.cli.shared.terminal import say, shown_progress, this_command
+from isocharge.cli.shared.virtual_sensor import virtual_sensor
+from isocharge.common.arrays import Array
+from isocharge.common.files import new_folder
+from isocharge.common.progress import track
+from isocharge.serve import Port, PredictionRecord, Predictor, TouchStream, find_model, load_model
+from isocharge.serve.benchmark import in_process_contenders, press_charges, take_turns
+from isocharge.serve.live.stream import StreamTotals
+from isocharge.simulate import Circle, Equilibrium, ForwardMap, Sweep, load_sensor, noise_model, press, read_dataset
+from isocharge.simulate.dataset.sweep import solve_maps, write_sweep
+from isocharge.simulate.plots.figure import FELT, PRESSED, new_figure, save_picture
+from isocharge.simulate.plots.film import (
+    draw_charge_map,
+    draw_deflection,
+    draw_electrodes,
+    draw_layout,
+    draw_section,
+)
+from isocharge.train import fit, load_config, release
+
+SENSOR = "three-25um-biaxial"
+"""Name of the simulated sensor and of the model that is trained."""
+
+SAMPLES = 24_000
+"""Number of presses on which the model is trained."""
+
+SEED = 0
+"""Seed of the presses of training and of the live part."""
+
+RATE_HZ = 200.0
+"""Frames per second of the virtual sensor, Hz."""
+
+LIVE_S = 20.0
+"""Duration of the live part, s."""
+
+PRINT_INTERVAL_S = 0.5
+"""Time between two printed lines of the live part, s."""
+
+DRAWN_POSITION_MM = (3.0, -2.0)
+"""Position of the press whose deflection is drawn, mm."""
+
+DRAWN_FORCE_N = 1.0
+"""Force of the press whose deflection is drawn, N."""
+
+TEST_PRESSES = 4096
+"""Number of presses, with another seed, on which the errors are measured."""
+
+LATENCY_S = 0.5
+"""Time for which the latency of a prediction is measured, s."""
+
+
+class FollowedPress(NamedTuple):
+    """One frame of the live part in which the model reports a press while the virtual sensor presses.
+
+    Attributes:
+        number: Number of the press, from 1.
+        true_x_mm, true_y_mm, true_force_N: What the virtual sensor plays.
+        x_mm, y_mm, force_N: What the model estimates.
+    """
+
+    number: int
+    true_x_mm: float
+    true_y_mm: float
+    true_force_N: float
+    x_mm: float
+    y_mm: float
+    force_N: float
+
+
+def run_demo(output: Path | None, seconds: float | None, config: Path | None) -> None:
+    """Run the demo, print a table of its results, and write dataset, model and picture into a new folder.
+
+    Args:
+        output: The folder; None for the first free name of demo-output, demo-output-2, ...
+        seconds: Duration of the live part, s; None for `LIVE_S`.
+        config: Training settings, TOML; None for those of the released models.
+    """
+    settings = load_config(config) if config else None
+    folder = output or _free_name(Path("demo-output"))
+    sweep = Sweep(samples=SAMPLES, seed=SEED)
+    durations_s: dict[str, float] = {}
+    with new_folder(folder) as draft:
+        with _step("simulate", f"{SENSOR}, circle of 1 mm, 0.05 to 2 N, within 8 mm", durations_s):
+            (forward_map,) = solve_maps(load_sensor(SENSOR), (Circle(1.0),), sweep)
+            dataset = read_dataset(write_sweep(draft / "presses", (forward_map,), sweep))
+            say(
+                f"   {len(dataset.samples)} presses interpolated from {forward_map.solves} solves, relative error "
+                f"{forward_map.error:.1e}"
+            )
+        with _step("train", "a small network on noisy charges, exported to ONNX", durations_s):
+            model = release(fit(dataset, settings), draft / "models" / SENSOR, command=this_command())
+            predictor = Predictor(model.folder)
+            say(f"   median position error {model.metadata.errors['position_median_mm']:g} mm with noise")
+        with _step(
+            "serve",
+            f"a virtual sensor sends {RATE_HZ:g} frames/s over a pseudo-terminal, the model answers live",
+            durations_s,
+        ):
+            followed, totals = _follow_live(forward_map, predictor, seconds or LIVE_S)
+            say(f"   {totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated")
+        with _step("show", "one page of pictures", durations_s):
+            tested = _test_presses(forward_map, predictor, sweep)
+            equilibrium = press(forward_map.sensor.film, forward_map.probe, DRAWN_POSITION_MM, DRAWN_FORCE_N)
+            draw_page(forward_map, equilibrium, followed, tested, draft / "demo.png")
+    say(f"   {folder / 'demo.png'}")
+    typer.echo(_summary(tested, followed, durations_s, folder))
+
+
+@contextmanager
+def _step(name: str, description: str, durations_s: dict[str, float]) -> Iterator[None]:
+    """Announce a step, show its progress, and store its duration, s."""
+    say(f"\n{len(durations_s) + 1}. {name}: {description}")
+    start_s = time.perf_counter()
+    with shown_progress():
+        yield
+    durations_s[name] = time.perf_counter() - start_s
+
+
+def _free_name(base: Path) -> Path:
+    """Return `base`, or the first of base-2, base-3, ... that does not exist."""
+    numbered = (base.with_name(f"{base.name}-{number}") for number in count(2))
+    return next(path for path in chain([base], numbered) if not path.exists())
+
+
+def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, StreamTotals]:
+    """Play a virtual sensor, read its port, and print estimate and truth twice a second.
+
+    Returns:
+        One row for each frame with a press, columns as in `FollowedPress`, shape (n, 7), mm and N; and the counts of
+        the stream.
+    """
+    touch = TouchStream(predictor)
+    frame_count = round(seconds * RATE_HZ)
+    print_interval = round(PRINT_INTERVAL_S * RATE_HZ)
+    followed: list[FollowedPress] = []
+    press_number = 0
+    is_pressed = False
+    say("   estimated: x mm, y mm, N   true: x mm, y mm, N")
+    with virtual_sensor(forward_map, "reference", SEED, RATE_HZ) as sensor, Port(sensor.url) as port:
+        all_records = (record for chunk in port for record in touch.feed(chunk))
+        records = islice(all_records, frame_count)
+        for frame_number, record in enumerate(track(records, "following", frame_count), start=1):
+            truth = sensor.truth(record.seq or 0)
+            true_contact = (truth.x_mm, truth.y_mm, truth.force_N)
+            contact = _contact_of(record)
+            was_pressed = is_pressed
+            is_pressed = record.contact and truth.force_N > 0.0
+            if is_pressed and not was_pressed:
+                press_number += 1
+            if is_pressed:
+                followed.append(FollowedPress(press_number, *true_contact, *contact))
+            if frame_number % print_interval == 0:
+                say(f"   {_columns(record.contact, contact)}     {_columns(truth.force_N > 0.0, true_contact)}")
+    return np.array(followed), touch.totals()
+
+
+def _contact_of(record: PredictionRecord) -> tuple[float, float, float]:
+    """Return x, y (mm) and force (N) of a record; zeros for what the record does not contain."""
+    return record.x_mm or 0.0, record.y_mm or 0.0, record.force_N or 0.0
+
+
+def _columns(is_contact: bool, contact: tuple[float, float, float]) -> str:
+    """Format x, y (mm) and force (N) for the table of the live part."""
+    if not is_contact:
+        return f"{'no contact':>22}"
+    x_mm, y_mm, force_N = contact
+    return f"{x_mm:7.2f} {y_mm:7.2f} {force_N:6.3f}"
+
+
+def _test_presses(forward_map: ForwardMap, predictor: Predictor, sweep: Sweep) -> Array:
+    """Estimate presses on which the model was not trained.
+
+    Returns:
+        True and estimated (x, y, F), shape (TEST_PRESSES, 6), mm and N.
+    """
+    test = Sweep(sweep.radius, sweep.force_range, TEST_PRESSES, sweep.seed + 1)
+    contact = test.over((forward_map.probe,)).contact
+    charge = noise_model("reference").add(forward_map.charges(contact), np.random.default_rng(test.seed))
+    return np.column_stack([contact, *predictor.predict_batch(charge)[:3]])
+
+
+def _position_error(presses: Array) -> Array:
+    """Compute the distance between true and estimated position, mm, from rows that end with both (x, y, F)."""
+    estimated_xy = presses[:, -3:-1]
+    true_xy = presses[:, -6:-4]
+    error: Array = np.linalg.norm(estimated_xy - true_xy, axis=1)
+    return error
+
+
+def _position_words(presses: Array) -> str:
+    """Format median and 95th percentile of the position error."""
+    median_mm, p95_mm = np.percentile(_position_error(presses), (50, 95))
+    return f"median {median_mm:.3f} mm, 95 % {p95_mm:.3f} mm"
+
+
+def _summary(tested: Array, followed: Array, durations_s: dict[str, float], folder: Path) -> str:
+    """Return the table of results.
+
+    Args:
+        tested: Test presses, true and estimated (x, y, F), shape (m, 6), mm and N.
+        followed: Frames of the live part, columns as in `FollowedPress`, shape (n, 7), mm and N.
+        durations_s: Duration of each step, s.
+        folder: Folder of the results.
+    """
+    force_error_percent = 100.0 * (tested[:, 5] / tested[:, 2] - 1.0)
+    force_median = np.median(np.abs(force_error_percent))
+    force_rms = np.sqrt(np.mean(force_error_percent**2))
+    model = load_model(find_model(str(folder / "models" / SENSOR)))
+    predictor = Predictor(model.folder)
+    charges = press_charges(predictor, model.golden.charge_pC)
+    (latency,) = take_turns(in_process_contenders(predictor, charges)[1:2], LATENCY_S)
+    size_KiB = (model.folder / "model.onnx").stat().st_size / 1024
+    rows = [
+        ("position error, with noise", _position_words(tested)),
+        ("position error, live", _position_words(followed)),
+        ("force error", f"median {force_median:.2f} %, rms {force_rms:.2f} %"),
+        ("model", f"{size_KiB:.0f} KiB, {model.metadata.label}"),
+        ("one prediction", f"p50 {latency.p50_us:.1f} us, p99 {latency.p99_us:.1f} us"),
+        ("seconds", ", ".join(f"{name} {duration:.1f}" for name, duration in durations_s.items())),
+        ("results in", str(folder)),
+    ]
+    return "\n" + "\n".join(f"{name:<32} {value}" for name, value in rows)
+
+
+def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array, tested: Array, path: Path) -> None:
+    """Draw the results on one page and write the picture.
+
+    Args:
+        forward_map: Forward map of the film.
+        equilibrium: The press whose deflection is drawn.
+        followed: Frames of the live part, columns as in `FollowedPress`, shape (n, 7), mm and N.
+        tested: Test presses, true and estimated (x, y, F), shape (m, 6), mm and N.
+        path: Path of the picture.
+    """
+    electrode_count = len(forward_map.electrodes)
+    figure = new_figure(15.0, 9.2)
+    top, bottom = cast(np.ndarray, figure.subfigures(2, 1))
+    left, middle, right = top.subplots(1, 3)
+    draw_deflection(left, equilibrium)
+    draw_electrodes(left, forward_map.sensor, names=False)
+    draw_section(middle, equilibrium)
+    _draw_live_paths(right, forward_map, followed)
+
+    width_ratios = [1.0] * electrode_count + [1.25]
+    *map_axes, error_axes = bottom.subplots(1, electrode_count + 1, width_ratios=width_ratios)
+    for number, (axes, name) in enumerate(zip(map_axes, forward_map.electrodes, strict=True)):
+        draw_charge_map(axes, forward_map, number)
+        title = f"isocharge contours of {name} at 1 N, pC"
+        draw_layout(axes, forward_map.sensor, forward_map.domain.radius, title, highlight=name)
+    true_force = tested[:, 2]
+    _draw_error_against_force(error_axes, true_force, _position_error(tested))
+    figure.suptitle(f"isocharge demo: {forward_map.sensor.name}, {forward_map.probe.notation}", fontsize=14)
+    save_picture(figure, path)
+
+
+def _draw_live_paths(axes: Any, forward_map: ForwardMap, followed: Array) -> None:
+    """Draw the true and the estimated path of each press of the live part."""
+    press_number = followed[:, 0]
+    true_xy = followed[:, 1:3]
+    estimated_xy = followed[:, 4:6]
+    for number in np.unique(press_number):
+        frames = press_number == number
+        axes.plot(*true_xy[frames].T, color=PRESSED, lw=3.0, solid_capstyle="round")
+        axes.plot(*estimated_xy[frames].T, color=FELT, lw=0.7)
+    true_line, estimated_line = axes.lines[:2]
+    true_line.set_label("pressed")
+    estimated_line.set_label("estimated")
+    axes.legend(loc="upper right")
+    draw_layout(axes, forward_map.sensor, forward_map.domain.radius, "live path, through the port")
+
+
+def _draw_error_against_force(axes: Any, force: Array, error: Array) -> None:
+    """Draw the position errors (mm) of presses against their forces (N), with median and 95th percentile."""
+    axes.loglog(force, error, ".", color=PRESSED, ms=2, alpha=0.5)
+    edges = np.geomspace(force.min(), force.max(), 13)
+    centres = np.sqrt(edges[:-1] * edges[1:])
+    for percentile, style, label in ((50, "-", "median"), (95, "--", "95 %")):
+        line = binned_statistic(force, error, partial(np.percentile, q=percentile), edges).statistic
+        axes.plot(centres, line, style, color=FELT, label=label)
+    axes.legend()
+    axes.set(title="position error of test presses", xlabel="force, N", ylabel="error, mm", ylim=(2e-3, None))
+    axes.grid(alpha=0.3, which="both")

@@ -1,0 +1,47 @@
+"""A virtual sensor on the live page, followed with the released model."""
+
+from contextlib import ExitStack, closing
+
+from isocharge.cli.shared.live_page import PageFeed, answering, live_page
+from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
+from isocharge.cli.shared.virtual_sensor import virtual_sensor
+from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE
+from isocharge.serve import Port, Predictor, TouchStream, find_model
+from isocharge.serve.live.recorded_stream import RecordedStream
+from isocharge.serve.network.address import Address
+from isocharge.simulate import Circle, ForwardMap, load_sensor
+
+SENSOR = "three-25um-biaxial"
+"""Name of the sensor and of its released model."""
+
+RATE_HZ = 200.0
+"""Frames per second of the virtual sensor, Hz."""
+
+SEED = 0
+"""Seed of the presses."""
+
+
+def show_live_film(address: Address, seconds: float | None) -> None:
+    """Play a virtual sensor, estimate its contacts, and show both on the live page.
+
+    Args:
+        address: Address at which the page listens.
+        seconds: Time after which to stop, s; None for Ctrl-C.
+    """
+    predictor = Predictor(SENSOR)
+    touch = TouchStream(predictor)
+    live = RecordedStream(touch)
+    with ExitStack() as stack:
+        stack.enter_context(until_stopped())
+        link = stack.enter_context(live_page(address, None, SENSOR, predictor.metadata, find_model(SENSOR)))
+        with shown_progress():
+            forward_map = ForwardMap.build(load_sensor(SENSOR), Circle(1.0), force_range=DEFAULT_PLAYED_FORCE_RANGE)
+        board = stack.enter_context(virtual_sensor(forward_map, "reference", SEED, RATE_HZ))
+        port = stack.enter_context(Port(board.url))
+        stack.enter_context(answering(link, live, ("every", {}, "")))
+        say("Ctrl-C stops")
+        feed = PageFeed(link, touch, live)
+        for record, _ in stack.enter_context(closing(live.follow(port))):
+            feed.put(record)
+            if seconds is not None and touch.counts.records > seconds * RATE_HZ:
+                break

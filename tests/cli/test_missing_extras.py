@@ -1,0 +1,114 @@
+"""A command that needs an extra names the install command, and no command ends in a traceback without extras."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+from cli.test_help import COMMANDS
+from isocharge.common.extras import PACKAGES
+
+BASE_COMMANDS = {"serve predict", "serve check", "serve stream", "serve replay", "serve doctor", "serve bench"}
+"""Commands that the base install runs. Their examples name files and ports that do not exist here."""
+
+EXTRAS = {"serve http": "http", "serve plot": "simulate", "serve virtual": "simulate", "simulate design": "design"}
+"""The extra of each command that is not that of its group."""
+
+OPTIONS = [
+    ("demo --live", "simulate,http"),
+    ("serve stream three-25um-biaxial --port - --live 0", "http"),
+    ("serve stream three-25um-biaxial --port - --mcap touch.mcap", "record"),
+    ("serve check three-25um-biaxial presses.parquet", "parquet"),
+    ("serve predict three-25um-biaxial charges.parquet", "parquet"),
+]
+"""Command lines whose options need an extra."""
+
+LOAD_ALL = """
+import json
+import typer
+from isocharge.cli.main import app
+from isocharge.common.errors import MissingExtra
+
+root = typer.main.get_command(app)
+outcomes = {}
+
+def load(group, path):
+    for name in group.list_commands(None):
+        words = [*path, name]
+        try:
+            _, command, _ = group.resolve_command(None, [name])
+        except MissingExtra as error:
+            outcomes[" ".join(words)] = str(error)
+            continue
+        if hasattr(command, "list_commands"):
+            load(command, words)
+        else:
+            outcomes[" ".join(words)] = ""
+
+load(root, [])
+print(json.dumps(outcomes))
+"""
+
+
+def extra_of(command):
+    group = command.split()[0]
+    return EXTRAS.get(command, "train" if group == "demo" else group)
+
+
+def example_of(command):
+    """The words of the example in the help of a command, in a form that takes no time."""
+    text = COMMANDS[command].help
+    example = re.search(r"Example: isocharge (.*)", text)[1].partition(" > ")[0]
+    return shlex.split(example.replace("--seconds 10", "--seconds 0.1"))
+
+
+def run(words, environment, folder):
+    done = subprocess.run(
+        [sys.executable, "-m", "isocharge.cli", *words],
+        env=environment,
+        cwd=folder,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    return done
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_in_the_base_install_runs_or_names_the_install_command(command, installed, tmp_path):
+    done = run(example_of(command), installed(), tmp_path)
+    if command in BASE_COMMANDS:
+        assert "not installed" not in done.stderr
+    else:
+        assert done.returncode == 1
+        assert f"pip install 'isocharge[{extra_of(command)}]'" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("line", "extra"), OPTIONS)
+def test_an_option_in_the_base_install_names_the_install_command(line, extra, installed, tmp_path):
+    done = run(line.split(), installed(), tmp_path)
+    assert done.returncode == 1
+    assert f"pip install 'isocharge[{extra}]'" in done.stderr
+
+
+@pytest.mark.parametrize("missing", PACKAGES)
+def test_commands_are_imported_or_name_the_one_extra_that_is_missing(missing, installed):
+    """Every command in an install that has all packages but those of one extra."""
+    environment = installed("all") | {"ABSENT_PACKAGES": " ".join(PACKAGES[missing] - {"google"})}
+    done = subprocess.run(
+        [sys.executable, "-c", LOAD_ALL], env=environment, capture_output=True, text=True, timeout=200, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    outcomes = json.loads(done.stdout)
+    assert outcomes.keys() == COMMANDS.keys()
+    for command, message in outcomes.items():
+        if message:
+            assert f"pip install 'isocharge[{extra_of(command)}]'" in message
+            assert PACKAGES[extra_of(command)] & PACKAGES[missing]
