@@ -9,7 +9,7 @@ import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TextIO
+from typing import BinaryIO, TextIO
 
 from isocharge.common.errors import IsochargeError, OutputError, OutputExists
 
@@ -32,24 +32,33 @@ def sha256_of(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file for reading, without waiting for the writer of a pipe.
+
+    Raises:
+        OSError: If the file cannot be opened or is a pipe, a device or a folder; `strerror` says which.
+    """
+    descriptor = os.open(path, READ_FLAGS)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return os.fdopen(descriptor, "rb")
+
+
 def read_whole(path: Path, most: int = MOST_BYTES) -> bytes:
-    """The bytes of a regular file.
+    """Read the bytes of a regular file.
 
     Args:
         path: The file. A pipe or a device is refused, because to read one may never end.
         most: Largest size, bytes.
 
     Raises:
-        OSError: If it cannot be read, is no regular file, or is larger; `strerror` says which.
+        OSError: If the file cannot be read, is not a regular file, or is larger; `strerror` says which.
     """
-    descriptor = os.open(path, READ_FLAGS)
-    state = os.fstat(descriptor)
-    if not stat.S_ISREG(state.st_mode):
-        os.close(descriptor)
-        raise OSError(errno.EINVAL, "not a regular file", str(path))
-    with os.fdopen(descriptor, "rb") as file:
-        data = file.read(most + 1) if state.st_size <= most else b""
-        if max(len(data), state.st_size) > most:
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(most + 1) if size <= most else b""
+        if max(len(data), size) > most:
             raise OSError(errno.EFBIG, f"larger than {most} bytes", str(path))
         return data
 

@@ -3,17 +3,15 @@
 import csv
 
 import numpy as np
-import pyarrow
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from pyarrow.parquet import read_table, write_table
 
-from isocharge.common.errors import PressError
+from isocharge.common.errors import OutputError, PressError
 from isocharge.serve import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.prediction import measured_presses
-from isocharge.serve.prediction.measured_presses import KINDS, presses_text, read_press_list
-from isocharge.serve.prediction.table import LARGEST
+from isocharge.serve.prediction.measured_presses import PRESS_RULES, presses_text, read_press_list
+from isocharge.serve.prediction.tables.number_table import LARGEST
 
 NAMES = ("A", "B", "C")
 HEADER = "x_mm,y_mm,force_N,A,B,C"
@@ -54,6 +52,16 @@ def test_the_same_press_from_every_kind_of_file(read, text):
     assert read(text) == read(f"{HEADER}\n1,2,0.5,10,20,30\n")
 
 
+def test_a_quoted_cell_may_hold_a_line_that_begins_with_a_hash(read):
+    presses = read(f'{HEADER},note\n1,2,3,4,5,6,"first\n# second"\n1,2,3,4,5,7,\n')
+    assert presses.charge_pC[:, 2].tolist() == [6.0, 7.0]
+
+
+def test_a_quotation_mark_that_is_not_closed_swallows_no_presses(read):
+    with pytest.raises(PressError, match=r"line 3: not CSV text \(unexpected end of data\)"):
+        read(f'{HEADER},note\n1,2,3,4,5,6,"first\n1,2,3,4,5,7,\n')
+
+
 def test_without_names_all_other_columns_are_electrodes(read, tmp_path):
     (tmp_path / "all.csv").write_text("force_N,A,y_mm,x_mm,C\n0.5,10,2,1,30\n")
     presses = read_presses(tmp_path / "all.csv")
@@ -62,31 +70,6 @@ def test_without_names_all_other_columns_are_electrodes(read, tmp_path):
     with pytest.raises(PressError, match=r"electrodes \('A', 'B'\) of mine, got \('A', 'C'\); missing: 'B'"):
         presses.of_electrodes(("A", "B"), "mine")
     assert read("day,x_mm,y_mm,note,A,B,C\n1,2,3,a,4,5,6\n").ignored == ("day", "note")
-
-
-def test_parquet_of_another_program_is_read_as_csv_is(tmp_path):
-    """pyarrow's own writer: whole numbers, null, NaN, a column of text."""
-    table = {"x_mm": [1, 2, None], "y_mm": [3, 4, None], "force_N": [0.5, 1.0, 2.0], "A": [100.5, np.nan, 3.0]}
-    table |= {"B": [-1, 2, 3], "C": [1.0, 2.0, 3.0], "note": ["a\n,b", "", None]}
-    write_table(pyarrow.table(table), tmp_path / "p.parquet")
-    rows = ["x_mm,y_mm,force_N,A,B,C", "1,3,0.5,100.5,-1,1", "2,4,1,,2,2", ",,2,3,3,3"]
-    (tmp_path / "p.csv").write_text("\n".join(rows))
-    presses = read_presses(tmp_path / "p.parquet", NAMES)
-    assert presses == read_presses(tmp_path / "p.csv", NAMES)
-    assert presses.ignored == ("note",)
-    write_presses(tmp_path / "again.parquet", presses)
-    assert read_presses(tmp_path / "again.parquet") == presses
-    assert read_table(tmp_path / "again.parquet")["A"].to_pylist() == [100.5, None, 3.0]
-
-
-@pytest.mark.parametrize(
-    ("content", "said"), [(None, r"cannot be read \(.*No such file"), (b"x_mm,y_mm\n1,2\n", "not a Parquet file")]
-)
-def test_parquet_that_is_none(content, said, tmp_path):
-    if content:
-        (tmp_path / "p.parquet").write_bytes(content)
-    with pytest.raises(PressError, match=said):
-        read_presses(tmp_path / "p.parquet", NAMES)
 
 
 def test_a_list_of_presses_for_a_machine(tmp_path):
@@ -149,7 +132,7 @@ def test_rows(read):
         (f"{HEADER}\n1,2,3,4,5,6,7\n", "line 2: expected 6 cells as in the header, got 7"),
         (f"{HEADER}\n1,2,3,4,5,6".replace(",", ";"), r"separated by ';': save the file .*tr ',;' '\.,' < FILE > NEW"),
         (f'{HEADER}\n1,2,"0,5",4,5,6\n', "column 'force_N': .*got '0,5'; write a decimal point"),
-        (b"x_mm,y_mm,force_N,A,B,C\n1,2,3,4,5,\xff\n", "line 1: not CSV text in UTF-8"),
+        (b"x_mm,y_mm,force_N,A,B,C\n1,2,3,4,5,\xff\n", "line 2: not CSV text in UTF-8"),
         ("x_mm,y_mm,force_N,A,B,C\n".encode("utf-16"), "not CSV text in UTF-8"),
     ],
 )
@@ -167,10 +150,25 @@ def test_too_many_presses(monkeypatch, read):
         read(HEADER + "\n1,2,3,4,5,6" * 4)
 
 
-@pytest.mark.parametrize("names", [(), ("A", "A"), ("",), ("force_N",), ("force_std", "A"), ("A\nB",)])
+@pytest.mark.parametrize(
+    "names",
+    [
+        (),
+        ("A", "A"),
+        ("",),
+        ("force_N",),
+        ("force_std", "A"),
+        ("A\nB",),
+        (" A",),
+        ("A\u2028B",),
+        ("\ud800",),
+        ("A" * 1001,),
+        tuple(f"Q{number}" for number in range(995)),
+    ],
+)
 def test_electrodes_that_cannot_be_columns(names):
     one = np.ones(1)
-    with pytest.raises(PressError, match=r"^electrode.*: expected (one|a) name"):
+    with pytest.raises(PressError, match=r"^electrode.*: expected (one|a|at most 994) name"):
         MeasuredPresses(np.ones((1, 3)), np.ones((1, len(names))), one, one, names, (1,))
 
 
@@ -190,34 +188,62 @@ def test_shapes_that_disagree():
 
 FINITE = st.floats(-LARGEST, LARGEST)
 POSITIVE = st.floats(0.0, LARGEST, exclude_min=True)
-TEXT = st.text(st.characters(codec="utf-8"), min_size=1, max_size=8)
+PRINTABLE = st.characters(codec="utf-8").filter(str.isprintable)
+NAME = st.text(PRINTABLE, min_size=1, max_size=8).filter(lambda name: name == name.strip())
 
 
 @st.composite
 def some_presses(draw):
-    names = tuple(draw(st.lists(TEXT, min_size=1, max_size=4, unique=True)))
-    assume(not set(names) & set(KINDS) and not any(mark in name for name in names for mark in "\r\n"))
+    names = tuple(draw(st.lists(NAME, min_size=1, max_size=4, unique=True)))
+    assume(not set(names) & set(PRESS_RULES))
     unknown = st.just(np.nan)
     place = st.one_of(st.tuples(FINITE, FINITE), st.tuples(unknown, unknown))
     row = st.tuples(place, POSITIVE | unknown, st.lists(FINITE | unknown, min_size=len(names), max_size=len(names)))
     rows = [r for r in draw(st.lists(row, min_size=1, max_size=5)) if not np.isnan(r[2]).all()]
     assume(rows)
     stds = [[draw(POSITIVE), draw(st.floats(0.0, 1.0, exclude_min=True))] for _ in rows]
+    temperatures = draw(
+        st.none() | st.lists(st.floats(-100.0, 200.0) | unknown, min_size=len(rows), max_size=len(rows))
+    )
     return MeasuredPresses(
         np.array([[*place, force] for place, force, _ in rows]),
         np.array([charges for *_, charges in rows]),
         *np.array(stds).T,
         names,
         tuple(range(1, len(rows) + 1)),
+        temperature_C=None if temperatures is None else np.array(temperatures),
     )
 
 
+@pytest.mark.parametrize("suffix", ["csv", "parquet", "PARQUET"])
 @given(presses=some_presses())
 @settings(derandomize=True, max_examples=60)
-def test_what_is_written_is_read(presses, tmp_path_factory):
-    path = tmp_path_factory.getbasetemp() / "written.csv"
+def test_what_is_written_is_read(suffix, presses, tmp_path_factory):
+    """With the names of the electrodes, and with every other column as an electrode."""
+    path = tmp_path_factory.getbasetemp() / f"written.{suffix}"
     write_presses(path, presses)
     assert read_presses(path, presses.electrodes) == presses
+    assert read_presses(path) == presses
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_presses_that_would_not_be_read_are_not_written(suffix, tmp_path, monkeypatch):
+    presses = MeasuredPresses(np.ones((2, 3)), np.ones((2, 3)), np.ones(2), np.ones(2), NAMES, (1, 2))
+    path = tmp_path / f"p.{suffix}"
+    with pytest.raises(PressError, match=r"expected 1 to 1,000,000 presses to write, got 0"):
+        write_presses(path, presses[:0])
+    monkeypatch.setattr(measured_presses, "MOST_ROWS", 1)
+    with pytest.raises(PressError, match=r"expected 1 to 1 presses to write, got 2"):
+        write_presses(path, presses)
+    assert not path.exists()
+    with pytest.raises(OutputError, match=r"nowhere.*cannot be written"):
+        write_presses(tmp_path / "nowhere" / f"p.{suffix}", presses[:1])
+
+
+def test_a_charge_that_would_not_be_read_is_refused():
+    ones = np.ones(1)
+    with pytest.raises(PressError, match=r"^line 1, column 'A': expected a charge in pC, got 1e\+39$"):
+        MeasuredPresses(np.ones((1, 3)), np.array([[1e39]]), ones, ones, ("A",), (1,))
 
 
 def test_a_written_file_is_plain_csv(read):

@@ -48,7 +48,7 @@ def test_further_columns_are_ignored_with_a_word():
     ("text", "said"),
     [
         (",".join(f"column {i}" for i in range(2000)), "expected at most 1,000 columns, got 2,000"),
-        ("A" * 200_000, "line 1: not CSV text in UTF-8 .field larger"),
+        ("A" * 200_000, "line 1: not CSV text .field larger"),
         ("A,B," + "x" * 90_000, "missing: 'C'"),
         ("A,B,C\n" + ",".join("1" * 20_000), "line 2: expected 3 cells"),
     ],
@@ -85,7 +85,7 @@ def test_charges_of_a_header_alone():
         ("A,B,C\n1,2,x\n", "line 2, column 'C': expected a charge in pC, got 'x'"),
         ("C,B,A\n1,nan,3\n", "line 2, column 'B': .* got 'nan'"),
         ("A,B,C\n1,2,-inf\n", "line 2, column 'C': .* got '-inf'"),
-        ("A,B,C\n1,2,1e39\n", "line 2, column 'C': .* got '1e39'"),
+        ("A,B,C\n1,2,1e39\n", "line 2, column 'C': .* got 1e.39$"),
         ("A,B,C\n1,1_0,3\n", "line 2, column 'B': .* got '1_0'"),
         ('A,B,C\n1,"2,5",3\n', "line 2, column 'B': .* got '2,5'; write a decimal point"),
         ('A,B,C\n1,"x,y",3\n', "line 2, column 'B': .* got 'x,y'$"),

@@ -1,8 +1,6 @@
 """`isocharge serve predict`: charges from a file to contacts."""
 
 import sys
-from collections.abc import Iterator
-from contextlib import nullcontext
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
@@ -11,10 +9,11 @@ import typer
 
 from isocharge.cli.shared.options import ModelArgument, ModelsOption
 from isocharge.cli.shared.terminal import say, until_stopped
+from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
 from isocharge.common.files import bounded_lines
 from isocharge.serve import Predictor, read_charges, table_records, write_contacts
-from isocharge.serve.prediction.parquet import SUFFIX, parquet_lines
+from isocharge.serve.prediction.table import read_charge_file
 
 
 def predict_command(
@@ -39,8 +38,7 @@ def predict_command(
     Example: isocharge serve predict three-25um-biaxial presses.csv > contacts.csv
     """
     predictor = Predictor(model, models=models)
-    where = "stdin" if file == "-" else file
-    charge_pC = read_charges(_lines(file), predictor.metadata.electrodes, where, say)
+    charge_pC = _read_charges(file, predictor.metadata.electrodes)
     with until_stopped():
         if json:
             for record in table_records(charge_pC, predictor):
@@ -50,18 +48,14 @@ def predict_command(
             sys.stdout.flush()
 
 
-def _lines(file: str) -> Iterator[str]:
-    """Lines of a file, or of stdin for `-`, for the csv module, without a byte order mark."""
-    if file.endswith(SUFFIX):
-        yield from parquet_lines(Path(file))
-        return
+def _read_charges(file: str, electrodes: tuple[str, ...]) -> Array:
+    """Read the charges of a file, or of CSV text on stdin for `-`, shape (n, electrodes), pC."""
+    if file != "-":
+        return read_charge_file(Path(file), electrodes, say)
+    text = TextIOWrapper(sys.stdin.buffer, encoding="utf-8-sig", newline="")
     try:
-        with nullcontext(sys.stdin.buffer) if file == "-" else Path(file).open("rb") as data:
-            text = TextIOWrapper(data, encoding="utf-8-sig", newline="")
-            try:
-                yield from bounded_lines(text)
-            finally:
-                if not text.closed:
-                    text.detach()  # or it closes stdin
+        return read_charges(bounded_lines(text), electrodes, "stdin", say)
     except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}); expected a CSV file, or - for stdin") from error
+        raise InputError(f"stdin: cannot be read ({error.strerror}); expected CSV text") from error
+    finally:
+        text.detach()  # otherwise the wrapper closes stdin

@@ -7,7 +7,7 @@ import typer
 
 from isocharge.cli.shared.terminal import say
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, read_presses
-from isocharge.serve.prediction.table import ignored_words
+from isocharge.serve.prediction.tables.number_table import ignored_words
 
 PositionStdOption = Annotated[
     float,

@@ -16,7 +16,7 @@ from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import TrainingError
 from isocharge.serve.model.golden import FLOORS
 from isocharge.serve.model.session import CORRELATION, OUTPUTS, open_session, run
-from isocharge.serve.prediction.table import LARGEST
+from isocharge.serve.prediction.tables.number_table import LARGEST
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 from isocharge.train.training.features import MISFIT_UNIT

@@ -1,0 +1,5 @@
+"""Files with named columns of numbers: the checks that all formats share, and one module for each format.
+
+`number_table` checks names, values and rows. `csv_table` and `parquet_table` turn their format into columns.
+`table_file` chooses the format by the name of the file.
+"""

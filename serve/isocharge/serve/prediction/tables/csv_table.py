@@ -1,0 +1,150 @@
+"""Columns of numbers as CSV text.
+
+A line that begins with # is a comment, unless it is inside a quoted cell. Blank lines and blanks around a name or a
+number do not matter. A number has a decimal point and possibly an exponent; `nan` and `inf` are not accepted.
+"""
+
+import csv
+import io
+import math
+from array import array
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import NoReturn
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError, shown
+from isocharge.common.number_text import number_of
+from isocharge.serve.prediction.tables.number_table import ColumnRule, NumberColumns, NumberTable
+
+_SEPARATORS = {";": "tr ',;' '.,'", "\t": r"tr '\t' ','"}
+"""Other separators of spreadsheets, and the command that turns such a file into CSV with decimal points."""
+
+
+class CsvTable(NumberTable):
+    """The columns of a CSV text."""
+
+    row_noun = "line"
+
+    def __init__(
+        self, lines: Iterable[str], names: Collection[str], where: str, error: type[InputError], expected: str
+    ) -> None:
+        """Read the header.
+
+        Args:
+            lines: Lines of the file.
+            names: Names that have a meaning. A header that begins with one of them is not a comment, even if the name
+                begins with #.
+            where: The file, for messages.
+            error: Class of the error that is raised for anything that is wrong with the file.
+            expected: The expected header, for messages.
+
+        Raises:
+            error: If the file is empty, is not CSV text in UTF-8, or has too many columns.
+        """
+        self._rows = _numbered_rows(lines, names, where, error)
+        _, header = next(self._rows, (0, None))
+        if header is None:
+            raise error(f"{where}: empty; expected {expected}")
+        super().__init__(header, names, where, error, expected)
+
+    def _read_columns(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
+        places = {name: self.header.index(name) for name in rules}
+        line_numbers = array("q")
+        numbers = array("d")
+        for line_number, cells in self._rows:
+            if len(line_numbers) == most_rows:
+                self._refuse_row_count(most_rows)
+            self._check_cell_count(line_number, cells)
+            line_numbers.append(line_number)
+            for name, place in places.items():
+                number = _number(cells[place])
+                if number is None:
+                    self._refuse_cell(line_number, name, rules[name], cells[place])
+                numbers.append(number)
+        matrix = np.array(numbers, dtype=np.float64).reshape(len(line_numbers), len(places))
+        values = dict(zip(places, matrix.T, strict=True))
+        return NumberColumns(values, np.array(line_numbers, dtype=np.intp), self.row_noun)
+
+    def _check_cell_count(self, line_number: int, cells: list[str]) -> None:
+        surplus = cells[len(self.header) :]
+        if len(cells) < len(self.header) or any(cell.strip() for cell in surplus):
+            raise self.error(
+                f"{self.where}, line {line_number}: expected {len(self.header)} cells as in the header, got "
+                f"{len(cells)}: {shown(cells)}"
+            )
+
+    def _refuse_cell(self, line_number: int, name: str, rule: ColumnRule, cell: str) -> NoReturn:
+        has_decimal_comma = "," in cell and _number(cell.replace(",", ".", 1)) is not None
+        advice = "; write a decimal point" if has_decimal_comma else ""
+        raise self.error(
+            f"{self.where}, line {line_number}, column {shown(name)}: expected {rule.description}, got "
+            f"{shown(cell)}{advice}"
+        )
+
+    def _refuse_header(self, reason: str) -> NoReturn:
+        for separator, command in _SEPARATORS.items():
+            if len(self.header) == 1 and separator in self.header[0]:
+                reason += (
+                    f"; the columns are separated by {separator!r}: save the file with commas between columns and "
+                    f"points in numbers, as with: {command} < FILE > NEW.csv"
+                )
+        super()._refuse_header(reason)
+
+
+def csv_text(columns: Mapping[str, Array]) -> str:
+    """Return columns of shape (n,) as CSV text that reads back to the same numbers; NaN becomes an empty cell."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    for row in np.column_stack([*columns.values()]).tolist():
+        writer.writerow("" if math.isnan(value) else repr(value) for value in row)
+    return text.getvalue()
+
+
+def _numbered_rows(
+    lines: Iterable[str], names: Collection[str], where: str, error: type[InputError]
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield line number, from 1, and cells of each row that is neither blank nor a comment."""
+    begins_row = True
+
+    def lines_without_comments() -> Iterator[str]:
+        nonlocal begins_row
+        for line in lines:
+            is_comment = begins_row and _is_comment(line, names)
+            begins_row = False
+            yield "\n" if is_comment else line
+
+    reader = csv.reader(lines_without_comments(), strict=True)
+    try:
+        for cells in reader:
+            begins_row = True
+            if any(cell.strip() for cell in cells):
+                yield reader.line_num, cells
+    except InputError:  # from the iterator that supplies the lines
+        raise
+    except csv.Error as cause:
+        raise error(f"{where}, line {reader.line_num}: not CSV text ({cause})") from cause
+    except UnicodeDecodeError as cause:
+        line_number = reader.line_num + 1 + cause.object[: cause.start].count(b"\n")
+        raise error(f"{where}, line {line_number}: not CSV text in UTF-8 ({cause})") from cause
+    except ValueError as cause:  # a line that is too long to be held
+        raise error(f"{where}, line {reader.line_num + 1}: not CSV text ({cause})") from cause
+
+
+def _is_comment(line: str, names: Collection[str]) -> bool:
+    first_cell = line.partition(",")[0].strip()
+    return first_cell.startswith("#") and first_cell not in names
+
+
+def _number(cell: str) -> float | None:
+    """Return the number in a cell, NaN for an empty cell, and None for anything that is not a finite number."""
+    text = cell.strip()
+    if not text:
+        return math.nan
+    try:
+        number = number_of(text)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None

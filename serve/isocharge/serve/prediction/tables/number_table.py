@@ -1,0 +1,193 @@
+"""Named columns of numbers from a file: the checks of names, values and rows that all formats share.
+
+A format is a subclass of `NumberTable`. It reads the header and turns the requested columns into float64 arrays with
+NaN for an empty cell. Everything that can be checked after that is checked here, so that the same fault gets the same
+message in every format.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, NoReturn
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.errors import InputError, shown
+
+MOST_COLUMNS = 1_000
+"""Largest number of columns of a file."""
+
+LARGEST = float(np.finfo(np.float32).max)
+"""Largest magnitude of a number in a file; it is the largest number of the models' tensors."""
+
+MOST_LISTED_NAMES = 10
+"""Largest number of column names that an error message lists."""
+
+
+@dataclass(frozen=True)
+class ColumnRule:
+    """The numbers that a column may hold.
+
+    Attributes:
+        description: The expected cell, for messages, as in "a force in N".
+        minimum: Smallest number that is accepted.
+        maximum: Largest number that is accepted.
+        is_positive: Whether only numbers above zero are accepted.
+        may_be_empty: Whether empty cells are accepted.
+    """
+
+    description: str
+    minimum: float = -LARGEST
+    maximum: float = LARGEST
+    is_positive: bool = False
+    may_be_empty: bool = True
+
+    def violations(self, values: Array) -> Booleans:
+        """Return which values break the rule, shape (n,), from values of shape (n,) with NaN for an empty cell."""
+        is_empty = np.isnan(values)
+        is_outside = (values < self.minimum) | (values > self.maximum)
+        if self.is_positive:
+            is_outside |= values <= 0.0
+        if not self.may_be_empty:
+            is_outside |= is_empty
+        return np.asarray(is_outside)
+
+
+CHARGE_RULE = ColumnRule("a charge in pC")
+"""Rule of the columns of charges."""
+
+
+@dataclass(frozen=True)
+class NumberColumns:
+    """Columns of numbers and the rows of the file that they come from.
+
+    Attributes:
+        values: The columns by name, each of shape (n,); NaN for an empty cell.
+        row_numbers: Number of each row in the file, shape (n,).
+        row_noun: What the row numbers count: "line" of a text, "row" of a table.
+    """
+
+    values: Mapping[str, Array]
+    row_numbers: Integers
+    row_noun: str
+
+    def check(self, rules: Mapping[str, ColumnRule], where: str, error: type[InputError]) -> None:
+        """Check the values of all columns.
+
+        Args:
+            rules: The rule of each column.
+            where: Beginning of the message, for example the file with a comma and a blank; may be empty.
+            error: Class of the error.
+
+        Raises:
+            error: At the first row with a value that breaks a rule; row, column, rule and value are named.
+        """
+        violations = [rules[name].violations(column) for name, column in self.values.items()]
+        rows_and_columns = np.argwhere(np.column_stack(violations))
+        if not rows_and_columns.size:
+            return
+        row, column_number = rows_and_columns[0]
+        name = list(self.values)[column_number]
+        value = _value_text(float(self.values[name][row]))
+        raise error(
+            f"{where}{self.row_noun} {self.row_numbers[row]}, column {shown(name)}: expected "
+            f"{rules[name].description}, got {value}"
+        )
+
+
+def _value_text(value: float) -> str:
+    """Return a number for a message, with as many digits as it needs to be recognised."""
+    if np.isnan(value):
+        return "an empty cell"
+    short = f"{value:.6g}"
+    if float(short) == value:
+        return short
+    return repr(value)
+
+
+class NumberTable(ABC):
+    """A file with a header and columns of numbers, which is read once.
+
+    Attributes:
+        header: Names of the columns.
+        where: The file, for messages.
+        error: Class of the error that is raised for anything that is wrong with the file.
+        row_noun: What the row numbers of the format count, for messages.
+    """
+
+    row_noun: ClassVar[str]
+
+    def __init__(
+        self, header: Sequence[str], names: Collection[str], where: str, error: type[InputError], expected: str
+    ) -> None:
+        """Check the number of columns and keep their names.
+
+        Args:
+            header: Names of the columns as the file has them.
+            names: Names that have a meaning. Blanks at the ends of all other names are removed.
+            where: The file, for messages.
+            error: Class of the error that is raised for anything that is wrong with the file.
+            expected: The expected header, for messages.
+
+        Raises:
+            error: If the file has too many columns.
+        """
+        if len(header) > MOST_COLUMNS:
+            raise error(f"{where}: expected at most {MOST_COLUMNS:,} columns, got {len(header):,}")
+        self.header = tuple(name if name in names else name.strip() for name in header)
+        self.where = where
+        self.error = error
+        self.expected = expected
+
+    def choose_columns(self, required: Iterable[str], optional: Iterable[str] = ()) -> tuple[str, ...]:
+        """Return the names of the columns to read: the required ones, then the optional ones that the file has.
+
+        Raises:
+            error: If a required column is missing, or if the file has one of the columns twice.
+        """
+        chosen = (*required, *(name for name in optional if name in self.header))
+        missing = [name for name in chosen if name not in self.header]
+        if missing:
+            self._refuse_header(f"missing: {_listed(missing)}")
+        repeated = [name for name in chosen if self.header.count(name) > 1]
+        if repeated:
+            self._refuse_header(f"repeated: {_listed(repeated)}")
+        return chosen
+
+    def read(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
+        """Read columns and check their values.
+
+        Args:
+            rules: The rules of the columns to read, in the wanted order; names from `choose_columns`.
+            most_rows: Largest number of rows that is accepted.
+
+        Raises:
+            error: If the file is damaged or has more rows, or if a cell is not a number that its rule accepts.
+        """
+        columns = self._read_columns(rules, most_rows)
+        columns.check(rules, f"{self.where}, ", self.error)
+        return columns
+
+    @abstractmethod
+    def _read_columns(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
+        """Turn the columns of the format into arrays, as `read` describes, without checking the values."""
+
+    def _refuse_header(self, reason: str) -> NoReturn:
+        raise self.error(f"{self.where}: expected {self.expected}, got the header {shown(list(self.header))}; {reason}")
+
+    def _refuse_row_count(self, most_rows: int) -> NoReturn:
+        raise self.error(f"{self.where}: expected at most {most_rows:,} presses, got more; split the file")
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names for a message, with the number of those that are not listed."""
+    listed = ", ".join(map(shown, names[:MOST_LISTED_NAMES]))
+    if len(names) <= MOST_LISTED_NAMES:
+        return listed
+    return f"{listed} and {len(names) - MOST_LISTED_NAMES} more"
+
+
+def ignored_words(where: str, names: Sequence[str]) -> str:
+    """Return the sentence that names the columns of a file that are not read."""
+    return f"{where}: ignored columns: {shown(list(names))}"

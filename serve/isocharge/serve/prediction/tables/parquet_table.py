@@ -1,0 +1,203 @@
+"""Columns of numbers as Parquet.
+
+Only the requested columns are decoded, after their types and the number of rows were checked in the metadata of the
+file. Integers and floating-point numbers of any width and decimals are accepted; null and NaN are empty
+cells. Other columns may have any type.
+"""
+
+import io
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError, cut, shown
+from isocharge.common.extras import require
+from isocharge.serve.prediction.tables.number_table import ColumnRule, NumberColumns, NumberTable
+
+if TYPE_CHECKING:
+    from pyarrow import Array as ArrowArray
+    from pyarrow import DataType
+
+SUFFIX = ".parquet"
+"""End of the names of Parquet files."""
+
+MARK = b"PAR1"
+"""First and last four bytes of a Parquet file."""
+
+MOST_FOOTER_BYTES = 16 << 20
+"""Largest size of the metadata at the end of a file."""
+
+ROWS_PER_BATCH = 1 << 16
+"""Number of rows of a column that are decoded at a time."""
+
+FIRST_INEXACT_INTEGER = 2**53
+"""Smallest positive integer from which on float64 does not hold every integer exactly."""
+
+
+class ParquetTable(NumberTable):
+    """The columns of a Parquet file."""
+
+    row_noun = "row"
+
+    def __init__(
+        self, file: BinaryIO, names: Collection[str], where: str, error: type[InputError], expected: str
+    ) -> None:
+        """Read the metadata.
+
+        Args:
+            file: A regular file, opened for reading; it stays open until the columns are read.
+            names: Names that have a meaning.
+            where: The file, for messages.
+            error: Class of the error that is raised for anything that is wrong with the file.
+            expected: The expected header, for messages.
+
+        Raises:
+            error: If the file is not Parquet, is damaged, or has too many columns.
+            MissingExtra: If pyarrow is not installed.
+        """
+        require_pyarrow()
+        from pyarrow.parquet import ParquetFile
+
+        _check_ends(file, where, error)
+        with _damage_explained(where, error):
+            self._parquet = ParquetFile(file)
+            self._metadata = self._parquet.metadata
+            self._schema = self._parquet.schema_arrow
+            header = self._schema.names
+        super().__init__(header, names, where, error, expected)
+
+    def _read_columns(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
+        row_count = self._metadata.num_rows
+        if row_count > most_rows:
+            self._refuse_row_count(most_rows)
+        values = {name: self._read_column(name, rule) for name, rule in rules.items()}
+        row_numbers = np.arange(1, row_count + 1, dtype=np.intp)
+        return NumberColumns(values, row_numbers, self.row_noun)
+
+    def _read_column(self, name: str, rule: ColumnRule) -> Array:
+        from pyarrow.types import is_integer
+
+        field = self._schema.field(self.header.index(name))
+        if not _is_number_type(field.type):
+            raise self.error(
+                f"{self.where}, column {shown(name)}: expected numbers ({rule.description}), got a column of type "
+                f"{cut(str(field.type))}; convert it to float64"
+            )
+        with _damage_explained(self.where, self.error):
+            numbers = self._decode(self._leaf_index(field.name), name)
+        if is_integer(field.type):
+            self._check_integers(numbers, name)
+        return numbers
+
+    def _decode(self, index: int, name: str) -> Array:
+        """Decode one column as Parquet stores it, in batches of rows, shape (n,)."""
+        row_count = self._metadata.num_rows
+        numbers = np.empty(row_count)
+        row = 0
+        groups = list(range(self._metadata.num_row_groups))
+        for batch in self._parquet.reader.iter_batches(ROWS_PER_BATCH, groups, [index], use_threads=False):
+            next_row = row + batch.num_rows
+            if next_row > row_count:
+                break
+            numbers[row:next_row] = _as_float64(batch.column(0))
+            row = next_row
+        if row != row_count:
+            raise self.error(
+                f"{self.where}, column {shown(name)}: expected {row_count:,} rows as in the metadata of the file, got "
+                "another number; the file is damaged, write it again"
+            )
+        return numbers
+
+    def _leaf_index(self, field_name: str) -> int:
+        """Return the number of a column that is not nested among the columns as Parquet stores them."""
+        schema = self._parquet.schema
+        indices = [index for index in range(len(schema)) if schema.column(index).path == field_name]
+        if len(indices) != 1:
+            raise self.error(
+                f"{self.where}: expected one column {shown(field_name)}, got {len(indices)} that are stored under "
+                "this name; rename the others"
+            )
+        return indices[0]
+
+    def _check_integers(self, numbers: Array, name: str) -> None:
+        """Refuse integers that float64 may have rounded."""
+        inexact_rows = np.flatnonzero(np.abs(numbers) >= FIRST_INEXACT_INTEGER)
+        if inexact_rows.size:
+            row = inexact_rows[0]
+            raise self.error(
+                f"{self.where}, row {row + 1}, column {shown(name)}: expected an integer of a magnitude below 2^53, "
+                f"which float64 holds exactly, got {numbers[row]:.0f}; convert the column to float64"
+            )
+
+
+def parquet_bytes(columns: Mapping[str, Array]) -> bytes:
+    """Return a Parquet file of columns of shape (n,), float64; NaN is written as null.
+
+    Raises:
+        MissingExtra: If pyarrow is not installed.
+    """
+    require_pyarrow()
+    import pyarrow
+    from pyarrow.parquet import write_table
+
+    table = pyarrow.table({name: pyarrow.array(values, from_pandas=True) for name, values in columns.items()})
+    data = io.BytesIO()
+    write_table(table, data)
+    return data.getvalue()
+
+
+def require_pyarrow() -> None:
+    """Raise MissingExtra if pyarrow is not installed."""
+    with require("parquet"):
+        import pyarrow.parquet  # noqa: F401
+
+
+def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
+    """Check the marks at both ends of a file and the size of its metadata, before pyarrow reads all of the metadata."""
+    head = file.read(len(MARK))
+    size = file.seek(0, io.SEEK_END)
+    file.seek(max(0, size - 4 - len(MARK)))
+    footer_bytes = int.from_bytes(file.read(4), "little")
+    tail = file.read(len(MARK))
+    file.seek(0)
+    if head != MARK or tail != MARK:
+        raise error(f"{where}: not a Parquet file, or one that was cut off; write it again, or as CSV")
+    if footer_bytes > MOST_FOOTER_BYTES:
+        raise error(
+            f"{where}: expected metadata of at most {MOST_FOOTER_BYTES:,} bytes, got {footer_bytes:,}; write the file "
+            "with fewer columns or row groups"
+        )
+
+
+@contextmanager
+def _damage_explained(where: str, error: type[InputError]) -> Iterator[None]:
+    """Turn the errors of pyarrow, which has one class for each kind of damage, into `error`."""
+    from pyarrow import ArrowException
+
+    try:
+        yield
+    except error:
+        raise
+    except (ArrowException, OSError, ValueError, MemoryError, OverflowError) as cause:
+        reason = cut(" ".join(str(cause).split()))
+        raise error(f"{where}: not a Parquet file, or a damaged one ({reason}); write it again, or as CSV") from cause
+
+
+def _is_number_type(given_type: "DataType") -> bool:
+    from pyarrow import types
+
+    checks = (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
+    return any(check(given_type) for check in checks)
+
+
+def _as_float64(column: "ArrowArray") -> Array:
+    """Return a column of numbers as float64, shape (n,); null becomes NaN."""
+    import pyarrow
+
+    if pyarrow.types.is_decimal(column.type):
+        column = column.cast(pyarrow.string())  # the conversion from text rounds to the nearest number
+    numbers: Any = column.cast(pyarrow.float64(), safe=False).to_numpy(zero_copy_only=False)
+    return np.asarray(numbers, dtype=np.float64)

@@ -1,0 +1,63 @@
+"""Files with columns of numbers: Parquet if the name ends in `.parquet`, else CSV."""
+
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import InputError, IsochargeError
+from isocharge.common.files import bounded_lines, open_regular, refusals_explained, write_whole
+from isocharge.serve.prediction.tables.csv_table import CsvTable, csv_text
+from isocharge.serve.prediction.tables.number_table import NumberTable
+from isocharge.serve.prediction.tables.parquet_table import SUFFIX, ParquetTable, parquet_bytes, require_pyarrow
+
+
+def is_parquet(path: Path) -> bool:
+    """Return whether a file is Parquet according to its name."""
+    return path.suffix.lower() == SUFFIX
+
+
+@contextmanager
+def open_table(path: Path, names: Collection[str], error: type[InputError], expected: str) -> Iterator[NumberTable]:
+    """Open a file and read its header.
+
+    Args:
+        path: Parquet, which has to be a regular file; or CSV in UTF-8 with or without byte order mark.
+        names: Names of columns that have a meaning.
+        error: Class of the error that is raised for anything that is wrong with the file.
+        expected: The expected header, for messages.
+
+    Raises:
+        error: If the file cannot be read, here or while the block reads the columns.
+        MissingExtra: If the file is Parquet and pyarrow is not installed.
+    """
+    if is_parquet(path):
+        require_pyarrow()
+        with _read_errors_explained(path, error, "a Parquet file"), open_regular(path) as data:
+            yield ParquetTable(data, names, str(path), error, expected)
+    else:
+        with _read_errors_explained(path, error, "a CSV file"), path.open(encoding="utf-8-sig", newline="") as text:
+            yield CsvTable(bounded_lines(text), names, str(path), error, expected)
+
+
+def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
+    """Write columns of shape (n,) to a file, which appears whole and replaces an older one.
+
+    Raises:
+        OutputError: If the file system refuses.
+        MissingExtra: If the file is to be Parquet and pyarrow is not installed.
+    """
+    data = parquet_bytes(columns) if is_parquet(path) else csv_text(columns).encode()
+    with refusals_explained(path):
+        write_whole(path, data)
+
+
+@contextmanager
+def _read_errors_explained(path: Path, error: type[InputError], expected: str) -> Iterator[None]:
+    """Turn the errors of the file system into `error`."""
+    try:
+        yield
+    except OSError as cause:
+        if isinstance(cause, IsochargeError):
+            raise
+        raise error(f"{path}: cannot be read ({cause.strerror or cause}); expected {expected} of presses") from cause

@@ -1,0 +1,293 @@
+"""Parquet files of presses: what other programs write is read as the same CSV is, and the rest is refused at once."""
+
+import os
+from datetime import datetime, timedelta
+from decimal import Decimal
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow
+import pytest
+from pyarrow.parquet import ParquetFile, read_metadata, read_table, write_table
+
+from isocharge.common.errors import ChargeError, PressError
+from isocharge.serve import read_presses, write_presses
+from isocharge.serve.prediction import table as charge_table
+from isocharge.serve.prediction.measured_presses import read_press_list
+from isocharge.serve.prediction.table import read_charge_file
+from isocharge.serve.prediction.tables import parquet_table
+
+NAMES = ("A", "B", "C")
+
+COLUMNS = {
+    "x_mm": [1.0, 2.0, None],
+    "y_mm": [3.0, 4.0, None],
+    "force_N": [0.5, 1.0, 2.0],
+    "A": [100.5, None, 3.0],
+    "B": [-1.0, 2.0, 3.0],
+    "C": [1.0, 2.0, 3.0],
+}
+CSV = "x_mm,y_mm,force_N,A,B,C\n1,3,0.5,100.5,-1,1\n2,4,1,,2,2\n,,2,3,3,3\n"
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write columns, with some of them replaced, as `p.parquet`, and return the path."""
+
+    def write(changes=None, *, names=None, **options):
+        path = tmp_path / "p.parquet"
+        columns = COLUMNS | (changes or {})
+        write_table(pyarrow.table(list(columns.values()), names=names or list(columns)), path, **options)
+        return path
+
+    return write
+
+
+@pytest.fixture
+def expected(tmp_path):
+    """The same presses from CSV."""
+    (tmp_path / "p.csv").write_text(CSV)
+    return read_presses(tmp_path / "p.csv", NAMES)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"compression": "gzip"},
+        {"compression": "zstd", "data_page_version": "2.0"},
+        {"compression": "none", "use_dictionary": False},
+        {"row_group_size": 1},
+        {"version": "1.0", "write_statistics": False},
+        {"write_page_index": True, "write_page_checksum": True},
+        {"store_schema": False},
+        {"use_dictionary": False, "column_encoding": {"x_mm": "PLAIN", "A": "BYTE_STREAM_SPLIT"}},
+    ],
+    ids=str,
+)
+def test_other_settings_of_the_writer(write, expected, options):
+    path = write({"note": ["a\n,b", "", None]}, **options)
+    presses = read_presses(path, NAMES)
+    assert presses == expected
+    assert (presses.ignored, presses.lines, presses.row_noun) == (("note",), (1, 2, 3), "row")
+
+
+@pytest.mark.parametrize("first", ["# of Monday", "#", "x\u2028y", "x\vy\fz", "\x85", "\x1c", "a\rb", "a\nb", '"'])
+def test_text_of_other_columns_neither_hides_nor_splits_rows(write, expected, first, tmp_path):
+    columns = {"note": [first, "", first]} | COLUMNS
+    write_table(pyarrow.table(columns), tmp_path / "first.parquet")
+    assert read_presses(tmp_path / "first.parquet", NAMES) == expected
+    assert len(read_charge_file(write({"A": [1.0, 2.0, 3.0], "note": [first] * 3}), NAMES)) == 3
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        pyarrow.array([1, None, 2**62], pyarrow.timestamp("ns")),
+        pyarrow.array([1, None, 2**40], pyarrow.timestamp("s")),
+        pyarrow.array([1, None, 3], pyarrow.duration("ns")),
+        pyarrow.array([1, None, 3], pyarrow.time64("ns")),
+        pyarrow.array([None, None, 2**30], pyarrow.date32()),
+        pyarrow.array([b"\xff", None, b""]),
+        pyarrow.array(["x" * 3_000_000] * 3),
+        pyarrow.array([[1, 2], None, []]),
+        pyarrow.array([{"A": 1, "B": None}, None, {}]),
+        pyarrow.array([{"A": 1}, {"A": 1}, {"A": 2}]),
+        pyarrow.array(["a", "b", "a"]).dictionary_encode(),
+    ],
+    ids=lambda column: str(column.type),
+)
+def test_ignored_columns_may_have_any_type(write, expected, column):
+    presses = read_presses(write({"more": column}), NAMES)
+    assert presses == expected
+    assert presses.ignored == ("more",)
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        pyarrow.array([1, -2, None], pyarrow.int8()),
+        pyarrow.array([1, 2, 2**53 - 1], pyarrow.uint64()),
+        pyarrow.array([1.5, -0.25, None], pyarrow.float16()),
+        pyarrow.array([1.5, np.nan, 3e38], pyarrow.float32()),
+        pyarrow.array([1.5, 1.5, -0.25]).dictionary_encode(),
+        pyarrow.array([Decimal("0.1"), Decimal("-12345678901234.567"), None], pyarrow.decimal128(38, 10)),
+        pyarrow.array([Decimal("12000.125"), None, Decimal(-3000)], pyarrow.decimal256(40, 3)),
+        pyarrow.array([Decimal("0.1"), None, None], pyarrow.decimal128(5, 2)),
+    ],
+    ids=lambda column: str(column.type),
+)
+def test_numbers_of_every_type_are_exact(write, column):
+    """Python rounds an integer and a decimal to the nearest float64."""
+    charge = read_presses(write({"A": column}), NAMES).charge_pC[:, 0]
+    given = [np.nan if value is None else float(value) for value in column.to_pylist()]
+    np.testing.assert_array_equal(charge, given)
+
+
+def test_a_column_of_nulls_is_empty(write):
+    presses = read_presses(write({"x_mm": pyarrow.nulls(3), "y_mm": pyarrow.nulls(3)}), NAMES)
+    assert np.isnan(presses.contact[:, :2]).all()
+
+
+@pytest.mark.parametrize(
+    ("column", "said"),
+    [
+        (["1", "2", "3"], r"column 'B': expected numbers \(a charge in pC\), got a column of type string; convert it"),
+        ([True, False, True], "column 'B': .* got a column of type bool"),
+        ([[1.0], [2.0], [3.0]], "column 'B': .* got a column of type list"),
+        ([{"B": 1.0}] * 3, "column 'B': .* got a column of type struct"),
+        (pyarrow.array(["1", "2", "3"]).dictionary_encode(), "column 'B': .* got a column of type dictionary"),
+        (pyarrow.array([1, 2, 3], pyarrow.timestamp("us")), "column 'B': .* got a column of type timestamp"),
+        ([timedelta(1), None, None], "column 'B': .* got a column of type duration"),
+        ([datetime(2026, 1, 1), None, None], "column 'B': .* got a column of type timestamp"),
+        ([1, 2**53 + 1, 3], r"row 2, column 'B': expected an integer of a magnitude below 2\^53.*got 9007199254740992"),
+        ([1.0, 2.0, -np.inf], "row 3, column 'B': expected a charge in pC, got -inf"),
+        ([1.0, 1e39, 3.0], r"row 2, column 'B': expected a charge in pC, got 1e\+39"),
+    ],
+)
+def test_a_column_of_another_type_is_refused(write, column, said):
+    with pytest.raises(PressError, match=rf"p\.parquet, {said}"):
+        read_presses(write({"B": column}), NAMES)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"force_N": [0.5, 0.0, 1.0]}, "row 2, column 'force_N': expected a positive force in N.*got 0$"),
+        ({"x_mm": [1.0, None, None]}, "row 2: expected both x_mm and y_mm, or two empty cells"),
+        ({"A": [None] * 3, "B": [None] * 3, "C": [1.0, 2.0, None]}, "row 3: expected a charge .* or remove the row"),
+        ({"force_std": [0.1, 2.0, 0.1]}, "row 2, column 'force_std': expected a positive share .*got 2$"),
+    ],
+)
+def test_impossible_presses(write, changes, said):
+    with pytest.raises(PressError, match=rf"p\.parquet, {said}"):
+        read_presses(write(changes), NAMES)
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["x_mm", "y_mm", "force_N", "A", "B", "D"], r"got the header .*; missing: 'C'"),
+        (["x_mm", "A", "force_N", "A", "B", "C"], r"got the header .*; repeated: 'A'"),
+    ],
+)
+def test_headers(write, names, said):
+    with pytest.raises(PressError, match=said):
+        read_presses(write(names=names), NAMES)
+
+
+def test_names_with_points_are_no_paths(write, expected):
+    """`Q`, `Q.1` and a structure that has a column `1` are three columns."""
+    names = ["x_mm", "y_mm", "force_N", "Q", "Q.1", "Q.1.a"]
+    presses = read_presses(write(names=names))
+    np.testing.assert_array_equal(presses.charge_pC, expected.charge_pC)
+    with pytest.raises(PressError, match=r"expected one column 'Q\.1', got 2 that are stored under this name"):
+        read_presses(
+            write({"S": [{"1": 1}] * 3}, names=["x_mm", "y_mm", "force_N", "A", "Q.1", "B", "Q"]), ("A", "Q.1")
+        )
+
+
+def test_charges_and_lists_of_presses(write):
+    path = write({"A": [1.0, 2.0, 3.0]})
+    ignored = []
+    np.testing.assert_array_equal(read_charge_file(path, ("B", "A"), ignored.append), [[-1, 1], [2, 2], [3, 3]])
+    assert ignored == [f"{path}: ignored columns: ['x_mm', 'y_mm', 'force_N', 'C']"]
+    with pytest.raises(ChargeError, match=r"p\.parquet, row 2, column 'A': expected a charge in pC, got an empty cell"):
+        read_charge_file(write(), NAMES)
+    np.testing.assert_array_equal(read_press_list(path), [[1, 3, 0.5], [2, 4, 1], [np.nan, np.nan, 2]])
+
+
+def test_a_written_file_has_nulls_where_nothing_is_known(tmp_path, expected):
+    write_presses(tmp_path / "again.parquet", expected)
+    assert read_table(tmp_path / "again.parquet")["A"].to_pylist() == [100.5, None, 3.0]
+
+
+# Limits
+
+
+def test_long_text_that_is_repeated_is_not_decoded(tmp_path):
+    """A small file whose ignored column has 5 GB of text."""
+    count = 50_000
+    table = pyarrow.table(dict.fromkeys(("force_N", *NAMES), np.ones(count)))
+    text = pyarrow.DictionaryArray.from_arrays(np.zeros(count, np.int32), ["x" * 100_000])
+    write_table(table.append_column("note", text), tmp_path / "bomb.parquet", compression="zstd")
+    assert (tmp_path / "bomb.parquet").stat().st_size < 10_000
+    pool = pyarrow.proxy_memory_pool(pyarrow.default_memory_pool())
+    earlier_pool = pyarrow.default_memory_pool()
+    pyarrow.set_memory_pool(pool)
+    try:
+        assert len(read_presses(tmp_path / "bomb.parquet", NAMES)) == count
+    finally:
+        pyarrow.set_memory_pool(earlier_pool)
+    assert pool.max_memory() < 10e6
+
+
+def test_more_rows_than_are_accepted(tmp_path, monkeypatch):
+    """They are counted in the metadata."""
+    one = pyarrow.array(np.ones(1_000_001))
+    write_table(pyarrow.table(dict.fromkeys(("force_N", *NAMES), one)), tmp_path / "long.parquet")
+    monkeypatch.setattr(ParquetFile, "reader", None, raising=False)
+    with pytest.raises(
+        PressError, match=r"long\.parquet: expected at most 1,000,000 presses, got more; split the file"
+    ):
+        read_presses(tmp_path / "long.parquet", NAMES)
+    monkeypatch.setattr(charge_table, "MOST_CHARGE_ROWS", 1_000_000)
+    with pytest.raises(ChargeError, match=r"long\.parquet: expected at most 1,000,000 presses"):
+        read_charge_file(tmp_path / "long.parquet", NAMES)
+
+
+@pytest.mark.parametrize("counted", [2, 4])
+def test_metadata_that_counts_other_rows(write, monkeypatch, counted):
+    path = write(row_group_size=2)
+    metadata = SimpleNamespace(num_rows=counted, num_row_groups=2, schema=read_metadata(path).schema)
+    monkeypatch.setattr(ParquetFile, "metadata", metadata)
+    with pytest.raises(
+        PressError, match=rf"column 'A': expected {counted} rows as in the metadata of the file, got an"
+    ):
+        read_presses(path, NAMES)
+
+
+@pytest.mark.parametrize("rows_per_batch", [1, 2, 3])
+def test_columns_are_decoded_in_batches(write, expected, monkeypatch, rows_per_batch):
+    monkeypatch.setattr(parquet_table, "ROWS_PER_BATCH", rows_per_batch)
+    assert read_presses(write(row_group_size=2), NAMES) == expected
+
+
+def test_a_file_without_rows(write):
+    with pytest.raises(PressError, match=r"expected one press or more below the header, got none"):
+        read_presses(write({name: pyarrow.array([], pyarrow.float64()) for name in COLUMNS}), NAMES)
+
+
+# What is not Parquet
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, r"cannot be read \(No such file or directory\); expected a Parquet file"),
+        (b"", "not a Parquet file"),
+        (b"x_mm,y_mm\n1,2\n", "not a Parquet file"),
+        (b"PAR1" + bytes(8) + b"PAR1", "not a Parquet file, or a damaged one"),
+        (b"PAR1" + b"\xff\xff\xff\x7f" + b"PAR1", "expected metadata of at most 16,777,216 bytes, got 2,147,483,647"),
+    ],
+)
+@pytest.mark.parametrize("read", [read_presses, read_charge_file])
+def test_files_that_are_not_parquet(read, content, said, tmp_path):
+    if content is not None:
+        (tmp_path / "p.parquet").write_bytes(content)
+    with pytest.raises((PressError, ChargeError), match=said) as caught:
+        read(tmp_path / "p.parquet", NAMES)
+    assert str(caught.value).startswith(str(tmp_path / "p.parquet"))
+
+
+@pytest.mark.parametrize("kind", ["FIFO", "folder", "device"])
+def test_a_fifo_a_folder_or_a_device_is_refused_at_once(kind, tmp_path):
+    path = tmp_path / "p.parquet"
+    if kind == "FIFO":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to("/dev/zero")
+    with pytest.raises(PressError, match=r"p\.parquet: cannot be read \(not a regular file\); expected a Parquet file"):
+        read_presses(path, NAMES)
