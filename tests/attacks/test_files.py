@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from attacks.companions import charge_arrays, pretension_arrays
 from attacks.faults import mutated, with_junk
 from isocharge.common.files import sha256_of
 from isocharge.common.resumable_run import resume_folder
@@ -26,7 +27,9 @@ from isocharge.serve import (
     load_model,
     read_charges,
 )
+from isocharge.serve.model.charge_series import read_charges as read_charge_series
 from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.pretensions import read_pretensions
 from isocharge.serve.virtual_sensor.script import load_script
 from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
 from isocharge.simulate.execution.workers import in_order
@@ -35,6 +38,8 @@ from isocharge.train import CalibrationProblem, read_earlier
 from isocharge.train.calibration.calibrate import film_without_presses
 from isocharge.train.calibration.calibration_file import film_table
 from isocharge.train.calibration.problem import Warming
+from isocharge.train.films.films_file import _checksum as films_checksum
+from isocharge.train.films.films_file import films_from_bytes
 from isocharge.train.training.config import load_config
 from isocharge.train.training.descent import tensors
 
@@ -274,6 +279,73 @@ def test_calibrations_with_faults(calibration, tmp_path, attack):
         attack(
             f"calibration {kind} numbers", read, lambda rng, text=text: number_bomb(rng, text.decode()).encode(), 500
         )
+
+
+def series_with_faults(rng, arrays):
+    """Arrays of a file with one of them replaced by something that it should not be."""
+    name = rng.choice(sorted(arrays))
+    value = arrays[name]
+    number = rng.choice((0.0, -1.0, 1e-300, 1e300, 1e38, np.nan, np.inf, -np.inf, 1e9))
+    choices = (
+        lambda: np.full(value.shape, number),
+        lambda: np.full(value.shape, "text"),
+        lambda: np.zeros(value.shape, "datetime64[s]"),
+        lambda: np.zeros(value.shape, complex),
+        lambda: value[..., None],
+        lambda: value[:0] if value.ndim else value,
+        lambda: np.repeat(value, 1000, axis=0) if value.ndim and value.size < 10_000 else value,
+        lambda: np.zeros((1, 1, 1_000_000), np.uint8),
+        lambda: np.where(np.arange(value.size).reshape(value.shape) == 0, number, 1.0),
+        lambda: None,
+    )
+    changed = dict(arrays)
+    changed[name] = rng.choice(choices)()
+    if changed[name] is None:
+        del changed[name]
+    return changed
+
+
+@pytest.mark.parametrize("name", ["charges.npz", "pretensions.npz"])
+def test_companion_files_with_faults(name, tmp_path, attack):
+    """A file that is accepted gives finite numbers."""
+    good = {"charges.npz": charge_arrays, "pretensions.npz": pretension_arrays}[name]()
+
+    def packed(arrays):
+        file = io.BytesIO()
+        np.savez_compressed(file, **arrays)
+        return file.getvalue()
+
+    def read(data):
+        (tmp_path / name).write_bytes(data)
+        if name == "charges.npz":
+            charges = read_charge_series(tmp_path, 3)
+            assert np.isfinite(charges.linearised(np.array([[0.0, 0.0, 0.0], [3.0, -2.0, -1.0]]))[0]).all()
+        else:
+            pretensions = read_pretensions(tmp_path)
+            middle = np.array([sum(pretensions.range_MPa) / 2.0])
+            assert np.isfinite(pretensions.misfits(pretensions.typical_pC, middle)).all()
+
+    read(packed(good))
+    attack(f"{name} arrays", read, lambda rng: packed(series_with_faults(rng, good)), 3_000)
+    attack(f"{name} bytes", read, lambda rng: mutated(rng, packed(good)), 3_000)
+
+
+def test_films_with_faults(attack):
+    """The checksum of the file fits: what is refused is refused by its content."""
+    path = find_model("four-25um-biaxial-films") / "films.npz"
+    with np.load(path) as file:
+        good = {key: file[key] for key in file.files if key != "sha256"}
+
+    def packed(arrays):
+        file = io.BytesIO()
+        np.savez(file, **arrays, sha256=np.array(films_checksum(arrays)))
+        return file.getvalue()
+
+    def read(data):
+        films_from_bytes(data, "films.npz")
+
+    read(packed(good))
+    attack("films.npz", read, lambda rng: packed(series_with_faults(rng, good)), 600)
 
 
 def test_a_dataset_with_faults(dataset, attack):

@@ -1,21 +1,42 @@
-"""Arrays of an npz file that somebody else may have made."""
+"""Arrays of an npz file that somebody else may have made.
+
+An npz file is a zip archive with one entry in NumPy's npy format for each array. Before anything is decompressed, the
+declared sizes, the compression method and the size of the LZMA dictionary are checked, so that a small file cannot
+request much memory. No Python object is ever unpickled.
+"""
 
 import io
 import lzma
+import math
+import struct
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-MOST_UNPACKED = 64 << 20
-"""Most that a file is unpacked to, bytes: far more than any of ours holds."""
+from isocharge.common.arrays import Array
 
-LONGEST_HEAD = 4096
-"""Longest head of an array, characters."""
+MAX_UNPACKED_BYTES = 64 << 20
+"""Largest total size of the arrays of a file, bytes."""
 
-PIECE = 4096
-"""Bytes unpacked at a time: from one read, a decompressor may make thousands of times as many."""
+MAX_ENTRIES = 1000
+"""Largest number of arrays in a file."""
+
+MAX_HEADER_CHARACTERS = 4096
+"""Longest header of an array, characters."""
+
+MAX_LZMA_DICTIONARY_BYTES = 16 << 20
+"""Largest dictionary of an entry that is compressed with LZMA, bytes; Python's default is half of it."""
+
+READ_BYTES = 4096
+"""Number of bytes that are decompressed at a time, because a decompressor may return far more than was requested."""
+
+COMPRESSION_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA)
+"""Compression methods that are accepted: those that NumPy and this project write."""
+
+_LOCAL_HEADER = struct.Struct("<26xHH")
+_LZMA_PROPERTIES = struct.Struct("<HHBI")
 
 DAMAGED = (
     OSError,
@@ -25,35 +46,144 @@ DAMAGED = (
     AttributeError,
     EOFError,
     RuntimeError,
+    NotImplementedError,
+    struct.error,
     zipfile.BadZipFile,
     lzma.LZMAError,
     zlib.error,
     MemoryError,
 )
-"""What NumPy, zipfile and whatever is made of the arrays raise over damaged files."""
+"""Exceptions that NumPy, zipfile and the code that uses the arrays raise for damaged files."""
 
 
 def npz_arrays(data: bytes, names: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-    """Arrays of an npz file; nothing in it is executed.
+    """Read the arrays of an npz file.
 
     Args:
-        data: The file's bytes.
-        names: The arrays to read; all if absent.
+        data: Bytes of the file.
+        names: Names of the arrays to read; all if absent.
 
     Raises:
-        ValueError: If they unpack to more than `MOST_UNPACKED` bytes, or are not arrays.
-        Exception: Those of `DAMAGED`, over damaged data.
+        ValueError: If the file is too large when it is unpacked, or an entry is not an array of numbers or text.
+        Exception: One of `DAMAGED`, if the data are damaged.
     """
-    arrays, left = {}, MOST_UNPACKED
-    with zipfile.ZipFile(io.BytesIO(data)) as packed:
-        for name in names or (entry.removesuffix(".npy") for entry in packed.namelist()):
-            unpacked = bytearray()
-            with packed.open(f"{name}.npy") as file:
-                while piece := file.read(PIECE):
-                    unpacked += piece
-                    if len(unpacked) > left:
-                        raise ValueError(f"unpacks to more than {MOST_UNPACKED} bytes")
-            left -= len(unpacked)
-            array = io.BytesIO(unpacked)
-            arrays[name] = np.lib.format.read_array(array, allow_pickle=False, max_header_size=LONGEST_HEAD)
-    return arrays
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = _checked_entries(archive)
+        selected = list(entries) if names is None else list(names)
+        missing = [name for name in selected if name not in entries]
+        if missing:
+            raise ValueError(f"the array {missing[0]!r} is missing")
+        total_bytes = sum(entries[name].file_size for name in selected)
+        if total_bytes > MAX_UNPACKED_BYTES:
+            raise ValueError(f"the arrays unpack to more than {MAX_UNPACKED_BYTES} bytes")
+        arrays = {}
+        for name in selected:
+            if entries[name].compress_type == zipfile.ZIP_LZMA:
+                _check_lzma_dictionary(data, entries[name])
+            arrays[name] = _array_of(_unpacked(archive, entries[name]), name)
+        return arrays
+
+
+def finite_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None, ...]) -> Array:
+    """Return an array of a file as float64.
+
+    Args:
+        arrays: Arrays of the file, by name.
+        name: Name of the array.
+        shape: Expected shape; None stands for any length of at least one.
+
+    Raises:
+        ValueError: If the array is missing, has another shape, or does not hold finite real numbers.
+    """
+    if name not in arrays:
+        raise ValueError(f"the array {name!r} is missing")
+    array = arrays[name]
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: expected real numbers, got an array of {array.dtype}")
+    fits = array.ndim == len(shape) and all(
+        length > 0 and expected in (None, length) for length, expected in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        lengths = ", ".join("n" if length is None else str(length) for length in shape)
+        raise ValueError(f"{name}: expected an array of shape ({lengths}), got {array.shape}")
+    values = array.astype(np.float64)
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name}: expected finite numbers, got {values[~np.isfinite(values)][0]}")
+    return values
+
+
+def finite_number(arrays: Mapping[str, np.ndarray], name: str) -> float:
+    """Return a finite number that a file holds as an array without dimensions; raise ValueError if it holds none."""
+    return float(finite_array(arrays, name, ()))
+
+
+def text_item(arrays: Mapping[str, np.ndarray], name: str) -> str:
+    """Return a text that a file holds as an array without dimensions.
+
+    Raises:
+        ValueError: If the array is missing or is not a single text.
+    """
+    if name not in arrays:
+        raise ValueError(f"the array {name!r} is missing")
+    array = arrays[name]
+    if array.dtype.kind != "U" or array.ndim != 0:
+        raise ValueError(f"{name}: expected a text, got an array of {array.dtype} with the shape {array.shape}")
+    return str(array[()])
+
+
+def _checked_entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """Return the entries of an archive by the name of their array, after a check of names and compression."""
+    infos = archive.infolist()
+    if len(infos) > MAX_ENTRIES:
+        raise ValueError(f"expected at most {MAX_ENTRIES} arrays, got {len(infos)}")
+    entries: dict[str, zipfile.ZipInfo] = {}
+    for info in infos:
+        name = info.filename.removesuffix(".npy")
+        if name in entries:
+            raise ValueError(f"the array {name[:100]!r} is there twice")
+        if info.compress_type not in COMPRESSION_METHODS:
+            raise ValueError(f"the array {name[:100]!r} has the compression method {info.compress_type}")
+        entries[name] = info
+    return entries
+
+
+def _check_lzma_dictionary(data: bytes, entry: zipfile.ZipInfo) -> None:
+    """Refuse an entry whose LZMA properties (APPNOTE.TXT of the zip format, 5.8.8) request a large dictionary."""
+    name_length, extra_length = _LOCAL_HEADER.unpack_from(data, entry.header_offset)
+    start = entry.header_offset + _LOCAL_HEADER.size + name_length + extra_length
+    _, _, _, dictionary_bytes = _LZMA_PROPERTIES.unpack_from(data, start)
+    if dictionary_bytes > MAX_LZMA_DICTIONARY_BYTES:
+        raise ValueError(
+            f"an LZMA dictionary of {dictionary_bytes} bytes; at most {MAX_LZMA_DICTIONARY_BYTES} are accepted"
+        )
+
+
+def _unpacked(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytearray:
+    """Decompress an entry; it must not be longer than the archive declares."""
+    unpacked = bytearray()
+    with archive.open(entry) as file:
+        while piece := file.read(READ_BYTES):
+            unpacked += piece
+            if len(unpacked) > entry.file_size:
+                raise ValueError(f"an entry is longer than the {entry.file_size} bytes that the archive declares")
+    return unpacked
+
+
+def _array_of(content: bytearray, name: str) -> np.ndarray:
+    """Return the array in the bytes of an npy file, without a copy of its numbers."""
+    header = io.BytesIO(content[: MAX_HEADER_CHARACTERS + 16])
+    version = np.lib.format.read_magic(header)
+    if version == (1, 0):
+        shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(header, MAX_HEADER_CHARACTERS)
+    elif version == (2, 0):
+        shape, is_fortran, dtype = np.lib.format.read_array_header_2_0(header, MAX_HEADER_CHARACTERS)
+    else:
+        raise ValueError(f"{name}: version {version} of the npy format is not supported")
+    if dtype.hasobject:
+        raise ValueError(f"{name}: expected numbers or text, got Python objects")
+    size = math.prod(shape)
+    declared_bytes = size * dtype.itemsize
+    if min(shape, default=0) < 0 or declared_bytes != len(content) - header.tell():
+        raise ValueError(f"{name}: the shape {shape} of {dtype} does not fit {len(content) - header.tell()} bytes")
+    array = np.frombuffer(content, dtype=dtype, count=size, offset=header.tell()) if size else np.empty(0, dtype)
+    return array.reshape(shape, order="F" if is_fortran else "C")

@@ -9,6 +9,7 @@ import pytest
 from numpy.polynomial import Polynomial, chebyshev
 
 from isocharge.common.errors import ModelError
+from isocharge.common.files import sha256_of
 from isocharge.serve import Chunk, Frame, Predictor, TouchStream, encode_frame
 from isocharge.serve.live.device import device_from_table
 from isocharge.serve.model.charge_series import ChargeSeries, Series, read_charges
@@ -111,8 +112,16 @@ def test_charges_that_no_contact_has_are_no_contact():
 def model(models, tmp_path):
     """A model with its film's charges beside it."""
     folder = shutil.copytree(models / "linear", tmp_path / "linear") / "1"
-    (folder / "charges.npz").write_bytes(folded().to_bytes())
+    put_charges(folder, folded().to_bytes())
     return folder
+
+
+def put_charges(folder, data):
+    """Write `charges.npz` beside a model, and its checksum into `golden.json`, as `write_model` does."""
+    (folder / "charges.npz").write_bytes(data)
+    golden = json.loads((folder / "golden.json").read_text("utf-8"))
+    golden["files"] = {"charges.npz": sha256_of(data)}
+    (folder / "golden.json").write_text(json.dumps(golden), "utf-8")
 
 
 def test_records_say_the_other_contact_and_repeat_bit_for_bit(model):
@@ -145,12 +154,15 @@ def test_records_say_the_other_contact_and_repeat_bit_for_bit(model):
         (lambda data: data[:200], "zip"),
         (lambda data: data[::-1], "zip"),
         (lambda data: re.sub(rb"(PK\x01\x02.{4})\0", rb"\g<1>" b"\x01", data, flags=re.DOTALL), "encrypted"),
-        (lambda _: ChargeSeries(Series(np.zeros((3, 3, 2, 4))), 6.0, FORCES).to_bytes(), "for 3 electrodes"),
+        (
+            lambda _: ChargeSeries(Series(np.zeros((3, 3, 2, 4))), 6.0, FORCES).to_bytes(),
+            r"shape \(n, n, n, 3\), got \(3, 3, 2, 4\)",
+        ),
         (lambda _: ChargeSeries(Series(np.full((3, 3, 2, 3), np.nan)), 6.0, FORCES).to_bytes(), "finite"),
-        (lambda _: ChargeSeries(folded().series, 6.0, (2.0, 1.0)).to_bytes(), "2 to 1 N"),
+        (lambda _: ChargeSeries(folded().series, 6.0, (2.0, 1.0)).to_bytes(), "got 2 and 1 N"),
     ],
 )
 def test_a_damaged_file_of_charges_is_refused(model, spoil, message):
-    (model / "charges.npz").write_bytes(spoil(folded().to_bytes()))
+    put_charges(model, spoil(folded().to_bytes()))
     with pytest.raises(ModelError, match=rf"charges\.npz: .*({message}).*train again"):
         read_charges(model, 3)

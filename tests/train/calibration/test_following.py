@@ -221,7 +221,7 @@ def test_touches_that_do_not_count(mine, flags, counted):
     assert follower.film.touches == counted
 
 
-@pytest.mark.parametrize("change", ["gone", "damaged", "another model"])
+@pytest.mark.parametrize("change", ["gone", "damaged", "another model", "another model without checksums"])
 def test_a_file_that_cannot_be_used(mine, tmp_path, change):
     folder = tmp_path / "mine"
     for name in ("model.onnx", "golden.json", "pretensions.npz"):
@@ -236,5 +236,9 @@ def test_a_file_that_cannot_be_used(mine, tmp_path, change):
         known = read_pretensions(folder / "1")
         weights = {name: 1.01 * rows for name, rows in known.weights.items()}
         path.write_bytes(replace(known, weights=weights).to_bytes())
+    if change == "another model without checksums":
+        golden = json.loads((folder / "1" / "golden.json").read_text("utf-8"))
+        del golden["files"]
+        (folder / "1" / "golden.json").write_text(json.dumps(golden), "utf-8")
     with pytest.raises(ModelError, match=r"pretensions\.npz.*calibrate"):
         FilmFollower(Predictor(folder))

@@ -61,7 +61,7 @@ def test_a_small_file_that_unpacks_to_very_much_is_refused_before_it_is_unpacked
     bomb = _npz({"mean": zeros, "whitening": zeros, "contact": zeros})
     del zeros
     tracemalloc.start()
-    with pytest.raises(ModelError, match=r"films\.npz: damaged \(.*unpacks to more than"):
+    with pytest.raises(ModelError, match=r"films\.npz: damaged \(.*unpack to more than"):
         films_from_bytes(bomb, "films.npz")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()

@@ -13,6 +13,7 @@ with r the radius up to which contacts are known, and l the logarithm of the for
 """
 
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,11 +23,22 @@ from numpy.polynomial import chebyshev
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import ModelError, cut
-from isocharge.common.files import read_whole
-from isocharge.common.npz import DAMAGED, npz_arrays
+from isocharge.common.npz import DAMAGED, finite_array, finite_number, npz_arrays
+from isocharge.serve.model.companion_files import read_companion_file
 
 FILE = "charges.npz"
 """Name of the file in a version folder."""
+
+ADVICE = "copy the model's folder again, or train again"
+
+MAX_DEGREE = 100
+"""Largest degree of the series; the series of this project have at most 30."""
+
+MAX_RADIUS_mm = 1e4
+"""Largest radius, mm."""
+
+MIN_FORCE_RATIO = 1.01
+"""Smallest ratio of the largest to the smallest force: with equal forces the scaled logarithm is not defined."""
 
 CHUNK = 4096
 """Contacts whose terms are held at once."""
@@ -123,24 +135,58 @@ class ChargeSeries:
 
 
 def read_charges(version_folder: Path, n_electrode: int) -> ChargeSeries | None:
-    """Read the file beside a model; None if there is none.
+    """Read the file `charges.npz` beside a model; return None if there is none.
+
+    Args:
+        version_folder: The folder that holds `model.onnx`.
+        n_electrode: Number of electrodes of the model.
 
     Raises:
-        ModelError: If it is damaged, or of another number of electrodes.
+        ModelError: If the file is damaged, belongs to another model, or does not describe the charges of contacts.
     """
     path = version_folder / FILE
     if not path.exists():
         return None
+    data = read_companion_file(version_folder, FILE, ADVICE)
     try:
-        file = npz_arrays(read_whole(path))
-        series, radius, (low, high) = file["series"].astype(float), float(file["radius_mm"]), file["force_N"].tolist()
-    except (ModelError, *DAMAGED) as error:
-        raise ModelError(f"{path}: {cut(str(error))}; copy the model's folder again, or train again") from error
-    good = series.ndim == 4 and series.shape[0] == series.shape[1] and np.isfinite(series).all()
-    if not (good and series.shape[3] == n_electrode and radius > 0.0 and 0.0 < low < high):
-        raise ModelError(
-            f"{path}: expected finite coefficients for {n_electrode} electrodes, a radius and two forces, got the "
-            f"shape {series.shape}, {radius:g} mm and {low:g} to {high:g} N; copy the model's "
-            "folder again, or train again"
+        return _charge_series(npz_arrays(data), n_electrode)
+    except DAMAGED as error:
+        raise ModelError(f"{path}: {cut(str(error))}; {ADVICE}") from error
+
+
+def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> ChargeSeries:
+    """Return the series that the arrays of a file describe; raise ValueError if they describe none."""
+    coefficients = finite_array(arrays, "series", (None, None, None, n_electrode))
+    degree, y_degree, force_degree, _ = (length - 1 for length in coefficients.shape)
+    if degree != y_degree or not (1 <= degree <= MAX_DEGREE and 1 <= force_degree <= MAX_DEGREE):
+        raise ValueError(
+            f"series: expected equal degrees in x and y and degrees from 1 to {MAX_DEGREE}, got {degree}, {y_degree} "
+            f"and {force_degree} in the force"
         )
-    return ChargeSeries(Series(series), radius, (low, high))
+    radius_mm = finite_number(arrays, "radius_mm")
+    if not 0.0 < radius_mm <= MAX_RADIUS_mm:
+        raise ValueError(f"radius_mm: expected a radius up to {MAX_RADIUS_mm:g} mm, got {radius_mm:g}")
+    low_N, high_N = finite_array(arrays, "force_N", (2,)).tolist()
+    if not (low_N > 0.0 and high_N >= MIN_FORCE_RATIO * low_N):
+        raise ValueError(
+            f"force_N: expected a smallest force above 0 and a largest force of at least {MIN_FORCE_RATIO:g} times the "
+            f"smallest, got {low_N:g} and {high_N:g} N"
+        )
+    charges = ChargeSeries(Series(coefficients), radius_mm, (low_N, high_N))
+    _check_charges(charges)
+    return charges
+
+
+def _check_charges(charges: ChargeSeries) -> None:
+    """Refuse a series whose charges overflow, or do not change with the position or with the force."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    log_forces = np.log(np.geomspace(*charges.force_N, 5))
+    circle = 0.5 * charges.radius_mm * np.column_stack([np.cos(angle), np.sin(angle)])
+    contacts = np.array([[x_mm, y_mm, log_force] for x_mm, y_mm in circle for log_force in log_forces])
+    with np.errstate(over="ignore", invalid="ignore"):
+        charge_pC, derivative = charges.linearised(contacts)
+    if not (np.isfinite(charge_pC).all() and np.isfinite(derivative).all() and (charge_pC > 0.0).all()):
+        raise ValueError("series: expected charges that are finite and positive for every contact")
+    changes = np.abs(derivative).max(axis=(0, 1))
+    if not (changes > 0.0).all():
+        raise ValueError("series: expected charges that change with x, y and the force")

@@ -6,10 +6,10 @@ the same answers: |a - b| <= 1e-5 max(|b|, floor).
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import onnxruntime as ort
@@ -56,6 +56,8 @@ class Golden:
         outputs: Answers by output name, shape (n, width).
         relative: Tolerance relative to max(|answer|, floor).
         floors: The floor for each column, by output name.
+        companion_sha256: Checksums of the files that lie beside the model, by file name. None for a model that was
+            written before these files had checksums.
     """
 
     sha256: str
@@ -63,10 +65,11 @@ class Golden:
     outputs: dict[str, Singles]
     relative: float
     floors: dict[str, tuple[float, ...]]
+    companion_sha256: Mapping[str, str] | None = None
 
     def to_json(self) -> str:
         """The text of `golden.json`."""
-        content = {
+        content: dict[str, Any] = {
             "sha256": self.sha256,
             "tolerance": {
                 "rule": "|a - b| <= relative * max(|b|, floor)",
@@ -76,6 +79,8 @@ class Golden:
             "inputs": {INPUT: self.charge_pC.tolist()},
             "outputs": {name: rows.tolist() for name, rows in self.outputs.items()},
         }
+        if self.companion_sha256 is not None:
+            content["files"] = dict(self.companion_sha256)
         return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
@@ -115,6 +120,7 @@ def read_golden(path: Path) -> Golden:
         outputs={name: _singles(getattr(file.outputs, name)) for name in given},
         relative=file.tolerance.relative,
         floors={name: getattr(file.tolerance.floor, name) for name in given},
+        companion_sha256=file.files,
     )
 
 
@@ -155,6 +161,7 @@ class _File(Struct):
     inputs: _Inputs
     outputs: _Outputs
     tolerance: _Tolerance
+    files: dict[Text, Text] | None = None
 
 
 def _singles(rows: Sequence[Sequence[float]]) -> Singles:

@@ -2,7 +2,7 @@
 
     <name>/config.pbtxt            for Triton
     <name>/<version>/model.onnx    charge_pC -> contact, its deviations and correlations, misfit; metadata inside
-    <name>/<version>/golden.json   charges, answers, tolerances, and the checksum of model.onnx
+    <name>/<version>/golden.json   charges, answers, tolerances, and the checksums of model.onnx and of further files
     <name>/<version>/card.md       for people
 
 A version appears whole or not at all: it is written under a temporary name, read back as a user reads it, and only then
@@ -15,7 +15,7 @@ was given, in `$ISOCHARGE_MODELS`, in `./models`, and in the models that ship wi
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -230,7 +230,8 @@ def write_model(
         metadata: The same metadata.
         golden_charge_pC: Inputs of the golden vectors, shape (n, electrodes), pC.
         card: Text of the model card.
-        further: More files for the version folder, by name; a server leaves them alone.
+        further: More files for the version folder, by name. A server ignores them. Their checksums go into
+            `golden.json`.
 
     Returns:
         The version folder.
@@ -248,7 +249,8 @@ def write_model(
     session = open_session(onnx_model, where)
     check_interface(session, len(metadata.electrodes), where)
     charges = as_batch(golden_charge_pC, metadata.electrodes)
-    golden = make_golden(session, onnx_model, charges, contact_floors(metadata))
+    answers = make_golden(session, onnx_model, charges, contact_floors(metadata))
+    golden = replace(answers, companion_sha256={name: sha256_of(content) for name, content in further.items()})
     with new_folder(target) as draft:
         write_whole(draft / "model.onnx", onnx_model)
         write_whole(draft / "golden.json", golden.to_json().encode())

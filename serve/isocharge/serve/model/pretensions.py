@@ -14,22 +14,40 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta, Struct
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ModelError, cut
-from isocharge.common.files import read_whole
-from isocharge.common.npz import DAMAGED, npz_arrays
+from isocharge.common.npz import DAMAGED, finite_array, npz_arrays, text_item
 from isocharge.common.structs import NotNegative, Positive, Text, parse_json
+from isocharge.serve.model.companion_files import read_companion_file
 
 FILE = "pretensions.npz"
 """Name of the file in a version folder."""
 
 FORMAT = 1
 """Version of the file's format."""
+
+MAX_CONSTANTS = 100
+"""Largest number of weight arrays."""
+
+MAX_NODES = 50
+"""Largest number of pretensions at which weights are given."""
+
+MAX_PRETENSION_MPa = 50.0
+"""Largest pretension, MPa; PVDF yields at about 45 MPa."""
+
+MAX_WEIGHT = 1e6
+"""Largest absolute value of a weight; those of trained networks are below 100."""
+
+CHECKED_PRETENSIONS = 50
+"""Number of pretensions at which the misfits of a file are checked to be finite."""
+
+MIN_NODE_DISTANCE_MPa = 1e-3
+"""Smallest distance of two pretensions, MPa, between which the interpolation is well conditioned."""
 
 TINY = 1e-12
 """Length that counts as none."""
@@ -124,8 +142,10 @@ class Pretensions:
 
 
 class _About(Struct):
+    """The numbers of `Pretensions` in the file."""
+
     format_version: Annotated[int, Meta(ge=1)]
-    constants: Annotated[list[Text], Meta(min_length=5)]
+    constants: Annotated[list[Text], Meta(min_length=5, max_length=MAX_CONSTANTS)]
     calibrated_MPa: NotNegative
     std_MPa: Positive
     floor_MPa: NotNegative
@@ -135,37 +155,85 @@ class _About(Struct):
 
 
 def read_pretensions(version_folder: Path) -> Pretensions:
-    """Read the file beside a model.
+    """Read the file `pretensions.npz` beside a model.
 
     Raises:
-        ModelError: If it is missing, damaged, or of another format.
+        ModelError: If the file is missing, damaged, of another format, or belongs to another model.
     """
     path = version_folder / FILE
+    data = read_companion_file(
+        version_folder,
+        FILE,
+        "a film is followed from a model that `isocharge train calibrate` made of presses on it, with four electrodes "
+        "or more: calibrate it, or again with this version",
+    )
     try:
-        data = read_whole(path)
-    except OSError as error:
-        raise ModelError(
-            f"{path}: cannot be read ({error.strerror}); a film is followed from a model that `isocharge train "
-            "calibrate` made of presses on it, with four electrodes or more: calibrate it, or again with this version"
-        ) from error
-    try:
-        file = npz_arrays(data)
-        about = parse_json(str(file["about"][()]), "about", ModelError, _About)
-        if about.format_version != FORMAT:
-            _refuse(path, f"format {about.format_version} is not supported (this version reads {FORMAT})")
-        node, typical = file["node_MPa"].astype(float), file["typical_pC"].astype(float)
-        weights = {name: file[name].astype(np.float32) for name in about.constants}
-    except ModelError as error:
-        _refuse(path, str(error))
-    except DAMAGED as error:
-        _refuse(path, cut(str(error)))
-    if node.ndim != 1 or node.size < 2 or not (np.diff(node) > 0.0).all() or about.calibrated_MPa not in node:
-        _refuse(path, f"expected rising pretensions with {about.calibrated_MPa} among them, got {cut(str(node))}")
-    if any(len(rows) != node.size or not np.isfinite(rows).all() for rows in weights.values()):
-        _refuse(path, f"expected finite weights for each of {node.size} pretensions")
+        return _pretensions(npz_arrays(data))
+    except (ModelError, *DAMAGED) as error:
+        advice = "copy the model's folder again, or calibrate again"
+        raise ModelError(f"{path}: {cut(str(error))}; {advice}") from error
+
+
+def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
+    """Return what the arrays of a file describe; raise ValueError or ModelError if they do not fit together."""
+    about = parse_json(text_item(arrays, "about"), "about", ModelError, _About)
+    if about.format_version != FORMAT:
+        raise ValueError(f"format {about.format_version} is not supported (this version reads {FORMAT})")
+    node_MPa = finite_array(arrays, "node_MPa", (None,))
+    _check_nodes(node_MPa, about.calibrated_MPa)
+    typical_pC = finite_array(arrays, "typical_pC", (None,))
+    low_pC, high_pC = about.limits_pC
+    if not ((typical_pC > 0.0).all() and low_pC < high_pC):
+        raise ValueError(
+            f"expected positive typical charges and rising limits, got {cut(str(typical_pC))} pC and "
+            f"{low_pC:g} to {high_pC:g} pC"
+        )
     numbers = {name: getattr(about, name) for name in _About.__struct_fields__[2:]}
-    return Pretensions(node_MPa=node, typical_pC=typical, weights=weights, **numbers)
+    with np.errstate(over="ignore"):
+        weights = {name: arrays[name].astype(np.float32) for name in _checked_weights(arrays, about, node_MPa.size)}
+    pretensions = Pretensions(node_MPa=node_MPa, typical_pC=typical_pC, weights=weights, **numbers)
+    between_MPa = np.linspace(*pretensions.range_MPa, CHECKED_PRETENSIONS)
+    with np.errstate(over="ignore", invalid="ignore"):
+        charges_pC = np.outer([0.5, 1.0, 2.0], typical_pC)
+        misfits = pretensions.at(between_MPa).vectors(charges_pC, between_MPa)
+    if not np.isfinite(misfits).all():
+        raise ValueError("the weights give misfits that are not finite")
+    return pretensions
 
 
-def _refuse(path: Path, why: str) -> NoReturn:
-    raise ModelError(f"{path}: {why}; copy the model's folder again, or calibrate again")
+def _check_nodes(node_MPa: Array, calibrated_MPa: float) -> None:
+    """Refuse pretensions between which weights cannot be interpolated."""
+    is_rising = node_MPa.size >= 2 and bool((np.diff(node_MPa) >= MIN_NODE_DISTANCE_MPa).all())
+    in_range = node_MPa.size <= MAX_NODES and bool((np.abs(node_MPa) <= MAX_PRETENSION_MPa).all())
+    if not (is_rising and in_range and calibrated_MPa in node_MPa):
+        raise ValueError(
+            f"node_MPa: expected 2 to {MAX_NODES} rising pretensions up to {MAX_PRETENSION_MPa:g} MPa with "
+            f"{calibrated_MPa:g} MPa among them, got {cut(str(node_MPa))}"
+        )
+
+
+def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: int) -> list[str]:
+    """Return the names of the weights in the order of the layers, after a check of their shapes.
+
+    The hidden layers are pairs of a matrix and a vector; then follow the matrix that bypasses them, the vector and the
+    matrix of the last layer.
+    """
+    *hidden, skip, bias, last = about.constants
+    if len(hidden) % 2 or len(set(about.constants)) < len(about.constants):
+        raise ValueError(f"constants: expected pairs of names that differ, got {cut(str(about.constants))}")
+    n_electrode = finite_array(arrays, "typical_pC", (None,)).size
+    width = n_electrode
+    for matrix, vector in zip(hidden[::2], hidden[1::2], strict=True):
+        next_width = finite_array(arrays, matrix, (n_node, width, None)).shape[2]
+        finite_array(arrays, vector, (n_node, next_width))
+        width = next_width
+    n_output = finite_array(arrays, last, (n_node, width, None)).shape[2]
+    finite_array(arrays, bias, (n_node, n_output))
+    finite_array(arrays, skip, (n_node, n_electrode, n_output))
+    if n_output < n_electrode:
+        raise ValueError(f"{last}: expected at least {n_electrode} outputs, got {n_output}")
+    for name in about.constants:
+        largest = np.abs(arrays[name].astype(float)).max()
+        if largest > MAX_WEIGHT:
+            raise ValueError(f"{name}: expected weights up to {MAX_WEIGHT:g}, got {largest:g}")
+    return about.constants

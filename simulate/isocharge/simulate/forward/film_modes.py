@@ -320,6 +320,9 @@ class FilmModes:
                     f"a part has {parts.shape[1]} values, expected those of the {ODD.size} fields of "
                     f"{', '.join(FIELDS)}; train the network for all films again"
                 )
+            n_size = arrays["node_size"].size
+            if 3 * n_size != parts.shape[1]:
+                raise ValueError(f"{n_size} sizes of nodes do not fit {parts.shape[1]} values of a part")
             grid = FilmGrid(*np.split(np.asarray(arrays["grid"], dtype=float), np.cumsum(shape)[:-1]))
             size = np.repeat(np.asarray(arrays["node_size"], dtype=float), 3)
             return cls(grid, arrays["coefficients"].astype(float), parts * np.asarray(scale, dtype=float) * size)

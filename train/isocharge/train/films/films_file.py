@@ -23,8 +23,9 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, ModelError
-from isocharge.common.files import read_needed, sha256_of
+from isocharge.common.files import sha256_of
 from isocharge.common.npz import DAMAGED, npz_arrays
+from isocharge.serve.model.companion_files import read_companion_file
 from isocharge.simulate import Circle, Domain, NoiseModel
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.sensor.film_prior import FilmPrior, FilmSpread
@@ -46,6 +47,9 @@ FILE_UNITS = {"pretension": 1e6, "shift": 1e-3, "probe_radius": 1e-3}
 
 FILE_PC = 1e-12
 """Factor to white noise in the file, which is in C."""
+
+MAX_LAYER_WIDTH = 2048
+"""Largest number of nodes of a layer."""
 
 AGAIN = "copy the model's folder again, or train it again (isocharge train fit --films)"
 
@@ -72,9 +76,9 @@ def read_films(version_folder: Path) -> FilmsModel:
     Raises:
         ModelError: If the file is missing or damaged, or of another format.
     """
-    path = version_folder / FILE
     advice = "expected the version folder of a model for all films, as `isocharge train fit --films` writes it"
-    return films_from_bytes(read_needed(path, ModelError, advice), str(path))
+    data = read_companion_file(version_folder, FILE, advice)
+    return films_from_bytes(data, str(version_folder / FILE))
 
 
 def films_from_bytes(data: bytes, where: str) -> FilmsModel:
@@ -111,6 +115,11 @@ def _arrays(data: bytes) -> dict[str, np.ndarray]:
     expected = str(arrays.pop("sha256"))
     if (actual := _checksum(arrays)) != expected:
         raise ValueError(f"expected the checksum {expected:.12}..., got {actual:.12}...")
+    for name, array in arrays.items():
+        is_text = array.dtype.kind == "U" and array.ndim == 0
+        is_finite = array.dtype.kind in "fiu" and bool(np.isfinite(array).all())
+        if not (is_text or is_finite):
+            raise ValueError(f"{name}: expected a text or finite real numbers, got {array.dtype}")
     return arrays
 
 
@@ -181,4 +190,7 @@ def _packed(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarray]:
 
 def _unpacked(packed: Mapping[str, np.ndarray]) -> ConditionalWeights:
     names = [name for name in packed if not name.endswith(".scale")]
+    for name in names:
+        if max(packed[name].shape, default=1) > MAX_LAYER_WIDTH:
+            raise ValueError(f"{name}: expected layers of at most {MAX_LAYER_WIDTH} nodes, got {packed[name].shape}")
     return ConditionalWeights({name: packed[name] * packed[f"{name}.scale"].astype(float) for name in names})

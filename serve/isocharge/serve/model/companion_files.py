@@ -1,0 +1,46 @@
+"""Files that belong to one `model.onnx` and lie beside it, such as `charges.npz`.
+
+`golden.json` holds the checksum of each companion file. A companion file of another model has the right format and
+would give wrong answers, so a file with another checksum, or without one, is refused. Models that were written before
+companion files had checksums are still read, with a warning in the log.
+"""
+
+import logging
+from pathlib import Path
+
+from isocharge.common.errors import ModelError
+from isocharge.common.files import read_needed, sha256_of
+from isocharge.serve.model.golden import read_golden
+
+log = logging.getLogger(__name__)
+
+
+def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
+    """Read a file that lies beside a `model.onnx`.
+
+    Args:
+        version_folder: The folder that holds `model.onnx`.
+        name: Name of the companion file.
+        advice: What the user can do if the file cannot be read, for the error message.
+
+    Returns:
+        The bytes of the file.
+
+    Raises:
+        ModelError: If the file cannot be read, or its checksum is not the one in `golden.json`.
+    """
+    path = version_folder / name
+    data = read_needed(path, ModelError, advice)
+    golden_path = version_folder / "golden.json"
+    checksums = read_golden(golden_path).companion_sha256 if golden_path.exists() else None
+    if checksums is None:
+        log.warning("%s: golden.json holds no checksum of this file; whether it fits model.onnx is not verified", path)
+        return data
+    expected = checksums.get(name, "no such file")
+    actual = sha256_of(data)
+    if actual != expected:
+        raise ModelError(
+            f"{path}: expected sha256 {expected:.12} (golden.json), got {actual:.12}; the file is damaged or belongs "
+            f"to another model: copy the whole folder of the model again, or {advice}"
+        )
+    return data

@@ -1,0 +1,47 @@
+"""Arrays of small companion files of a model: those of `charges.npz` and of `pretensions.npz`."""
+
+import io
+
+import numpy as np
+
+from isocharge.serve.model.pretensions import Pretensions
+
+
+def linear_series():
+    """Coefficients whose charges change with x, y and the force."""
+    series = np.zeros((2, 2, 2, 3))
+    series[0, 0, 0] = 5.0
+    series[1, 0, 0] = [0.1, -0.1, 0.2]
+    series[0, 1, 0] = [-0.2, 0.1, 0.1]
+    series[0, 0, 1] = 0.7
+    return series
+
+
+def charge_arrays():
+    """The arrays of a small `charges.npz`."""
+    return {"series": linear_series(), "radius_mm": np.array(8.0), "force_N": np.array([0.05, 2.0])}
+
+
+def pretension_arrays():
+    """The arrays of a small network at three pretensions."""
+    rng = np.random.default_rng(0)
+    weights = {
+        "w0": rng.normal(size=(3, 4, 5)),
+        "b0": rng.normal(size=(3, 5)),
+        "skip": rng.normal(size=(3, 4, 7)),
+        "bias": rng.normal(size=(3, 7)),
+        "last": rng.normal(size=(3, 5, 7)),
+    }
+    pretensions = Pretensions(
+        node_MPa=np.array([0.2, 0.8, 1.4]),
+        calibrated_MPa=0.8,
+        std_MPa=0.1,
+        floor_MPa=0.01,
+        misfit_rms=1.0,
+        misfit_unit=1.0,
+        limits_pC=(1.0, 1e5),
+        typical_pC=np.array([500.0, 400.0, 300.0, 200.0]),
+        weights={name: value.astype(np.float32) for name, value in weights.items()},
+    )
+    with np.load(io.BytesIO(pretensions.to_bytes())) as file:
+        return dict(file)

@@ -1,0 +1,159 @@
+"""Files beside a model: those of another model, and those with numbers that nothing can be computed from."""
+
+import json
+import logging
+import shutil
+
+import numpy as np
+import pytest
+
+from attacks.companions import charge_arrays, linear_series, pretension_arrays
+from isocharge.common.errors import ModelError
+from isocharge.common.files import sha256_of
+from isocharge.serve import load_model, write_model
+from isocharge.serve.model.charge_series import ChargeSeries, Series, read_charges
+from isocharge.serve.model.companion_files import read_companion_file
+from isocharge.serve.model.pretensions import read_pretensions
+
+ADVICE = "train again"
+
+
+@pytest.fixture
+def folder(film, tmp_path):
+    """The version folder of a model that was written with a companion file."""
+    metadata = film.metadata()
+    graph = film.onnx(metadata.to_props())
+    return write_model(
+        tmp_path / "models" / metadata.name, graph, metadata, film.golden_pC(), "card", {"charges.npz": b"content"}
+    )
+
+
+def test_file_that_was_written_with_the_model_is_read(folder):
+    assert read_companion_file(folder, "charges.npz", ADVICE) == b"content"
+    assert load_model(folder).golden.companion_sha256 == {"charges.npz": sha256_of(b"content")}
+
+
+def test_file_of_another_model_is_refused(folder):
+    (folder / "charges.npz").write_bytes(b"content of another model")
+    with pytest.raises(ModelError, match=r"charges\.npz: expected sha256 .* belongs to another model.*train again"):
+        read_companion_file(folder, "charges.npz", ADVICE)
+
+
+def test_file_that_the_model_was_not_written_with_is_refused(folder):
+    (folder / "pretensions.npz").write_bytes(b"content")
+    with pytest.raises(ModelError, match=r"pretensions\.npz: expected sha256 no such file"):
+        read_companion_file(folder, "pretensions.npz", ADVICE)
+
+
+def test_file_of_a_model_without_checksums_is_read_with_a_warning(folder, caplog):
+    golden = json.loads((folder / "golden.json").read_text("utf-8"))
+    del golden["files"]
+    (folder / "golden.json").write_text(json.dumps(golden), "utf-8")
+    with caplog.at_level(logging.WARNING):
+        assert read_companion_file(folder, "charges.npz", ADVICE) == b"content"
+    assert "golden.json holds no checksum of this file" in caplog.text
+
+
+def test_missing_file_is_named(folder):
+    with pytest.raises(ModelError, match=r"films\.npz: cannot be read .*train again"):
+        read_companion_file(folder, "films.npz", ADVICE)
+
+
+def write_npz(folder, name, arrays):
+    """Write arrays to a companion file; `golden.json` is removed, so that only the content is checked."""
+    np.savez_compressed(folder / name, **{key: value for key, value in arrays.items() if value is not None})
+    (folder / "golden.json").unlink(missing_ok=True)
+
+
+CHARGES = charge_arrays()
+
+
+def test_series_of_charges_is_read(tmp_path):
+    expected = ChargeSeries(Series(linear_series()), 8.0, (0.05, 2.0))
+    (tmp_path / "charges.npz").write_bytes(expected.to_bytes())
+    read = read_charges(tmp_path, 3)
+    np.testing.assert_array_equal(read.series.coefficients, expected.series.coefficients)
+    assert (read.radius_mm, read.force_N) == (8.0, (0.05, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"series": np.full((2, 2, 2, 3), "text")}, "expected real numbers"),
+        ({"series": linear_series().astype(complex)}, "expected real numbers"),
+        ({"series": np.zeros((2, 2, 2, 3), "datetime64[s]")}, "expected real numbers"),
+        ({"series": linear_series()[0, 0]}, "expected an array of shape"),
+        ({"series": np.zeros((0, 0, 0, 3))}, "expected an array of shape"),
+        ({"series": linear_series()[:1, :1]}, "degrees from 1"),
+        ({"series": np.zeros((200, 200, 2, 3))}, "degrees from 1 to 100"),
+        ({"series": np.full((2, 2, 2, 3), np.inf)}, "expected finite numbers"),
+        ({"series": 300.0 * linear_series()}, "finite and positive"),
+        ({"series": 0.0 * linear_series()}, "change with x, y and the force"),
+        ({"series": None}, "the array 'series' is missing"),
+        ({"force_N": np.array([1.0, 1.0000001])}, "at least 1.01 times the smallest"),
+        ({"force_N": np.array([0.0, 1.0])}, "a smallest force above 0"),
+        ({"force_N": np.array([1.0, 0.5])}, "got 1 and 0.5 N"),
+        ({"force_N": np.array([1.0])}, "expected an array of shape"),
+        ({"radius_mm": np.array(np.inf)}, "expected finite numbers"),
+        ({"radius_mm": np.array(1e9)}, "expected a radius up to 10000 mm"),
+        ({"radius_mm": np.array(-1.0)}, "expected a radius"),
+        ({"radius_mm": np.array("8")}, "expected real numbers"),
+    ],
+)
+def test_series_that_describes_no_charges_is_refused(tmp_path, change, reason):
+    write_npz(tmp_path, "charges.npz", CHARGES | change)
+    with pytest.raises(ModelError, match=rf"charges\.npz: .*{reason}.*train again"):
+        read_charges(tmp_path, 3)
+
+
+def test_pretensions_are_read(tmp_path):
+    write_npz(tmp_path, "pretensions.npz", pretension_arrays())
+    assert read_pretensions(tmp_path).range_MPa == (0.2, 1.4)
+
+
+def about(**changes):
+    content = json.loads(str(pretension_arrays()["about"])) | changes
+    return {"about": np.array(json.dumps(content))}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"w0": None}, "the array 'w0' is missing"),
+        ({"w0": np.zeros((3, 5, 5))}, r"w0: expected an array of shape \(3, 4, n\)"),
+        ({"b0": np.zeros((3, 6))}, r"b0: expected an array of shape \(3, 5\)"),
+        ({"last": np.full((3, 5, 7), np.inf)}, "last: expected finite numbers"),
+        ({"last": np.full((3, 5, 7), 1e200)}, "last: expected weights up to 1e.06"),
+        ({"last": np.full((3, 5, 7), 1e5)}, "misfits that are not finite"),
+        ({"node_MPa": np.array([0.2, 0.8, 1e9])}, "node_MPa: expected 2 to 50 rising pretensions up to 50 MPa"),
+        ({"node_MPa": np.array([0.2, 0.8, 0.8])}, "rising pretensions"),
+        ({"node_MPa": np.array([0.2, 0.8, 0.8 + 1e-9])}, "rising pretensions"),
+        ({"node_MPa": np.array([0.2, 0.7, 1.4])}, "with 0.8 MPa among them"),
+        ({"typical_pC": np.array([500.0, 400.0, 0.0, 200.0])}, "positive typical charges"),
+        ({"typical_pC": np.array([500.0, 400.0, np.nan, 200.0])}, "expected finite numbers"),
+        (about(limits_pC=[5.0, 5.0]), "rising limits"),
+        (about(misfit_rms=0.0), "misfit_rms: expected a positive number"),
+        (about(std_MPa=0.0), "std_MPa: expected a positive number"),
+        (about(constants=["w0", "b0", "skip", "bias"]), "constants"),
+        (about(constants=["w0", "b0", "w0", "b0", "skip", "bias", "last"]), "names that differ"),
+        (about(format_version=2), "format 2 is not supported"),
+        ({"about": np.array(5.0)}, "about: expected a text"),
+    ],
+)
+def test_pretensions_that_nothing_can_be_computed_from_are_refused(tmp_path, change, reason):
+    write_npz(tmp_path, "pretensions.npz", pretension_arrays() | change)
+    with pytest.raises(ModelError, match=rf"pretensions\.npz: .*{reason}.*calibrate again"):
+        read_pretensions(tmp_path)
+
+
+def test_released_models_hold_the_checksums_of_their_files(pytestconfig):
+    folders = sorted((pytestconfig.rootpath / "models").glob("*/[0-9]*"))
+    assert len(folders) >= 10
+    for folder in folders:
+        checksums = {path.name: sha256_of(path.read_bytes()) for path in folder.glob("*.npz")}
+        assert load_model(folder).golden.companion_sha256 == checksums
+
+
+def test_copied_model_still_reads_its_file(folder, tmp_path):
+    copied = shutil.copytree(folder, tmp_path / "copied" / "1")
+    assert read_companion_file(copied, "charges.npz", ADVICE) == b"content"
