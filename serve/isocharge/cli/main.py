@@ -12,7 +12,7 @@ import typer
 
 from isocharge.cli.serve.app import serve_app
 from isocharge.cli.shared.lazy import LazyCommand, lazy_group
-from isocharge.cli.shared.terminal import open_closed_streams, say, warnings_to_stderr
+from isocharge.cli.shared.terminal import open_closed_streams, say, show, warnings_to_stderr
 from isocharge.cli.simulate.app import simulate_app
 from isocharge.cli.train.app import train_app
 from isocharge.common.errors import InputError, IsochargeError
@@ -33,7 +33,7 @@ app.add_typer(serve_app, name="serve")
 
 def _print_version(asked: bool) -> None:
     if asked:
-        typer.echo(f"isocharge {package_version()}")
+        show(f"isocharge {package_version()}")
         raise typer.Exit
 
 

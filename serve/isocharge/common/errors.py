@@ -1,32 +1,40 @@
-"""The one tree of exceptions; each is also the built-in that fits it, so plain Python code can catch it.
+"""The exceptions of isocharge. Each also inherits from the built-in exception that fits it.
 
-A message says what was expected, what was got, where, and what to do. The command line maps the tree to exit codes in
-`isocharge.cli.main` (wrong input is 2, everything else is 1), the servers to HTTP and gRPC statuses in
-`isocharge.serve.network.protocol.response`.
+A message states what was expected, what was given, where, and what to do. The command line maps the exceptions to exit
+codes in `isocharge.cli.main` (2 for wrong input, 1 for everything else), the servers map them to HTTP and gRPC statuses
+in `isocharge.serve.network.protocol.response`.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from isocharge.common.printable_text import printable, printable_lines
+
 LONGEST_VALUE = 200
-"""Characters of a wrong value, or of a list of keys, that a message shows."""
+"""Largest number of characters of a wrong value, or of a list of keys, in a message."""
 
 
 def cut(text: str) -> str:
-    """A text for a message, cut after `LONGEST_VALUE` characters."""
-    return text if len(text) <= LONGEST_VALUE else text[:LONGEST_VALUE] + "..."
+    """Return a text for a message: printable, and cut after `LONGEST_VALUE` characters."""
+    if len(text) <= LONGEST_VALUE:
+        return printable(text)
+    return printable(text[:LONGEST_VALUE]) + "..."
 
 
 def shown(value: object) -> str:
-    """A value for a message: its repr, cut after `LONGEST_VALUE` characters."""
+    """Return the repr of a value for a message, cut after `LONGEST_VALUE` characters."""
     try:
         return cut(repr(value))
-    except (RecursionError, ValueError):  # nested too deeply; an int with more digits than Python prints
+    except (RecursionError, ValueError):  # nested too deeply, or an int with more digits than Python prints
         return f"a {type(value).__name__} that is too large to print"
 
 
 class IsochargeError(Exception):
-    """Root of all errors that isocharge raises on purpose."""
+    """Base class of all errors that isocharge raises on purpose."""
+
+    def __str__(self) -> str:
+        """Return the message in printable characters, because messages contain names from files and boards."""
+        return printable_lines(super().__str__())
 
 
 class InputError(IsochargeError, ValueError):

@@ -9,8 +9,9 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from isocharge.common.printable_text import printable
+
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
-_CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
 
 
 def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
@@ -24,7 +25,7 @@ def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
     Raises:
         TypeError: If a value is of another type.
     """
-    lines = [f"# {_CONTROL.sub(' ', line)}".rstrip() for text in comment for line in text.splitlines() or [""]]
+    lines = [f"# {printable(line)}".rstrip() for text in comment for line in text.splitlines() or [""]]
     lines += [""] * bool(lines)
     lines += [_pair(key, value) for key, value in tables.items() if not isinstance(value, Mapping)]
     for name, table in tables.items():

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-import typer
 from scipy.stats import binned_statistic
 
-from isocharge.cli.shared.terminal import say, shown_progress, this_command
+from isocharge.cli.shared.terminal import say, show, shown_progress, this_command
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.arrays import Array
 from isocharge.common.files import new_folder
@@ -117,7 +116,7 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None) ->
             equilibrium = press(forward_map.sensor.film, forward_map.probe, DRAWN_POSITION_MM, DRAWN_FORCE_N)
             draw_page(forward_map, equilibrium, followed, tested, draft / "demo.png")
     say(f"   {folder / 'demo.png'}")
-    typer.echo(_summary(tested, followed, durations_s, folder))
+    show(_summary(tested, followed, durations_s, folder))
 
 
 @contextmanager

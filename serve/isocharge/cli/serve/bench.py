@@ -1,13 +1,12 @@
 """`isocharge serve bench`: how fast a model is on this machine, and how accurate."""
 
-import json as json_module
 from collections.abc import Iterator
 from typing import Annotated
 
 import typer
 
 from isocharge.cli.shared.options import JsonOption
-from isocharge.cli.shared.terminal import shown_progress
+from isocharge.cli.shared.terminal import show, show_json, shown_progress
 from isocharge.serve import Model, Predictor, check_golden, find_model, load_model
 from isocharge.serve.benchmark import Timing, in_process_contenders, machine, press_charges, take_turns
 
@@ -44,9 +43,9 @@ def bench_command(
     if json:
         report = {"model": loaded.metadata.label, "seconds": seconds, "machine": machine()}
         report |= {"timings": [timing._asdict() for timing in timings], "errors": errors}
-        typer.echo(json_module.dumps(report, allow_nan=False))
+        show_json(report)
     else:
-        typer.echo("\n".join(_lines(loaded, timings, errors)))
+        show("\n".join(_lines(loaded, timings, errors)))
 
 
 def _lines(model: Model, timings: list[Timing], errors: dict[str, float]) -> Iterator[str]:

@@ -1,6 +1,5 @@
 """`isocharge serve check`: how wrong a model is on measured presses."""
 
-import json as json_module
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +9,7 @@ import typer
 
 from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
 from isocharge.cli.shared.options import JsonOption, ModelArgument, ModelsOption
+from isocharge.cli.shared.terminal import show, show_json
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses
 from isocharge.serve.prediction.press_errors import ErrorSummary
@@ -41,7 +41,10 @@ def check_command(
     """
     predictor = Predictor(model, models=models)
     check = check_presses(predictor, read_presses_of(file, predictor.metadata.electrodes, position_std_mm, force_std))
-    typer.echo(json_module.dumps(check.to_dict(), allow_nan=False) if json else "\n".join(_text(check)))
+    if json:
+        show_json(check.to_dict())
+    else:
+        show("\n".join(_text(check)))
     raise typer.Exit(0 if check.fits else 1)
 
 

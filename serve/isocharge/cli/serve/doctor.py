@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict
-from json import dumps
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,10 +11,11 @@ from serial.tools import list_ports
 
 from isocharge.cli.serve.records import WaitOption
 from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.terminal import say, show, show_json
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.files import refuse_existing, write_whole
 from isocharge.common.number_text import number_of
+from isocharge.common.printable_text import printable
 from isocharge.serve import Examination, Predictor, examine, load_device
 from isocharge.serve.examination.listening import BAUDS
 from isocharge.serve.examination.port_check import device_text
@@ -97,7 +97,7 @@ def doctor_command(
     Example: isocharge serve doctor --port /dev/ttyACM0 --write board.toml
     """
     if port is None:
-        print("\n".join(port_lines()) or "no serial ports; is the board plugged in?")
+        show("\n".join(port_lines()) or "no serial ports; is the board plugged in?")
         return
     if write is not None:
         refuse_existing(write)
@@ -114,7 +114,10 @@ def doctor_command(
         request=_request(request, request_Hz),
         wait=wait,
     )
-    print(dumps(asdict(examination)) if json else "\n".join(report_lines(examination)))
+    if json:
+        show_json(asdict(examination))
+    else:
+        show("\n".join(report_lines(examination)))
     alive = len(examination.channels)
     if examination.good and len(electrodes) > alive:
         say(f"models of {alive} electrodes: {', '.join(_models_of(alive, models)) or 'none'}; choose one with --model")
@@ -191,7 +194,7 @@ def report_lines(examination: Examination) -> Iterator[str]:
     )
     yield f"{numbers}; {'a' if examination.device_clock else 'no'} device clock"
     if examination.unused:
-        yield f"channels that no electrode uses: {', '.join(examination.unused)}"
+        yield f"channels that no electrode uses: {printable(', '.join(examination.unused))}"
     if examination.unit != "pC":
         yield f"the channels are {'volts, it seems' if examination.unit == 'V' else examination.unit}, not pC"
     if examination.channels:
@@ -200,7 +203,7 @@ def report_lines(examination: Examination) -> Iterator[str]:
         figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
         digits = (5, 6, 5, 5, 5) if examination.unit == "V" else (2, 3, 2, 2, 2)
         columns = zip(figures, (12, 11, 12, 10, 10), digits, strict=True)
-        yield f"{channel.name:8.8s}" + "".join(
+        yield f"{printable(channel.name):8.8s}" + "".join(
             f"{'?' if figure is None else f'{figure:.{digits}f}':>{width}s}" for figure, width, digits in columns
         )
     if examination.held:

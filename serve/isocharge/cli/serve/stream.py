@@ -35,8 +35,9 @@ from isocharge.cli.shared.terminal import (
     unless_hung_up,
     until_stopped,
 )
-from isocharge.common.errors import InputError, ModelError
+from isocharge.common.errors import InputError, ModelError, shown
 from isocharge.common.files import new_file
+from isocharge.common.printable_text import is_printable
 from isocharge.serve import (
     Policy,
     Predictor,
@@ -149,8 +150,8 @@ def stream_command(
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
-    if name is not None and not (0 < len(name) <= LONGEST_NAME and name.isprintable()):
-        raise InputError(f"--name: expected 1 to {LONGEST_NAME} printable characters, got {name[:LONGEST_NAME]!r}")
+    if name is not None and not (0 < len(name) <= LONGEST_NAME and is_printable(name)):
+        raise InputError(f"--name: expected 1 to {LONGEST_NAME} printable characters, got {shown(name)}")
     address = None if live is None else page_address(live, token)
     predictor, board = Predictor(model, models=models), load_device(device)
     if offset_limit_pC is not None:

@@ -12,7 +12,7 @@ import typer
 
 from isocharge.cli.shared.forward_maps import SLACK
 from isocharge.cli.shared.options import ProbeOption, SensorArgument
-from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
+from isocharge.cli.shared.terminal import announce, say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import film_charges, measuring, random_script
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
@@ -122,7 +122,7 @@ def virtual_command(
         link=link,
     )
     with until_stopped(), player:
-        print(player.port_path, flush=True)
+        announce(player.port_path)
         say("solving the film, which is not touched until then")
         with shown_progress():
             forward_map = ForwardMap.build(

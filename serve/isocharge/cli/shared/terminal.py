@@ -1,10 +1,12 @@
-"""What a command says and how it ends: messages and progress for people, standard streams, signals.
+"""Output of the commands and their end: results, messages, progress, standard streams and signals.
 
-Messages go to stderr, and bars only if that is a terminal. Where streams are closed, full or slow, a command neither
-breaks nor writes where it should not.
+All text that a command prints passes through this module, which escapes the characters that a terminal obeys or hides.
+Messages go to stderr, and progress bars only if stderr is a terminal. If a stream is closed, full or slow, a command
+neither fails nor writes to another file.
 """
 
 import io
+import json
 import logging
 import os
 import select
@@ -14,18 +16,20 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import Any
 
 import typer
 
 from isocharge.common.errors import OutputError
+from isocharge.common.printable_text import printable, printable_lines
 from isocharge.common.progress import Listener, listening
 
 
 class ClosedOutput(io.TextIOBase):
-    """What takes the place of a stdout that was closed when the command started."""
+    """Replacement of a stdout that was closed when the command started."""
 
     def write(self, _: str, /) -> int:
-        """Say what is wrong.
+        """Refuse to write.
 
         Raises:
             OutputError: Always.
@@ -34,9 +38,9 @@ class ClosedOutput(io.TextIOBase):
 
 
 def open_closed_streams() -> None:
-    """Put something in the place of standard streams that are closed.
+    """Replace standard streams that are closed.
 
-    Their numbers must not go to the next file that is opened: what is printed would go into it.
+    Otherwise the next file that is opened would get the number of a closed stream, and printed text would go into it.
     """
     for number in (0, 1, 2):
         try:
@@ -52,23 +56,38 @@ def open_closed_streams() -> None:
 
 
 def forget(number: int) -> None:
-    """Send what is still to be written to a stream to nowhere, or Python would complain at exit."""
+    """Discard what is still to be written to a stream, because Python would otherwise fail at exit."""
     with suppress(OSError):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, number)
-        os.close(nowhere)
+        null_device = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null_device, number)
+        os.close(null_device)
+
+
+def show(text: str) -> None:
+    """Print a result for people on stdout, in printable characters."""
+    typer.echo(printable_lines(text))
+
+
+def show_json(value: Any) -> None:
+    """Print a result for programs on stdout, as one line of JSON. Numbers that are not finite become null."""
+    from isocharge.common.json_values import plain_values  # imports numpy, which help does not need
+
+    print(printable(json.dumps(plain_values(value), allow_nan=False)), flush=True)
 
 
 def announce(line: str) -> None:
-    """Print a line on stdout for programs that wait for it; a command that serves others goes on if it cannot."""
+    """Print a line on stdout for programs that wait for it. A command that serves others continues if stdout fails."""
     try:
-        print(line, flush=True)
+        print(printable(line), flush=True)
     except OSError:
         forget(1)
 
 
 def stdout_writer() -> Callable[[str], None]:
-    """The function that writes a text to stdout at once, without Python's buffer: a thread may hang in it at exit."""
+    """Return the function that writes lines of records to stdout at once.
+
+    The function does not use Python's buffer, in which a thread may hang at exit.
+    """
     try:
         descriptor = sys.stdout.fileno()
     except (OSError, io.UnsupportedOperation):
@@ -77,22 +96,22 @@ def stdout_writer() -> Callable[[str], None]:
 
 
 def write_stderr(line: str) -> None:
-    """Write a line to stderr at once; if that is full or gone, the command goes on without."""
+    """Write a line to stderr at once. The command continues if stderr is full or closed."""
     try:
-        _write_all(2, f"{line}\n".encode())
+        _write_all(2, f"{printable(line)}\n".encode())
     except OSError:
         forget(2)
 
 
 def stdout_is_ready() -> bool:
-    """Whether stdout would take a line without waiting, after a tenth of a second at most.
+    """Return whether stdout accepts a line within a tenth of a second.
 
-    A pipe that is ready has room for `PIPE_BUF` bytes, more than a record has.
+    A pipe that is ready has room for `PIPE_BUF` bytes, which is more than the length of a record.
     """
     try:
         return bool(select.select([], [sys.stdout.fileno()], [], 0.1)[1])
     except (OSError, ValueError, io.UnsupportedOperation):
-        return True  # whatever is wrong, the write says it
+        return True  # the write raises the error
 
 
 def _write_buffered(text: str) -> None:
@@ -104,7 +123,7 @@ def _write_all(descriptor: int, data: bytes) -> None:
     while data:
         try:
             data = data[os.write(descriptor, data) :]
-        except BlockingIOError:  # another program that has the terminal made it so
+        except BlockingIOError:  # another program on the same terminal has made it non-blocking
             select.select([], [descriptor], [])
 
 
@@ -124,7 +143,7 @@ def until_stopped() -> Iterator[None]:
 
 @contextmanager
 def stop_after(seconds: float | None) -> Iterator[None]:
-    """As if Ctrl-C were pressed after some time, also where the command waits for a port; None for never."""
+    """Interrupt the block after some time as by Ctrl-C, also while the command waits for a port; None for never."""
     if seconds is None:
         yield
         return
@@ -139,7 +158,7 @@ def stop_after(seconds: float | None) -> Iterator[None]:
 
 @contextmanager
 def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[None]:
-    """Act when a signal comes."""
+    """Call `act` whenever a signal arrives during the block."""
     before = signal.signal(number, lambda *_: act())
     try:
         yield
@@ -148,7 +167,7 @@ def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[Non
 
 
 def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
-    """Act at SIGHUP, but stop as at Ctrl-C where it says that the terminal of this command was closed."""
+    """Return a handler of SIGHUP that calls `act`, or stops as by Ctrl-C if the terminal of this command was closed."""
     terminals = [number for number in (0, 1, 2) if os.isatty(number)]
 
     def act_or_stop() -> None:
@@ -160,27 +179,31 @@ def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
 
 
 LINE_S = 5.0
-"""Time between two lines of progress where there is no terminal, s."""
+"""Time between two lines of progress if stderr is not a terminal, s."""
 
 
 def say(message: str) -> None:
-    """Print a message for people on stderr; if that is full or gone, the command goes on without."""
+    """Print a message for people on stderr, in printable characters.
+
+    The command continues if stderr is full or closed.
+    """
     try:
-        typer.echo(message, err=True)
+        typer.echo(printable_lines(message), err=True)
     except OSError:
         forget(2)
 
 
 def this_command() -> str:
-    """The command line as it was given, for cards and reports that say how they were made."""
+    """Return the command line as it was given, for the cards and reports that state how they were made."""
     return shlex.join(["isocharge", *sys.argv[1:]])
 
 
 @contextmanager
 def warnings_to_stderr() -> Iterator[None]:
-    """Print warnings of all packages for people; those of simulation and training begin with `caution:`."""
-    handler, logger = logging.StreamHandler(), logging.getLogger("isocharge")
-    handler.setFormatter(_Sentence())
+    """Print the warnings of all packages. Those of simulation and training begin with `caution:`."""
+    handler = logging.StreamHandler()
+    logger = logging.getLogger("isocharge")
+    handler.setFormatter(_WarningFormatter())
     logger.addHandler(handler)
     try:
         yield
@@ -188,39 +211,41 @@ def warnings_to_stderr() -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-class _Sentence(logging.Formatter):
+class _WarningFormatter(logging.Formatter):
+    """Formats a warning as one sentence in printable characters, without time and traceback."""
+
     def format(self, record: logging.LogRecord) -> str:
         caution = "" if record.name.startswith("isocharge.serve") else "caution: "
-        return caution + record.getMessage()
+        return caution + printable_lines(record.getMessage())
 
 
 @contextmanager
 def shown_progress() -> Iterator[None]:
-    """Show the progress of all work inside the block: bars on a terminal, else a line every few seconds."""
+    """Show the progress of all work inside the block: bars on a terminal, otherwise a line every few seconds."""
     if not sys.stderr.isatty():
-        with listening(_Lines()):
+        with listening(_ProgressLines()):
             yield
         return
-    with _bars() as bar, listening(bar):
+    with _progress_bars() as bar, listening(bar):
         yield
 
 
-class _Lines:
+class _ProgressLines:
     """Progress as plain lines, at most one every `LINE_S`."""
 
     def __init__(self) -> None:
-        self._next = time.monotonic() + LINE_S
+        self._next_line_s = time.monotonic() + LINE_S
 
     def __call__(self, title: str, done: int, total: int, note: str) -> None:
-        if time.monotonic() >= self._next:
-            self._next = time.monotonic() + LINE_S
+        if time.monotonic() >= self._next_line_s:
+            self._next_line_s = time.monotonic() + LINE_S
             say(f"{title}: {done} of {total} {note}".rstrip())
 
 
 @contextmanager
-def _bars() -> Iterator[Listener]:
-    """A bar for each title, with the remaining time."""
-    # 40 ms that help and short commands need not wait for
+def _progress_bars() -> Iterator[Listener]:
+    """Show a bar for each title, with the remaining time."""
+    # The import takes 40 ms, which help and short commands need not wait for.
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -233,20 +258,22 @@ def _bars() -> Iterator[Listener]:
     )
 
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
         rows: dict[str, TaskID] = {}
 
         def show(title: str, done: int, total: int, note: str) -> None:
+            title = printable(title)
+            note = printable(note)
             if title not in rows:
                 rows[title] = bars.add_task(title, total=total, note=note)
-            elif done < bars.tasks[rows[title]].completed:  # the same work once more: its clock starts again
+            elif done < bars.tasks[rows[title]].completed:  # the same work has started again, and so does its clock
                 bars.reset(rows[title])
             bars.update(rows[title], completed=done, total=total, note=note)
 

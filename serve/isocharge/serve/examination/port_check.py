@@ -11,6 +11,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import IsochargeError
+from isocharge.common.printable_text import printable
 from isocharge.common.toml_text import to_toml
 from isocharge.serve.examination.held_press import HeldPress, held_press
 from isocharge.serve.examination.listening import BAUDS, Capture, Heard, listen, read_frames
@@ -310,7 +311,7 @@ def _missing(
         yield TO_ASK_FOR[unit]
     for channel in channels:
         if channel.span_pC == 0.0:
-            yield f"life on channel {channel.name}: every value is {channel.offset_pC:g}"
+            yield f"life on channel {printable(channel.name)}: every value is {channel.offset_pC:g}"
         if unit == "pC":
             yield from _missing_in(channel, device.tare or TareRule())
     if capture.frames[0].t_us is None and device.leak is not None:
@@ -328,21 +329,22 @@ def _missing(
 
 def _missing_in(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
     """What is wrong with the charges of a channel."""
+    name = printable(channel.name)
     if channel.unusable:
-        yield f"charges on channel {channel.name}: {channel.unusable} values are no numbers, or absurd"
+        yield f"charges on channel {name}: {channel.unusable} values are no numbers, or absurd"
     if (noise_pC := channel.noise_pC or 0.0) > rule.noise_limit_pC:
-        yield f"quiet on channel {channel.name}: {noise_pC:.3g} pC rms, for a tare {rule.noise_limit_pC:g}"
+        yield f"quiet on channel {name}: {noise_pC:.3g} pC rms, for a tare {rule.noise_limit_pC:g}"
     if abs(channel.offset_pC or 0.0) > rule.offset_limit_pC:
         yield (
-            f"rest near zero on channel {channel.name}: {channel.offset_pC:.4g} pC, a tare takes "
+            f"rest near zero on channel {name}: {channel.offset_pC:.4g} pC, a tare takes "
             f"{rule.offset_limit_pC:g} (is something lying on the film? or does the amplifier rest there? then "
             "[gain] offset, as --write has it)"
         )
     if abs(drift := channel.drift_pC_per_s or 0.0) > DRIFT_LIMIT_PC_PER_S:
-        yield f"a steady channel {channel.name}: it drifts by {drift:.2g} pC/s"
+        yield f"a steady channel {name}: it drifts by {drift:.2g} pC/s"
     for frequency, hum in zip(MAINS_HZ, channel.hum_pC, strict=True):
         if hum is not None and hum > HUM_LIMIT_PC:
-            yield f"[hum] frequency_Hz = {frequency:g} (device file): channel {channel.name} hums by {hum:.2g} pC"
+            yield f"[hum] frequency_Hz = {frequency:g} (device file): channel {name} hums by {hum:.2g} pC"
 
 
 HEAD = (
@@ -375,4 +377,4 @@ def device_text(examination: Examination) -> str:
 def _words(examination: Examination) -> Iterator[str]:
     yield f"{examination.format}; {examination.rate_Hz:.4g} frames per second"
     if examination.unused:
-        yield f"channels that no electrode uses: {', '.join(examination.unused)}"
+        yield f"channels that no electrode uses: {printable(', '.join(examination.unused))}"

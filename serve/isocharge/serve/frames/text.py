@@ -16,6 +16,7 @@ channels. The values at which counter and clock wrap are learned when they wrap 
 
 from collections.abc import Mapping, Sequence
 
+from isocharge.common.printable_text import printable
 from isocharge.serve.frames.frame import (
     SEQ,
     SEQ_MODULUS,
@@ -163,7 +164,7 @@ class TextParser(DelimitedParser):
         self.layout = layout
         self._clock_wrap = clock_wrap(layout.columns.time_unit_us)
         names = ", ".join(layout.names) or f"{layout.width} columns without names"
-        self.format = f"text, {layout.notation}: {names}"
+        self.format = f"text, {layout.notation}: {printable(names)}"
 
     def _recognise(self, line: Line, size: int) -> list[Frame]:
         """Collect lines until their layout repeats, then read the lines that repeat it."""

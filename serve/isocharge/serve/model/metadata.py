@@ -13,6 +13,7 @@ from msgspec import Meta, Struct
 
 from isocharge.common.errors import ModelError, shown
 from isocharge.common.model_labels import ModelName
+from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, Positive, Settings, Text, WrongKey, convert, parse_json
 
 FORMAT_VERSION = 1
@@ -63,6 +64,9 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
             raise WrongKey("sensor.name", "a text", name)
         if len(set(self.electrodes)) < len(self.electrodes):
             raise WrongKey("electrodes", "names that differ", self.electrodes)
+        for key, texts in (("electrodes", self.electrodes), ("probes", self.probes), ("sensor.name", (name,))):
+            if not all(is_printable(text) for text in texts):
+                raise WrongKey(key, "printable characters", texts)
         if self.force_range_N[0] > self.force_range_N[1]:
             raise WrongKey("force_range_N", "a smaller and a larger number", list(self.force_range_N))
 

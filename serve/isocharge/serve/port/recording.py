@@ -26,6 +26,7 @@ from msgspec import Meta, Struct
 from isocharge.common.errors import RecordingError, cut
 from isocharge.common.files import WholeWrites, bounded_lines
 from isocharge.common.model_labels import ModelLabel
+from isocharge.common.printable_text import is_printable
 from isocharge.common.progress import report
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.port.source import Chunk
@@ -247,6 +248,10 @@ class _Header(Struct):
     policy: Literal["every", "latest"]
     device: dict[str, Any]
     name: str = ""
+
+    def __post_init__(self) -> None:
+        if not is_printable(self.name):
+            raise WrongKey("name", "printable characters", self.name)
 
 
 class _Entry(Struct):

@@ -37,6 +37,7 @@ from msgspec import Meta, Struct
 
 from isocharge.common.deflection_field import DeflectionField, read_deflection_field
 from isocharge.common.errors import InputError, RequestError
+from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, WrongKey, convert
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.model.metadata import ModelMetadata
@@ -173,7 +174,7 @@ class Marker(PageRequest):
 
     def __post_init__(self) -> None:
         """Refuse what does not fit on a line."""
-        if len(self.text) > LONGEST_MARKER or not self.text.isprintable():
+        if len(self.text) > LONGEST_MARKER or not is_printable(self.text):
             raise WrongKey("text", f"at most {LONGEST_MARKER} printable characters", self.text)
 
 

@@ -15,7 +15,7 @@ from isocharge.cli.shared.options import (
     StressLimitOption,
     WorkersOption,
 )
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.terminal import say, show
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
 from isocharge.common.resumable_run import refuse_finished, resume_parts
@@ -108,7 +108,7 @@ def design_command(
     ):
         found = design(case, executor=run.keeping("design", pool))
         write_design(found, output)
-    typer.echo(_table(found))
+    show(_table(found))
     caution = "" if found.unambiguous else "caution: "
     say(f"{caution}{found.summary}; {straight_leads(found.sensor).summary}; files in {output}")
 

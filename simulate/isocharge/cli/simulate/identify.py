@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from isocharge.cli.shared.options import ForceRangeOption, JsonOption, NoiseOption, ProbeOption, SensorArgument
-from isocharge.cli.shared.terminal import say, shown_progress
+from isocharge.cli.shared.terminal import say, show, show_json, shown_progress
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import InputError
 from isocharge.common.files import new_folder, refuse_existing
@@ -63,7 +63,10 @@ def identify_command(
         with new_folder(output) as folder:
             (folder / PICTURE).write_bytes(picture_bytes(identification_picture(identified)))
             (folder / NUMBERS).write_bytes(json_module.dumps(numbers, indent=1).encode())
-    typer.echo(json_module.dumps(numbers) if json else _table(numbers))
+    if json:
+        show_json(numbers)
+    else:
+        show(_table(numbers))
     say(identified.summary)
 
 

@@ -1,13 +1,12 @@
 """`isocharge simulate point`: the charges of one press."""
 
-import json as json_module
 from math import isfinite
 from typing import Annotated, Any
 
 import typer
 
 from isocharge.cli.shared.options import ForceOption, JsonOption, ProbeOption, SensorArgument, position_of
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.terminal import say, show, show_json
 from isocharge.common.errors import InputError
 from isocharge.simulate import Equilibrium, SolveSettings, load_sensor, parse_probe, press, touch_charge
 from isocharge.simulate.forward.readout import thermal_charge
@@ -55,7 +54,10 @@ def point_command(
     charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
     charge_pC = dict(zip(film_sensor.electrode_names, charge.tolist(), strict=True))
     report = {"charge_pC": charge_pC, **summary(equilibrium)}
-    typer.echo(json_module.dumps(report) if json else _table(report))
+    if json:
+        show_json(report)
+    else:
+        show(_table(report))
     for warning in [*_cautions(equilibrium, accuracy), *report["warnings"]]:
         say(f"caution: {warning}")
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SensorError, cut, shown
+from isocharge.common.printable_text import is_printable
 from isocharge.simulate.numerics.polygon import area_of, is_convex, overlap, to_complex, to_corners
 from isocharge.simulate.numerics.polygon_union import is_simple, pieces, trace_outline, union_parts
 from isocharge.simulate.sensor.film import Coat, Film, Piezo, Surface
@@ -289,7 +290,7 @@ def _check_name(name: str) -> None:
     Raises:
         SensorError: If it is empty or too long, has a comma or what cannot be printed, or means something else there.
     """
-    if not (0 < len(name) <= LONGEST_NAME and name.isprintable() and name == name.strip() and "," not in name):
+    if not (0 < len(name) <= LONGEST_NAME and is_printable(name) and name == name.strip() and "," not in name):
         raise SensorError(
             f"electrode {shown(name)}: expected a name of 1 to {LONGEST_NAME} printable characters, without commas and "
             "without blanks at its ends: it heads a column of CSV files"

@@ -1,6 +1,5 @@
 """`isocharge train calibrate`: from a few measured presses to a model that is right about one film."""
 
-import json as json_module
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -19,10 +18,9 @@ from isocharge.cli.shared.options import (
     StressLimitOption,
     refuse,
 )
-from isocharge.cli.shared.terminal import say, this_command
+from isocharge.cli.shared.terminal import say, show, show_json, this_command
 from isocharge.cli.train.press_session import PressPort, calibrate_at_port
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
-from isocharge.common.json_values import plain_values
 from isocharge.serve.prediction.measured_presses import COLDEST_C, WARMEST_C
 from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, ProposedPress, calibrate, next_presses
@@ -168,13 +166,12 @@ def calibrate_command(
         proposed = next_presses(problem, next_count, known, position_std_mm=position_std_mm, force_std=force_std)
     if json:
         table = result_table(result) if result else {}
-        values = plain_values(table | {"next": [vars(press) for press in proposed]})
-        typer.echo(json_module.dumps(values, allow_nan=False))
+        show_json(table | {"next": [vars(press) for press in proposed]})
         return
     for sentence in result.summary if result else ():
-        typer.echo(sentence)
+        show(sentence)
     for press in proposed:
-        typer.echo(
+        show(
             f"press {press.force_N:.2f} N at ({press.x_mm:.1f}, {press.y_mm:.1f}) mm: "
             f"leaves {press.position_mm:.3f} mm, {press.force_percent:.2f} %"
         )

@@ -1,6 +1,5 @@
 """`isocharge train fit`: a dataset, measured presses, or a sensor, to a model."""
 
-import json as json_module
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -21,7 +20,7 @@ from isocharge.cli.shared.options import (
     radius_mm_of,
     refuse,
 )
-from isocharge.cli.shared.terminal import say, shown_progress, this_command
+from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.resumable_run import ResumableRun, resume_parts
@@ -241,7 +240,7 @@ def release_resumably(
         made = release(train(run), target.parent, version=int(target.name), command=this_command())
     errors = made.metadata.errors
     if json:
-        typer.echo(json_module.dumps({"folder": str(made.folder), "errors": dict(errors)}))
+        show_json({"folder": str(made.folder), "errors": dict(errors)})
     measured = errors.get("measured_presses")
     unseen = "at places that were left out" if "folds" in made.metadata.made_with.get("measured", {}) else UNSEEN
     presses = f"on {measured:.0f} measured presses {unseen}, " if measured else ""

@@ -1,6 +1,5 @@
 """A session of presses from its port to its calibration: everything taken is on disk at once."""
 
-import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,10 +9,9 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from isocharge.cli.shared.terminal import say
+from isocharge.cli.shared.terminal import say, show_json
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, Screen
 from isocharge.common.errors import InputError, PressError, told_where
-from isocharge.common.json_values import plain_values
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress
 from isocharge.serve.prediction.measured_presses import read_press_list
@@ -139,4 +137,4 @@ def _print_press(session: PressSession, press: SteadyPress, *, machine: bool) ->
         "enough": session.enough,
         "next": None if machine or session.enough else vars(session.proposed),
     }
-    print(json.dumps(plain_values(values), allow_nan=False), flush=True)
+    show_json(values)

@@ -1,6 +1,5 @@
 """`isocharge train report`: speed against error, all methods, with the limits."""
 
-import json as json_module
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +8,7 @@ import typer
 
 from isocharge.cli.shared.measured_presses import read_presses_of
 from isocharge.cli.shared.options import FreshOption, JsonOption, NewFolderOption, ProbeOption
-from isocharge.cli.shared.terminal import say, shown_progress, this_command
+from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.errors import InputError, ModelError
 from isocharge.common.resumable_run import refuse_finished
 from isocharge.serve import find_model
@@ -83,7 +82,7 @@ def report_command(
             say(f"{section['sensor']}: {sentence}")
     say(str(output / "report.md"))
     if json:
-        typer.echo(json_module.dumps(record))
+        show_json(record)
 
 
 def _students_of(models: list[str]) -> list[Path]:

@@ -1,0 +1,200 @@
+"""Names that attack a terminal: from boards, models, recordings and CSV files, through the commands that print them."""
+
+import contextlib
+import io
+import json
+import logging
+import unicodedata
+from dataclasses import asdict
+
+import pytest
+
+from isocharge.cli.serve.doctor import report_lines
+from isocharge.cli.shared.terminal import say, show, show_json, warnings_to_stderr
+from isocharge.common.errors import IsochargeError
+from isocharge.serve import (
+    Chunk,
+    Predictor,
+    Recorder,
+    Recording,
+    TouchStream,
+    device_from_table,
+    load_model,
+    read_charges,
+)
+from isocharge.serve.examination.listening import Heard
+from isocharge.serve.examination.port_check import device_text, findings
+from isocharge.serve.live.outputs import csv_header
+from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.model_folder import find_model
+
+HARMFUL_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
+
+CHARACTERS = (
+    "\x1b[2J",
+    "\x1b]0;title\x07",
+    "\x07",
+    "\r",
+    "\n",
+    "\t",
+    "\x00",
+    "\x7f",
+    "\x9b31m",
+    "\u061c",
+    "\u115f",
+    "\u200b",
+    "\u200d",
+    "\u200e",
+    "\u202e",
+    "\u2028",
+    "\u2066",
+    "\u3164",
+    "\ufe0f",
+    "\ufeff",
+    "\U000e0041",
+    "\U000e0101",
+    "A",
+    "B_pC",
+    "é",
+    "[red]",
+)
+
+
+def foreign_name(rng):
+    return "".join(rng.choice(CHARACTERS) for _ in range(rng.choice((1, 2, 3, 12, 60))))
+
+
+def foreign_names(rng):
+    return [foreign_name(rng) for _ in range(3)]
+
+
+def check_terminal_text(text):
+    harmful = {character for character in text if unicodedata.category(character) in HARMFUL_CATEGORIES}
+    harmful |= {character for character in text if character in "\u115f\u3164\ufe0f\U000e0101"}
+    assert harmful <= {"\n"}, ascii(text)
+
+
+@contextlib.contextmanager
+def checked_terminal():
+    """Check all that the block prints, also if it ends with an error, whose message is printed as by a command."""
+    stdout, stderr = io.StringIO(newline=""), io.StringIO(newline="")
+    with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stderr):
+        try:
+            with warnings_to_stderr():
+                yield
+        except IsochargeError as error:
+            say(f"{type(error).__name__}: {error}")
+    check_terminal_text(stdout.getvalue())
+    check_terminal_text(stderr.getvalue())
+
+
+def json_lines(names):
+    for number in range(12):
+        values = {name: 1.5 * position + 0.1 * (number % 3) for position, name in enumerate(names)}
+        yield json.dumps({"seq": number} | values, ensure_ascii=number % 2 == 0).encode("utf-8") + b"\n"
+
+
+def without_separators(names):
+    """The names as notations with separators can carry them, so that the lines are recognised."""
+    for position, name in enumerate(names):
+        kept = (character for character in name if not character.isspace() and character not in ":;=,\x1c\x1d\x1e")
+        yield "A" + "".join(kept) + str(position)
+
+
+def teleplot_lines(names):
+    for number in range(12):
+        for name in without_separators(names):
+            yield f">{name}:{number}:{1.5 + 0.1 * (number % 3)}§{name}\n".encode()
+
+
+def csv_lines(names):
+    yield (",".join(names) + "\n").encode()
+    for number in range(12):
+        yield b"1.5,2.5,%d\n" % (number % 3)
+
+
+def pair_lines(names):
+    for number in range(12):
+        yield (",".join(f"{name}:{1.5 + 0.1 * (number % 3)}" for name in without_separators(names)) + "\n").encode()
+
+
+NOTATIONS = {"json": json_lines, "teleplot": teleplot_lines, "csv": csv_lines, "pairs": pair_lines}
+
+
+@pytest.mark.parametrize("notation", NOTATIONS)
+def test_names_of_a_board_through_the_doctor(notation, attack):
+    def read(names):
+        chunks = [Chunk(data, 1.7e9 + 0.005 * number, 0) for number, data in enumerate(NOTATIONS[notation](names))]
+        with checked_terminal():
+            examination = findings(Heard("/dev/ttyACM0", 115200, chunks=chunks, seconds=1.0))
+            show("\n".join(report_lines(examination)))
+            show_json(asdict(examination))
+            comments = [line for line in device_text(examination).splitlines() if line.startswith("#")]
+            check_terminal_text("\n".join(comments))
+
+    attack(f"doctor {notation}", read, foreign_names, 500, longest_s=10.0)
+
+
+@pytest.mark.parametrize("notation", NOTATIONS)
+def test_names_of_a_board_through_the_stream(notation, attack):
+    predictor = Predictor("three-25um-biaxial")
+
+    def read(names):
+        with checked_terminal():
+            channels = dict(zip("ABC", names, strict=True))
+            device = device_from_table({"name": names[0], "channels": channels}, names[0])
+            touch = TouchStream(predictor, device)
+            for data in NOTATIONS[notation](names[::-1] if len(names[0]) > 3 else names):
+                for record in touch.feed(Chunk(data, 1.7e9, 0)):
+                    show(record.to_json())
+            logging.getLogger("isocharge.serve").warning("%s", names)
+
+    attack(f"stream {notation}", read, foreign_names, 2_000)
+
+
+def test_device_files_with_foreign_keys(attack):
+    def read(names):
+        with checked_terminal():
+            device_from_table({"name": names[0], names[1]: {names[2]: names[0]}, "frames": {"format": names[2]}}, "f")
+
+    attack("foreign device file", read, foreign_names, 2_000)
+
+
+def test_metadata_of_models(attack):
+    good = load_model(find_model("three-25um-biaxial")).metadata.to_props()
+
+    def read(names):
+        key = ("electrodes", "sensor", "probes", "name", "noise")[len(names[0]) % 5]
+        content = {"electrodes": names, "sensor": {"name": names[0]}, "probes": names, "noise": {names[0]: names[1]}}
+        with checked_terminal():
+            props = good | {key: json.dumps(content.get(key, names[0]))}
+            metadata = ModelMetadata.from_props(props, names[2])
+            show(metadata.label)
+            print(csv_header(metadata.electrodes))
+            print(metadata.frame_id)
+
+    attack("foreign metadata", read, foreign_names, 2_000)
+
+
+def test_headers_of_csv_files(attack):
+    def read(names):
+        with checked_terminal():
+            header = ",".join(["A", "B", "C", *names])
+            read_charges([header, "1,2,3,4,5,6"], ("A", "B", "C"), names[0], say)
+
+    attack("foreign csv", read, foreign_names, 2_000)
+
+
+def test_recordings(attack, tmp_path):
+    path = tmp_path / "foreign.rec"
+
+    def read(names):
+        path.unlink(missing_ok=True)
+        with checked_terminal():
+            with Recorder(path, names[0], "every", {"name": names[1]}, names[2]):
+                pass
+            recording = Recording(path)
+            print(recording.name)
+            device_from_table(recording.device, recording.model)
+
+    attack("foreign recording", read, foreign_names, 1_000)
