@@ -15,6 +15,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError, shown, told_where
 from isocharge.serve.prediction.tables.csv_table import csv_text
+from isocharge.serve.prediction.tables.header_advice import ColumnMeaning
 from isocharge.serve.prediction.tables.number_table import (
     CHARGE_RULE,
     MOST_COLUMNS,
@@ -39,12 +40,17 @@ TEMPERATURE = "temperature_C"
 COLDEST_C, WARMEST_C = -100.0, 200.0
 """Range of temperatures that a film of PVDF may have."""
 
-_POSITION = ColumnRule("a position in mm, or an empty cell if it is unknown")
+_POSITION = "a position in mm, or an empty cell if it is unknown"
+_FORCE_WORDS = frozenset({"force", "kraft", "fuerza", "forza", "f", "load", "last"})
 
 PRESS_RULES = {
-    "x_mm": _POSITION,
-    "y_mm": _POSITION,
-    "force_N": ColumnRule("a positive force in N, or an empty cell if it is unknown", is_positive=True),
+    "x_mm": ColumnRule(_POSITION, meaning=ColumnMeaning(unit="mm", words=frozenset({"x"}))),
+    "y_mm": ColumnRule(_POSITION, meaning=ColumnMeaning(unit="mm", words=frozenset({"y"}))),
+    "force_N": ColumnRule(
+        "a positive force in N, or an empty cell if it is unknown",
+        is_positive=True,
+        meaning=ColumnMeaning(unit="N", words=_FORCE_WORDS, is_known_by_unit=True),
+    ),
     "position_std_mm": ColumnRule("a positive standard deviation in mm", is_positive=True),
     "force_std": ColumnRule("a positive share of the force up to 1 (0.01 is 1 %)", maximum=1.0, is_positive=True),
     TEMPERATURE: ColumnRule(
@@ -236,12 +242,12 @@ def read_presses(
     with open_table(path, (*(electrodes or ()), *PRESS_RULES), PressError, expected) as table:
         if electrodes is None:
             electrodes = [name for name in table.header if name and name not in PRESS_RULES]
+            table.refuse_similar_names([name for name in electrodes if len(name) > 1], PRESS_RULES)
         names = tuple(electrodes)
         with told_where(f"{path}: ", PressError):
             _check_electrodes(names)
-        chosen = table.choose_columns(names, PRESS_RULES)
-        rules = PRESS_RULES | dict.fromkeys(names, CHARGE_RULE)
-        columns = table.read({name: rules[name] for name in chosen}, MOST_ROWS)
+        chosen = table.choose_columns(dict.fromkeys(names, CHARGE_RULE), PRESS_RULES)
+        columns = table.read(chosen, MOST_ROWS)
         ignored = tuple(name for name in table.header if name not in chosen)
     count = len(columns.row_numbers)
     if not count:
@@ -277,8 +283,8 @@ def read_press_list(path: Path) -> Array:
     """
     path = Path(path)
     with open_table(path, CONTACT, PressError, f"a header with {', '.join(CONTACT)}") as table:
-        table.choose_columns(CONTACT)
-        columns = table.read({name: PRESS_RULES[name] for name in CONTACT}, MOST_ROWS)
+        chosen = table.choose_columns({name: PRESS_RULES[name] for name in CONTACT})
+        columns = table.read(chosen, MOST_ROWS)
     count = len(columns.row_numbers)
     if not count:
         raise PressError(f"{path}: expected one press or more below the header, got none")

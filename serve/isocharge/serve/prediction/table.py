@@ -79,12 +79,12 @@ def _expected_header(electrodes: tuple[str, ...]) -> str:
 
 def _charges(table: NumberTable, electrodes: tuple[str, ...], warn: Callable[[str], None]) -> Array:
     """Read the charges of a table, shape (n, electrodes), pC."""
-    table.choose_columns(electrodes)
+    rule = replace(CHARGE_RULE, may_be_empty=False)
+    chosen = table.choose_columns(dict.fromkeys(electrodes, rule))
     ignored = [name for name in table.header if name not in electrodes]
     if ignored:
         warn(ignored_words(table.where, ignored))
-    rule = replace(CHARGE_RULE, may_be_empty=False)
-    columns = table.read(dict.fromkeys(electrodes, rule), MOST_CHARGE_ROWS)
+    columns = table.read(chosen, MOST_CHARGE_ROWS)
     return np.column_stack([columns.values[name] for name in electrodes])
 
 

@@ -4,6 +4,7 @@ A line that begins with # is a comment, unless it is inside a quoted cell. Blank
 number do not matter. A number has a decimal point and possibly an exponent; `nan` and `inf` are not accepted.
 """
 
+import codecs
 import csv
 import io
 import math
@@ -20,6 +21,18 @@ from isocharge.serve.prediction.tables.number_table import ColumnRule, NumberCol
 
 _SEPARATORS = {";": "tr ',;' '.,'", "\t": r"tr '\t' ','"}
 """Other separators of spreadsheets, and the command that turns such a file into CSV with decimal points."""
+
+_OTHER_FORMATS = {
+    codecs.BOM_UTF32_LE: "the file is UTF-32: save it as UTF-8, as with: iconv -f UTF-32 -t UTF-8 FILE > NEW.csv",
+    codecs.BOM_UTF16_LE: "the file is UTF-16: save it as UTF-8, as with: iconv -f UTF-16 -t UTF-8 FILE > NEW.csv",
+    codecs.BOM_UTF16_BE: "the file is UTF-16: save it as UTF-8, as with: iconv -f UTF-16 -t UTF-8 FILE > NEW.csv",
+    b"PK\x03\x04": "the file is a workbook of a spreadsheet or a zip file: save the sheet as CSV in UTF-8",
+    b"PAR1": "the file is Parquet: rename it so that its name ends in .parquet",
+    b"\x1f\x8b": "the file is compressed: unpack it, as with: gunzip < FILE > NEW.csv",
+}
+"""What a file is that is not text in UTF-8, and what to do, by its first bytes. UTF-32 begins as UTF-16 does."""
+
+BYTE_ORDER_MARK = "\ufeff"
 
 
 class CsvTable(NumberTable):
@@ -47,6 +60,11 @@ class CsvTable(NumberTable):
         _, header = next(self._rows, (0, None))
         if header is None:
             raise error(f"{where}: empty; expected {expected}")
+        if any("\0" in name for name in header):
+            raise error(
+                f"{where}: the header has null characters: the file seems to be UTF-16 without a byte order mark; save "
+                "it as UTF-8, as with: iconv -f UTF-16LE -t UTF-8 FILE > NEW.csv"
+            )
         super().__init__(header, names, where, error, expected)
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
@@ -111,7 +129,8 @@ def _numbered_rows(
 
     def lines_without_comments() -> Iterator[str]:
         nonlocal begins_row
-        for line in lines:
+        for index, text in enumerate(lines):
+            line = text.removeprefix(BYTE_ORDER_MARK) if index == 0 else text
             is_comment = begins_row and _is_comment(line, names)
             begins_row = False
             yield "\n" if is_comment else line
@@ -127,10 +146,25 @@ def _numbered_rows(
     except csv.Error as cause:
         raise error(f"{where}, line {reader.line_num}: not CSV text ({cause})") from cause
     except UnicodeDecodeError as cause:
+        is_first_piece = reader.line_num == 0
+        other_format = _other_format(cause.object) if is_first_piece else None
+        if other_format:
+            raise error(f"{where}: {other_format}") from cause
         line_number = reader.line_num + 1 + cause.object[: cause.start].count(b"\n")
-        raise error(f"{where}, line {line_number}: not CSV text in UTF-8 ({cause})") from cause
+        raise error(
+            f"{where}, line {line_number}: the byte 0x{cause.object[cause.start]:02x} is not text in UTF-8: save the "
+            "file as UTF-8; if it is Windows or Latin-1 text, as with: iconv -f WINDOWS-1252 -t UTF-8 FILE > NEW.csv"
+        ) from cause
     except ValueError as cause:  # a line that is too long to be held
         raise error(f"{where}, line {reader.line_num + 1}: not CSV text ({cause})") from cause
+
+
+def _other_format(data: bytes) -> str | None:
+    """Return what a file is that begins with some bytes, and what to do; None if it may be text in one byte each."""
+    for mark, advice in _OTHER_FORMATS.items():
+        if data.startswith(mark):
+            return advice
+    return None
 
 
 def _is_comment(line: str, names: Collection[str]) -> bool:

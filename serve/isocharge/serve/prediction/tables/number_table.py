@@ -7,13 +7,15 @@ message in every format.
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import islice
 from typing import ClassVar, NoReturn
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import InputError, shown
+from isocharge.serve.prediction.tables.header_advice import ColumnMeaning, header_advice
 
 MOST_COLUMNS = 1_000
 """Largest number of columns of a file."""
@@ -35,6 +37,7 @@ class ColumnRule:
         maximum: Largest number that is accepted.
         is_positive: Whether only numbers above zero are accepted.
         may_be_empty: Whether empty cells are accepted.
+        meaning: How other programs may call the column, for advice on a header.
     """
 
     description: str
@@ -42,6 +45,7 @@ class ColumnRule:
     maximum: float = LARGEST
     is_positive: bool = False
     may_be_empty: bool = True
+    meaning: ColumnMeaning = field(default_factory=ColumnMeaning)
 
     def violations(self, values: Array) -> Booleans:
         """Return which values break the rule, shape (n,), from values of shape (n,) with NaN for an empty cell."""
@@ -54,7 +58,7 @@ class ColumnRule:
         return np.asarray(is_outside)
 
 
-CHARGE_RULE = ColumnRule("a charge in pC")
+CHARGE_RULE = ColumnRule("a charge in pC", meaning=ColumnMeaning("electrode", "pC"))
 """Rule of the columns of charges."""
 
 
@@ -140,20 +144,35 @@ class NumberTable(ABC):
         self.error = error
         self.expected = expected
 
-    def choose_columns(self, required: Iterable[str], optional: Iterable[str] = ()) -> tuple[str, ...]:
-        """Return the names of the columns to read: the required ones, then the optional ones that the file has.
+    def choose_columns(
+        self, required: Mapping[str, ColumnRule], optional: Mapping[str, ColumnRule] | None = None
+    ) -> dict[str, ColumnRule]:
+        """Return the rules of the columns to read: the required columns, then the optional ones that the file has.
 
         Raises:
-            error: If a required column is missing, or if the file has one of the columns twice.
+            error: If a required column is missing, if an optional column is named almost as expected, or if the file
+                has one of the columns twice. The message says which column to rename.
         """
-        chosen = (*required, *(name for name in optional if name in self.header))
+        allowed = {**required, **(optional or {})}
+        chosen = {name: rule for name, rule in allowed.items() if name in self.header or name in required}
+        other_columns = [name for name in self.header if name not in chosen]
         missing = [name for name in chosen if name not in self.header]
         if missing:
-            self._refuse_header(f"missing: {_listed(missing)}")
+            absent = {name: rule.meaning for name, rule in allowed.items() if name not in self.header}
+            advice = header_advice(other_columns, absent)
+            self._refuse_header("; ".join([f"missing: {_listed(missing)}", *islice(advice, MOST_LISTED_NAMES)]))
         repeated = [name for name in chosen if self.header.count(name) > 1]
         if repeated:
             self._refuse_header(f"repeated: {_listed(repeated)}")
+        self.refuse_similar_names(other_columns, optional or {})
         return chosen
+
+    def refuse_similar_names(self, columns: Iterable[str], optional: Mapping[str, ColumnRule]) -> None:
+        """Raise `error` if columns are named almost as optional columns that the file does not have."""
+        absent = {name: rule.meaning for name, rule in optional.items() if name not in self.header}
+        advice = list(islice(header_advice(columns, absent), MOST_LISTED_NAMES))
+        if advice:
+            self._refuse_header(f"{'; '.join(advice)}; or remove the column")
 
     def read(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
         """Read columns and check their values.

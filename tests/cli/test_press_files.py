@@ -1,0 +1,56 @@
+"""Every command that reads a file of presses refuses the same faults with the same words."""
+
+import pytest
+
+COMMANDS = {
+    "predict": ("serve", "predict", "four-25um-biaxial"),
+    "check": ("serve", "check", "four-25um-biaxial"),
+    "calibrate": ("train", "calibrate", "--sensor", "four-25um-biaxial", "-o", "film"),
+    "fit": ("train", "fit", "--sensor", "four-25um-biaxial", "-o", "models/rig"),
+    "fit alone": ("train", "fit", "-o", "models/pad"),
+}
+"""Words of the commands, to which the file is appended."""
+
+PRESS = "1,2,0.5,100,200,300,400\n"
+
+
+@pytest.fixture
+def refuses(refused, tmp_path, monkeypatch):
+    """Check that a command refuses a file, and that nothing but the file is left."""
+    monkeypatch.chdir(tmp_path)
+
+    def check(name, data, said, suffix="csv"):
+        (tmp_path / f"p.{suffix}").write_bytes(data)
+        refused(*COMMANDS[name], f"p.{suffix}", said=said)
+        assert [path.name for path in tmp_path.iterdir()] == [f"p.{suffix}"]
+
+    return check
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_file_in_utf_16(refuses, name):
+    data = f"x_mm,y_mm,force_N,A,B,C,D\n{PRESS}".encode("utf-16")
+    refuses(name, data, "p.csv: the file is UTF-16: save it as UTF-8")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_file_in_latin_1(refuses, name):
+    data = f"x_mm,y_mm,Maßkraft,A,B,C,D\n{PRESS}".encode("latin-1")
+    refuses(name, data, "p.csv, line 1: the byte 0xdf is not text in UTF-8: save the file as UTF-8")
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "fit alone"])
+def test_electrodes_in_lower_case(refuses, name):
+    data = f"x_mm,y_mm,force_N,a,b,c,d\n{PRESS}".encode()
+    refuses(name, data, "column 'a' differs from electrode 'A' only by case: rename it to 'A'")
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "predict"])
+def test_a_force_in_another_language(refuses, name):
+    data = f"x_mm,y_mm,Kraft [N],A,B,C,D\n{PRESS}".encode()
+    refuses(name, data, "rename 'Kraft [N]' to 'force_N'")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_file_that_is_named_as_parquet_and_is_none(refuses, name):
+    refuses(name, f"x_mm,y_mm,force_N,A,B,C,D\n{PRESS}".encode(), "p.parquet: not a Parquet file", suffix="parquet")
