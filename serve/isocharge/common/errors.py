@@ -149,6 +149,10 @@ class PortLost(PortError):
     """A port went away while it was read."""
 
 
+class NoFramesError(PortError):
+    """The bytes of a port contain no frames of a known format."""
+
+
 class TareError(IsochargeError, RuntimeError):
     """The film was not left alone while it was tared."""
 

@@ -340,3 +340,52 @@ def test_a_file_waits_for_a_slow_reader(models, frames):
     """Nothing is lost of a file, however slow the reader is."""
     script = f"{ISOCHARGE} serve stream linear --port {frames} --models {models} | (sleep 1; wc -l)"
     assert bash(script).stdout == "300\n"
+
+
+@pytest.mark.parametrize("reader", ["stream", "doctor"])
+def test_a_recording_as_a_port_names_replay(recorded, models, refused, reader):
+    path, _ = recorded
+    words = ["stream", "linear", "--models", models] if reader == "stream" else ["doctor"]
+    refused("serve", *words, "--port", path, said=f"got a recording; play it with: isocharge serve replay {path}")
+
+
+def test_a_board_that_is_not_recognised_names_the_doctor(models, command):
+    """Bytes that are no frames end the stream; few of them, or none, are named at its end."""
+    noise = bytes(range(128, 256))
+    for rows, seconds, code in ([noise] * 200, 30.0, 1), ([noise], 0.5, 0):
+        with VirtualBytes(rows) as board:
+            result = command(
+                *("serve", "stream", "linear", "--models", models, "--port", board.url, "--seconds", seconds)
+            )
+            message = f"isocharge serve doctor --port {board.url} --write board.toml"
+            assert result[0] == code
+            assert message in result[2]
+            assert "Traceback" not in result[2]
+
+
+class VirtualBytes:
+    """A board that sends some pieces of bytes, then nothing; a context manager."""
+
+    def __init__(self, pieces):
+        self._pieces = pieces
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"tcp://127.0.0.1:{self._server.getsockname()[1]}"
+        self._thread = threading.Thread(target=self._send)
+        self._done = threading.Event()
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def _send(self):
+        connection, _ = self._server.accept()
+        with connection:
+            time.sleep(0.2)
+            for piece in self._pieces:
+                connection.sendall(piece)
+            self._done.wait(20.0)
+
+    def __exit__(self, *_):
+        self._done.set()
+        self._thread.join()
+        self._server.close()

@@ -53,7 +53,7 @@ def test_chunk_has_the_bytes_unchanged_and_the_time_of_arrival(board):
     ("url", "said"),
     [
         ("/dev/ttyNone", "there is no such port: plug the board in"),
-        ("/etc/hostname", r"cannot be opened at 115200 baud .*check the cable"),
+        ("/dev/null", r"cannot be opened at 115200 baud .*check the cable"),
         ("socket://127.0.0.1:1", r"cannot be opened \(.*refused\); check the host and the port number"),
         ("telepathy://x", r"cannot be opened \(invalid URL"),
         *(
@@ -65,7 +65,7 @@ def test_chunk_has_the_bytes_unchanged_and_the_time_of_arrival(board):
 def test_port_that_cannot_be_opened(url, said):
     with pytest.raises(PortError, match=f"^{url}: {said}") as caught, Port(url):
         pass
-    assert ("baud" in str(caught.value)) == url.startswith("/etc")
+    assert ("baud" in str(caught.value)) == (url == "/dev/null")
 
 
 @pytest.mark.parametrize("make", [Port, open_source])

@@ -26,6 +26,7 @@ from isocharge.cli.serve.records import (
 )
 from isocharge.cli.shared.live_page import LiveOption, PageFeed, TokenOption, answering, live_page, page_address
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption
+from isocharge.cli.shared.port_hints import doctor_is_named, no_frames_hint
 from isocharge.cli.shared.terminal import (
     on_signal,
     say,
@@ -194,10 +195,13 @@ def stream_command(
         records = stack.enter_context(closing(recorded.follow(source)))  # closed before the recorder
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
-            write_records(islice(records, count), writers, latencies)
+            with doctor_is_named(port, device):
+                write_records(islice(records, count), writers, latencies)
         finally:
             lines.close()
             say(summary(path, latencies, lines.lost))
+    if path.totals().frames == 0:
+        say(f"no frames were recognised; {no_frames_hint(port, device)}")
     if (recorder and recorder.failed) or (mcap_output and not mcap_output.is_whole):
         raise typer.Exit(1)
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import ChargeError, PortError, TareError, cut
+from isocharge.common.errors import ChargeError, NoFramesError, TareError, cut
 from isocharge.serve.flags import RECONNECTED
 from isocharge.serve.frames.frame import SATURATED_BIT, Frame, Parser, SequenceGaps
 from isocharge.serve.live.device import ANY_BOARD, Device
@@ -170,7 +170,7 @@ class ReadingStream:
         Raises:
             ChargeError: If a frame has another number of charges.
             TareError: If the film is not left alone to tare.
-            PortError: If the bytes are no frames.
+            NoFramesError: If the bytes are no frames.
         """
         frames = self.frames(chunk)
         for frame in frames:
@@ -213,7 +213,7 @@ class ReadingStream:
         """A chunk is over: its arrival sets the clock; bytes that are no frames are refused.
 
         Raises:
-            PortError: If there was not one intact frame among many bytes.
+            NoFramesError: If there was not one intact frame among many bytes.
         """
         if frames:
             self.clock.arrived(chunk.timestamp)
@@ -224,7 +224,7 @@ class ReadingStream:
         """End the stream, as at the end of a file.
 
         Raises:
-            PortError: If there was not one intact frame.
+            NoFramesError: If there was not one intact frame.
         """
         _check_recognised(self.parser, allowed=-1)
 
@@ -240,7 +240,7 @@ class ReadingStream:
 def _check_recognised(parser: Parser, allowed: int = BYTES_TO_RECOGNISE) -> None:
     counts = parser.counts
     if counts.frames == 0 and counts.bytes_dropped > allowed:
-        raise PortError(
+        raise NoFramesError(
             f"no intact frame among the first {counts.bytes_dropped} bytes ({counts.crc_errors} with a wrong CRC, "
             f"{counts.malformed} of another form); {parser.format}: check baud rate and device"
         )

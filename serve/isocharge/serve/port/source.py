@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 from isocharge.common.errors import InputError, PortError, PortLost
+from isocharge.serve.port.foreign_files import HEAD_BYTES, refuse_foreign_file
 from isocharge.serve.port.serial_line import (
     HAS_POSIX_PORTS,
     OPEN_ERRORS,
@@ -102,6 +103,7 @@ class Port:
 
         Raises:
             PortError: If the port cannot be opened, or not in time.
+            InputError: If the port is a file.
         """
         deadline_s = time.monotonic() + self._wait
         while True:
@@ -118,6 +120,8 @@ class Port:
         is_path = "://" not in self.url
         if is_path and HAS_POSIX_PORTS and not Path(self.url).exists():
             raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
+        if is_path and Path(self.url).is_file():
+            _refuse_file(Path(self.url))
         try:
             if self.url.startswith(UDP_SCHEME):
                 self._line = UdpSocket(self.url)
@@ -260,6 +264,7 @@ class FileSource:
 
     Args:
         descriptor: File descriptor, open for reading.
+        name: Path of the file, or - for the standard input.
 
     Attributes:
         outages: Always 0.
@@ -269,14 +274,23 @@ class FileSource:
     outages = 0
     is_live = False
 
-    def __init__(self, descriptor: int) -> None:
+    def __init__(self, descriptor: int, name: str) -> None:
         self._descriptor = descriptor
+        self._name = name
 
     def __iter__(self) -> Iterator[Chunk]:
-        """Yield chunks until the file ends. All bytes of a file on a disk arrive at the time at which it is opened."""
+        """Yield chunks until the file ends. All bytes of a file on a disk arrive at the time at which it is opened.
+
+        Raises:
+            InputError: If the file is a recording, a table or another file that does not come from a board.
+        """
         opened_s = time.time()
         is_on_disk = stat.S_ISREG(os.fstat(self._descriptor).st_mode)
+        is_start = True
         while data := os.read(self._descriptor, CHUNK_BYTES):
+            if is_start:
+                refuse_foreign_file(self._name, data)
+            is_start = False
             arrival_s = opened_s if is_on_disk else time.time()
             yield Chunk(data, arrival_s, time.perf_counter_ns())
 
@@ -298,10 +312,11 @@ def open_source(
         wait: Time to wait until the port can be opened or the file exists, s.
 
     Raises:
-        InputError: If the file cannot be read.
+        InputError: If the file cannot be read, or is a recording, a table or another file that does not come from a
+            board.
     """
     if url == STDIN:
-        return contextlib.nullcontext(FileSource(sys.stdin.fileno()))
+        return contextlib.nullcontext(FileSource(sys.stdin.fileno(), STDIN))
     deadline_s = time.monotonic() + wait
     is_path = "://" not in url
     while is_path and not Path(url).exists() and time.monotonic() < deadline_s:
@@ -310,6 +325,19 @@ def open_source(
         return _open_file(Path(url))
     remaining_s = max(0.0, deadline_s - time.monotonic())
     return Port(url, baud=baud, silence_s=silence_s, reconnect=reconnect, request=request, wait=remaining_s)
+
+
+def _refuse_file(path: Path) -> None:
+    """Refuse a file where only a port is possible.
+
+    Raises:
+        InputError: Always.
+    """
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        refuse_foreign_file(str(path), file.read(HEAD_BYTES))
+    raise InputError(
+        f"{path}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a board from a file"
+    )
 
 
 def _is_file_or_pipe(path: Path) -> bool:
@@ -326,4 +354,6 @@ def _open_file(path: Path) -> Iterator[FileSource]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a file of frames") from error
     with file:
-        yield FileSource(file.fileno())
+        if path.is_file():
+            refuse_foreign_file(str(path), os.pread(file.fileno(), HEAD_BYTES, 0))
+        yield FileSource(file.fileno(), str(path))

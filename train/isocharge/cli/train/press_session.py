@@ -9,6 +9,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
+from isocharge.cli.shared.port_hints import doctor_is_named
 from isocharge.cli.shared.terminal import say, show_json
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, Screen
 from isocharge.common.errors import InputError, PressError, told_where
@@ -104,6 +105,7 @@ def _events(port: PressPort, problem: CalibrationProblem) -> Iterator[PressEvent
     stream = ReadingStream(problem.electrodes, board, reader=f"sensor {problem.sensor.name}")
     keyboard = None if machine or port.yes else _keyboard()
     with (
+        doctor_is_named(port.url, port.device),
         open_source(port.url, baud=port.baud, reconnect=not machine, request=board.request) as source,
         PressEvents(source, stream, PressWatch(problem.electrodes), keyboard) as events,
     ):

@@ -1,0 +1,40 @@
+"""Hints for a port whose bytes contain no frames of a known format."""
+
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from isocharge.common.errors import NoFramesError
+from isocharge.serve.port.source import STDIN
+
+
+@contextmanager
+def doctor_is_named(port: str, device: Path | None) -> Iterator[None]:
+    """Add the next command to the message if the bytes of a port contain no frames.
+
+    Args:
+        port: Value of `--port`.
+        device: Value of `--device`.
+
+    Raises:
+        NoFramesError: If the block raises it.
+    """
+    try:
+        yield
+    except NoFramesError as error:
+        raise NoFramesError(f"{error}; {no_frames_hint(port, device)}") from error
+
+
+def no_frames_hint(port: str, device: Path | None) -> str:
+    """Return what to do about a port whose bytes contain no frames of a known format.
+
+    Args:
+        port: Value of `--port`.
+        device: Value of `--device`.
+    """
+    if port == STDIN or Path(port).is_file():
+        return "describe the board in a device file (--device)"
+    wrong_device = f"{device} may describe another board; " if device is not None else ""
+    command = f"isocharge serve doctor --port {shlex.quote(port)} --write board.toml"
+    return f"{wrong_device}to find out what the board sends: {command}"

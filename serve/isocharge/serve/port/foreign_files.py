@@ -1,0 +1,77 @@
+"""Files that are given as a port by mistake: recordings, records, tables of presses, MCAP and Parquet files.
+
+The lines of such files contain numbers, which the parsers of text would read as the charges of a board.
+"""
+
+import shlex
+
+from isocharge.common.errors import InputError
+
+HEAD_BYTES = 4096
+"""Number of bytes at the start of a file by which its kind is recognised."""
+
+RECORDING_START = b'{"isocharge_recording"'
+RECORD_KEYS = (b'"frame_id"', b'"charge_pC"', b'"tare_pC"')
+MCAP_START = b"\x89MCAP"
+PARQUET_START = b"PAR1"
+
+PRESS_COLUMNS = frozenset({"x_mm", "y_mm", "force_N", "charge_pC.A", "flags"})
+"""Columns that only tables of presses and records have."""
+
+COLUMNS_OF_BOARDS = frozenset({"seq", "t_us", "t_ms", "t_s"})
+"""Columns that only lines from boards have."""
+
+
+def refuse_foreign_file(name: str, head: bytes) -> None:
+    """Refuse a file that does not contain the bytes of a board.
+
+    Args:
+        name: Path of the file, or - for the standard input.
+        head: Its first bytes.
+
+    Raises:
+        InputError: If the file is of another kind. The message names the command that reads the file.
+    """
+    kind_and_command = _kind_and_command(name, head)
+    if kind_and_command is not None:
+        kind, command = kind_and_command
+        raise InputError(f"{name}: expected a port, or a file of bytes from a board, got {kind}; {command}")
+
+
+def _kind_and_command(name: str, head: bytes) -> tuple[str, str] | None:
+    """Return the kind of a file and what to do with the file; None for bytes of a board."""
+    file = shlex.quote(name)
+    first_line = head.removeprefix(b"\xef\xbb\xbf").lstrip().partition(b"\n")[0]
+    if first_line.startswith(RECORDING_START):
+        return "a recording", f"play it with: isocharge serve replay {file}"
+    if first_line.startswith(b"{") and all(key in first_line for key in RECORD_KEYS):
+        return (
+            "records of `serve stream`",
+            "records hold results; record the board with `isocharge serve stream MODEL --port PORT --record touch.rec` "
+            "and play it with `isocharge serve replay touch.rec`",
+        )
+    if head.startswith(MCAP_START):
+        return (
+            "an MCAP file",
+            "MCAP files hold results, and isocharge only writes them; play the recording that was made beside it with "
+            "`isocharge serve replay touch.rec`",
+        )
+    if head.startswith(PARQUET_START):
+        return "a Parquet file", f"compute its contacts with: isocharge serve predict MODEL {file}"
+    if _is_table_of_presses(name, first_line):
+        return (
+            "a table of presses",
+            f"compute its contacts with: isocharge serve predict MODEL {file}; if a board has sent these lines, use: "
+            f"isocharge serve stream MODEL --port - < {file}",
+        )
+    return None
+
+
+def _is_table_of_presses(name: str, first_line: bytes) -> bool:
+    """Return whether a file is a CSV with the columns of presses or records, or a .csv file with only electrodes."""
+    header = first_line.decode("utf-8", "replace").strip()
+    columns = {column.strip().strip('"') for column in header.split(",")}
+    if columns & PRESS_COLUMNS:
+        return True
+    has_names = len(columns) > 1 and all(column[:1].isalpha() for column in columns)
+    return name.endswith(".csv") and has_names and not columns & COLUMNS_OF_BOARDS

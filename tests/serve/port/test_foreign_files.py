@@ -1,0 +1,98 @@
+"""Recordings, records, tables, MCAP and Parquet files that are given as a port: the message names the right command."""
+
+import pyarrow as pa
+import pytest
+from mcap.writer import Writer
+from pyarrow.parquet import write_table
+
+from isocharge.common.errors import InputError
+from isocharge.serve import Frame, Port, Recorder, TouchStream, encode_text, open_source
+from isocharge.serve.live.outputs import csv_header
+from isocharge.serve.port.source import Chunk, FileSource
+
+
+def recording(path):
+    with Recorder(path, "linear/1", "every", {}) as recorder:
+        recorder.chunk(Chunk(b"A:1,B:2,C:3\n", 1.7e9, 0), [])
+
+
+def mcap(path):
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()
+
+
+def table(text):
+    return lambda path: path.write_text(text)
+
+
+FOREIGN = {
+    "touch.rec": (recording, r"got a recording; play it with: isocharge serve replay \S*touch.rec$"),
+    "touch.mcap": (mcap, "got an MCAP file; .*isocharge serve replay touch.rec"),
+    "presses.parquet": (
+        lambda path: write_table(pa.table({"A": [1.0]}), path),
+        "got a Parquet file; .*isocharge serve predict MODEL",
+    ),
+    "presses.csv": (table("A,B,C\n1,2,3\n"), "got a table of presses; .*isocharge serve predict MODEL .*--port - <"),
+    "measured.txt": (table("x_mm,y_mm,force_N,A,B,C\n1,2,3,4,5,6\n"), "got a table of presses"),
+    "touch.csv": (table(csv_header(("A", "B", "C")) + "\n"), "got a table of presses"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+@pytest.mark.parametrize("make", [open_source, Port])
+def test_a_foreign_file_as_a_port_names_the_command_that_reads_it(name, make, tmp_path):
+    write, message = FOREIGN[name]
+    write(tmp_path / name)
+    with pytest.raises(InputError, match=message), make(str(tmp_path / name)):
+        pass
+
+
+def test_records_as_a_port(tmp_path, predictor):
+    stream = TouchStream(predictor)
+    lines = b"".join(encode_text(Frame(number, None, (1.0, 2.0, 3.0)), "pairs") for number in range(3))
+    record = next(iter(stream.feed(Chunk(lines, 0.0, 0))))
+    path = tmp_path / "touch.jsonl"
+    path.write_text(record.to_json() + "\n")
+    message = r"got records of `serve stream`; .*--record touch\.rec"
+    with pytest.raises(InputError, match=message), open_source(str(path)):
+        pass
+
+
+def test_a_recording_on_stdin(tmp_path):
+    recording(tmp_path / "touch.rec")
+    with (tmp_path / "touch.rec").open("rb") as file, pytest.raises(InputError, match="got a recording"):
+        next(iter(FileSource(file.fileno(), "-")))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("lines.csv", "seq,t_us,A,B,C\n1,2,3,4,5\n"),
+        ("lines.csv", "801.2,799.5,803.3\n"),
+        ("lines.txt", "A,B,C\n1,2,3\n"),
+        ("lines.txt", '{"seq": 1, "A": 801.2}\n'),
+        ("lines.txt", '{"timestamp": 1.5, "charge_pC": [1, 2, 3]}\n'),
+        ("frames.bin", "\x01\x02\x03\x00"),
+    ],
+)
+def test_bytes_of_a_board_in_a_file_are_read(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_text(text)
+    with open_source(str(path)) as source:
+        assert b"".join(chunk.data for chunk in source) == text.encode()
+
+
+def test_lines_of_a_board_in_a_csv_file_are_read_from_stdin(tmp_path):
+    path = tmp_path / "lines.csv"
+    path.write_text("A,B,C\n1,2,3\n")
+    with path.open("rb") as file:
+        assert [chunk.data for chunk in FileSource(file.fileno(), "-")] == [b"A,B,C\n1,2,3\n"]
+
+
+def test_a_file_of_bytes_is_no_port_for_the_doctor(tmp_path):
+    path = tmp_path / "frames.bin"
+    path.write_bytes(b"\x01\x02")
+    with pytest.raises(InputError, match="expected a port, got a file; only `isocharge serve stream`"), Port(str(path)):
+        pass
