@@ -223,15 +223,120 @@ def test_deviations_that_are_too_small_are_multiplied():
     [
         (lambda given: given[:499], "expected at least 500 presses at 50 places with .* got 499 at 499; .*--sensor"),
         (lambda given: given.of_electrodes(("Q1", "Q2"), "us"), r"expected 3 to 8 channels, got 2 \(Q1, Q2\)"),
-        (
-            lambda given: measured(given.contact, given.charge_pC * [1, 1, 0, 1]),
-            "channel 'Q3': expected charges that vary, got 0 everywhere",
-        ),
     ],
 )
-def test_what_cannot_train_a_model_is_refused(change, message):
+def test_too_few_presses_or_channels_train_no_model(change, message):
     with pytest.raises(PressError, match=message):
         usable_presses(change(l_shaped()))
+
+
+def with_channel(channel, values):
+    """Return the presses of the L with other charges of one channel, which are a function of the charges."""
+    presses = l_shaped()
+    charge = presses.charge_pC.copy()
+    charge[:, channel] = values(charge)
+    return measured(presses.contact, charge)
+
+
+def with_contact(column, values):
+    """Return the presses of the L with another column of the contact, which is a function of the contact."""
+    presses = l_shaped()
+    contact = presses.contact.copy()
+    contact[:, column] = values(contact)
+    return measured(contact, presses.charge_pC)
+
+
+def once(value, column):
+    """Return a function that gives a column with another value in the eighth press."""
+    return lambda rows: np.where(np.arange(len(rows)) == 7, value, rows[:, column])
+
+
+JITTER = np.random.default_rng(5).standard_normal(1_200)
+
+FAULTY_PRESSES = {
+    "a copied channel": (
+        with_channel(1, lambda charge: charge[:, 0]),
+        r"channels 'Q1', 'Q2': expected charges that are linearly independent",
+    ),
+    "a copy in single precision": (
+        with_channel(1, lambda charge: charge[:, 0].astype(np.float32).astype(float)),
+        "channels 'Q1', 'Q2': expected charges that are linearly independent",
+    ),
+    "a scaled and shifted copy": (with_channel(3, lambda charge: 3.0 - 2.0 * charge[:, 1]), "channels 'Q2', 'Q4': "),
+    "a sum of channels": (with_channel(3, lambda charge: charge[:, 0] + charge[:, 2]), "channels 'Q1', 'Q3', 'Q4': "),
+    "a charge of 1e37": (
+        with_channel(2, once(1e37, 2)),
+        r"^line 9, column 'Q3': expected a value of the size of the others, whose median is .* got 1e\+37; correct it",
+    ),
+    "a charge of -1e6": (
+        with_channel(0, once(-1e6, 0)),
+        r"^line 9, column 'Q1': .* got -1e\+06; correct it, or remove",
+    ),
+    "a position in another unit": (with_contact(0, once(1e6, 0)), r"^line 9, column 'x_mm': .* got 1e\+06"),
+    "a force of 1e20": (with_contact(2, once(1e20, 2)), r"^line 9, column 'force_N': .* got 1e\+20"),
+    "a force of 1e-20": (with_contact(2, once(1e-20, 2)), "^line 9, column 'force_N': .* got 1e-20"),
+    "denormal charges": (
+        with_channel(1, lambda charge: 1e-310 * charge[:, 1]),
+        "channel 'Q2': expected charges in pC, of 1e-30 to 1e.30, got .*e-310 as the median .* check the unit",
+    ),
+    "huge charges": (with_channel(1, lambda charge: 1e35 * charge[:, 1]), "channel 'Q2': expected charges in pC"),
+    "a constant channel": (
+        with_channel(2, lambda charge: 0.0 * charge[:, 2]),
+        "channel 'Q3': expected charges that vary, got 0 everywhere; leave the channel out",
+    ),
+    "a channel that is constant but for rounding": (
+        with_channel(2, lambda charge: 5.0 + 1e-12 * charge[:, 2]),
+        "channel 'Q3': expected charges that vary, got 5 everywhere",
+    ),
+    "a channel with a single charge": (
+        with_channel(2, lambda _: np.where(np.arange(1_200) == 7, 5.0, 0.0)),
+        "channel 'Q3': expected charges that vary, got 0 in all but 1 of 1200 presses",
+    ),
+    "positions with one y": (with_contact(1, lambda _: np.full(1_200, 3.0)), "got 1200 places on one line"),
+    "positions with one y but for rounding": (
+        with_contact(1, lambda _: 3.0 + 1e-9 * JITTER),
+        "got 1200 places on one line; press beside it, too",
+    ),
+    "positions on a line": (with_contact(1, lambda contact: 2.0 * contact[:, 0]), "got 1200 places on one line"),
+    "one position": (with_contact(slice(2), lambda _: np.ones((1_200, 2))), "got 1200 at 1; measure more"),
+}
+"""Presses of which each has one fault, and the message that names the fault."""
+
+
+@pytest.mark.parametrize("fault", FAULTY_PRESSES)
+def test_faulty_presses_are_refused_before_the_training(fault):
+    presses, message = FAULTY_PRESSES[fault]
+    with pytest.raises(PressError, match=message):
+        fit_presses(presses, "pad", QUICK)
+
+
+def test_presses_of_one_force_are_learned_with_a_warning(caplog):
+    usable_presses(with_contact(2, lambda _: np.full(1_200, 2.0)))
+    assert "all presses have a force of about 2 N: the model can estimate no other force" in caplog.text
+    caplog.clear()
+    usable_presses(l_shaped())
+    assert not caplog.text
+
+
+def test_the_faults_are_found_in_no_intact_presses():
+    """Charges of any unit, channels that are mostly zero, a few percent of noise, and a measured pad."""
+    usable_presses(read_presses(ROOT / "tests" / "data" / "tactile_fsi.csv"))
+    given = l_shaped()
+    for unit in (1e-12, 1e12):
+        usable_presses(measured(given.contact, unit * given.charge_pC))
+    mostly_zero = np.random.default_rng(7).random((1_200, 4)) < 0.9
+    usable_presses(measured(given.contact, np.where(mostly_zero, 0.0, given.charge_pC)))
+    usable_presses(with_channel(1, lambda charge: charge[:, 0] * (1.0 + 0.01 * JITTER)))
+
+
+def test_a_faulty_file_leaves_no_folder(refused, tmp_path):
+    presses, _ = FAULTY_PRESSES["a copied channel"]
+    write_presses(tmp_path / "pad.csv", presses)
+    refused(
+        *("train", "fit", tmp_path / "pad.csv", "-o", tmp_path / "pad"),
+        said="channels 'Q1', 'Q2': expected charges that are linearly independent",
+    )
+    assert not (tmp_path / "pad").exists()
 
 
 @pytest.mark.slow

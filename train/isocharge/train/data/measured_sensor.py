@@ -19,6 +19,9 @@ LEAST_HOLE = 6.0
 LEAST_RANGE = 1.1
 """Least ratio of the largest to the smallest force: presses of one force are learned, too."""
 
+LEAST_WIDTH = 1e-3
+"""Smallest standard deviation of the places across the line on which they almost lie, relative to that along it."""
+
 LONGEST_MITRE = 2.0
 """Largest distance by which a corner moves out, over that of the sides."""
 
@@ -108,14 +111,16 @@ def outline(places: Array) -> Array:
         places: Different (x, y), shape (m, 2), mm.
 
     Raises:
-        PressError: If they lie on a line.
+        PressError: If they lie on a line, or almost.
     """
+    on_a_line = f"expected presses over an area, got {len(places)} places on one line; press beside it, too"
+    length, width = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+    if width <= LEAST_WIDTH * length:
+        raise PressError(on_a_line)
     try:
         triangles = Delaunay(places).simplices
     except QhullError as error:
-        raise PressError(
-            f"expected presses over an area, got {len(places)} places on one line; press beside it, too"
-        ) from error
+        raise PressError(on_a_line) from error
     spacing = float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
     sizes = _circumradii(places[triangles])
     limits = [*LEAST_HOLE * spacing * 2.0 ** np.arange(0.0, 20.0, 0.5), np.inf]

@@ -20,11 +20,12 @@ from msgspec import structs
 from torch import Tensor
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.common.errors import PressError
+from isocharge.common.errors import PressError, cut
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
-from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
+from isocharge.train.data.measured_checks import check_measured_presses
+from isocharge.train.data.measured_sensor import LEAST_RANGE, MeasuredSensor, PressedArea
 from isocharge.train.data.misfit_charges import draw_charges
 from isocharge.train.data.presses import (
     FEWEST,
@@ -80,11 +81,12 @@ def fit_presses(
         run: Keeps the state, so that a killed fit goes on.
 
     Raises:
-        PressError: If there are too few presses or places, or not three to eight channels that vary.
+        PressError: If there are too few presses or places, not three to eight channels, or a fault that
+            `check_measured_presses` finds.
         ConfigError: If a setting is out of its range.
         TrainingError: If the loss is not finite.
 
-    Warns the logger of this module of presses that are left out.
+    A warning is logged if presses are left out, and if all presses have the same force.
     """
     settings, usable = (config or FitConfig()).checked(), usable_presses(presses)
     known = LabelledPresses(usable.contact, usable.charge_pC, measured=True)
@@ -145,25 +147,30 @@ def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, o
 
 
 def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
-    """The presses of which everything is known; errors and warnings as `fit_presses`."""
-    names, (fewest, most) = presses.electrodes, CHANNELS
-    if not fewest <= len(names) <= most:
+    """Return the presses of which everything is known; errors and warnings as `fit_presses`."""
+    names = presses.electrodes
+    fewest_channels, most_channels = CHANNELS
+    if not fewest_channels <= len(names) <= most_channels:
         raise PressError(
-            f"expected {fewest} to {most} channels, got {len(names)} ({', '.join(names)}): every column without "
-            "another meaning is one; leave other columns out of the file"
+            f"expected {fewest_channels} to {most_channels} channels, got {len(names)} ({cut(', '.join(names))}): "
+            "every column without another meaning is one; leave other columns out of the file"
         )
+
     usable = presses[complete(presses)]
-    places = len(np.unique(np.round(usable.contact[:, :2], 3), axis=0))
-    if len(usable) < FEWEST or places < FEWEST_POSITIONS:
+    place_count = len(np.unique(np.round(usable.contact[:, :2], 3), axis=0))
+    if len(usable) < FEWEST or place_count < FEWEST_POSITIONS:
         raise PressError(
             f"expected at least {FEWEST} presses at {FEWEST_POSITIONS} places with known place, force and charges, got "
-            f"{len(usable)} at {places}; measure more, or describe the sensor (--sensor): 50 presses then suffice"
+            f"{len(usable)} at {place_count}; measure more, or describe the sensor (--sensor): 50 presses then suffice"
         )
-    for electrode, charge in zip(names, usable.charge_pC.T, strict=True):
-        if np.ptp(charge) == 0.0:
-            raise PressError(f"channel {electrode!r}: expected charges that vary, got {charge[0]:g} everywhere")
-    if left := len(presses) - len(usable):
-        _log.warning("%d of %d presses are left out: an unknown place, force or charge", left, len(presses))
+    check_measured_presses(usable)
+
+    left_out_count = len(presses) - len(usable)
+    if left_out_count:
+        _log.warning("%d of %d presses are left out: an unknown place, force or charge", left_out_count, len(presses))
+    force = usable.contact[:, 2]
+    if force.max() < LEAST_RANGE * force.min():
+        _log.warning("all presses have a force of about %.3g N: the model can estimate no other force", force.mean())
     return usable
 
 

@@ -1,0 +1,119 @@
+"""Checks of measured presses before a network is trained on them: the message names the cause of each fault.
+
+Without these checks the faults would end the training with a loss that is not finite, or give a model whose errors and
+misfits mean nothing.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import PressError, shown
+from isocharge.serve.prediction.measured_presses import CONTACT, MeasuredPresses
+from isocharge.train.data.channel_noise import usual_size
+from isocharge.train.data.measured_sensor import PressedArea
+
+USUAL_SIZES = (1e-30, 1e30)
+"""Range of the median size of the charges of a channel, pC: squares and shares of them are still float32 numbers."""
+
+LEAST_VARIATION = 1e-6
+"""Smallest range of the charges of a channel, relative to the largest size."""
+
+LEAST_VARYING_SHARE = 0.01
+"""Smallest share of the presses in which the charge of a channel differs from its most frequent value."""
+
+USUAL_SHARE = 0.9
+"""Share of the values of a column that lie in its usual range, dimensionless."""
+
+FARTHEST = 1_000.0
+"""Largest distance of a value from the median of its column, as a multiple of the usual range."""
+
+LEAST_INDEPENDENCE = 1e-4
+"""Smallest singular value of the standardised charges of independent channels, relative to the largest."""
+
+LEAST_PARTICIPATION = 1e-2
+"""Smallest coefficient of a channel that takes part in a linear dependence, relative to the largest coefficient."""
+
+
+def check_measured_presses(presses: MeasuredPresses) -> None:
+    """Check that a network can be trained on measured presses of which everything is known.
+
+    Raises:
+        PressError: If the charges of a channel hardly vary or are too small or too large, if a value is far from all
+            others, if channels depend linearly on each other, or if the positions enclose no area. The message names
+            the channels, or the line and the column.
+    """
+    channels = dict(zip(presses.electrodes, presses.charge_pC.T, strict=True))
+    contact_columns = dict(zip(CONTACT, presses.contact.T, strict=True))
+    for name, charge in channels.items():
+        _check_variation(name, charge)
+        _check_size(name, charge)
+    for name, values in {**contact_columns, **channels}.items():
+        _check_far_value(presses, name, values, values)
+    force = contact_columns["force_N"]
+    _check_far_value(presses, "force_N", force, 1.0 / force)
+    _check_independence(channels)
+    PressedArea.of(presses.contact)
+
+
+def _check_variation(name: str, charge: Array) -> None:
+    values, counts = np.unique(charge, return_counts=True)
+    if np.ptp(charge) <= LEAST_VARIATION * np.abs(charge).max():
+        raise PressError(
+            f"channel {shown(name)}: expected charges that vary, got {charge[0]:g} everywhere; leave the channel out"
+        )
+    varying_count = len(charge) - int(counts.max())
+    if varying_count < LEAST_VARYING_SHARE * len(charge):
+        raise PressError(
+            f"channel {shown(name)}: expected charges that vary, got {values[counts.argmax()]:g} in all but "
+            f"{varying_count} of {len(charge)} presses; leave the channel out"
+        )
+
+
+def _check_size(name: str, charge: Array) -> None:
+    size = float(usual_size(charge[:, np.newaxis])[0])
+    smallest, largest = USUAL_SIZES
+    if not smallest <= size <= largest:
+        raise PressError(
+            f"channel {shown(name)}: expected charges in pC, of {smallest:g} to {largest:g}, got {size:.3g} as the "
+            "median of their sizes; check the unit of the column"
+        )
+
+
+def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compared: Array) -> None:
+    """Refuse a value that is far from all others.
+
+    Args:
+        presses: The presses, for the number of the line.
+        name: The column, for the message.
+        values: Values of the column, shape (n,).
+        compared: Numbers that are compared, shape (n,): the values, or a function of them.
+    """
+    distance = np.abs(compared - np.median(compared))
+    if not distance.any():
+        return
+    usual_range = float(np.quantile(distance[distance > 0.0], USUAL_SHARE))
+    row = int(distance.argmax())
+    if distance[row] > FARTHEST * usual_range:
+        raise PressError(
+            f"{presses.row_noun} {presses.lines[row]}, column {shown(name)}: expected a value of the size of the "
+            f"others, whose median is {np.median(values):.3g}, got {values[row]:.6g}; correct it, or remove the "
+            f"{presses.row_noun}"
+        )
+
+
+def _check_independence(channels: Mapping[str, Array]) -> None:
+    charge = np.column_stack(list(channels.values()))
+    charge = charge / usual_size(charge)
+    standardised = (charge - charge.mean(axis=0)) / charge.std(axis=0)
+    _, singular, directions = np.linalg.svd(standardised, full_matrices=False)
+    if singular[-1] > LEAST_INDEPENDENCE * singular[0]:
+        return
+    coefficients = np.abs(directions[-1])
+    takes_part = coefficients > LEAST_PARTICIPATION * coefficients.max()
+    dependent = [shown(name) for name, is_part in zip(channels, takes_part, strict=True) if is_part]
+    raise PressError(
+        f"channels {', '.join(dependent)}: expected charges that are linearly independent, got channels of which each "
+        "follows from the others; leave out a channel that is a copy or a sum of others"
+    )
