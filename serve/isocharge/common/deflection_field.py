@@ -48,8 +48,8 @@ class DeflectionField:
         force_N: Forces, increasing, N.
         distance_mm: Distances of the probe from the centre, increasing from 0, mm.
         rings: Radii of the rings about the probe before the automorphism, from 0 to 1, in film radii.
-        deflection_mm: Shape (forces, distances, rings, angles), mm, positive the way the probe pushes; the angles go
-            from 0, outwards, to pi; the other half mirrors it.
+        deflection_mm: Shape (forces, distances, rings, angles), mm, positive in the direction of the push. The
+            angles go from 0, outwards, to pi, and the other half is the mirror image.
     """
 
     film: Mapping[str, float]

@@ -5,10 +5,10 @@ a number that may be null has to be a plain "number" there. Validators of draft 
 and check `definitions/record`, which allows null wherever a record has it. So viewers list all fields, and all records
 are valid.
 
-The frame is `frame_id`, the name of the sensor: origin at the film's centre in the plane of the unloaded film, x along
-the drawn direction, y transverse, z towards the probe, right-handed. The wrench is what the probe does to the film, so
-that a press of F at (x, y) has the force (0, 0, -F) and, about the origin, the torque (-y F, x F, 0). The pose is the
-point of contact in the plane, unturned, with the model's standard deviations.
+The frame is `frame_id`, the name of the sensor. Origin, x and y are those of README.md, Coordinates. ROS requires
+right-handed frames, so z points towards the probe, against the push. The wrench is the load of the probe on the film: a
+press of F at (x, y) has the force (0, 0, -F) and the torque (-y F, x F, 0) about the origin. The pose is the point of
+contact in the plane of the unloaded film, without rotation, with the model's standard deviations.
 
 Where contacts are followed, wrench and pose are those of the contact by all frames up to now, as on the live page; what
 the frame alone says is in the record.

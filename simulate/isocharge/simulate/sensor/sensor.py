@@ -1,6 +1,7 @@
 """What a sensor is: film, piezoelectric coefficients, electrodes, readout, calibration. mm, N, MPa and pC throughout.
 
-Frame: origin at the film's centre, x along the drawn direction (1), y transverse (2), z the way the probe pushes.
+Coordinates: origin at the film's centre, x along the drawn direction (1), y transverse (2), seen from the side of the
+probe. Force and deflection are positive in the direction of the push (README.md, Coordinates).
 """
 
 from dataclasses import dataclass, field, replace

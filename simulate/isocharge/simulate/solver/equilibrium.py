@@ -80,7 +80,7 @@ def deflection(equilibrium: Equilibrium, points: Array) -> Array:
         points: (x, y), shape (n, 2), mm, on the film.
 
     Returns:
-        Shape (n,), mm, positive the way the probe pushes.
+        Shape (n,), mm, positive in the direction of the push.
 
     Raises:
         SceneError: If a point is off the film.
