@@ -87,6 +87,14 @@ def test_random_presses_come_after_a_second_of_rest(played, asked):
     assert asked == [(*DESCRIBED, 8.0, (0.05, 0.5))]
 
 
+def test_the_film_rests_as_long_as_it_is_told(played):
+    """A second of rest more, which is the begin of the random presses."""
+    values, _ = played(300, "--noise", "clean", "--rest", 1.5)
+    total = values.sum(axis=1)
+    assert np.ptp(total[:2000]) < 1e-3
+    assert total.max() - total[0] > 30.0
+
+
 @pytest.mark.parametrize("frames", ["binary", "teleplot"])
 def test_a_film_of_a_seed_plays_its_charges_and_does_not_tell_it(played, tmp_path, frames):
     """A script: half a second without touch, then one press that is held."""

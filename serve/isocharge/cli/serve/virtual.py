@@ -1,6 +1,7 @@
 """`isocharge serve virtual`: a virtual sensor, made of the simulator's forward map and amplifier."""
 
 import threading
+import time
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
@@ -61,6 +62,15 @@ def virtual_command(
         float,
         typer.Option("--radius", metavar="MM", help="Largest distance of a random press from the centre, mm."),
     ] = DEFAULT_RADIUS,
+    rest: Annotated[
+        float,
+        typer.Option(
+            "--rest",
+            min=0.0,
+            max=1e6,
+            help="Time after the start in which nothing touches the film, at least, s. The film is solved meanwhile.",
+        ),
+    ] = 0.0,
     noise: Annotated[
         str, typer.Option("--noise", help="Amplifier: clean, reference, bench, surgery, or a TOML file.")
     ] = "reference",
@@ -99,8 +109,8 @@ def virtual_command(
 ) -> None:
     """Play a sensor: simulate presses that wander over the film, and send their charges as frames on a pseudo-terminal.
 
-    Prints the path of the port, solves the film, then plays until Ctrl-C. Until it is solved, and in the first second
-    of random presses, nothing touches the film.
+    Prints the path of the port, solves the film, then plays until Ctrl-C. Nothing touches the film until it is solved,
+    during --rest, and in the first second of the random presses.
 
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
@@ -122,6 +132,7 @@ def virtual_command(
         link=link,
     )
     with until_stopped(), player:
+        start_s = time.monotonic()
         announce(player.port_path)
         say("solving the film, which is not touched until then")
         with shown_progress():
@@ -131,6 +142,9 @@ def virtual_command(
                 radius=_largest_distance_mm(radius, scripted_presses),
                 force_range=(DEFAULT_PLAYED_FORCE_RANGE[0], _largest_force_N(force_max, scripted_presses)),
             )
+        remaining_rest_s = start_s + rest - time.monotonic()
+        if remaining_rest_s > 0.0:
+            threading.Event().wait(remaining_rest_s)
         presses = scripted_presses or random_script(forward_map, seed, rate, force_max)
         player.use(film_charges(forward_map), presses)
         played_name = sensor if film is None else f"film {film} of {sensor}"
