@@ -22,8 +22,9 @@ from isocharge.serve import (
     load_model,
     read_charges,
 )
+from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import Heard
-from isocharge.serve.examination.port_check import device_text, findings
+from isocharge.serve.examination.port_check import findings
 from isocharge.serve.live.outputs import csv_header
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import find_model

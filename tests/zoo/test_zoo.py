@@ -21,8 +21,9 @@ import pytest
 from cobs import cobs
 
 from isocharge.serve import Chunk, Predictor, TouchStream, load_device
+from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import Heard
-from isocharge.serve.examination.port_check import device_text, findings
+from isocharge.serve.examination.port_check import findings
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
 

@@ -153,6 +153,10 @@ class NoFramesError(PortError):
     """The bytes of a port contain no frames of a known format."""
 
 
+class PressCheckError(IsochargeError, RuntimeError):
+    """The presses of a check did not come, or do not tell the channels apart."""
+
+
 class TareError(IsochargeError, RuntimeError):
     """The film was not left alone while it was tared."""
 

@@ -14,8 +14,10 @@ import pytest
 from isocharge.cli.serve.doctor import report_lines
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text
+from isocharge.serve.examination.channel_health import channel_health
+from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import Heard
-from isocharge.serve.examination.port_check import channel_health, device_text, findings
+from isocharge.serve.examination.port_check import findings
 from isocharge.serve.port.serial_line import Request
 
 RATE_HZ = 200.0

@@ -1,8 +1,8 @@
-"""`isocharge serve doctor`: what is on a port, as text or as JSON, and the device file that fits it."""
+"""`isocharge serve doctor`: what a port sends, as text or as JSON, and the device file that fits the board."""
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,9 +16,11 @@ from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.files import refuse_existing, write_whole
 from isocharge.common.number_text import number_of
 from isocharge.common.printable_text import printable
-from isocharge.serve import Examination, Predictor, examine, load_device
+from isocharge.serve import Examination, Port, Predictor, device_from_table, examine, load_device
+from isocharge.serve.examination.channel_health import ChannelHealth
+from isocharge.serve.examination.device_text import device_text
+from isocharge.serve.examination.electrode_check import ElectrodeCheck, check_electrodes, corrected_table
 from isocharge.serve.examination.listening import BAUDS
-from isocharge.serve.examination.port_check import device_text
 from isocharge.serve.model.model_folder import model_names, repositories
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.port.source import has_speed
@@ -87,12 +89,20 @@ def doctor_command(
     request_Hz: Annotated[
         float, typer.Option("--request-hz", min=0.1, max=1e5, help="Rate of the requests, at most, Hz.")
     ] = 100.0,
+    check_wiring: Annotated[
+        bool,
+        typer.Option(
+            "--check-electrodes",
+            help="After listening, ask for a press near each electrode in turn, and report channels that are swapped "
+            "or turned. --write then writes the order that was found. (default: no)",
+        ),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Listen on a port: what frames arrive, how good the charges are, what is missing for a touch, a device file.
 
-    Leave the film alone meanwhile: offset, noise and drift are those of a film at rest. Exit code 1 if no frames are
-    recognised.
+    Leave the film alone meanwhile: offset, noise and drift are those of a film at rest. If the film is touched, no
+    device file is written. Exit code 1 if no frames are recognised, or the film is touched.
 
     Example: isocharge serve doctor --port /dev/ttyACM0 --write board.toml
     """
@@ -103,7 +113,7 @@ def doctor_command(
         refuse_existing(write)
     electrodes = Predictor(model, models=models).metadata.electrodes if model else ()
     settings = {"pC_per_unit": pC_per_unit, "V_per_unit": V_per_unit, "feedback_pF": feedback_pF}
-    say(f"listening for {seconds:g} s")
+    say(f"listening for {seconds:g} s; leave the film alone")
     examination = examine(
         port,
         bauds=(baud,) if baud else BAUDS,
@@ -114,34 +124,66 @@ def doctor_command(
         request=_request(request, request_Hz),
         wait=wait,
     )
+    wiring = None
+    if check_wiring and examination.good and not examination.touch:
+        wiring = _check_wiring(examination, electrodes)
+        examination = replace(examination, device=corrected_table(examination.device, wiring))
     if json:
-        show_json(asdict(examination))
+        show_json(asdict(examination) | ({} if wiring is None else {"found_channels": wiring.found}))
     else:
         show("\n".join(report_lines(examination)))
+        if wiring is not None:
+            show("\n".join(wiring.sentences))
     alive = len(examination.channels)
     if examination.good and len(electrodes) > alive:
         say(f"models of {alive} electrodes: {', '.join(_models_of(alive, models)) or 'none'}; choose one with --model")
-    if examination.good and write is not None:
-        _write(write, examination)
     if not examination.good:
         raise typer.Exit(1)
+    if examination.touch:
+        not_written = "" if write is None else f"{write} is not written, because "
+        say(f"{not_written}the film was touched: take the finger away, and try again")
+        raise typer.Exit(1)
+    if write is not None:
+        _write(write, examination)
+
+
+def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> ElectrodeCheck:
+    """Ask for a press near each electrode, and return which channels answer.
+
+    Args:
+        examination: Result of listening.
+        electrodes: Electrodes of the model; empty for any model.
+
+    Raises:
+        PressCheckError: If a press does not come, or the presses do not tell the channels apart.
+    """
+    device = device_from_table(examination.device, "board")
+    names = [channel.name for channel in examination.channels]
+    if device.channels:
+        channels = dict(device.channels)
+    elif len(electrodes) == len(names) and not set(electrodes) <= set(names):
+        channels = dict(zip(electrodes, names, strict=True))
+    else:
+        channels = dict(zip(names, names, strict=True))
+    with Port(examination.url, baud=examination.baud, request=device.request) as port:
+        return check_electrodes(port, device, channels, say)
 
 
 def port_lines() -> Iterator[str]:
-    """The serial ports of this machine, what the system says of each, and what came in a second."""
+    """Yield a line for each serial port of this machine: its description, and what came within a second."""
     for found in sorted(list_ports.comports()):
         try:
-            heard = examine(found.device, seconds=1.0)
-            sends = (
-                f"{heard.format}, {heard.rate_Hz:.0f} frames/s at {heard.baud} baud" if heard.good else heard.missing[0]
-            )
+            examination = examine(found.device, seconds=1.0)
+            received = examination.missing[0] if examination.missing else "nothing is missing"
+            if examination.good:
+                received = f"{examination.format}, {examination.rate_Hz:.0f} frames/s at {examination.baud} baud"
         except IsochargeError as error:
-            sends = str(error)
-        yield f"{found.device} ({found.description}): {sends}"
+            received = str(error)
+        yield f"{found.device} ({found.description}): {received}"
 
 
 def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
-    """Names of the models with as many electrodes; those that cannot be read are left out."""
+    """Yield the names of the models with so many electrodes. Models that cannot be read are left out."""
     for name in dict.fromkeys(name for root in repositories(models) for name in model_names(root)):
         with suppress(IsochargeError):
             if len(Predictor(name, models=models).metadata.electrodes) == electrodes:
@@ -149,7 +191,11 @@ def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
 
 
 def _setting(key: str, text: str) -> Any:
-    """A number for all electrodes, or one for each: `A=0.1,B=-0.1`."""
+    """Return the number of an option for all electrodes, or one for each as in `A=0.1,B=-0.1`.
+
+    Raises:
+        InputError: If the text is neither.
+    """
     try:
         if "=" not in text:
             return number_of(text)
@@ -161,6 +207,11 @@ def _setting(key: str, text: str) -> Any:
 
 
 def _request(text: str | None, rate_Hz: float) -> Request | None:
+    """Return the request of `--request`, whose text may contain escape sequences.
+
+    Raises:
+        InputError: If the text is empty, or an escape sequence is wrong.
+    """
     if text is None:
         return None
     try:
@@ -173,43 +224,75 @@ def _request(text: str | None, rate_Hz: float) -> Request | None:
 
 
 def _write(path: Path, examination: Examination) -> None:
+    """Write the device file, and print how to use it.
+
+    Raises:
+        InputError: If it cannot be written.
+    """
     try:
         write_whole(path, device_text(examination).encode())
     except OSError as error:
         raise InputError(f"--write {path}: cannot be written ({error.strerror}); choose another path") from error
-    use = f"use it with: isocharge serve stream MODEL --port {examination.url} --device {path}"
-    say(f"{path} written; {use if examination.works else 'it gives no touches yet: put in what is missing above'}")
+    if not examination.works:
+        say(f"{path} written; it gives no touches yet: put in what is missing above")
+        return
+    if "offset" in examination.device.get("gain", {}):
+        say("the offsets are right only if nothing lay on the film; a steady weight cannot be noticed")
+    say(f"{path} written; use it with: isocharge serve stream MODEL --port {examination.url} --device {path}")
 
 
 def report_lines(examination: Examination) -> Iterator[str]:
-    """An examination as text for people."""
+    """Yield the lines of an examination as text for people."""
     speed = f" at {examination.baud} baud" if has_speed(examination.url) else ""
     yield f"{examination.url}{speed}: {examination.format}"
     yield f"{examination.bytes_seen} bytes in {examination.seconds:.1f} s, {examination.rate_Hz:.1f} frames/s"
     yield f"{examination.good} good frames, {examination.bad} bad pieces"
-    numbers = (
-        "frames have no numbers"
-        if examination.lost is None
-        else f"{examination.lost} lost, {examination.repeated} repeated"
-    )
-    yield f"{numbers}; {'a' if examination.device_clock else 'no'} device clock"
+    yield _numbering_line(examination)
     if examination.unused:
         yield f"channels that no electrode uses: {printable(', '.join(examination.unused))}"
-    if examination.unit != "pC":
-        yield f"the channels are {'volts, it seems' if examination.unit == 'V' else examination.unit}, not pC"
+    if examination.unit == "V":
+        yield "the channels are volts, it seems, not pC"
+    elif examination.unit != "pC":
+        yield f"the channels are {examination.unit}, not pC"
     if examination.channels:
-        yield _HEAD.replace("pC", {"counts": "ct", "V": " V"}.get(examination.unit, "pC"))
+        unit = UNIT_SYMBOLS[examination.unit]
+        yield f"channel    offset {unit}   noise {unit}  drift {unit}/s  50 Hz {unit}  60 Hz {unit}"
     for channel in examination.channels:
-        figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
-        digits = (5, 6, 5, 5, 5) if examination.unit == "V" else (2, 3, 2, 2, 2)
-        columns = zip(figures, (12, 11, 12, 10, 10), digits, strict=True)
-        yield f"{printable(channel.name):8.8s}" + "".join(
-            f"{'?' if figure is None else f'{figure:.{digits}f}':>{width}s}" for figure, width, digits in columns
-        )
+        yield _channel_line(channel, examination.unit)
     if examination.held:
         yield examination.held
-    yield "missing to get a touch: nothing" if not examination.missing else "missing to get a touch:"
-    yield from (f"- {sentence}" for sentence in examination.missing)
+    yield "missing to get a touch:" if examination.missing else "missing to get a touch: nothing"
+    for sentence in examination.missing:
+        yield f"- {sentence}"
 
 
-_HEAD = "channel    offset pC   noise pC  drift pC/s  50 Hz pC  60 Hz pC"
+UNIT_SYMBOLS = {"pC": "pC", "counts": "ct", "V": " V"}
+"""Symbols of the units in the head of the table, of two characters."""
+
+COLUMN_WIDTHS = (12, 11, 12, 10, 10)
+"""Widths of the columns of numbers, characters."""
+
+DECIMALS = (2, 3, 2, 2, 2)
+"""Decimals of the columns of numbers in pC and in counts."""
+
+VOLT_DECIMALS = (5, 6, 5, 5, 5)
+"""Decimals of the columns of numbers in volts."""
+
+
+def _numbering_line(examination: Examination) -> str:
+    """Return what the numbers of the frames and the clock of the device show."""
+    clock = "a device clock" if examination.device_clock else "no device clock"
+    if examination.lost is None:
+        return f"frames have no numbers; {clock}"
+    return f"{examination.lost} lost, {examination.repeated} repeated; {clock}"
+
+
+def _channel_line(channel: ChannelHealth, unit: str) -> str:
+    """Return the row of a channel in the table."""
+    figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
+    all_decimals = VOLT_DECIMALS if unit == "V" else DECIMALS
+    cells = [f"{printable(channel.name):8.8s}"]
+    for figure, width, decimals in zip(figures, COLUMN_WIDTHS, all_decimals, strict=True):
+        text = "?" if figure is None else f"{figure:.{decimals}f}"
+        cells.append(f"{text:>{width}s}")
+    return "".join(cells)

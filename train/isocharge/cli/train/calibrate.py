@@ -130,6 +130,9 @@ def calibrate_command(
     With --port it proposes a press, takes it when it is steady, asks whether it was there, and says how well the film
     is known by now. Every press is on disk at once: the same command goes on with a session that was stopped.
 
+    Check the wiring first: `isocharge serve doctor --check-electrodes` asks for a press near each electrode in turn,
+    and finds electrodes that are swapped.
+
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
     moved_to_C = temperature_C if earlier is not None and file is None else None

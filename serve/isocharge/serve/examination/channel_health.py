@@ -1,0 +1,78 @@
+"""Health of one channel of a board while the film is at rest: offset, noise, drift and hum."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.serve.signal_chain.chain import LARGEST_PC
+
+MAINS_HZ = (50.0, 60.0)
+"""Frequencies at which hum is searched for, Hz."""
+
+SAMPLES_PER_PERIOD = 2.2
+"""Smallest frame rate at which a hum is estimated, in samples per period: 10 % above the Nyquist rate."""
+
+SHORTEST_S = 0.5
+"""Shortest time from which hum is estimated, s. Its resolution of 2 Hz separates 50 from 60 Hz."""
+
+
+@dataclass(frozen=True)
+class ChannelHealth:
+    """Health of one channel, in pC after the gain. Values are None if no value of the channel is a charge.
+
+    Attributes:
+        name: Name that the device uses, or the number of the channel from 1.
+        offset_pC: Mean.
+        noise_pC: Standard deviation without drift and hum.
+        drift_pC_per_s: Slope.
+        hum_pC: Amplitudes at 50 and at 60 Hz; None if the rate is too low, or the time too short, to estimate them.
+        span_pC: Difference between the largest and the smallest value.
+        unusable: Number of values that are not finite, or larger than the charges of any film.
+    """
+
+    name: str
+    offset_pC: float | None = None
+    noise_pC: float | None = None
+    drift_pC_per_s: float | None = None
+    hum_pC: tuple[float | None, float | None] = (None, None)
+    span_pC: float | None = None
+    unusable: int = 0
+
+
+def channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz: float) -> ChannelHealth:
+    """Fit a constant, a slope and the hum to the values of a channel.
+
+    Args:
+        name: Name of the channel.
+        charge_pC: Values, shape (n,), pC.
+        times_s: Times since the first frame, shape (n,), s.
+        rate_Hz: Frames per second, Hz.
+    """
+    is_usable = np.abs(charge_pC) <= LARGEST_PC
+    unusable = int(np.count_nonzero(~is_usable))
+    if unusable == is_usable.size:
+        return ChannelHealth(name, unusable=unusable)
+    charge_pC = charge_pC[is_usable]
+    times_s = times_s[is_usable]
+
+    is_long_enough = times_s[-1] > SHORTEST_S
+    fitted_Hz = [hum_Hz for hum_Hz in MAINS_HZ if is_long_enough and rate_Hz > SAMPLES_PER_PERIOD * hum_Hz]
+    columns = [np.ones_like(times_s), times_s]
+    for hum_Hz in fitted_Hz:
+        phase = 2.0 * np.pi * hum_Hz * times_s
+        columns += [np.cos(phase), np.sin(phase)]
+    design_matrix = np.column_stack(columns)
+    coefficients = np.linalg.lstsq(design_matrix, charge_pC, rcond=None)[0]
+    slope = coefficients[1]
+    waves = coefficients[2:].reshape(-1, 2)
+    amplitudes = {hum_Hz: float(np.hypot(*wave)) for hum_Hz, wave in zip(fitted_Hz, waves, strict=True)}
+    return ChannelHealth(
+        name,
+        offset_pC=float(charge_pC.mean()),
+        noise_pC=float((charge_pC - design_matrix @ coefficients).std()),
+        drift_pC_per_s=float(slope),
+        hum_pC=(amplitudes.get(50.0), amplitudes.get(60.0)),
+        span_pC=float(np.ptp(charge_pC)),
+        unusable=unusable,
+    )

@@ -1,0 +1,41 @@
+"""The text of the device file that fits a board."""
+
+from collections.abc import Iterator
+
+from isocharge.common.printable_text import printable
+from isocharge.common.toml_text import to_toml
+from isocharge.serve.examination.port_check import Examination
+
+HEAD = (
+    "Written by `isocharge serve doctor` from what came through a port; the keys are in serve/docs/device_file.md.",
+)
+"""First lines of the file."""
+
+LINES_TO_FILL_IN = {
+    "counts": ("# pC_per_unit = ?    # the charge of one count, pC; with a minus where the amplifier inverts",),
+    "V": (
+        "# V_per_unit = 1.0    # with a minus where the amplifier inverts",
+        "# feedback_pF = ?     # the feedback capacitance of the amplifiers, pF",
+    ),
+}
+"""Lines for the section `[gain]` that the user completes, by the unit of the channels."""
+
+
+def device_text(examination: Examination) -> str:
+    """Return the device file of a board, TOML. Keys of the gain that are not known are comments to fill in."""
+    table = {key: value for key, value in examination.device.items() if key != "gain"}
+    text = to_toml(table, (*HEAD, *_description(examination)))
+    gain = examination.device.get("gain")
+    lines = LINES_TO_FILL_IN.get(examination.unit, ())
+    if gain is not None:
+        text += "\n" + to_toml({"gain": gain})
+    elif lines:
+        text += "\n[gain]\n"
+    return text + "".join(f"{line}\n" for line in lines)
+
+
+def _description(examination: Examination) -> Iterator[str]:
+    """Yield comments that describe what the board sends."""
+    yield f"{examination.format}; {examination.rate_Hz:.4g} frames per second"
+    if examination.unused:
+        yield f"channels that no electrode uses: {printable(', '.join(examination.unused))}"

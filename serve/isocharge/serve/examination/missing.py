@@ -1,0 +1,143 @@
+"""What prevents a board from giving contacts: one sentence for each reason."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from isocharge.common.printable_text import printable
+from isocharge.serve.examination.channel_health import MAINS_HZ, ChannelHealth
+from isocharge.serve.examination.held_press import HeldPress
+from isocharge.serve.examination.listening import Capture
+from isocharge.serve.live.device import Device
+from isocharge.serve.signal_chain.tare import TareRule
+
+CLEAN_SHARE = 0.99
+"""Share of bytes in good frames below which the cable or the baud rate may be wrong, dimensionless."""
+
+HUM_LIMIT_PC = 0.5
+"""Largest harmless amplitude of hum, pC. It is below the noise of the film."""
+
+DRIFT_LIMIT_PC_PER_S = 2.0
+"""Largest harmless drift, pC/s."""
+
+GAIN_REQUESTS = {
+    "counts": "the charge of one count, pC: --pc-per-unit NUMBER, negative where the amplifier inverts (1 if these are "
+    "pC)",
+    "V": "the amplifier's feedback capacitance, if these are volts: --v-per-unit 1 --feedback-pf NUMBER; or the charge "
+    "of one unit, pC: --pc-per-unit NUMBER (1 if these are pC)",
+}
+"""What the user has to state about the gain, by the unit of the channels."""
+
+
+@dataclass(frozen=True)
+class BoardFindings:
+    """What is known about a board when the reasons are listed.
+
+    Attributes:
+        capture: The frames.
+        channels: Health of the channels that electrodes use.
+        unused: Names of the other channels.
+        device: What is known about the board.
+        electrodes: Electrodes of the model; empty for any model.
+        unit: Unit of the channels: "pC", "counts" or "V".
+        held: Press that was held while listening; None without one.
+        touch: Sentence about a touch that disturbed the rest; empty without one.
+    """
+
+    capture: Capture
+    channels: tuple[ChannelHealth, ...]
+    unused: tuple[str, ...]
+    device: Device
+    electrodes: tuple[str, ...]
+    unit: str
+    held: HeldPress | None
+    touch: str
+
+
+def missing_sentences(findings: BoardFindings) -> Iterator[str]:
+    """Yield one sentence for each thing that is missing to get a contact."""
+    capture = findings.capture
+    if not capture.bytes_seen:
+        yield "not one byte came: check power and cable, and whether the board sends unasked (if not: --request)"
+        return
+    if not capture.frames:
+        yield (
+            "bytes come, but no frames: another baud rate (--baud), or a format for a device file (--device); a board "
+            "without noise shows its channels only while the film is touched"
+        )
+        return
+    if findings.touch:
+        yield findings.touch
+    yield from _transmission_sentences(capture)
+    yield from _channel_count_sentences(findings)
+    if findings.unit != "pC":
+        yield GAIN_REQUESTS[findings.unit]
+    for channel in findings.channels:
+        if channel.span_pC == 0.0:
+            yield f"life on channel {printable(channel.name)}: every value is {channel.offset_pC:g}"
+        if findings.unit == "pC":
+            yield from _charge_sentences(channel, findings.device.tare or TareRule())
+    yield from _leak_sentences(findings)
+
+
+def _transmission_sentences(capture: Capture) -> Iterator[str]:
+    """Yield what is wrong with the transmission."""
+    if capture.share < CLEAN_SHARE:
+        yield f"{1 - capture.share:.1%} of the bytes are no good frames: a bad cable, or a rate that is a little off"
+    if capture.gaps.lost:
+        yield f"{capture.gaps.lost} frames lost: a slower rate, or a faster link"
+
+
+def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
+    """Yield a sentence if the number of channels is not that of the model's electrodes."""
+    electrodes = findings.electrodes
+    channel_count = len(findings.channels)
+    is_described = set(findings.device.channels) >= set(electrodes)
+    if not electrodes or channel_count == len(electrodes) or is_described:
+        return
+    alive = f"{channel_count} channels"
+    if findings.unused:
+        alive += f" that live, of {len(findings.capture.names)}"
+    yield (
+        f"{alive}, but the model has the electrodes {electrodes}: another model (--model), or [channels] in a device "
+        "file"
+    )
+
+
+def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
+    """Yield what is wrong with the charges of a channel, pC."""
+    name = printable(channel.name)
+    noise_pC = channel.noise_pC or 0.0
+    offset_pC = channel.offset_pC or 0.0
+    drift_pC_per_s = channel.drift_pC_per_s or 0.0
+    if channel.unusable:
+        yield f"charges on channel {name}: {channel.unusable} values are no numbers, or absurd"
+    if noise_pC > rule.noise_limit_pC:
+        yield f"quiet on channel {name}: {noise_pC:.3g} pC rms, for a tare {rule.noise_limit_pC:g}"
+    if abs(offset_pC) > rule.offset_limit_pC:
+        yield (
+            f"rest near zero on channel {name}: {offset_pC:.4g} pC, a tare takes {rule.offset_limit_pC:g} (is "
+            "something lying on the film? or does the amplifier rest there? then [gain] offset, as --write has it)"
+        )
+    if abs(drift_pC_per_s) > DRIFT_LIMIT_PC_PER_S:
+        yield f"a steady channel {name}: it drifts by {drift_pC_per_s:.2g} pC/s"
+    for frequency_Hz, hum_pC in zip(MAINS_HZ, channel.hum_pC, strict=True):
+        if hum_pC is not None and hum_pC > HUM_LIMIT_PC:
+            yield f"[hum] frequency_Hz = {frequency_Hz:g} (device file): channel {name} hums by {hum_pC:.2g} pC"
+
+
+def _leak_sentences(findings: BoardFindings) -> Iterator[str]:
+    """Yield what is missing to undo the leak of the amplifiers."""
+    device = findings.device
+    held = findings.held
+    if findings.capture.frames[0].t_us is None and device.leak is not None:
+        yield "a device clock (t_us, t_ms or t_s): without it the leak is undone by arrival times, which jitter"
+    if held is not None:
+        for name, section in held.sections.items():
+            if name not in device.table:
+                keys = ", ".join(f"{key} = {value:g}" for key, value in section.items())
+                yield f"[{name}] {keys} in a device file"
+    elif device.leak is None:
+        yield (
+            "the amplifier's time constants ([leak] tau_s in a device file), of its circuit: without them held presses "
+            "fade. To measure them, listen for 20 s (--seconds 20), and from the third on hold a press with a weight"
+        )

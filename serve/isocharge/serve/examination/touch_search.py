@@ -1,0 +1,118 @@
+"""Search for touches in charges that should come from a film at rest.
+
+The gain and the rest level of a board are not known yet, so a touch is recognised by its changes: a press begins, ends
+or wavers within half a second, while warming, creep and the slow noise of amplifiers take longer. Hum averages out
+within a block of 0.1 s, and a single damaged value does not change the median of a block.
+
+A press that is held with constant force for the whole time does not change the charges. It cannot be distinguished from
+an amplifier that rests at another level.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from isocharge.common.arrays import Array
+from isocharge.serve.examination.proposal import noise_of
+
+BLOCK_S = 0.1
+"""Time over which values are averaged, s: whole periods of 50 and 60 Hz."""
+
+MIN_BLOCKS = 6
+"""Number of blocks below which no touch is searched for."""
+
+STEEP_BLOCKS = 5
+"""Number of blocks within which the changes of a touch are searched for: half a second."""
+
+CHANGE_SIGMAS = 20.0
+"""Change within half a second from which the film was touched, in standard deviations of the noise of one frame."""
+
+MIN_CHANGE_PC = 20.0
+"""Smallest change within half a second that counts as a touch, pC. A press of 0.01 N on a film of 25 um causes 40."""
+
+MAX_SLOW_CHANGE_PC = 100.0
+"""Change during the whole time from which the film was touched, pC. It is the largest rest that a tare accepts."""
+
+
+class TouchFound(NamedTuple):
+    """The largest change of a charge during the time in which the film should be at rest.
+
+    Attributes:
+        position: Position of the channel in the frame.
+        change: Size of the change, in the unit of the values.
+        time_s: Time of the steepest change, s from the first frame.
+    """
+
+    position: int
+    change: float
+    time_s: float
+
+
+def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | None:
+    """Search for a touch.
+
+    Args:
+        values: Values of the channels, shape (n, channels).
+        times_s: Times since the first frame, shape (n,), s.
+        unit_is_pC: Whether the values are charges in pC. Otherwise only the noise tells how large a change must be.
+
+    Returns:
+        The channel with the largest change, of those that change as under a touch; None if there is none.
+    """
+    blocks = block_medians(values, times_s)
+    if len(blocks) < MIN_BLOCKS:
+        return None
+    levels = np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0)
+    touches: list[TouchFound] = []
+    for position, level in enumerate(levels.T):
+        if not np.isfinite(level).all():
+            continue
+        min_change = CHANGE_SIGMAS * noise_of(values[:, position])
+        if unit_is_pC:
+            min_change = max(min_change, MIN_CHANGE_PC)
+        else:
+            min_change = max(min_change, CHANGE_SIGMAS * resolution_of(values[:, position]))
+        windows = sliding_window_view(level, min(STEEP_BLOCKS, len(level)))
+        steep_change = np.ptp(windows, axis=1)
+        total_change = float(np.ptp(level))
+        is_slow_touch = unit_is_pC and total_change > max(min_change, MAX_SLOW_CHANGE_PC)
+        if steep_change.max() > min_change or is_slow_touch:
+            middle_block = int(np.argmax(steep_change)) + STEEP_BLOCKS // 2 + 1
+            touches.append(TouchFound(position, total_change, BLOCK_S * middle_block))
+    return max(touches, key=lambda touch: touch.change, default=None)
+
+
+def block_medians(values: Array, times_s: Array) -> Array:
+    """Compute the median of each channel in each whole block of time.
+
+    Args:
+        values: Values of the channels, shape (n, channels).
+        times_s: Times since the first frame, shape (n,), s, in ascending order.
+
+    Returns:
+        Medians of the finite values, shape (blocks, channels). Blocks without frames are left out, and so is the last
+        block, which may be incomplete. NaN if a block of a channel has no finite value.
+    """
+    number = np.floor(times_s / BLOCK_S).astype(int)
+    starts = np.flatnonzero(np.diff(number, prepend=-1))
+    pieces = np.split(values, starts[1:])[:-1]
+    if not pieces:
+        return np.zeros((0, values.shape[1]))
+    return np.array([_finite_medians(piece) for piece in pieces])
+
+
+def _finite_medians(piece: Array) -> Array:
+    medians = np.full(piece.shape[1], np.nan)
+    for position, column in enumerate(piece.T):
+        finite = column[np.isfinite(column)]
+        if finite.size:
+            medians[position] = np.median(finite)
+    return medians
+
+
+def resolution_of(column: Array) -> float:
+    """Return the standard deviation of the rounding of a channel: that of whole numbers, or 0 for other values."""
+    finite = column[np.isfinite(column)]
+    is_whole = bool((finite == np.round(finite)).all())
+    return 12.0**-0.5 if is_whole else 0.0

@@ -1,0 +1,155 @@
+"""Swapped and turned channels, found by a press near each electrode of a virtual sensor."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from isocharge.cli.shared.virtual_sensor import film_charges
+from isocharge.common.errors import PressCheckError
+from isocharge.serve import Port, Predictor, Script, VirtualSensor, device_from_table, load_device
+from isocharge.serve.examination.electrode_check import (
+    ElectrodeCheck,
+    assign_channels,
+    check_electrodes,
+    corrected_table,
+)
+from isocharge.simulate import Circle, ForwardMap, load_sensor
+from kept import kept
+
+RATE_HZ = 200.0
+REST_S = 0.9
+PRESS_S = 0.6
+
+
+def press_script(directions, rest_s=REST_S, first_rest_s=REST_S):
+    """Presses of 0.3 N, 8 mm from the centre in some directions, with a rest before each."""
+    seconds, points = [0.0], [(0.0, 0.0, 0.0)]
+    for number, (x, y) in enumerate(directions):
+        begin_s = seconds[-1] + (rest_s if number else first_rest_s)
+        place = (8.0 * x, 8.0 * y)
+        seconds += [begin_s, begin_s + 0.1, begin_s + PRESS_S, begin_s + PRESS_S + 0.1]
+        points += [(*place, 0.0), (*place, 0.3), (*place, 0.3), (*place, 0.0)]
+    seconds.append(seconds[-1] + 60.0)
+    points.append((0.0, 0.0, 0.0))
+    times_s = np.arange(0.0, seconds[-1], 1.0 / RATE_HZ)
+    x, y, force = (np.interp(times_s, seconds, column) for column in np.array(points).T)
+    is_pressed = force > 0.0
+    return Script(np.where(is_pressed, x, np.nan), np.where(is_pressed, y, np.nan), force, RATE_HZ)
+
+
+def noise(charge_pC, rng):
+    return charge_pC + rng.normal(0.0, 1.0, charge_pC.shape)
+
+
+def sensor_with_wiring(charges, directions, wiring, gain=1.0, **options):
+    """A virtual sensor whose channel k is connected to electrode `wiring[k]`."""
+    wired = lambda contact: np.asarray(gain) * charges(contact)[:, list(wiring)]  # noqa: E731
+    return VirtualSensor(wired, press_script(directions, **options), noise=noise, offset_pC=[20.0] * len(wiring))
+
+
+def check(sensor, electrodes, timeout_s=20.0):
+    device = device_from_table({}, "test")
+    channels = {electrode: str(number + 1) for number, electrode in enumerate(electrodes)}
+    asked = []
+    with sensor, Port(sensor.url) as port:
+        result = check_electrodes(port, device, channels, asked.append, timeout_s)
+    assert [sentence.split()[3].rstrip(",") for sentence in asked] == list(electrodes)
+    return result
+
+
+@pytest.mark.parametrize(
+    ("wiring", "sentence"),
+    [
+        ((0, 1, 2), "every channel belongs to its electrode"),
+        ((1, 0, 2), "the channels of A and B are swapped"),
+        ((2, 1, 0), "the channels of A and C are swapped"),
+        ((1, 2, 0), "the channels are turned by"),
+    ],
+)
+def test_channels_of_three_electrodes(film, wiring, sentence):
+    sensor = sensor_with_wiring(film.charges, film.directions, wiring)
+    result = check(sensor, "ABC")
+    assert result.found == {"ABC"[electrode]: str(channel + 1) for channel, electrode in enumerate(wiring)}
+    assert sentence in "\n".join(result.sentences)
+    assert result.is_as_expected == (wiring == (0, 1, 2))
+
+
+def test_swapped_channels_of_the_simulated_film():
+    """With the charges of the simulator, gains that differ by a factor of two, and one that inverts."""
+    sensor = load_sensor("three-25um-biaxial")
+    forward_map = kept(ForwardMap.build, sensor, Circle(1.0))
+    places = np.array([electrode.centre for electrode in sensor.electrodes])
+    directions = places / np.linalg.norm(places, axis=1, keepdims=True)
+    board = sensor_with_wiring(film_charges(forward_map), 0.99 * directions, (0, 2, 1), gain=(1.0, -2.0, 0.7))
+    result = check(board, "ABC")
+    assert result.found == {"A": "1", "B": "3", "C": "2"}
+    assert result.inverted == ("2",)
+    assert "check the signs of the gain" in "\n".join(result.sentences)
+
+
+@pytest.mark.parametrize("order", [*permutations(range(4))])
+def test_channels_are_assigned_for_any_order_and_gain(order):
+    rng = np.random.default_rng(0)
+    near = np.full((4, 4), 0.6) + np.eye(4)
+    answers = near[:, list(order)] * rng.uniform(0.2, 5.0, 4) * rng.uniform(0.2, 5.0, (4, 1))
+    assert [order[column] for column in assign_channels(answers, "ABCD")] == [0, 1, 2, 3]
+
+
+def test_presses_that_do_not_tell_the_channels_apart():
+    with pytest.raises(PressCheckError, match="moves two channels alike; press closer"):
+        assign_channels(np.ones((3, 3)), "ABC")
+
+
+def test_no_press_comes(film):
+    sensor = sensor_with_wiring(film.charges, film.directions[:2], (0, 1, 2))
+    with pytest.raises(PressCheckError, match="electrode C: no press came within 3 s"):
+        check(sensor, "ABC", timeout_s=3.0)
+
+
+def test_a_press_that_does_not_end(film):
+    force_N = np.where(np.arange(6000) < 250, 0.0, 0.3)
+    position_mm = np.where(force_N > 0.0, 0.0, np.nan)
+    script = Script(position_mm, position_mm, force_N, RATE_HZ)
+    with pytest.raises(PressCheckError, match="take the finger away"):
+        check(VirtualSensor(film.charges, script, noise=noise), "ABC", timeout_s=3.0)
+
+
+def test_settings_of_single_electrodes_move_with_their_channels():
+    table = {
+        "name": "board",
+        "channels": {"A": "1", "B": "2", "C": "3"},
+        "gain": {"pC_per_unit": {"A": 0.1, "B": 0.2, "C": 0.3}, "offset": 5},
+        "tare": {"frames": 50},
+    }
+    result = ElectrodeCheck(table["channels"], {"A": "2", "B": "1", "C": "3"}, np.eye(3), ())
+    assert corrected_table(table, result) == {
+        "name": "board",
+        "channels": {"A": "2", "B": "1", "C": "3"},
+        "gain": {"pC_per_unit": {"A": 0.2, "B": 0.1, "C": 0.3}, "offset": 5},
+        "tare": {"frames": 50},
+    }
+
+
+def test_doctor_writes_the_order_that_the_presses_show(film, models, command, tmp_path):
+    """From swapped wires to the right contact, with nothing but the file that doctor writes."""
+    path = tmp_path / "board.toml"
+    with sensor_with_wiring(film.charges, film.directions, (1, 0, 2), first_rest_s=4.0) as sensor:
+        words = ("--port", sensor.url, "--seconds", 1, "--check-electrodes", "--write", path)
+        code, out, err = command("serve", "doctor", *words, "--model", "linear", "--models", models)
+        assert code == 0, err
+        assert "the channels of A and B are swapped" in out
+        assert err.count("press near electrode") == 3
+        assert dict(load_device(path).channels) == {"A": "2", "B": "1", "C": "3"}
+    assert Predictor("linear", models=models).metadata.electrodes == ("A", "B", "C")
+
+
+def test_doctor_does_not_write_a_file_from_a_touched_film(film, command, tmp_path):
+    path = tmp_path / "board.toml"
+    for first_rest_s in (0.5, 0.0):  # the press begins while doctor listens; it ends then
+        with sensor_with_wiring(film.charges, film.directions, (0, 1, 2), first_rest_s=first_rest_s) as sensor:
+            code, out, err = command("serve", "doctor", "--port", sensor.url, "--seconds", 3, "--write", path)
+        assert code == 1
+        assert "an untouched film: channel " in out
+        assert "is not written, because the film was touched: take the finger away, and try again" in err
+        assert not path.exists()

@@ -1,0 +1,83 @@
+"""Touches while doctor measures the rest: presses are noticed, noise, drift and warming are not taken for presses."""
+
+import numpy as np
+import pytest
+
+from isocharge.serve.examination.touch_search import block_medians, find_touch
+from isocharge.simulate import load_amplifier
+
+PRESS_PC = np.array([150.0, 90.0, 110.0])
+"""Charges of a press of 0.05 N, pC."""
+
+
+def measured(level, seed, press, seconds=5.0, rate_Hz=200.0):
+    """Output of a simulated amplifier, shape (n, 3), pC, and the times, s; `press(t)` is the share of a press."""
+    times_s = np.arange(round(seconds * rate_Hz)) / rate_Hz
+    charges = np.multiply.outer(press(times_s), PRESS_PC)
+    measure = load_amplifier(level).start(3, rate_Hz, np.random.default_rng(seed))
+    blocks = np.array_split(charges, max(1, round(2.0 * seconds)))
+    return np.concatenate([measure(block) for block in blocks]), times_s
+
+
+def no_press(t):
+    return np.zeros_like(t)
+
+
+PRESSES = {
+    "begins": lambda t: (t > 2.5).astype(float),
+    "ends": lambda t: (t < 2.5).astype(float),
+    "tap": lambda t: ((t > 2.0) & (t < 2.3)).astype(float),
+    "wavers": lambda t: 1.0 + 0.3 * np.sin(3.0 * t),
+    "slow": lambda t: t / t[-1],
+}
+
+
+@pytest.mark.parametrize("level", ["clean", "reference", "bench", "surgery"])
+@pytest.mark.parametrize("seconds", [1.0, 20.0])
+def test_noise_drift_and_warming_are_no_touch(level, seconds):
+    for seed in range(5):
+        charges, times_s = measured(level, seed, no_press, seconds)
+        assert find_touch(charges, times_s, unit_is_pC=True) is None
+        assert find_touch(np.round(20.0 * charges), times_s, unit_is_pC=False) is None
+
+
+@pytest.mark.parametrize("level", ["reference", "bench"])
+@pytest.mark.parametrize("press", PRESSES)
+def test_a_press_of_0_05_N_is_noticed(level, press):
+    """A slow press needs the unit, because a slow change may be a drift."""
+    for seed in range(5):
+        charges, times_s = measured(level, seed, PRESSES[press])
+        touch = find_touch(charges, times_s, unit_is_pC=True)
+        assert touch is not None
+        if level == "reference":  # the amplifier `bench` leaks
+            assert touch.position == 0
+            assert touch.change == pytest.approx(150.0 * np.ptp(PRESSES[press](times_s)), abs=20.0)
+        if press != "slow":
+            assert find_touch(np.round(20.0 * charges), times_s, unit_is_pC=False) is not None
+        if press in ("begins", "ends"):
+            assert touch.time_s == pytest.approx(2.5, abs=0.3)
+
+
+def test_a_press_that_is_held_all_the_time_is_not_noticed():
+    """The limit of the search: constant charges may be the rest of an amplifier."""
+    charges, times_s = measured("reference", 0, np.ones_like)
+    assert find_touch(charges, times_s, unit_is_pC=True) is None
+
+
+def test_a_damaged_value_is_no_touch():
+    charges, times_s = measured("reference", 0, no_press)
+    charges[300] = 1e6
+    charges[500, 1] = np.nan
+    assert find_touch(charges, times_s, unit_is_pC=True) is None
+
+
+def test_too_few_blocks():
+    charges, times_s = measured("reference", 0, PRESSES["begins"], seconds=0.5)
+    assert find_touch(charges, times_s, unit_is_pC=True) is None
+    assert len(block_medians(charges, times_s)) == 4
+
+
+def test_hum_averages_out_of_block_medians():
+    times_s = np.arange(0.0, 2.0, 0.001)
+    hum = 100.0 * np.sin(2.0 * np.pi * 50.0 * times_s)
+    assert np.abs(block_medians(hum[:, None], times_s)).max() < 1.0
