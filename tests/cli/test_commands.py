@@ -67,6 +67,10 @@ def test_a_sweep_as_a_table_for_other_programs(command, refused, tmp_path, monke
     two = "--probe", "circle:1.0", "--probe", "circle:2.0"
     refused(*SMALL, *two, "-o", tmp_path / "c.csv", said="a table of presses has one probe")
     refused(*SMALL, "-o", tmp_path / "a.csv", said="the dataset that belongs beside", code=1)
+    many = "--samples", "1000001"
+    refused(
+        *SMALL, *many, "-o", tmp_path / "d.csv", said="a table has at most 1,000,000 presses, got --samples 1000001"
+    )
     refused(*SMALL, "-o", ".", said="is already there", code=1)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     refused(*SMALL, "-o", tmp_path / "b.parquet", said="pip install 'isocharge[parquet]'", code=1)
@@ -309,7 +313,7 @@ BAD = [
     ),
     (("serve", "predict", SENSOR, "x.csv", "--models", "nope"), 2, "ModelError: nope: expected a folder of models"),
     (("serve", "predict", "no-such-model", "x.csv"), 2, "ModelError"),
-    (("serve", "predict", SENSOR, "none.csv"), 2, "InputError: none.csv: cannot be read"),
+    (("serve", "predict", SENSOR, "none.csv"), 2, "ChargeError: none.csv: cannot be read"),
     (("serve", "predict", SENSOR, "-"), 2, "stdin"),
     (("serve", "stream", SENSOR, "--port", "/dev/none"), 1, "PortError"),
 ]

@@ -1,6 +1,8 @@
 """Every command that reads a file of presses refuses the same faults with the same words."""
 
+import pyarrow
 import pytest
+from pyarrow.parquet import write_table
 
 COMMANDS = {
     "predict": ("serve", "predict", "four-25um-biaxial"),
@@ -54,3 +56,14 @@ def test_a_force_in_another_language(refuses, name):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_file_that_is_named_as_parquet_and_is_none(refuses, name):
     refuses(name, f"x_mm,y_mm,force_N,A,B,C,D\n{PRESS}".encode(), "p.parquet: not a Parquet file", suffix="parquet")
+
+
+def test_presses_of_a_parquet_file_are_named_by_their_rows(command, tmp_path):
+    """The check of a film names the presses that do not count by their rows, counted from 1 without a header."""
+    contact_columns = {"x_mm": [2.0, 40.0], "y_mm": [0.0, 0.0], "force_N": [0.5, 0.5]}
+    columns = contact_columns | {name: [500.0, 500.0] for name in "ABCD"}
+    write_table(pyarrow.table(columns), tmp_path / "p.parquet")
+    code, out, err = command("serve", "check", "four-25um-biaxial", tmp_path / "p.parquet")
+    assert (code, err) == (1, "")
+    assert out.split()[0] == "row"
+    assert "(row 2)" in out

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from isocharge.common.errors import OutputError, PressError
 from isocharge.serve import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.prediction import measured_presses
-from isocharge.serve.prediction.measured_presses import PRESS_RULES, presses_text, read_press_list
+from isocharge.serve.prediction.measured_presses import PRESS_RULES, presses_text, read_press_list, row_words
 from isocharge.serve.prediction.tables.number_table import LARGEST
 
 NAMES = ("A", "B", "C")
@@ -174,6 +174,12 @@ def test_electrodes_that_cannot_be_columns(names):
 def test_no_file(tmp_path, name):
     with pytest.raises(PressError, match=r"cannot be read .*expected a CSV file of presses"):
         read_presses(tmp_path / name, NAMES)
+
+
+def test_rows_in_words():
+    assert row_words([3], "line") == "line 3"
+    assert row_words([3, 5], "row") == "rows 3, 5"
+    assert row_words(range(1, 6), "line", most=3) == "lines 1, 2, 3 and 2 more"
 
 
 def test_shapes_that_disagree():

@@ -97,7 +97,7 @@ def test_a_described_film_is_corrected_by_many_presses(truth, caplog):
     presses = measured(truth, 300)
     presses.charge_pC[5] *= 4.0
     film = corrected_film(presses, truth, DOMAIN, noise_model("reference"))
-    assert "1 presses are left out, which are nothing like the others (lines [7])" in caplog.text
+    assert "presses are left out, which are nothing like the others: line 7; look at them" in caplog.text
     calibrated, corrected = left(film, truth, 1.0)
     assert corrected < 0.3 * calibrated
     assert film.correction_percent(presses.contact) == pytest.approx(calibrated, rel=0.2)

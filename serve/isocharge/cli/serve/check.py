@@ -80,7 +80,7 @@ def _press_lines(check: PressCheck) -> Iterator[str]:
     chosen = sorted(np.argsort(-squares, kind="stable")[:MOST_ROWS].tolist())
     if check.presses > MOST_ROWS:
         yield f"the {MOST_ROWS} worst of {check.presses} presses; --json has all"
-    yield f"{'line':>6}{'x, mm':>9}{'y, mm':>9}{'force, N':>10}{'off, mm':>9}{'off, %':>9}  flags"
+    yield f"{check.errors.row_noun:>6}{'x, mm':>9}{'y, mm':>9}{'force, N':>10}{'off, mm':>9}{'off, %':>9}  flags"
     for press in chosen:
         row = check.errors.row(press)
         cells = [(row["x_mm"], 9, 2), (row["y_mm"], 9, 2), (row["force_N"], 10, 3)]

@@ -52,10 +52,11 @@ def _read_charges(file: str, electrodes: tuple[str, ...]) -> Array:
     """Read the charges of a file, or of CSV text on stdin for `-`, shape (n, electrodes), pC."""
     if file != "-":
         return read_charge_file(Path(file), electrodes, say)
-    text = TextIOWrapper(sys.stdin.buffer, encoding="utf-8-sig", newline="")
     try:
-        return read_charges(bounded_lines(text), electrodes, "stdin", say)
+        text = TextIOWrapper(sys.stdin.buffer, encoding="utf-8-sig", newline="")
+        try:
+            return read_charges(bounded_lines(text), electrodes, "stdin", say)
+        finally:
+            text.detach()  # otherwise the wrapper closes stdin
     except OSError as error:
-        raise InputError(f"stdin: cannot be read ({error.strerror}); expected CSV text") from error
-    finally:
-        text.detach()  # otherwise the wrapper closes stdin
+        raise InputError(f"stdin: cannot be read ({error.strerror or error}); expected CSV text") from error

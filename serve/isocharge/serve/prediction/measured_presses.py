@@ -323,6 +323,21 @@ def presses_text(presses: MeasuredPresses) -> str:
     return csv_text(presses.columns)
 
 
+def row_words(rows: Sequence[int], row_noun: str, most: int = 10) -> str:
+    """Return the numbers of presses in words, as in "line 3" or "rows 3, 4 and 12 more".
+
+    Args:
+        rows: Numbers of the presses in their file.
+        row_noun: What the numbers count: "line" or "row".
+        most: Largest number of presses that are listed.
+    """
+    noun = row_noun if len(rows) == 1 else f"{row_noun}s"
+    listed = ", ".join(map(str, rows[:most]))
+    if len(rows) <= most:
+        return f"{noun} {listed}"
+    return f"{noun} {listed} and {len(rows) - most} more"
+
+
 def _check_electrodes(electrodes: Collection[str]) -> None:
     """Raise PressError if names of electrodes cannot be names of columns that are read back."""
     if not electrodes or len(set(electrodes)) < len(electrodes) or not all(electrodes):

@@ -17,7 +17,7 @@ from isocharge.common.json_values import plain_values
 from isocharge.serve.flags import MISFIT
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.prediction.contact import Validity
-from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.serve.prediction.measured_presses import MeasuredPresses, row_words
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_errors import (
     NOT_TRAINED,
@@ -40,6 +40,9 @@ BAD_SHARE = 0.1
 
 MISFIT_SHARE, MISFIT_PROBABILITY = 0.01, 2e-3
 """Share of good presses with a misfit beyond the model's limit; probability below which more of them are too many."""
+
+MOST_LISTED = 5
+"""Largest number of presses that a note lists."""
 
 ENOUGH_TO_FIT = 50
 """Presses from which `train fit` learns a model from them."""
@@ -211,9 +214,11 @@ def _notes(
     """What else a reader should know."""
     for reason in sorted(set(filter(None, errors.left_out))):
         chosen = [line for line, other in zip(errors.lines, errors.left_out, strict=True) if other == reason]
-        yield f"{len(chosen)} of {len(rows)} presses do not count: {_explained(reason, metadata)} ({_lines(chosen)})"
+        words = row_words(chosen, errors.row_noun, MOST_LISTED)
+        yield f"{len(chosen)} of {len(rows)} presses do not count: {_explained(reason, metadata)} ({words})"
     if bad.any():
-        yield f"{_lines(np.array(errors.lines)[bad].tolist())}: nothing like the other presses, left out; look at it"
+        words = row_words(np.array(errors.lines)[bad].tolist(), errors.row_noun, MOST_LISTED)
+        yield f"{words}: nothing like the other presses, left out; look at it"
     if misfits := _too_many(errors, np.ones_like(rows), metadata):
         yield (
             f"{misfits}: no single press on the model's film gives such charges (gain, tare, swapped or dead electrode)"
@@ -246,9 +251,3 @@ def _common_notes(agreement: Agreement) -> Iterator[str]:
             f"forces are {1.0 + force.mean:.4g} +- {force.std:.2g} times the known ones on the average, as after a "
             "change of pretension, d31 or gains"
         )
-
-
-def _lines(lines: list[int]) -> str:
-    """ "line 3", or "lines 3, 4, 5, 6, 7 and 12 more"."""
-    more = f" and {len(lines) - 5} more" if len(lines) > 5 else ""
-    return f"line{'s' if len(lines) > 1 else ''} {', '.join(map(str, lines[:5]))}{more}"

@@ -26,7 +26,8 @@ class PressErrors:
     """A model's answers to n measured presses, and how far they are off.
 
     Attributes:
-        lines: Line of each press in its file.
+        lines: Number of each press in its file.
+        row_noun: What `lines` counts: "line" of a CSV file, "row" of a Parquet file.
         answer: The numbers of a `Contact`, shape (n, 10); NaN where they or a charge are unknown.
         error: Predicted less known x and y, mm, and force, a share of the known one, shape (n, 3); NaN where unknown.
         noise_std: The model's own standard deviations, in the units of `error`, shape (n, 3): noise of the charges.
@@ -36,6 +37,7 @@ class PressErrors:
     """
 
     lines: tuple[int, ...]
+    row_noun: str
     answer: Array
     error: Array
     noise_std: Array
@@ -91,6 +93,7 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     unknown = np.where(np.isnan(known), np.nan, 1.0)
     return PressErrors(
         presses.lines,
+        presses.row_noun,
         answer,
         (answer[:, :3] - known) / scale,
         answer[:, 3:6] / scale * unknown,

@@ -26,6 +26,7 @@ from isocharge.common.extras import require
 from isocharge.common.files import refuse_existing
 from isocharge.common.resumable_run import refuse_finished
 from isocharge.serve import MeasuredPresses, write_presses
+from isocharge.serve.prediction.measured_presses import MOST_ROWS
 from isocharge.simulate import Dataset, Sweep, load_sensor, parse_probe, read_dataset, run_sweep
 
 TABLES = (".csv", ".parquet")
@@ -103,6 +104,11 @@ def sweep_command(
             raise OutputExists(
                 f"{output}, the dataset that belongs beside {table}, is already there and is not overwritten; choose "
                 "another name, or write its table as simulate/docs/datasets.md does"
+            )
+        if samples > MOST_ROWS:
+            raise InputError(
+                f"{table}: a table has at most {MOST_ROWS:,} presses, got --samples {samples}; give a folder, -o "
+                f"{output}"
             )
         if table.suffix.lower() == ".parquet":
             with require("parquet"):  # missed now, not after the sweep

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.serve.prediction.measured_presses import MeasuredPresses, row_words
 from isocharge.simulate import Circle, Sensor
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
@@ -253,8 +253,9 @@ def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tup
     if not is_outside.any():
         return presses, []
     low, high = domain.force_range
+    words = row_words(presses[is_outside].lines, presses.row_noun)
     sentence = (
-        f"{_lines(presses[is_outside])}: a calibration takes presses within {domain.radius:.3g} mm of the "
+        f"{words}: a calibration takes presses within {domain.radius:.3g} mm of the "
         f"centre and of {low:.2g} to {high:.2g} N"
     )
     if is_outside.mean() > 0.5:
@@ -320,14 +321,6 @@ def _check_enough_measured(presses: MeasuredPresses, problem: CalibrationProblem
         )
 
 
-def _lines(presses: MeasuredPresses) -> str:
-    """Return the lines of presses in words, ten of them at most."""
-    noun = "line" if len(presses) == 1 else "lines"
-    listed = ", ".join(map(str, presses.lines[:10]))
-    more = ", ..." if len(presses) > 10 else ""
-    return f"{noun} {listed}{more}"
-
-
 def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> None:
     """Raise PressError if no film explains the presses, or only a film that hardly exists."""
     chi2, freedom = posterior.total
@@ -370,7 +363,7 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
 def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> Iterator[str]:
     """Yield warnings for the user, a sentence each."""
     if posterior.bad.any():
-        lines = _lines(presses[posterior.bad])
+        lines = row_words(presses[posterior.bad].lines, presses.row_noun)
         yield f"{lines}: left out, since no film fits them and all others; look at them again"
     good = presses[~posterior.bad]
     if len(good) <= FEW:

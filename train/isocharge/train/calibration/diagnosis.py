@@ -78,7 +78,7 @@ def check_places(presses: MeasuredPresses, radius: float) -> None:
     places = presses.contact[:, :2]
     for row in np.flatnonzero(np.hypot(*places.T) >= radius)[:1]:
         raise PressError(
-            f"line {presses.lines[row]}: a press at ({places[row, 0]:g}, {places[row, 1]:g}) mm "
+            f"{presses.row_noun} {presses.lines[row]}: a press at ({places[row, 0]:g}, {places[row, 1]:g}) mm "
             f"is off the film, whose radius is {radius:g} mm; positions are in mm from the film's centre"
         )
     places = places[np.isfinite(places[:, 0])]

@@ -96,7 +96,7 @@ def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
     ticks = np.arange(0, len(lines), max(1, len(lines) // 20))
     axes.set(
         title="how well the film fits",
-        xlabel="line of the press",
+        xlabel=f"{result.presses.row_noun} of the press",
         ylabel="residual over what noise and rig explain",
         xticks=ticks,
         xticklabels=[lines[tick] for tick in ticks],

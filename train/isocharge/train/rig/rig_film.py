@@ -12,7 +12,7 @@ import numpy as np
 import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.serve.prediction.measured_presses import MeasuredPresses, row_words
 from isocharge.simulate import ForwardMap, NoiseModel
 from isocharge.simulate.forward.charge_map import ChargeMap, Domain, differences
 from isocharge.simulate.numerics.statistics import rms
@@ -182,10 +182,9 @@ def corrected_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Do
             break
         correction = fit_correction(residuals[~gross])
     if gross.any():
-        count, lines = gross.sum(), list(presses[gross].lines[:10])
-        _log.warning(
-            "%d presses are left out, which are nothing like the others (lines %s); look at them", count, lines
-        )
+        left_out = presses[gross]
+        words = row_words(left_out.lines, left_out.row_noun)
+        _log.warning("presses are left out, which are nothing like the others: %s; look at them", words)
         residuals = residuals[~gross]
     total = residuals.chi2(correction.log_factor(residuals.contact)).sum()
     freedom = max(residuals.log_ratio.size - correction.freedom, 1.0)
