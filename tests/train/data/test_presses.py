@@ -11,6 +11,7 @@ from isocharge.common.errors import DatasetError, PressError
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle, Domain, Samples
 from isocharge.train.data.presses import dataset_of, domain_of, held_out, is_measured, presses_of, split_by_position
+from isocharge.train.training.source import TrainingData
 
 
 def with_samples(dataset, **columns):
@@ -69,6 +70,22 @@ def few(dataset):
 def test_presses_that_cannot_train_are_refused(dataset, change, message):
     with pytest.raises(DatasetError, match=message):
         presses_of(change(dataset))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: changed(d, 1e30), r"^sample 17, column 'B': expected a value of the size of the others.*got 1e\+30"),
+        (lambda d: changed(d, 1e39), r"^sample 17, column 'B': expected a charge in pC, got 1e\+39"),
+        (lambda d: with_samples(d, charge_pC=d.samples.charge_pC[:, [0, 0, 2]]), "channels 'A', 'B': expected charges"),
+        (lambda d: with_samples(d, charge_pC=1e-310 * d.samples.charge_pC), "channel 'A': expected charges in pC"),
+    ],
+)
+def test_a_measured_dataset_with_a_fault_is_refused(dataset, change, message):
+    measured = replace(dataset, manifest={})
+    assert TrainingData.of(measured).presses.measured
+    with pytest.raises(DatasetError, match=message):
+        TrainingData.of(change(measured))
 
 
 def contacts(count: int, seed: int) -> np.ndarray:

@@ -9,8 +9,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import PressError, shown
-from isocharge.serve.prediction.measured_presses import CONTACT, MeasuredPresses
+from isocharge.common.errors import DatasetError, PressError, shown
+from isocharge.serve.prediction.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
+from isocharge.simulate import Dataset
 from isocharge.train.data.channel_noise import usual_size
 from isocharge.train.data.measured_sensor import PressedArea
 
@@ -55,6 +56,29 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
     _check_far_value(presses, "force_N", force, 1.0 / force)
     _check_independence(channels)
     PressedArea.of(presses.contact)
+
+
+def check_measured_dataset(dataset: Dataset) -> None:
+    """Check that a network can be trained on a dataset of measured presses, whose samples are numbered from 0.
+
+    Raises:
+        DatasetError: If `check_measured_presses` finds a fault, or if a number is too large for a file of presses.
+    """
+    samples = dataset.samples
+    count = len(samples)
+    try:
+        presses = MeasuredPresses(
+            contact=np.column_stack([samples.x_mm, samples.y_mm, samples.force_N]),
+            charge_pC=samples.charge_pC,
+            position_std_mm=np.full(count, POSITION_STD_MM),
+            force_std=np.full(count, FORCE_STD),
+            electrodes=tuple(dataset.sensor.electrode_names),
+            lines=tuple(range(count)),
+            row_noun="sample",
+        )
+        check_measured_presses(presses)
+    except PressError as error:
+        raise DatasetError(str(error)) from error
 
 
 def _check_variation(name: str, charge: Array) -> None:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Dataset, Domain, Sensor
+from isocharge.train.data.measured_checks import check_measured_dataset
 from isocharge.train.data.presses import LabelledPresses, domain_of, presses_of
 from isocharge.train.training.fitted import Provenance
 from isocharge.train.training.network import as_tensor
@@ -64,15 +65,18 @@ class TrainingData:
 
     @classmethod
     def of(cls, dataset: Dataset) -> "TrainingData":
-        """A dataset, simulated or measured.
+        """Return the training data of a dataset, simulated or measured.
 
         Raises:
-            DatasetError: If it cannot train an inverse.
+            DatasetError: If the dataset cannot train a network, for example because of a copied channel.
         """
+        presses = presses_of(dataset)
+        if presses.measured:
+            check_measured_dataset(dataset)
         return cls(
             sensor=dataset.sensor,
             probes=tuple(sorted({str(probe) for probe in dataset.samples.probe})),
             domain=domain_of(dataset),
-            presses=presses_of(dataset),
+            presses=presses,
             sha256=dataset.sha256,
         )
