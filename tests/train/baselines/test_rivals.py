@@ -14,12 +14,14 @@ from isocharge.simulate import Domain, FunctionMap, noise_model
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines.gauss_newton import GaussNewton
 from isocharge.train.baselines.learned import Logarithms
-from isocharge.train.baselines.networks import OnnxContact, ReleasedModel, contact_graph
+from isocharge.train.baselines.networks import OnnxContact, ReleasedModel
 from isocharge.train.baselines.paper import Triangulate
 from isocharge.train.baselines.rivals import polynomial_ridge, rivals
 from isocharge.train.data.presses import LabelledPresses, position_error
-from isocharge.train.training.features import Features
-from isocharge.train.training.network import InverseNetwork, contact_alone
+from isocharge.train.model_release.onnx_graph import write_contact_graph
+from isocharge.train.training.config import NetworkConfig
+from isocharge.train.training.features import WhitenedFeatures
+from isocharge.train.training.network import InverseNetwork, fold_contact_mean
 
 ALLOWED = {
     "polynomial ridge": (0.1, 0.01),
@@ -154,7 +156,8 @@ def network():
     """Untrained: they have to agree on any weights."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
-        network = InverseNetwork(Domain(8.0, (0.05, 2.0)), Features.fit(CHARGE), (24, 24), (8, 8))
+        config = NetworkConfig(hidden=(24, 24), misfit_hidden=(8, 8))
+        network = InverseNetwork(Domain(8.0, (0.05, 2.0)), WhitenedFeatures.fit_logarithms(CHARGE), config)
         torch.nn.init.normal_(network.contact.skip.weight, std=0.3)
         return network.eval()
 
@@ -168,7 +171,7 @@ def check_contact(alone, expected):
 def test_the_graph_gives_the_networks_contact(network):
     with torch.no_grad():
         expected = network(torch.tensor(CHARGE).float())[0].numpy()
-    graph = contact_graph(contact_alone(network))
+    graph = write_contact_graph(fold_contact_mean(network))
     check_contact(OnnxContact(graph), expected)
     count = sum(parameter.numel() for parameter in network.contact.parameters())
     assert 4 * count < len(graph) < 4 * count + 8000

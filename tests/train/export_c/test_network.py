@@ -1,23 +1,19 @@
-"""The network in C against onnxruntime and against the network in double precision; graphs that are refused."""
+"""The network in C against onnxruntime and against the network in double precision."""
 
 import itertools
 from dataclasses import replace
 
 import numpy as np
-import onnx
 import pytest
 from msgspec import structs
-from onnx import numpy_helper
+from tests.train.random_networks import random_network
 
-from isocharge.common.errors import ModelError
 from isocharge.serve import find_model, load_model, write_model
 from isocharge.serve.model.session import outputs_of
 from isocharge.simulate import load_sensor, noise_model
 from isocharge.train.data.presses import draw_contacts
-from isocharge.train.export_c.network import read_network
-from isocharge.train.model_release.export import export_onnx
-from isocharge.train.training.features import SignedCharges
-from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, PlainPerceptron
+from isocharge.train.model_release.onnx_graph import write_graph
+from isocharge.train.training.features import signed_features
 
 FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0, 5.0, 5.0, 5.0])
 """mm and N, and larger ones for the misfit, which golden vectors have, too, and the correlations."""
@@ -58,33 +54,12 @@ def test_absurd_charges_are_finite_as_in_onnxruntime_and_nan_is_nan(model, build
     assert np.isnan(exported.predict(charge_pC)).all()
 
 
-def perceptron(rng, *widths):
-    """A perceptron of random weights."""
-    layers = tuple(
-        (rng.standard_normal((a, b)) / np.sqrt(a), 0.3 * rng.standard_normal(b)) for a, b in itertools.pairwise(widths)
-    )
-    return PlainPerceptron(layers, 0.1 * rng.standard_normal((widths[0], widths[-1])))
-
-
-def random_network(electrodes, contact, misfit, *, int8=False):
-    """A network as ours are, of any widths and number of electrodes."""
-    rng = np.random.default_rng(0)
-    parts = [perceptron(rng, electrodes, *contact, 6), perceptron(rng, electrodes, *misfit, electrodes)]
-    units = np.diag([8.0, 8.0, *[1.0] * (4 + electrodes)]), np.zeros(6 + electrodes)
-    layers = FoldedLayers.of(parts, np.eye(electrodes), np.zeros(electrodes), units)
-    if int8:
-        first, (weights, bias) = layers.hidden
-        scale = np.abs(weights).max(axis=0) / 127.0
-        layers = replace(layers, hidden=(first, (np.round(weights / scale) * scale, bias)))
-    return FoldedNetwork(layers, np.full(electrodes, 512.0))
-
-
 def written(folder, network):
     """A model folder of a network."""
-    names = tuple(f"E{number} */" for number in range(network.typical.size))
+    names = tuple(f"E{number} */" for number in range(network.features.n_electrode))
     about = structs.replace(load_model(find_model(MODELS[0])).metadata, name=folder.name, version=1, electrodes=names)
     charges = np.random.default_rng(1).uniform(100.0, 3000.0, (64, len(names))).astype(np.float32)
-    return write_model(folder, export_onnx(network, about.to_props()), about, charges, "card")
+    return write_model(folder, write_graph(network, about.to_props()), about, charges, "card")
 
 
 @pytest.mark.parametrize(
@@ -98,7 +73,7 @@ def written(folder, network):
 )
 def test_any_width_and_number_of_electrodes(electrodes, contact, misfit, int8, arrays, build, tmp_path):
     """Against the network in double precision; zeros beside the two perceptrons are left out, 8 bits are a byte."""
-    network = random_network(electrodes, contact, misfit, int8=int8)
+    network = random_network(electrodes, contact, misfit, is_int8=int8)
     exported = build(written(tmp_path / "random", network))
     charge_pC = np.random.default_rng(2).uniform(50.0, 5000.0, (500, electrodes)).astype(np.float32)
     check_agreement(exported.predict(charge_pC), np.concatenate(network.predict(charge_pC.astype(float)), axis=1))
@@ -110,7 +85,7 @@ def test_signed_charges(build, tmp_path):
     """asinh within bounds: against the network in double precision, and against onnxruntime beyond the bounds."""
     draw = np.random.default_rng(3).normal([0.0, -300.0, 900.0, 5.0], [200.0, 100.0, 300.0, 2.0], (1_000, 4))
     typical = np.array([20.0, 50.0, 10.0, 3.0])
-    network = replace(random_network(4, (24, 24), (16, 16)), typical=typical, signed=SignedCharges.of(draw, typical))
+    network = replace(random_network(4, (24, 24), (16, 16)), features=signed_features(draw, typical))
     folder = written(tmp_path / "signed", network)
     exported, charge_pC = build(folder), draw.astype(np.float32)
     check_agreement(exported.predict(charge_pC), np.concatenate(network.predict(charge_pC.astype(float)), axis=1))
@@ -119,56 +94,3 @@ def test_signed_charges(build, tmp_path):
     unknown = np.where(np.eye(4, dtype=bool), np.nan, charge_pC[:4]).astype(np.float32)
     assert np.isnan(exported.predict(unknown)).all()
     assert np.isnan(answers(folder, unknown)).all()
-
-
-def changed(change):
-    """A graph of ours after a change."""
-    model = onnx.load_model_from_string(export_onnx(random_network(3, (8, 8), (8, 8)), {}))
-    change(model)
-    return model.SerializeToString()
-
-
-def relu(model):
-    model.graph.node[4].op_type = "Relu"
-
-
-def rewired(model):
-    model.graph.node[5].input[0] = model.graph.node[3].output[0]
-
-
-def other_parts(model):
-    """y as a logarithm: every shape fits."""
-    sizes = [tensor for tensor in model.graph.initializer if tensor.data_type == onnx.TensorProto.INT64]
-    for tensor, values in zip(sizes, ([1, 5, 3], [2, 3]), strict=True):
-        tensor.CopyFrom(numpy_helper.from_array(np.array(values), tensor.name))
-
-
-def not_finite(model):
-    bias = model.graph.initializer[4]
-    bias.CopyFrom(numpy_helper.from_array(np.full(16, np.nan, np.float32), bias.name))
-
-
-def narrow(model):
-    bias = model.graph.initializer[4]
-    bias.CopyFrom(numpy_helper.from_array(np.zeros(1, np.float32), bias.name))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (relu, r"node Gemm \['t3'\]: expected|node Relu .*expected \('Tanh'"),
-        (rewired, "node Gemm"),
-        (other_parts, r"expected the outputs contact, contact_std, misfit from 2 \+ 4 \+ 3 answers"),
-        (not_finite, "expected finite constants"),
-        (narrow, r"a bias for each column"),
-    ],
-)
-def test_a_graph_that_is_not_ours_is_refused_by_the_node(change, message):
-    read_network(changed(lambda _: None), "f")
-    with pytest.raises(ModelError, match=f"^f: .*({message}).*; this is not a graph of isocharge"):
-        read_network(changed(change), "f")
-
-
-def test_a_file_that_is_no_graph_is_refused():
-    with pytest.raises(ModelError, match="f: not a valid ONNX file"):
-        read_network(b"nonsense", "f")

@@ -13,7 +13,8 @@ from isocharge.serve import Predictor, check_golden, load_model
 from isocharge.simulate import Calibration, load_sensor, press, touch_charge
 from isocharge.train import Provenance, evaluate, release
 from isocharge.train.films.film_scaling import FilmScaling
-from isocharge.train.training.features import MISFIT_UNIT
+from isocharge.train.training.folded_network import MISFIT_UNIT
+from isocharge.train.training.output_regression import adapt_to_charges
 
 AT, FORCE = (3.0, -4.0), 0.3
 
@@ -118,7 +119,7 @@ def test_what_is_linear_in_the_logarithms_is_corrected_exactly(films, drawn):
     logs = rng.normal(6.0, 0.3, (300, 4))
     as_if = np.exp(logs @ rng.normal(np.eye(4), 0.1) + 0.7)
     expected = network.predict(as_if)
-    found = network.corrected(np.exp(logs[:200]), as_if[:200], expected[0][:200]).predict(np.exp(logs))
+    found = adapt_to_charges(network, np.exp(logs[:200]), as_if[:200], expected[0][:200]).predict(np.exp(logs))
     np.testing.assert_allclose(np.hstack(found[::2]), np.hstack(expected[::2]), rtol=1e-6)
 
 

@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from isocharge.simulate import noise_model
 from isocharge.train import LabelledPresses
 from isocharge.train.training.correlation import ANGLE_SUMS, correlation_loss, with_correlation
-from isocharge.train.training.folding import COSINES
+from isocharge.train.training.folded_network import COSINES_TO_CORRELATIONS
 from isocharge.train.training.network import fold_network
 
 RNG = np.random.default_rng(0)
@@ -30,11 +30,14 @@ def test_any_angles_give_the_gram_matrix_of_unit_vectors():
     rows.append([np.cos(b), np.sin(b) * np.cos(c), np.sin(b) * np.sin(c)])
     factor = np.moveaxis(np.array(rows), 2, 0)
     gram = factor @ factor.transpose(0, 2, 1)
-    np.testing.assert_allclose(matrices(np.cos(ANGLES @ ANGLE_SUMS) @ COSINES), gram, atol=1e-14)
+    np.testing.assert_allclose(matrices(np.cos(ANGLES @ ANGLE_SUMS) @ COSINES_TO_CORRELATIONS), gram, atol=1e-14)
 
 
 def test_the_loss_is_the_likelihood_of_a_gaussian():
-    deviation, correlation = RNG.standard_normal((50, 3)), matrices(np.cos(ANGLES @ ANGLE_SUMS) @ COSINES)
+    deviation, correlation = (
+        RNG.standard_normal((50, 3)),
+        matrices(np.cos(ANGLES @ ANGLE_SUMS) @ COSINES_TO_CORRELATIONS),
+    )
     pairs = zip(deviation, correlation, strict=True)
     expected = -np.mean([multivariate_normal(cov=cov).logpdf(row) for row, cov in pairs])
     constant = 1.5 * np.log(2.0 * np.pi) + 0.5 * np.mean(deviation[:, 0] ** 2)

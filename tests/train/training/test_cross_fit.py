@@ -18,7 +18,7 @@ from isocharge.train.data.measured_sensor import PressedArea, outline
 from isocharge.train.data.presses import folds_by_place, held_out
 from isocharge.train.model_release.release import model_domain, release
 from isocharge.train.training.cross_fit import deviation_factors, usable_presses
-from isocharge.train.training.features import Features
+from isocharge.train.training.features import WhitenedFeatures
 from kept import ROOT, kept
 
 QUICK = FitConfig(
@@ -200,7 +200,7 @@ def test_one_force_and_channels_that_are_mostly_zero():
     noise = ChannelNoise.of(charge, PressedArea.of(contact).to_unit(contact))
     np.testing.assert_allclose(noise.charge(noise.level(charge)), charge, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(noise.bend(np.abs(charge)), noise.bend(-np.abs(charge)))
-    assert np.isfinite(Features.of_signed(charge, noise.bend(charge)).matrix).all()
+    assert np.isfinite(WhitenedFeatures.fit_signed(charge, noise.bend(charge)).matrix).all()
 
 
 def test_a_place_is_in_one_fold():

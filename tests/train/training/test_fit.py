@@ -15,7 +15,7 @@ from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, T
 from isocharge.train.training import descent
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fit import Split, fit_identity, start_loss, teaching_loss, train_network
-from isocharge.train.training.network import LARGEST_INT8, Perceptron
+from isocharge.train.training.network import LARGEST_INT8, TrainablePerceptron
 
 REPORT_EVERY = 20
 
@@ -36,7 +36,7 @@ def test_a_teacher_answers_in_the_coordinates_of_the_network():
 def stage(scores, steps=20 * REPORT_EVERY, warm_up_steps=0):
     """A small network that is pulled to a target, with given scores at successive evaluations."""
     torch.manual_seed(0)
-    part, given, seen = Perceptron(2, (4, 4), 1), iter(scores), []
+    part, given, seen = TrainablePerceptron(2, (4, 4), 1), iter(scores), []
 
     def loss(_, random):
         inputs = torch.rand(8, 2, generator=random)
@@ -196,7 +196,7 @@ def test_rounded_weights_are_whole_numbers_times_the_scale_of_their_output(datas
             torch.testing.assert_close(matrix / scale, (matrix / scale).round(), atol=1e-4, rtol=0.0)
             assert (matrix - before).abs().max() <= 0.51 * scale.max()  # rounded, and trained no further
             assert not torch.equal(matrix, before)
-        assert not torch.equal(part.layers()[-1].weight, other.layers()[-1].weight)  # trained on
+        assert not torch.equal(part.layers[-1].weight, other.layers[-1].weight)  # trained on
 
 
 class Killed(BaseException):

@@ -1,12 +1,12 @@
-"""The file `pretensions.npz` beside a calibrated model: its weights at other pretensions. Its writer and reader.
+"""The file `pretensions.npz` beside a calibrated model: the network's weights at several pretensions of the film.
 
-    about                JSON: the numbers of `Pretensions`, and the graph's constants in the order of the layers
-    node_MPa             pretensions at which weights are given, that of the calibration among them
-    typical_pC           charges over these, and the logarithm, are what the layers see
-    <constant>           weights that the graph's constant of this name has at each of the pretensions
+    about                JSON: the numbers of `Pretensions`, and the names of the weights in the order of the layers
+    node_MPa             pretensions at which the weights are given, that of the calibration among them
+    typical_pC           charges by which the charges are divided before the logarithm
+    <constant>           values of the graph's constant of this name at each of these pretensions
 
-In between, weights are interpolated by a polynomial: six pretensions over 2.8 MPa are right to 0.003 mm. `model.onnx`
-stays the graph of every film: onnxruntime is handed its constants, so that an answer takes as long as before.
+Between these pretensions the weights are interpolated by a polynomial. The graph `model.onnx` stays the same for every
+pretension: onnxruntime gets other constants, so a prediction takes as long as before.
 """
 
 import io
@@ -19,9 +19,12 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct
 
+from isocharge.common.activations import ACTIVATIONS, TANH
 from isocharge.common.arrays import Array, Singles
+from isocharge.common.charge_features import ChargeFeatures
 from isocharge.common.errors import ModelError, cut
 from isocharge.common.npz import DAMAGED, finite_array, npz_arrays, text_item
+from isocharge.common.perceptron import Layer, Perceptron, evaluate
 from isocharge.common.structs import NotNegative, Positive, Text, parse_json
 from isocharge.serve.model.companion_files import read_companion_file
 
@@ -49,25 +52,29 @@ CHECKED_PRETENSIONS = 50
 MIN_NODE_DISTANCE_MPa = 1e-3
 """Smallest distance of two pretensions, MPa, between which the interpolation is well conditioned."""
 
-TINY = 1e-12
-"""Length that counts as none."""
+MIN_LENGTH = 1e-12
+"""Length below which a misfit vector counts as having this length, so that no division by zero occurs."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pretensions:
-    """The network of one film at any pretension of a range.
+    """The network of one film at every pretension of a range.
 
     Attributes:
-        node_MPa: Pretensions at which weights are given, shape (k,), rising.
-        calibrated_MPa: That of the model as calibrated, one of these.
-        std_MPa: How well it is known when a stream begins: by the calibration, and a drift since.
-        floor_MPa: Standard deviation of what touches tell, however many: the film's other parameters are not exact.
-        misfit_rms: Root mean square of the misfits of good touches, in units of the noise.
-        misfit_unit: Scale of the misfit's arcsinh.
-        limits_pC: Smallest and largest charge that the layers see.
-        typical_pC: Shape (n_electrode,).
-        weights: Of each layer the graph's constants by name, (k, inputs, outputs) and (k, outputs): first those
-            followed by tanh, then skip and bias of the last, and its weights.
+        node_MPa: Pretensions at which the weights are given, shape (k,), rising.
+        calibrated_MPa: Pretension that the calibration found; one of `node_MPa`.
+        std_MPa: Standard deviation of the pretension when a stream begins: the uncertainty of the calibration and of
+            the drift since then.
+        floor_MPa: Standard deviation of the pretension that many touches estimate, caused by errors of the film's other
+            parameters.
+        misfit_rms: Root mean square of the misfits of good touches, in standard deviations of the noise.
+        misfit_unit: Scale of the misfit: misfit = misfit_unit * sinh(|misfit vector|).
+        limits_pC: Smallest and largest charge, to which charges are clipped, pC.
+        typical_pC: Charge by which each charge is divided before the logarithm, shape (n_electrode,), pC.
+        weights: Arrays of each layer by the name of the graph's constant, float32. First the hidden layers, weight of
+            shape (k, n_input, n_output) and bias of shape (k, n_output) each; then the skip layer, shape
+            (k, n_electrode, n_answer), the bias and the weight of the output layer.
+        activation: Name of the activation of the hidden layers.
     """
 
     node_MPa: Array
@@ -79,10 +86,11 @@ class Pretensions:
     limits_pC: tuple[float, float]
     typical_pC: Array
     weights: Mapping[str, Singles]
+    activation: str = TANH.name
 
     def to_bytes(self) -> bytes:
-        """The file."""
-        numbers = {name: getattr(self, name) for name in _About.__struct_fields__[2:]}
+        """Return the content of the file."""
+        numbers = {name: getattr(self, name) for name in _NUMBERS}
         about = json.dumps({"format_version": FORMAT, "constants": [*self.weights], **numbers}, allow_nan=False)
         file = io.BytesIO()
         arrays: dict[str, Any] = {"node_MPa": self.node_MPa, "typical_pC": self.typical_pC, **self.weights}
@@ -91,58 +99,91 @@ class Pretensions:
 
     @property
     def range_MPa(self) -> tuple[float, float]:
-        """Smallest and largest pretension."""
+        """Smallest and largest pretension, MPa."""
         return float(self.node_MPa[0]), float(self.node_MPa[-1])
 
-    def shares(self, pretension_MPa: Array) -> Array:
-        """Lagrange's polynomials at pretensions of shape (n,): what each of the k has in between, (n, k)."""
-        others = ~np.eye(self.node_MPa.size, dtype=bool)
-        apart = self.node_MPa[:, None] - self.node_MPa
-        steps = (pretension_MPa[:, None, None] - self.node_MPa) / np.where(others, apart, 1.0)
-        return np.asarray(np.prod(steps, axis=2, where=others))
+    @property
+    def features(self) -> ChargeFeatures:
+        """Input features of the network."""
+        low_pC, high_pC = self.limits_pC
+        return ChargeFeatures(self.typical_pC, np.array(low_pC), np.array(high_pC))
+
+    @property
+    def perceptron(self) -> Perceptron[Singles]:
+        """The perceptrons of all k pretensions, with weights of shape (k, n_input, n_output)."""
+        *hidden_arrays, skip, bias, weight = self.weights.values()
+        hidden = [
+            Layer(hidden_weight, hidden_bias[:, None])
+            for hidden_weight, hidden_bias in zip(hidden_arrays[::2], hidden_arrays[1::2], strict=True)
+        ]
+        return Perceptron(tuple(hidden), Layer(weight, bias[:, None]), skip, ACTIVATIONS[self.activation])
+
+    def interpolation_weights(self, pretension_MPa: Array) -> Array:
+        """Evaluate the Lagrange polynomials of the k pretensions.
+
+        Args:
+            pretension_MPa: Shape (n,).
+
+        Returns:
+            Shape (n, k). Each row sums to 1.
+        """
+        is_other = ~np.eye(self.node_MPa.size, dtype=bool)
+        node_distance = self.node_MPa[:, None] - self.node_MPa
+        distance = pretension_MPa[:, None, None] - self.node_MPa
+        factors = distance / np.where(is_other, node_distance, 1.0)
+        return np.asarray(np.prod(factors, axis=2, where=is_other))
 
     def at(self, node_MPa: Array) -> "Pretensions":
-        """The same, its weights given at other pretensions of the range, shape (k,)."""
-        shares = self.shares(node_MPa)
-        weights = {name: np.tensordot(shares, rows, axes=1).astype(np.float32) for name, rows in self.weights.items()}
+        """Return the same network with its weights given at other pretensions of the range, shape (k,)."""
+        factors = self.interpolation_weights(node_MPa)
+        weights = {name: np.tensordot(factors, rows, axes=1).astype(np.float32) for name, rows in self.weights.items()}
         return replace(self, node_MPa=node_MPa, weights=weights)
 
     def constants(self, pretension_MPa: float) -> dict[str, Singles]:
-        """The graph's constants at one pretension of the range."""
-        return {name: rows[0] for name, rows in self.at(np.array([pretension_MPa])).weights.items()}
+        """Return the graph's constants by name for one pretension of the range."""
+        single = self.at(np.array([pretension_MPa]))
+        return {name: rows[0] for name, rows in single.weights.items()}
 
     def misfits(self, charge_pC: Array, pretension_MPa: Array) -> Array:
-        """Misfits of one press, shape (n,), from charges of shape (n_electrode,), at pretensions of shape (n,)."""
-        return np.asarray(np.linalg.norm(self.vectors(charge_pC[None], pretension_MPa)[0], axis=1))
+        """Compute the misfit of one press at several pretensions.
+
+        Args:
+            charge_pC: Shape (n_electrode,), pC.
+            pretension_MPa: Shape (n,).
+
+        Returns:
+            Shape (n,), in standard deviations of the noise.
+        """
+        (vectors,) = self.vectors(charge_pC[None], pretension_MPa)
+        return np.asarray(np.linalg.norm(vectors, axis=1))
 
     def vectors(self, charge_pC: Array, pretension_MPa: Array) -> Array:
-        """The vectors whose lengths the misfits are, in units of the noise.
+        """Compute the vectors whose lengths are the misfits of presses at several pretensions.
 
-        They are interpolated linearly: `at` gives weights at pretensions close enough.
+        The vectors are interpolated linearly between the pretensions of `node_MPa`, which must therefore lie close to
+        each other; `at` provides that.
 
         Args:
             charge_pC: Shape (m, n_electrode), pC.
             pretension_MPa: Shape (n,).
 
         Returns:
-            Shape (m, n, n_electrode).
+            Shape (m, n, n_electrode), in standard deviations of the noise.
         """
-        *hidden, skip, bias, last = self.weights.values()
-        logs = np.log(np.clip(charge_pC, *self.limits_pC) / self.typical_pC).astype(np.float32)
-        value = logs
-        for weight, shift in zip(hidden[::2], hidden[1::2], strict=True):
-            value = np.tanh(value @ weight + shift[:, None])
-        nodes = (value @ last + logs @ skip + bias[:, None])[..., -logs.shape[1] :]
-        after = np.clip(np.searchsorted(self.node_MPa, pretension_MPa), 1, self.node_MPa.size - 1)
-        gap = self.node_MPa[after] - self.node_MPa[after - 1]
-        share = np.clip((pretension_MPa - self.node_MPa[after - 1]) / gap, 0.0, 1.0)[:, None, None]
-        between = (1.0 - share) * nodes[after - 1] + share * nodes[after]
-        length = np.maximum(np.linalg.norm(between, axis=2, keepdims=True), TINY)
-        return np.asarray((between * (self.misfit_unit * np.sinh(length) / length)).swapaxes(0, 1))
+        inputs = self.features.evaluate(charge_pC).astype(np.float32)
+        _, misfit_vectors = np.split(evaluate(self.perceptron, inputs), [-inputs.shape[1]], axis=-1)
+        upper = np.clip(np.searchsorted(self.node_MPa, pretension_MPa), 1, self.node_MPa.size - 1)
+        lower = upper - 1
+        gap_MPa = self.node_MPa[upper] - self.node_MPa[lower]
+        fraction = np.clip((pretension_MPa - self.node_MPa[lower]) / gap_MPa, 0.0, 1.0)[:, None, None]
+        interpolated = (1.0 - fraction) * misfit_vectors[lower] + fraction * misfit_vectors[upper]
+        length = np.maximum(np.linalg.norm(interpolated, axis=2, keepdims=True), MIN_LENGTH)
+        vectors = interpolated * (self.misfit_unit * np.sinh(length) / length)
+        return np.asarray(vectors.swapaxes(0, 1))
 
 
 class _About(Struct):
-    """The numbers of `Pretensions` in the file."""
+    """The JSON object `about` of the file: the numbers of `Pretensions`."""
 
     format_version: Annotated[int, Meta(ge=1)]
     constants: Annotated[list[Text], Meta(min_length=5, max_length=MAX_CONSTANTS)]
@@ -152,6 +193,11 @@ class _About(Struct):
     misfit_rms: Positive
     misfit_unit: Positive
     limits_pC: tuple[Positive, Positive]
+    activation: str = TANH.name
+
+
+_NUMBERS = tuple(name for name in _About.__struct_fields__ if name not in ("format_version", "constants"))
+"""Attributes of `Pretensions` that the JSON object holds."""
 
 
 def read_pretensions(version_folder: Path) -> Pretensions:
@@ -179,6 +225,8 @@ def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
     about = parse_json(text_item(arrays, "about"), "about", ModelError, _About)
     if about.format_version != FORMAT:
         raise ValueError(f"format {about.format_version} is not supported (this version reads {FORMAT})")
+    if about.activation not in ACTIVATIONS:
+        raise ValueError(f"activation: expected one of {', '.join(ACTIVATIONS)}, got {about.activation!r}")
     node_MPa = finite_array(arrays, "node_MPa", (None,))
     _check_nodes(node_MPa, about.calibrated_MPa)
     typical_pC = finite_array(arrays, "typical_pC", (None,))
@@ -188,7 +236,7 @@ def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
             f"expected positive typical charges and rising limits, got {cut(str(typical_pC))} pC and "
             f"{low_pC:g} to {high_pC:g} pC"
         )
-    numbers = {name: getattr(about, name) for name in _About.__struct_fields__[2:]}
+    numbers = {name: getattr(about, name) for name in _NUMBERS}
     with np.errstate(over="ignore"):
         weights = {name: arrays[name].astype(np.float32) for name in _checked_weights(arrays, about, node_MPa.size)}
     pretensions = Pretensions(node_MPa=node_MPa, typical_pC=typical_pC, weights=weights, **numbers)

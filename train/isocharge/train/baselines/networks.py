@@ -20,11 +20,10 @@ from isocharge.serve.model.session import INPUT, BoundPress, open_session
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.baselines.rivals import GivenMethod
 from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.model_release.export import GraphBuilder, add_inputs, add_layers, make_model
+from isocharge.train.model_release.onnx_graph import write_contact_graph
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
 from isocharge.train.training.fit import train_network
-from isocharge.train.training.folding import FoldedNetwork
-from isocharge.train.training.network import contact_alone
+from isocharge.train.training.network import fold_contact_mean
 from isocharge.train.training.source import TrainingData
 
 RELEASED = "released network"
@@ -84,7 +83,7 @@ class TrainedNetwork(OnnxContact):
         )
         sizes = NetworkConfig(hidden=self.hidden, misfit_hidden=(8,) * len(self.hidden))
         data = replace(self.data, presses=LabelledPresses(contact, charge, self.data.presses.measured))
-        self.graph = contact_graph(contact_alone(train_network(data, FitConfig(sizes, training)).network))
+        self.graph = write_contact_graph(fold_contact_mean(train_network(data, FitConfig(sizes, training)).network))
         return self
 
 
@@ -125,12 +124,3 @@ class ReleasedModel(GivenMethod):
         """Its contact alone, which is all that the other methods give."""
         part = Extractor(onnx.load_model_from_string(self.graph)).extract_model([INPUT], ["contact"])
         return OnnxContact(part.SerializeToString())
-
-
-def contact_graph(network: FoldedNetwork) -> bytes:
-    """An ONNX graph with the input `charge_pC` [n, n_electrode] and the output `contact` [n, 3], float32."""
-    build = GraphBuilder()
-    value = add_layers(build, add_inputs(build, network), network.layers)
-    plane, log_force = build.split(value, ("plane", "log_force"), (2, 1), axis=1)
-    build.add("Concat", plane, build.add("Exp", log_force), to="contact", axis=1)
-    return bytes(make_model(build, "contact", network.typical.size, {"contact": 3}).SerializeToString())

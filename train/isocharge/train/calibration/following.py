@@ -4,7 +4,6 @@ The network for all films is folded at some pretensions, with all other paramete
 network learns the film's discrepancy and the remaining uncertainty as the model itself does.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,13 +11,13 @@ import onnx
 from onnx import numpy_helper
 
 from isocharge.common.arrays import Array
+from isocharge.common.perceptron import Layer
 from isocharge.serve.model.pretensions import Pretensions
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.calibrate import CalibrationResult
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, draw_contacts
-from isocharge.train.model_release.export import export_onnx
-from isocharge.train.training.features import MISFIT_UNIT
-from isocharge.train.training.folding import KNOWN, FoldedNetwork
+from isocharge.train.model_release.onnx_graph import write_graph
+from isocharge.train.training.folded_network import MISFIT_UNIT, FoldedNetwork
 
 NODES = 6
 """Pretensions at which weights are given."""
@@ -69,7 +68,8 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
         misfit_rms=1.0,
         misfit_unit=MISFIT_UNIT,
         limits_pC=(LOWEST_CHARGE, HIGHEST_CHARGE),
-        typical_pC=network.typical,
+        typical_pC=network.features.typical_pC,
+        activation=network.layers.activation.name,
         weights=dict(zip(_constants(network), weights, strict=True)),
     )
     rng = np.random.default_rng(SEED)
@@ -93,24 +93,26 @@ def _nodes(own: float, low: float, high: float) -> Array:
 
 def _like(network: FoldedNetwork, other: FoldedNetwork) -> FoldedNetwork:
     """Another network with the correlations of this one: they hardly change with the pretension."""
-    if not network.angles:
+    if not network.n_angle:
         return other
-    weight, bias, skip = (
-        values[..., KNOWN : KNOWN + network.angles] for values in (*network.layers.last, network.layers.skip)
-    )
-    return replace(other, layers=other.layers.with_angles(weight, bias, skip))
+    columns = network.angle_columns
+    last = network.layers.last
+    return other.with_angles(Layer(last.weight[:, columns], last.bias[columns]), network.layers.skip[:, columns])
 
 
 def _arrays(network: FoldedNetwork) -> list[np.ndarray]:
     """Weights in the order of `Pretensions`."""
     layers = network.layers
-    arrays: Sequence[Array] = [*(array for layer in layers.hidden for array in layer), layers.skip, layers.last[1]]
-    return [np.asarray(array, dtype=np.float32) for array in (*arrays, layers.last[0])]
+    arrays: list[Array] = []
+    for layer in layers.hidden:
+        arrays += [layer.weight, layer.bias]
+    arrays += [layers.skip, layers.last.bias, layers.last.weight]
+    return [np.asarray(array, dtype=np.float32) for array in arrays]
 
 
 def _constants(network: FoldedNetwork) -> list[str]:
     """Names of the graph's constants that hold them."""
-    graph = onnx.load_from_string(export_onnx(network, {})).graph
+    graph = onnx.load_from_string(write_graph(network, {})).graph
     constants = [(constant.name, numpy_helper.to_array(constant)) for constant in graph.initializer]
     return [next(name for name, held in constants if np.array_equal(held, array)) for array in _arrays(network)]
 

@@ -13,7 +13,7 @@ from isocharge.serve.model.model_folder import load_model
 from isocharge.serve.signal_chain.hum import LEAST_TURN
 from isocharge.train.export_c.c_text import c_comment, c_double, c_doubles, source_text
 from isocharge.train.export_c.model_source import model_header, model_source, self_test
-from isocharge.train.export_c.network import read_network
+from isocharge.train.model_release.onnx_graph import read_graph
 
 MOST_TARE_FRAMES = 10_000
 """Frames of a tare that a state in C may hold: 320 kB with four electrodes."""
@@ -113,7 +113,7 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
     """The texts of an export by their paths in its folder; the errors are those of `export_c`."""
     loaded = load_model(model)
     path, metadata = loaded.folder / "model.onnx", loaded.metadata
-    network = read_network(path.read_bytes(), str(path))
+    network = read_graph(path.read_bytes(), str(path))
     files = {
         "isocharge_model.h": model_header(metadata, network),
         "isocharge_model.c": model_source(metadata, network),

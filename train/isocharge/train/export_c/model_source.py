@@ -1,140 +1,42 @@
-"""`isocharge_model.h`, `isocharge_model.c` and `self_test.c` of a model.
+"""The files `isocharge_model.h`, `isocharge_model.c` and `self_test.c` of a model.
 
-A layer has weights as (inputs, outputs), a few rows at a time added to all outputs: the inner loop runs over
-neighbouring outputs and a constant count, so compilers work on several at once from -O2 on without changing the order
-of any sum. Two perceptrons that run side by side have two blocks of weights; the zeros beside them are left out.
-Weights that training rounded to 8 bits take a byte each.
-
-The first layer takes one logarithm of the charges and the others' distances from it: the same function, with less
-rounding. The charges of a film rise and fall together, and position is in what tells them apart. So a first layer has
-large weights of both signs on logarithms that are nearly equal, and its sums nearly cancel:
+The first layer gets the logarithm of one charge and the differences of the other logarithms from it. This is the same
+function of the charges, with less rounding. The charges of a film rise and fall together, and the position changes
+their ratios. A first layer therefore has large weights of both signs on logarithms that are nearly equal, and its sums
+nearly cancel:
 
     sum_k w_k ln q_k = (sum_k w_k) ln q_0 + sum_k w_k ln(q_k / q_0).
 
-On the right the subtraction comes first. The difference of two charges within a factor of two is exact (Sterbenz 1974),
-and the logarithm of 1 + (q_k - q_0) / q_0 has all its digits, where that of a charge has lost some to its size.
+On the right-hand side the subtraction comes first. The difference of two charges within a factor of two is exact
+(Sterbenz 1974), and the logarithm of 1 + (q_k - q_0) / q_0 has all its digits, whereas the logarithm of a charge has
+lost some digits to its magnitude.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import chain, cycle, islice, pairwise
-from typing import Any
+from itertools import cycle, islice, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from isocharge.common.arrays import Singles
+from isocharge.common.arrays import Array, Singles
+from isocharge.common.charge_features import ChargeFeatures
 from isocharge.serve import Contact, ModelMetadata
 from isocharge.serve.model.golden import Golden
 from isocharge.serve.model.session import CORRELATION, SEVEN
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
-from isocharge.train.export_c.network import LOGS, PLANE, Network
-
-ROWS = 4
-"""Rows of weights that are added at a time: each output is loaded and stored once for all of them."""
-
-LARGEST_INT8 = 127
-"""The largest weight of a column in units of its scale, where weights are rounded to 8 bits."""
-
-Block = tuple[slice, slice]
-"""Rows and columns, each from a first."""
-
-WHOLE: Block = (slice(0, None), slice(0, None))
+from isocharge.train.export_c.layer_source import LayerSource, find_blocks
+from isocharge.train.training.folded_network import (
+    COSINES_TO_CORRELATIONS,
+    LOG_STD,
+    MISFIT_UNIT,
+    POSITION,
+    FoldedNetwork,
+)
 
 
-@dataclass(frozen=True)
-class Layer:
-    """A function `name(x, c, y)` in C: y = f(x W + c), shapes (inputs,) and (outputs,).
-
-    Attributes:
-        name: Of the function.
-        weights: W, shape (inputs, outputs), float32.
-        bias: c where it is constant, written as the array `name_bias`.
-        blocks: Outside which W is zero.
-        activation: Name of f in C; "" for none.
-    """
-
-    name: str
-    weights: Singles
-    bias: Singles | None = None
-    blocks: tuple[Block, ...] = (WHOLE,)
-    activation: str = ""
-
-    def text(self) -> str:
-        """Constant arrays and the function; c is added last, lest each sum be rounded to the digits of a large c."""
-        inputs, outputs = self.weights.shape
-        values, scale = rounded_to_int8(self.weights)
-        names = [f"{self.name}_weights_{number}" for number in range(len(self.blocks))]
-        arrays = [c_array(name, values[block]) for name, block in zip(names, self.blocks, strict=True)]
-        constants = {"scale": scale, "bias": self.bias}
-        arrays += [c_array(f"{self.name}_{word}", row) for word, row in constants.items() if row is not None]
-        answer = "y[j] + c[j]" if scale is None else f"y[j] * {self.name}_scale[j] + c[j]"
-        lines = [
-            f"/* {inputs} numbers x to {outputs} numbers y */",
-            f"static void {self.name}(const float *restrict x, const float *restrict c, float *restrict y)",
-            "{",
-            f"    for (int j = 0; j < {outputs}; ++j)",
-            "        y[j] = 0.0f;",
-            *chain(*(_product(name, block, values[block]) for name, block in zip(names, self.blocks, strict=True))),
-            f"    for (int j = 0; j < {outputs}; ++j)",
-            f"        y[j] = {f'{self.activation}({answer})' if self.activation else answer};",
-            "}",
-            "",
-        ]
-        return "\n".join([*arrays, *lines])
-
-
-def blocks_of(weights: Sequence[Singles], answers: int) -> list[tuple[Block, ...]]:
-    """The blocks of layers one behind the other: two where two perceptrons run side by side, one where they do not.
-
-    Args:
-        weights: Of each layer but the first, whose inputs both perceptrons share.
-        answers: Columns of the last that the first perceptron gives.
-    """
-    blocks: list[tuple[Block, ...]] = []
-    column = answers
-    for matrix in reversed(weights):
-        row = int(matrix[:, column:].any(axis=1).argmax())  # the first that the second perceptron has
-        if row == 0 or matrix[row:, :column].any():
-            row = column = 0
-        first, second = (slice(0, row), slice(0, column)), (slice(row, None), slice(column, None))
-        blocks.append((first, second) if row else (second,))
-        column = row
-    return blocks[::-1]
-
-
-def rounded_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
-    """Weights as int8 and a scale of each column if they are whole multiples of it, else as they are and None."""
-    scale = np.abs(values).max(axis=0) / np.float32(LARGEST_INT8)
-    multiples = np.round(values / np.where(scale > 0.0, scale, 1.0))
-    if np.allclose(multiples * scale, values, rtol=2.0**-21, atol=0.0):  # as far as float32 can tell
-        return multiples.astype(np.int8), scale
-    return values, None
-
-
-def _product(name: str, block: Block, values: NDArray[Any]) -> list[str]:
-    """Add the product with one block to y: rows in fours, then those that are left."""
-    rows, width = values.shape
-    first, offset = (part.start for part in block)
-    kind, cast = ("signed char", "(float)") if values.dtype == np.int8 else ("float", "")
-    lines = []
-    for begin, end in ((0, rows - rows % ROWS), (rows - rows % ROWS, rows)):
-        count = min(ROWS, end - begin)
-        terms = [f"x{k} * {cast}w[{k * width} + j]" for k in range(count)]
-        lines += [
-            f"    for (int i = {begin}; i < {end}; i += {count}) {{",
-            f"        const {kind} *w = {name} + {width} * i;",
-            f"        const float {', '.join(f'x{k} = x[{first + k} + i]' for k in range(count))};",
-            "",
-            f"        for (int j = 0; j < {width}; ++j)",
-            f"            y[{offset} + j] += {' + '.join(terms)};",
-            "    }",
-        ] * (count > 0)
-    return lines
-
-
-def model_header(metadata: ModelMetadata, network: Network) -> str:
-    """The text of `isocharge_model.h`."""
+def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
+    """Return the text of `isocharge_model.h`."""
+    features = network.features
+    is_logarithmic = features.mean is None
+    n_number = _contact_size(network)
     return source_text(
         "isocharge_model.h",
         label=c_comment(metadata.label),
@@ -142,64 +44,82 @@ def model_header(metadata: ModelMetadata, network: Network) -> str:
         sensor=c_string(metadata.frame_id),
         electrodes=len(metadata.electrodes),
         names=", ".join(map(c_string, metadata.electrodes)),
-        fields=", ".join(f'"{name}"' for name in Contact._fields[: _numbers(network)]),
-        numbers=_numbers(network),
-        all=source_text("isocharge_all.h") if len(network.cosines) else "",
-        low=f"{network.low:g}" if network.mean is None else "LOW",
-        high=f"{network.high:g}" if network.mean is None else "HIGH (isocharge_model.c)",
+        fields=", ".join(f'"{name}"' for name in Contact._fields[:n_number]),
+        numbers=n_number,
+        all=source_text("isocharge_all.h") if network.n_angle else "",
+        low=f"{features.low_pC:g}" if is_logarithmic else "LOW",
+        high=f"{features.high_pC:g}" if is_logarithmic else "HIGH (isocharge_model.c)",
     )
 
 
-def model_source(metadata: ModelMetadata, network: Network) -> str:
-    """The text of `isocharge_model.c`."""
-    (weights, bias), *behind = network.hidden
-    *blocks, of_last = blocks_of([*(weights for weights, _ in behind), network.last], network.known)
-    as_inputs = _of_differences if network.mean is None else np.asarray
-    hidden = [Layer("layer_0", as_inputs(weights), bias, activation="tanh_of")]
-    hidden += [
-        Layer(f"layer_{number}", weights, bias, parts, "tanh_of")
-        for number, ((weights, bias), parts) in enumerate(zip(behind, blocks, strict=True), 1)
-    ]
-    skip = Layer("skip", as_inputs(network.skip[0]), network.skip[1])
-    rows = ["logs", *islice(cycle(["one", "other"]), len(hidden))]
+def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
+    """Return the text of `isocharge_model.c`."""
+    hidden, skip, last = _layer_sources(network)
+    activation = network.layers.activation
+    widest = max(layer.weight.shape[1] for layer in hidden)
+    buffers = ["logs", *islice(cycle(["one", "other"]), len(hidden))]
     calls = [
-        *(f"{layer.name}({x}, {layer.name}_bias, {y});" for layer, (x, y) in zip(hidden, pairwise(rows), strict=True)),
-        "skip(logs, skip_bias, skipped);",
-        f"last({rows[-1]}, skipped, answers);",
+        f"{layer.name}({x}, {layer.name}_bias, {y});" for layer, (x, y) in zip(hidden, pairwise(buffers), strict=True)
     ]
-    width = max(len(bias) for _, bias in network.hidden)
+    calls += [f"skip({buffers[0]}, skip_bias, skipped);", f"last({buffers[-1]}, skipped, answers);"]
+    hidden_buffers = dict.fromkeys(buffers[1:])
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),
-        features=_features(network),
-        layers="\n".join(layer.text() for layer in (*hidden, skip, Layer("last", network.last, None, of_last))),
-        rows=", ".join(f"{row}[{width}]" for row in dict.fromkeys(rows[1:])),
+        activation=activation.c_source,
+        features=_features_source(network.features),
+        layers="\n".join(layer.text() for layer in (*hidden, skip, last)),
+        rows=", ".join(f"{buffer}[{widest}]" for buffer in hidden_buffers),
         calls="\n    ".join(calls),
-        electrodes=network.factor.size,
-        plane=PLANE,
-        logs=PLANE + LOGS,
-        known=network.known,
-        answers=network.last.shape[1],
-        all=_all_source(network) if len(network.cosines) else "",
-        misfit_unit=c_float(network.misfit_unit),
+        electrodes=network.features.n_electrode,
+        plane=POSITION.stop,
+        logs=LOG_STD.stop,
+        known=network.angle_columns.stop,
+        answers=last.weight.shape[1],
+        all=_correlations_source(network) if network.n_angle else "",
+        misfit_unit=c_float(MISFIT_UNIT),
     )
 
 
-def _numbers(network: Network) -> int:
-    """Numbers of a Contact that a model gives."""
-    return len(Contact._fields) if len(network.cosines) else SEVEN
+def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSource, LayerSource]:
+    """Return the hidden layers, the skip layer and the output layer of a network."""
+    perceptron = network.layers
+    is_logarithmic = network.features.mean is None
+    from_inputs = _weights_on_differences if is_logarithmic else _singles
+    first, *others = perceptron.hidden
+    other_weights = [_singles(layer.weight) for layer in others]
+    last_weight = _singles(perceptron.last.weight)
+    *other_blocks, last_blocks = find_blocks([*other_weights, last_weight], network.angle_columns.stop)
+
+    hidden = [LayerSource("layer_0", from_inputs(first.weight), _singles(first.bias), activation=perceptron.activation)]
+    for number, (layer, weight, blocks) in enumerate(zip(others, other_weights, other_blocks, strict=True), start=1):
+        bias = _singles(layer.bias)
+        hidden.append(LayerSource(f"layer_{number}", weight, bias, blocks, perceptron.activation))
+    skip = LayerSource("skip", from_inputs(perceptron.skip), _singles(perceptron.last.bias))
+    last = LayerSource("last", last_weight, blocks=last_blocks)
+    return hidden, skip, last
 
 
-def _all_source(network: Network) -> str:
-    """The function that gives the correlations, too."""
-    table, (_, answers) = c_array("COSINES", network.cosines), network.last.shape
-    values = {"table": table, "cosines": len(network.cosines), "first": PLANE + LOGS, "answers": answers}
-    return "\n" + source_text("isocharge_all.c", **values)
+def _contact_size(network: FoldedNetwork) -> int:
+    """Return how many numbers of a `Contact` a network gives."""
+    return len(Contact._fields) if network.n_angle else SEVEN
+
+
+def _correlations_source(network: FoldedNetwork) -> str:
+    """Return the function that also gives the correlations."""
+    text = source_text(
+        "isocharge_all.c",
+        table=c_array("COSINES", COSINES_TO_CORRELATIONS.astype(np.float32)),
+        cosines=network.n_angle,
+        first=network.angle_columns.start,
+        answers=network.layers.skip.shape[1],
+    )
+    return f"\n{text}"
 
 
 def self_test(golden: Golden) -> str:
-    """The text of `self_test.c`: golden vectors, and how far an answer may be from them."""
-    names = sorted(golden.outputs, key=CORRELATION.__eq__)  # the order of a Contact
+    """Return the text of `self_test.c`: golden vectors and their tolerances."""
+    names = sorted(golden.outputs, key=CORRELATION.__eq__)  # a Contact ends with the correlations
     answers = np.concatenate([golden.outputs[name] for name in names], axis=1)
     floors = np.array([floor for name in names for floor in golden.floors[name]], np.float32)
     return source_text(
@@ -214,22 +134,33 @@ def self_test(golden: Golden) -> str:
     )
 
 
-def _features(network: Network) -> str:
-    """The function `features`: from charges to what the first layer takes."""
-    arrays = {"FACTOR": network.factor}
-    if network.mean is not None:
-        arrays |= {"LOW": network.low, "HIGH": network.high, "MEAN": network.mean}
-        return source_text("features_signed.c", arrays=_arrays(arrays), electrodes=network.factor.size)
-    low, high = c_float(network.low.item()), c_float(network.high.item())
-    return source_text("features.c", arrays=_arrays(arrays), electrodes=network.factor.size, low=low, high=high)
+def _features_source(features: ChargeFeatures) -> str:
+    """Return the function `features` from the charges to the inputs of the first layer."""
+    factor = _singles(1.0 / features.typical_pC)
+    if features.mean is None:
+        return source_text(
+            "features.c",
+            arrays=c_array("FACTOR", factor),
+            electrodes=features.n_electrode,
+            low=c_float(features.low_pC.item()),
+            high=c_float(features.high_pC.item()),
+        )
+    arrays = [
+        c_array("FACTOR", factor),
+        c_array("LOW", _singles(features.low_pC)),
+        c_array("HIGH", _singles(features.high_pC)),
+        c_array("MEAN", _singles(features.mean)),
+    ]
+    return source_text("features_signed.c", arrays="\n".join(arrays), electrodes=features.n_electrode)
 
 
-def _arrays(arrays: Mapping[str, Singles]) -> str:
-    return "\n".join(c_array(name, values) for name, values in arrays.items())
+def _singles(values: Array) -> Singles:
+    """Return values in single precision."""
+    return np.asarray(values, dtype=np.float32)
 
 
-def _of_differences(weights: Singles) -> Singles:
-    """Weights on (ln q_0, ln(q_1 / q_0), ...) instead of on the logarithms."""
-    values = weights.astype(np.float64)
+def _weights_on_differences(weight: Array) -> Singles:
+    """Return weights on (ln q_0, ln(q_1 / q_0), ...) from weights on the logarithms, shape (inputs, outputs)."""
+    values = np.array(weight)
     values[0] = values.sum(axis=0)
     return values.astype(np.float32)

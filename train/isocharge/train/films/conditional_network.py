@@ -1,8 +1,13 @@
-"""The network for all films: a perceptron whose weights depend on a film's context (`film_scaling`).
+"""The network for all films during training: a perceptron whose weights depend on the film.
 
-Its inputs are the charges with the exact scales of the film divided out. A small network turns the context
-into psi. Layer l then has the weights W_l0 + sum_k phi_lk W_lk, with phi linear in psi, and a bias that is linear in
-psi; so has the layer that skips the others. Computed once per film, it is a plain perceptron (`ConditionalWeights`).
+The inputs are logarithms of the charges, from which the exact scales of the film are subtracted (`film_scaling`). A
+small context network turns the context of the film, a few numbers that describe it, into a vector psi. The weights of
+layer l are then
+
+    W_l = W_l0 + sum over k of phi_lk W_lk,    phi linear in psi,
+
+and the bias is linear in psi. The skip layer has weights of the same form. For one film, the result is an ordinary
+perceptron (`films_model.ConditionalWeights`).
 """
 
 from dataclasses import dataclass
@@ -12,34 +17,42 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from isocharge.common.activations import TANH, Activation
 from isocharge.common.arrays import Array
+from isocharge.common.charge_features import ChargeFeatures
+from isocharge.common.perceptron import Layer, Perceptron
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.films.films_data import FilmPresses
+from isocharge.train.films.films_model import CONTEXT_LAYERS
 from isocharge.train.training.features import whitening
-from isocharge.train.training.network import Trainable, as_tensor
+from isocharge.train.training.network import TrainableNetwork, as_tensor
+from isocharge.train.training.torch_evaluation import evaluate, evaluate_features, evaluate_hidden_layers
 
-BASES = 6
-"""Matrices that a layer's weights are made of, besides the constant one."""
+N_BASES = 6
+"""Number of weight matrices W_lk that are mixed in a layer, besides the constant matrix W_l0."""
 
-PSI = 64
-"""Width of the context's network."""
+CONTEXT_WIDTH = 64
+"""Width of the context network and length of psi."""
 
-FITTED = 512
-"""Films that the whitening is taken from."""
+N_WHITENING_FILMS = 512
+"""Number of films from whose charges the whitening is computed."""
 
-FIRST_BASIS, FIRST_SHARE = 0.3, 0.3
-"""Sizes at the start: of the bases, over the constant matrix; of phi."""
+INITIAL_BASIS_SIZE = 0.3
+"""Initial size of the matrices W_lk, relative to the constant matrix."""
+
+INITIAL_PHI_STD = 0.3
+"""Initial standard deviation of phi."""
 
 
 @dataclass(frozen=True)
 class FilmInputs:
-    """x = (ln clip(Q) - ln scale(film) - mean) @ whitening.
+    """Inputs of the network for all films: (ln clip(Q) - log charge scale of the film - mean) @ whitening.
 
     Attributes:
-        scaling: Exact scales and context of films.
-        mean: Of the logarithms (Q in pC), shape (n_electrode,).
-        whitening: Shape (n_electrode, n_electrode).
+        scaling: Exact scales and contexts of films.
+        mean: Mean of the scaled logarithms (Q in pC), shape (n_electrode,).
+        whitening: Whitening matrix, shape (n_electrode, n_electrode).
     """
 
     scaling: FilmScaling
@@ -48,69 +61,118 @@ class FilmInputs:
 
     @classmethod
     def fit(cls, scaling: FilmScaling, presses: FilmPresses) -> "FilmInputs":
-        """Zero mean and unit covariance along the principal axes, over clean charges of many films."""
-        logs = np.log(np.clip(presses.charge()[:FITTED], LOWEST_CHARGE, HIGHEST_CHARGE))
-        logs = (logs - scaling.log_charge_scale(presses.parameters[:FITTED])[:, None]).reshape(-1, logs.shape[-1])
-        return cls(scaling, *whitening(logs))
+        """Fit mean and whitening to charges without noise of many films."""
+        logarithms = np.log(np.clip(presses.charge()[:N_WHITENING_FILMS], LOWEST_CHARGE, HIGHEST_CHARGE))
+        log_scale = scaling.log_charge_scale(presses.parameters[:N_WHITENING_FILMS])
+        scaled = logarithms - log_scale[:, None]
+        mean, matrix = whitening(scaled.reshape(-1, scaled.shape[-1]))
+        return cls(scaling, mean, matrix)
+
+    @property
+    def charge_features(self) -> ChargeFeatures:
+        """Logarithms of the charges in pC."""
+        return ChargeFeatures(np.ones(self.mean.size), np.array(LOWEST_CHARGE), np.array(HIGHEST_CHARGE))
 
     def values(self, charge: Tensor, parameters: Array) -> Tensor:
-        """Charges (n_film, n, n_electrode) of films (n_film, n_parameter) to inputs of the same shape."""
+        """Compute the inputs of the network.
+
+        Args:
+            charge: Shape (n_film, n, n_electrode), pC.
+            parameters: Parameters of the films, shape (n_film, n_parameter).
+
+        Returns:
+            Shape (n_film, n, n_electrode).
+        """
         shift = as_tensor(self.scaling.log_charge_scale(parameters) + self.mean)
-        logs = torch.log(charge.clamp(LOWEST_CHARGE, HIGHEST_CHARGE)) - shift[:, None]
-        return logs @ as_tensor(self.whitening)
+        logarithms = evaluate_features(self.charge_features, charge)
+        return (logarithms - shift[:, None]) @ as_tensor(self.whitening)
 
     def context(self, parameters: Array) -> Tensor:
-        """Contexts of films, (n_film, n_parameter) to (n_film, n_context)."""
+        """Compute the contexts, shape (n_film, n_context), of films with parameters of shape (n_film, n_parameter)."""
         return as_tensor(self.scaling.context(parameters))
 
 
-class ConditionalPerceptron(Trainable):
-    """Perceptrons of many films at once.
+class ConditionalPerceptron(TrainableNetwork):
+    """A perceptron with a skip layer whose weights depend on the film. It is evaluated for many films at once.
 
     Args:
-        inputs: Number of electrodes.
+        n_input: Number of electrodes.
         hidden: Widths of the hidden layers.
-        outputs: Number of outputs.
-        context: Number of context values.
+        n_output: Number of outputs.
+        n_context: Number of context values.
+        activation: Activation of the hidden layers and of the context network.
     """
 
-    def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int, context: int) -> None:
+    def __init__(
+        self,
+        n_input: int,
+        hidden: tuple[int, ...],
+        n_output: int,
+        n_context: int,
+        activation: Activation = TANH,
+    ) -> None:
         super().__init__()
-        sizes = list(pairwise((inputs, *hidden, outputs)))
-        self.context = nn.Sequential(nn.Linear(context, PSI), nn.Tanh(), nn.Linear(PSI, PSI), nn.Tanh())
-        self.constant = nn.ParameterList([_uniform(1.0, *size) for size in sizes])
-        self.bases = nn.ParameterList([_uniform(FIRST_BASIS, *size, count=BASES) for size in sizes])
-        self.bias = nn.ModuleList([nn.Linear(PSI, size[1]) for size in sizes])
-        self.skip = nn.Parameter(torch.zeros(inputs, outputs))
-        self.skip_bases = nn.Parameter(torch.zeros(BASES, inputs, outputs))
-        self.phi = nn.Linear(PSI, BASES * (len(sizes) + 1))
+        self.activation = activation
+        sizes = list(pairwise((n_input, *hidden, n_output)))
+        context_sizes = [(n_context, CONTEXT_WIDTH), (CONTEXT_WIDTH, CONTEXT_WIDTH)]
+        self.context = nn.ModuleDict(
+            {name: nn.Linear(*size) for name, size in zip(CONTEXT_LAYERS, context_sizes, strict=True)}
+        )
+        self.constant = nn.ParameterList([_uniform_weights(1.0, size) for size in sizes])
+        self.bases = nn.ParameterList([_uniform_weights(INITIAL_BASIS_SIZE, size, (N_BASES,)) for size in sizes])
+        self.bias = nn.ModuleList([nn.Linear(CONTEXT_WIDTH, width) for _, width in sizes])
+        self.skip = nn.Parameter(torch.zeros(n_input, n_output))
+        self.skip_bases = nn.Parameter(torch.zeros(N_BASES, n_input, n_output))
+        self.phi = nn.Linear(CONTEXT_WIDTH, N_BASES * (len(sizes) + 1))
         for linear in self.bias:
             nn.init.zeros_(linear.weight)  # type: ignore[arg-type]
-        nn.init.normal_(self.phi.weight, std=FIRST_SHARE / np.sqrt(PSI))
+        nn.init.normal_(self.phi.weight, std=INITIAL_PHI_STD / np.sqrt(CONTEXT_WIDTH))
         nn.init.zeros_(self.phi.bias)
 
     def forward(self, inputs: Tensor, context: Tensor) -> Tensor:
-        """Inputs (n_film, n, inputs) and contexts (n_film, n_context) to (n_film, n, outputs)."""
-        psi = self.context(context)
-        phi = self.phi(psi).view(len(context), len(self.constant) + 1, -1)
-        value, last = inputs, len(self.constant) - 1
+        """Compute the outputs for films.
+
+        Args:
+            inputs: Inputs for each film, shape (n_film, n, n_input).
+            context: Contexts of the films, shape (n_film, n_context).
+
+        Returns:
+            Shape (n_film, n, n_output).
+        """
+        return evaluate(self.definition(context), inputs)
+
+    def definition(self, context: Tensor) -> Perceptron[Tensor]:
+        """Return the perceptrons of films with contexts of shape (n_film, n_context)."""
+        context_layers = [Layer(linear.weight.T, linear.bias) for linear in self._context_linears()]
+        psi = evaluate_hidden_layers(context_layers, self.activation, context)
+        phi = self.phi(psi).view(len(context), len(self.constant) + 1, N_BASES)
+        layers = []
         for number, (constant, bases, bias) in enumerate(zip(self.constant, self.bases, self.bias, strict=True)):
-            weight = constant + torch.einsum("fk,kio->fio", phi[:, number], bases)
-            value = torch.baddbmm(bias(psi)[:, None], value, weight)
-            value = value if number == last else torch.tanh(value)
-        skip = self.skip + torch.einsum("fk,kio->fio", phi[:, -1], self.skip_bases)
-        return value + torch.bmm(inputs, skip)
+            layers.append(Layer(_mix(constant, bases, phi[:, number]), bias(psi)[:, None]))
+        skip = _mix(self.skip, self.skip_bases, phi[:, len(layers)])
+        *hidden, last = layers
+        return Perceptron(tuple(hidden), last, skip, self.activation)
 
     def hidden_matrices(self) -> list[Tensor]:
-        """Constant weights from one hidden layer to the next."""
-        return list(self.constant)[1:-1]
+        """Return the constant weights between hidden layers."""
+        _, *between, _ = self.constant
+        return between
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Weights by name, as `ConditionalWeights` takes them."""
+        """Return the weights by name, as `ConditionalWeights` takes them."""
         return {name: values.detach().double().numpy() for name, values in self.state_dict().items()}
 
+    def _context_linears(self) -> list[nn.Linear]:
+        """Return the layers of the context network."""
+        return [module for module in self.context.values() if isinstance(module, nn.Linear)]
 
-def _uniform(share: float, inputs: int, outputs: int, count: int = 0) -> nn.Parameter:
-    """Weights of shape (inputs, outputs), or `count` of them, uniform in +-share / sqrt(inputs)."""
-    shape = (count, inputs, outputs) if count else (inputs, outputs)
-    return nn.Parameter(share * (2.0 * torch.rand(shape) - 1.0) / np.sqrt(inputs))
+
+def _mix(constant: Tensor, bases: Tensor, phi: Tensor) -> Tensor:
+    """Compute the weights W_l of films, shape (n_film, n_input, n_output), from phi of shape (n_film, n_basis)."""
+    return constant + torch.einsum("fk,kio->fio", phi, bases)
+
+
+def _uniform_weights(size: float, shape: tuple[int, int], batch: tuple[int, ...] = ()) -> nn.Parameter:
+    """Draw weights of shape (*batch, n_input, n_output), uniform within +-size / sqrt(n_input)."""
+    n_input, _ = shape
+    return nn.Parameter(size * (2.0 * torch.rand((*batch, *shape)) - 1.0) / np.sqrt(n_input))

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.common.activations import ACTIVATIONS, TANH, Activation
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, ModelError
 from isocharge.common.files import sha256_of
@@ -133,8 +134,10 @@ def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def _about(films: FilmsModel) -> dict[str, Any]:
+    """Return the JSON object of a model. The activation is left out if it is tanh, as in files of before."""
     prior = films.prior
-    return {
+    activation = films.contact.activation
+    about = {
         "format": FORMAT,
         "sensor": sensor_to_dict(prior.sensor),
         "probe_radius": _converted(prior.probe.radius, FILE_UNITS["probe_radius"]),
@@ -143,6 +146,9 @@ def _about(films: FilmsModel) -> dict[str, Any]:
         "force_range_N": list(films.domain.force_range),
         "noise": {**asdict(films.noise), "white": _converted(films.noise.white, FILE_PC)},
     }
+    if activation != TANH:
+        about["activation"] = activation.name
+    return about
 
 
 def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str) -> FilmsModel:
@@ -150,13 +156,14 @@ def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str)
     probe = Circle(_converted(about["probe_radius"], 1.0 / FILE_UNITS["probe_radius"]))
     prior, noise = FilmPrior(sensor_from_dict(about["sensor"]), probe, FilmSpread(**spread)), about["noise"]
     low, high = about["force_range_N"]
+    activation = ACTIVATIONS[about.get("activation", TANH.name)]
     model = FilmsModel(
         family=FilmFamily.from_arrays(_within(arrays, "family")),
         scaling=FilmScaling(prior, Domain(float(about["radius_mm"]), (float(low), float(high)))),
         mean=arrays["mean"],
         whitening=arrays["whitening"],
-        contact=_unpacked(_within(arrays, "contact")),
-        misfit=_unpacked(_within(arrays, "misfit")),
+        contact=_unpacked(_within(arrays, "contact"), activation),
+        misfit=_unpacked(_within(arrays, "misfit"), activation),
         noise=NoiseModel(**{**noise, "white": _converted(noise["white"], 1.0 / FILE_PC)}),
         sha256=sha256,
     )
@@ -188,9 +195,10 @@ def _packed(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarray]:
     return packed
 
 
-def _unpacked(packed: Mapping[str, np.ndarray]) -> ConditionalWeights:
+def _unpacked(packed: Mapping[str, np.ndarray], activation: Activation) -> ConditionalWeights:
     names = [name for name in packed if not name.endswith(".scale")]
     for name in names:
         if max(packed[name].shape, default=1) > MAX_LAYER_WIDTH:
             raise ValueError(f"{name}: expected layers of at most {MAX_LAYER_WIDTH} nodes, got {packed[name].shape}")
-    return ConditionalWeights({name: packed[name] * packed[f"{name}.scale"].astype(float) for name in names})
+    arrays = {name: packed[name] * packed[f"{name}.scale"].astype(float) for name in names}
+    return ConditionalWeights(arrays, activation)

@@ -6,15 +6,20 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.common.activations import TANH, Activation
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
+from isocharge.common.perceptron import Layer, Perceptron, evaluate_hidden_layers
 from isocharge.simulate import Domain, FilmPrior, ForwardMap, NoiseModel
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.training.correlation import with_correlation
+from isocharge.train.training.features import logarithmic_features
 from isocharge.train.training.fitted import Fitted, Provenance
-from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, PlainPerceptron, answer_units
+from isocharge.train.training.folded_network import FoldedNetwork
+from isocharge.train.training.folding import answer_units, fold
+from isocharge.train.training.output_regression import adapt_to_charges, add_variance
 
 TAUGHT, COPIES = 750, 4
 """Presses by which layers are changed, each with noise drawn so often; twice as many change errors by 0.5 %."""
@@ -26,33 +31,47 @@ PRESSES, SEED = 1000, 11
 """Fresh presses on which a film's network is judged, and their seed."""
 
 
+CONTEXT_LAYERS = ("0", "2")
+"""Names of the layers of the context network in the films file."""
+
+
 @dataclass(frozen=True)
 class ConditionalWeights:
-    """The same weights in NumPy, and the plain perceptron that they are for one film.
+    """The weights of a trained `ConditionalPerceptron` as NumPy arrays.
 
     Attributes:
-        arrays: By name, as `ConditionalPerceptron.to_arrays` gives them.
+        arrays: Weights by name, as `ConditionalPerceptron.to_arrays` returns them.
+        activation: Activation of the hidden layers and of the context network.
     """
 
     arrays: Mapping[str, Array]
+    activation: Activation = TANH
 
-    def plain(self, context: Array) -> PlainPerceptron:
-        """The perceptron for one context, shape (n_context,)."""
-        psi = context
-        for number in (0, 2):
-            psi = np.tanh(self._linear(f"context.{number}", psi))
-        count = sum(name.startswith("constant.") for name in self.arrays)
-        phi = self._linear("phi", psi).reshape(count + 1, -1)
-        layers = tuple(
-            (self._mixed(f"constant.{k}", f"bases.{k}", phi[k]), self._linear(f"bias.{k}", psi)) for k in range(count)
-        )
-        return PlainPerceptron(layers, self._mixed("skip", "skip_bases", phi[count]))
+    def perceptron(self, context: Array) -> Perceptron[Array]:
+        """Compute the perceptron of one film from its context, shape (n_context,)."""
+        context_layers = [self._linear(f"context.{name}") for name in CONTEXT_LAYERS]
+        psi = evaluate_hidden_layers(context_layers, self.activation, context)
+        n_layer = sum(name.startswith("constant.") for name in self.arrays)
+        phi = self._apply_linear("phi", psi).reshape(n_layer + 1, -1)
+        layers = []
+        for number in range(n_layer):
+            weight = self._mix(f"constant.{number}", f"bases.{number}", phi[number])
+            layers.append(Layer(weight, self._apply_linear(f"bias.{number}", psi)))
+        *hidden, last = layers
+        return Perceptron(tuple(hidden), last, self._mix("skip", "skip_bases", phi[n_layer]), self.activation)
 
-    def _linear(self, name: str, value: Array) -> Array:
-        return np.asarray(self.arrays[f"{name}.weight"] @ value + self.arrays[f"{name}.bias"])
+    def _linear(self, name: str) -> Layer[Array]:
+        """Return a linear layer; the file holds its weight with shape (n_output, n_input)."""
+        return Layer(self.arrays[f"{name}.weight"].T, self.arrays[f"{name}.bias"])
 
-    def _mixed(self, constant: str, bases: str, shares: Array) -> Array:
-        return np.asarray(self.arrays[constant] + np.tensordot(shares, self.arrays[bases], axes=1))
+    def _apply_linear(self, name: str, value: Array) -> Array:
+        """Apply a linear layer to a vector."""
+        layer = self._linear(name)
+        return np.asarray(value @ layer.weight + layer.bias)
+
+    def _mix(self, constant: str, bases: str, phi: Array) -> Array:
+        """Compute the weights of a layer from phi, shape (n_basis,)."""
+        return np.asarray(self.arrays[constant] + np.tensordot(phi, self.arrays[bases], axes=1))
 
 
 @dataclass(frozen=True)
@@ -136,7 +155,7 @@ class FilmsModel:
         if factor is not None:
             taught = np.arange(fresh, fresh + TAUGHT).repeat(COPIES)
             noisy = self.noise.add((charge * ratio)[taught], rng)
-            network = network.corrected(noisy, noisy / ratio[taught], contact[taught])
+            network = adapt_to_charges(network, noisy, noisy / ratio[taught], contact[taught])
         if correlation:
             of = slice(fresh, fresh + learned)
             examples = LabelledPresses(contact[of], (charge * ratio)[of])
@@ -144,7 +163,7 @@ class FilmsModel:
         if left is not None:
             taught = np.arange(fresh + learned, len(contact)).repeat(COPIES)
             noisy = self.noise.add((charge * ratio)[taught], rng)
-            network = network.widened_at(noisy, variance.repeat(COPIES, axis=0))
+            network = add_variance(network, noisy, variance.repeat(COPIES, axis=0))
         return Fitted(
             network=network,
             sensor=sensor,
@@ -171,9 +190,11 @@ class FilmsModel:
                 f"{parameters.tolist()}"
             )
         context = self.scaling.context(parameters)
-        perceptrons = [weights.plain(context) for weights in (self.contact, self.misfit)]
-        logs_mean = self.mean + self.scaling.log_charge_scale(parameters)
-        typical = 2.0 ** np.round(logs_mean / np.log(2.0))
-        rotation, offset = self.scaling.rotation(parameters), self.scaling.offset(parameters)
-        units = answer_units(self.domain, rotation, offset, self.mean.size)
-        return FoldedNetwork(FoldedLayers.of(perceptrons, self.whitening, logs_mean - np.log(typical), units), typical)
+        perceptrons = [weights.perceptron(context) for weights in (self.contact, self.misfit)]
+        logarithms_mean = self.mean + self.scaling.log_charge_scale(parameters)
+        features = logarithmic_features(logarithms_mean)
+        features_mean = logarithms_mean - np.log(features.typical_pC)
+        units = answer_units(
+            self.domain, self.scaling.rotation(parameters), self.scaling.offset(parameters), features.n_electrode
+        )
+        return FoldedNetwork(features, fold(perceptrons, features_mean, self.whitening, units))

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from isocharge.common.activations import ACTIVATIONS, TANH, Activation
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.resumable_run import ResumableRun
@@ -41,6 +42,7 @@ from isocharge.train.training.fit import (
     threads_and_seed,
     with_fresh_noise,
 )
+from isocharge.train.training.folded_network import N_CONTACT_ANSWERS
 from isocharge.train.training.network import as_tensor, compress_length
 
 BEYOND = 1.5
@@ -71,6 +73,7 @@ class FilmsConfig:
         force_range: Smallest and largest force, N.
         hidden: Widths of the hidden layers of the contact network.
         misfit_hidden: Widths of the one that gives the misfit; as many layers.
+        activation: Name of the activation of the hidden layers (`isocharge.common.activations`).
         films: Films that the contact network learns from; `watched` of them are only watched.
         presses: Presses on each.
         watched: Films that are watched while it trains.
@@ -90,6 +93,7 @@ class FilmsConfig:
     force_range: tuple[float, float] = DEFAULT_FORCE_RANGE
     hidden: tuple[int, ...] = (96, 96, 96)
     misfit_hidden: tuple[int, ...] = (64, 64, 64)
+    activation: str = TANH.name
     films: int = 4096
     presses: int = 128
     watched: int = 64
@@ -144,21 +148,22 @@ def fit_films(
         presses = draw_film_presses(prior, family, domain, *sizes, kept("presses"))
         inputs = FilmInputs.fit(FilmScaling(prior, domain), presses)
 
-        part = _network(inputs, config.hidden, 6)
+        activation = ACTIVATIONS[config.activation]
+        part = _network(inputs, config.hidden, N_CONTACT_ANSWERS, activation)
         _descend(contact_stage(part, inputs, presses, noise, config), config, run)
 
         sizes = config.misfit_films, config.misfit_charges, config.seed
         examples = draw_misfit_films(source, *sizes, kept("nearest-contacts"))
         near = draw_near_films(source, config.near_films, config.presses, config.seed, kept("good-presses"))
-        vector = _network(inputs, config.misfit_hidden, inputs.mean.size)
+        vector = _network(inputs, config.misfit_hidden, inputs.mean.size, activation)
         _descend(misfit_stage(vector, inputs, examples, near, source.noise, config), config, run)
     return FilmsModel(
         family=family,
         scaling=inputs.scaling,
         mean=inputs.mean,
         whitening=inputs.whitening,
-        contact=ConditionalWeights(part.to_arrays()),
-        misfit=ConditionalWeights(vector.to_arrays()),
+        contact=ConditionalWeights(part.to_arrays(), activation),
+        misfit=ConditionalWeights(vector.to_arrays(), activation),
         noise=noise,
         made_with={"config": config.to_dict(), "torch": torch.__version__},
     )
@@ -186,8 +191,12 @@ def _family(prior: FilmPrior, config: FilmsConfig, executor: Executor | None) ->
     return FilmFamily.from_arrays(replace(family, imperfections=modes).to_arrays())
 
 
-def _network(inputs: FilmInputs, hidden: tuple[int, ...], outputs: int) -> ConditionalPerceptron:
-    return ConditionalPerceptron(inputs.mean.size, hidden, outputs, inputs.scaling.standard[0].size)
+def _network(
+    inputs: FilmInputs, hidden: tuple[int, ...], n_output: int, activation: Activation
+) -> ConditionalPerceptron:
+    """Return an untrained perceptron for all films."""
+    context_mean, _ = inputs.scaling.standard
+    return ConditionalPerceptron(inputs.mean.size, hidden, n_output, context_mean.size, activation)
 
 
 def _descend(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | None) -> None:

@@ -24,8 +24,9 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.data.measured_sensor import MeasuredSensor, PressedArea
 from isocharge.train.model_release.evaluate import evaluate
-from isocharge.train.model_release.export import check_graph, export_onnx
+from isocharge.train.model_release.graph_check import check_graph
 from isocharge.train.model_release.measured_card import measured_card, measured_errors
+from isocharge.train.model_release.onnx_graph import write_graph
 from isocharge.train.training.fitted import Fitted
 
 CORNERS = 64
@@ -157,7 +158,7 @@ def _interface(metadata: ModelMetadata, fitted: Fitted) -> str:
     electrodes = ", ".join(metadata.electrodes)
     taught = f"\nA small network that learned the answers of `{teacher}`." if teacher else ""
     folded = f" (of {fitted.asked.radius:g} mm asked for: beyond, two contacts give the same charges)"
-    correlated = ", `contact_correlation` (xy, xF, yF)" if fitted.network.angles else ""
+    correlated = ", `contact_correlation` (xy, xF, yF)" if fitted.network.n_angle else ""
     unknown_probe = "; which of them presses is not known to the model" if len(metadata.probes) > 1 else ""
     return f"""# {metadata.name}, version {metadata.version}
 
@@ -266,7 +267,7 @@ def release(
         },
         yield_force_N=_yield_force(fitted),
     )
-    graph = export_onnx(fitted.network, about.to_props())
+    graph = write_graph(fitted.network, about.to_props())
     golden = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, contact_floors(about))
     text = hub_block(about) + card(about, fitted)
     return Release(write_model(folder, graph, about, golden, text, fitted.provenance.files), about)

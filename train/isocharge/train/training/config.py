@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, json
 
+from isocharge.common.activations import ACTIVATIONS, TANH
 from isocharge.common.errors import ConfigError
 from isocharge.common.structs import Settings, WrongKey, convert, read_toml
 from isocharge.simulate import NoiseModel, noise_model
@@ -24,6 +25,7 @@ class NetworkConfig(Settings, frozen=True):
         hidden: Widths of the hidden layers of the contact network.
         misfit_hidden: Widths of the one that gives the misfit; as many layers.
         electrodes: How many electrodes the dataset has to have; 0 takes what it has.
+        activation: Name of the activation of the hidden layers (`isocharge.common.activations`).
         weights: "int8" rounds the weights between hidden layers to 8 bits and trains the others on; in C they then
             take a quarter of the memory.
     """
@@ -31,12 +33,15 @@ class NetworkConfig(Settings, frozen=True):
     hidden: Widths = (96, 96, 96)
     misfit_hidden: Widths = (64, 64, 64)
     electrodes: int = 0
+    activation: str = TANH.name
     weights: Literal["float32", "int8"] = "float32"
 
     def __post_init__(self) -> None:
         if len(self.hidden) != len(self.misfit_hidden):
             layers = f"as many layers as network.hidden ({len(self.hidden)}; they run side by side)"
             raise WrongKey("misfit_hidden", layers, list(self.misfit_hidden))
+        if self.activation not in ACTIVATIONS:
+            raise WrongKey("activation", f"one of {', '.join(ACTIVATIONS)}", self.activation)
         if not (self.electrodes == 0 or 3 <= self.electrodes <= MOST_ELECTRODES):
             raise WrongKey("electrodes", f"0 (as the dataset) or 3 to {MOST_ELECTRODES}", self.electrodes)
 

@@ -15,17 +15,17 @@ contact network and in the logarithms of the charges, and learned by maximum lik
 """
 
 import logging
-from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array, Singles
+from isocharge.common.perceptron import Layer, evaluate_hidden_layers, evaluate_output_layer
 from isocharge.simulate import NoiseModel
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.features import whitening
-from isocharge.train.training.folding import KNOWN, FoldedNetwork
+from isocharge.train.training.folded_network import N_CONTACT_ANSWERS, FoldedNetwork
 
 _log = logging.getLogger(__name__)
 
@@ -73,20 +73,20 @@ def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: No
     """
     examples = presses[np.arange(max(EXAMPLES, len(presses))) % len(presses)]
     charge, truth = examples.noisy(noise, seed), examples.contact
-    logs = network.inputs(charge)
-    features = network.layers.features(logs)
-    contact, std, *_ = network.of_answers(network.layers.from_features(features, logs))
+    logs = network.features.evaluate(charge)
+    features = evaluate_hidden_layers(network.layers.hidden, network.layers.activation, logs)
+    contact, std, *_ = network.outputs_from_answers(evaluate_output_layer(network.layers, features, logs))
     errors = np.column_stack([truth[:, :2] - contact[:, :2], np.log(truth[:, 2] / contact[:, 2])])
     weight, _ = network.layers.last
-    of_contact = weight[:, :KNOWN].any(axis=1)
+    of_contact = weight[:, :N_CONTACT_ANSWERS].any(axis=1)
     features = np.hstack([features[:, of_contact], logs])
     deviation = errors / np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]])
     with threadpool_limits(1):  # many small steps: two threads take three times as long
         slopes, angles = _fit_angles(features, deviation)
     head = np.zeros((len(weight), 3))
     head[of_contact] = slopes[: -logs.shape[1]]
-    sums = (values @ ANGLE_SUMS for values in (head, angles, slopes[-logs.shape[1] :]))
-    return replace(network, layers=network.layers.with_angles(*sums))
+    last = Layer(head @ ANGLE_SUMS, angles @ ANGLE_SUMS)
+    return network.with_angles(last, slopes[-logs.shape[1] :] @ ANGLE_SUMS)
 
 
 def _fit_angles(features: Array, deviation: Array) -> tuple[Array, Array]:

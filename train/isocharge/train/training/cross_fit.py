@@ -37,7 +37,7 @@ from isocharge.train.data.presses import (
 )
 from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.features import Features
+from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fit import contact_stage, misfit_stage, teaching_loss, threads_and_seed, train_part
 from isocharge.train.training.fitted import Fitted, Provenance
 from isocharge.train.training.network import InverseNetwork, as_tensor, fold_network
@@ -93,11 +93,8 @@ def fit_presses(
     domain = PressedArea.of(known.contact)
     noise = ChannelNoise.of(known.charge, domain.to_unit(known.contact))
     with threads_and_seed(settings.training.threads, settings.training.seed):
-        features = Features.of_signed(known.charge, noise.bend(known.charge))
-        network, *members = (
-            InverseNetwork(domain, features, settings.network.hidden, settings.network.misfit_hidden)
-            for _ in range(1 + FOLDS)
-        )
+        features = WhitenedFeatures.fit_signed(known.charge, noise.bend(known.charge))
+        network, *members = (InverseNetwork(domain, features, settings.network) for _ in range(1 + FOLDS))
         fold = folds_by_place(known.contact, FOLDS)
         steps = _train_members(members, known, fold, noise, settings.training, run)
         judged = [_answers(member, known.charge) for member in members]
@@ -108,7 +105,7 @@ def fit_presses(
         examples = run.keeping("misfit-charges").submit(draw).result() if run else draw()
         train_part(misfit_stage(network, examples, settings.training), network.misfit_vector, settings, run)
     return Fitted(
-        network=fold_network(network.eval()).widened(position, force),
+        network=fold_network(network.eval()).with_scaled_std(position, force),
         sensor=MeasuredSensor(name, usable.electrodes),
         probes=probes,
         domain=domain,

@@ -19,7 +19,7 @@ from torch import Tensor
 from isocharge.common.errors import TrainingError
 from isocharge.common.progress import report
 from isocharge.common.resumable_run import ResumableRun
-from isocharge.train.training.network import Trainable
+from isocharge.train.training.network import TrainableNetwork
 
 MUON_RATE = 6.0
 """Ratio of Muon's rate to Adam's: a step of Muon has a given size whatever the gradient."""
@@ -49,7 +49,7 @@ class TrainingStage:
     """
 
     name: str
-    part: Trainable
+    part: TrainableNetwork
     loss: Callable[[int, torch.Generator], Tensor]
     score: Callable[[], tuple[float, str]]
     steps: int
@@ -158,7 +158,7 @@ def _rate_share(done: float) -> float:
     return 0.5 * (1.0 + math.cos(math.pi * (done - RISE) / (1.0 - RISE)))
 
 
-def _optimisers(part: Trainable, rate: float) -> list[tuple[torch.optim.Optimizer, float]]:
+def _optimisers(part: TrainableNetwork, rate: float) -> list[tuple[torch.optim.Optimizer, float]]:
     """Optimisers of a network, each with its largest rate; rounded matrices have none."""
     hidden = {id(matrix) for matrix in part.hidden_matrices()}
     adam = torch.optim.Adam([each for each in part.parameters() if id(each) not in hidden], betas=(0.9, 0.98))

@@ -1,86 +1,105 @@
-"""What a network sees of charges: whitened logarithms, or what stands for them where charges may have any sign."""
+"""Whitened input features of a network, fitted to the charges of presses."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.charge_features import ChargeFeatures
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 
-MISFIT_UNIT = 5.0
-"""Standard deviations up to which the misfit is learned about linearly; beyond, its logarithm is."""
+CLIPPING_MARGIN = 1.0
+"""Distance between the extreme charges of the presses and the limits to which charges of both signs are clipped,
+relative to the range of the presses' charges. The distance is measured in asinh(Q / typical), dimensionless."""
 
-WIDER = 1.0
-"""How far signed charges may lie beyond those of presses, over the width of these, in asinh: farther ones count as just
-so far. What is absurd still gives a finite answer."""
-
-
-@dataclass(frozen=True)
-class SignedCharges:
-    """Charges of any sign: asinh(clip(Q) / typical) - mean stands for the logarithm.
-
-    Attributes:
-        low, high: Charges are brought between these, shape (n_electrode,), pC.
-        mean: Shape (n_electrode,): numbers about 0 keep the digits of a float32.
-    """
-
-    low: Array
-    high: Array
-    mean: Array
-
-    @classmethod
-    def of(cls, charge: Array, typical: Array) -> "SignedCharges":
-        """From charges of presses, shape (n, n_electrode), and the typical ones, pC."""
-        levels = np.arcsinh(charge / typical)
-        low, high = levels.min(axis=0), levels.max(axis=0)
-        beyond = WIDER * (high - low)
-        return cls(np.sinh(low - beyond) * typical, np.sinh(high + beyond) * typical, levels.mean(axis=0))
+MIN_SINGULAR_VALUE = 1e-12
+"""Singular value below which the whitening does not enlarge a direction further."""
 
 
 @dataclass(frozen=True)
-class Features:
-    """Whitened logarithms of the charges: x = (ln(clip(Q) / typical) - mean) @ matrix.
+class WhitenedFeatures:
+    """Features with zero mean and unit covariance: (features of the charges - mean) @ matrix.
 
     Attributes:
-        typical: The power of two nearest to each charge's geometric mean, shape (n_electrode,), pC: dividing by it
-            costs a float32 no digit, and the logarithms are small enough to keep theirs. For signed charges the size
-            from which noise grows with the charge.
-        mean: Of the logarithms, shape (n_electrode,).
-        matrix: Shape (n_electrode, n_electrode).
-        signed: What stands for the logarithm if charges may have any sign.
+        charge_features: Logarithms or inverse hyperbolic sines of the charges.
+        mean: Mean of these features over the presses, shape (n_electrode,).
+        matrix: Whitening matrix, shape (n_electrode, n_electrode).
     """
 
-    typical: Array
+    charge_features: ChargeFeatures
     mean: Array
     matrix: Array
-    signed: SignedCharges | None = None
 
     @classmethod
-    def fit(cls, charge: Array) -> "Features":
-        """From clean positive charges, shape (n, n_electrode): zero mean, unit covariance along the principal axes."""
-        within = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
-        typical = 2.0 ** np.round(np.log2(within).mean(axis=0))
-        return cls(typical, *whitening(np.log(within / typical)))
+    def fit_logarithms(cls, charge: Array) -> "WhitenedFeatures":
+        """Fit whitened logarithms to positive charges without noise, shape (n, n_electrode), pC."""
+        clipped = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
+        return cls._fit(logarithmic_features(np.log(clipped).mean(axis=0)), charge)
 
     @classmethod
-    def of_signed(cls, charge: Array, typical: Array) -> "Features":
-        """From charges of any sign, shape (n, n_electrode), and the size from which noise grows with them, pC."""
-        signed = SignedCharges.of(charge, typical)
-        return cls(typical, *whitening(bent(charge, typical, signed)), signed)
+    def fit_signed(cls, charge: Array, typical: Array) -> "WhitenedFeatures":
+        """Fit whitened inverse hyperbolic sines to charges of both signs.
+
+        Args:
+            charge: Charges of presses, shape (n, n_electrode), pC.
+            typical: Charge above which the noise is proportional to the charge, shape (n_electrode,), pC.
+        """
+        return cls._fit(signed_features(charge, typical), charge)
+
+    @classmethod
+    def _fit(cls, charge_features: ChargeFeatures, charge: Array) -> "WhitenedFeatures":
+        mean, matrix = whitening(charge_features.evaluate(charge))
+        return cls(charge_features, mean, matrix)
 
 
-def bent(charge: Array, typical: Array, signed: SignedCharges | None) -> Array:
-    """What features are linear in, shape (n, n_electrode): ln(Q / typical), or what stands for it."""
-    if signed:
-        return np.asarray(np.arcsinh(np.clip(charge, signed.low, signed.high) / typical) - signed.mean)
-    return np.asarray(np.log(np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE) / typical))
+def logarithmic_features(mean_logarithm: Array) -> ChargeFeatures:
+    """Return features for positive charges.
+
+    The typical charge is the power of two next to the geometric mean. The division by a power of two is exact in
+    float32, and the logarithms are then small enough to keep their digits.
+
+    Args:
+        mean_logarithm: Mean of the logarithms of the charges in pC, shape (n_electrode,).
+    """
+    return ChargeFeatures(
+        typical_pC=2.0 ** np.round(mean_logarithm / np.log(2.0)),
+        low_pC=np.array(LOWEST_CHARGE),
+        high_pC=np.array(HIGHEST_CHARGE),
+    )
 
 
-def whitening(values: Array, least: float = 0.0) -> tuple[Array, Array]:
-    """Mean and matrix M of values (n, k): (values - mean) @ M has unit covariance along its principal axes.
+def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
+    """Return features for charges of both signs.
 
-    Where the deviation along an axis is less than `least` of the largest, it stays below 1.
+    Args:
+        charge: Charges of presses, shape (n, n_electrode), pC.
+        typical: Charge by which each charge is divided, shape (n_electrode,), pC.
+    """
+    levels = np.arcsinh(charge / typical)
+    lowest = levels.min(axis=0)
+    highest = levels.max(axis=0)
+    margin = CLIPPING_MARGIN * (highest - lowest)
+    return ChargeFeatures(
+        typical_pC=typical,
+        low_pC=np.sinh(lowest - margin) * typical,
+        high_pC=np.sinh(highest + margin) * typical,
+        mean=levels.mean(axis=0),
+    )
+
+
+def whitening(values: Array, min_relative_std: float = 0.0) -> tuple[Array, Array]:
+    """Compute the whitening transform of values by a principal component analysis.
+
+    Args:
+        values: Shape (n, k).
+        min_relative_std: Principal components with a standard deviation below this fraction of the largest one are
+            scaled as if they had this fraction, so that their standard deviation stays below 1.
+
+    Returns:
+        Mean, shape (k,), and matrix M, shape (k, k): (values - mean) @ M has unit covariance.
     """
     mean = values.mean(axis=0)
-    _, singular, axes = np.linalg.svd(values - mean, full_matrices=False)
-    return mean, axes.T * (np.sqrt(len(values)) / np.maximum(singular, max(1e-12, least * singular[0])))
+    _, singular_values, axes = np.linalg.svd(values - mean, full_matrices=False)
+    smallest = max(MIN_SINGULAR_VALUE, min_relative_std * singular_values[0])
+    scale = np.sqrt(len(values)) / np.maximum(singular_values, smallest)
+    return mean, axes.T * scale

@@ -33,9 +33,15 @@ from isocharge.train.data.presses import LabelledPresses, held_out, split_by_pos
 from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.features import Features
+from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fitted import Fitted
-from isocharge.train.training.network import InverseNetwork, Perceptron, as_tensor, compress_length, fold_network
+from isocharge.train.training.network import (
+    InverseNetwork,
+    TrainablePerceptron,
+    as_tensor,
+    compress_length,
+    fold_network,
+)
 from isocharge.train.training.source import Teacher, TrainingData
 
 _log = logging.getLogger(__name__)
@@ -154,13 +160,13 @@ class Split:
         folded = first.of_positive if domain != data.domain else None
         return cls(domain, train, watched, held, field_within, cautions, folded)
 
-    def features(self, noise: NoiseModel) -> Features:
+    def features(self, noise: NoiseModel) -> WhitenedFeatures:
         """Logarithms, unless some charge has none."""
         charge = self.train.charge
         if not (self.train.signed or self.watched.signed or self.held.signed):
-            return Features.fit(charge)
+            return WhitenedFeatures.fit_logarithms(charge)
         channels = ChannelNoise.alike(noise, charge.shape[1])
-        return Features.of_signed(charge, replace(channels, white=SHARPER * channels.white).bend(charge))
+        return WhitenedFeatures.fit_signed(charge, replace(channels, white=SHARPER * channels.white).bend(charge))
 
 
 @dataclass(frozen=True)
@@ -184,7 +190,7 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
         for caution in split.cautions:
             _log.warning("%s", caution)
         features, sizes = split.features(misfit_noise(training.noise_model)), config.network
-        network = InverseNetwork(split.domain, features, sizes.hidden, sizes.misfit_hidden)
+        network = InverseNetwork(split.domain, features, sizes)
         stage = contact_stage(network, split.train, split.watched, training.noise_model, training, data.teacher)
         train_part(stage, network.contact, config, run)
         train_part(
@@ -213,12 +219,12 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def train_part(stage: TrainingStage, part: Perceptron, config: FitConfig, run: ResumableRun | None) -> None:
+def train_part(stage: TrainingStage, part: TrainablePerceptron, config: FitConfig, run: ResumableRun | None) -> None:
     """Train a perceptron; where weights are to be rounded, round its hidden ones and train the others on."""
     settings = config.training
     Descent(stage, settings.learning_rate, settings.patience, settings.seed).run(run)
     if config.network.weights == "int8":
-        part.round_hidden()
+        part.round_hidden_matrices()
         settling = replace(
             stage,
             name=f"{stage.name}-rounded",
@@ -258,13 +264,16 @@ def contact_stage(
     return TrainingStage("contact", network.contact, loss, score, config.steps, warm_up)
 
 
-def _misfit_examples(split: Split, features: Features, config: TrainingConfig, run: ResumableRun | None) -> Array:
+def _misfit_examples(
+    split: Split, features: WhitenedFeatures, config: TrainingConfig, run: ResumableRun | None
+) -> Array:
     """What `draw_misfit_examples` gives; the search takes long enough to keep it in the run."""
     noise: Noise = misfit_noise(config.noise_model)
     draw = partial(draw_misfit_examples, split.train, split.field)
-    if signed := features.signed:
-        noise = ChannelNoise.alike(misfit_noise(config.noise_model), features.typical.size)
-        draw = partial(draw, limits=(signed.low, signed.high))
+    charge_features = features.charge_features
+    if charge_features.mean is not None:
+        noise = ChannelNoise.alike(misfit_noise(config.noise_model), charge_features.n_electrode)
+        draw = partial(draw, limits=(charge_features.low_pC, charge_features.high_pC))
     draw = partial(draw, noise, config.misfit_charges, config.seed)
     return run.keeping("misfit-charges").submit(draw).result() if run else draw()
 

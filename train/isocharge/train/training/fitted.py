@@ -9,7 +9,7 @@ from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.measured_sensor import MeasuredSensor
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.presses import LabelledPresses
-from isocharge.train.training.folding import FoldedNetwork
+from isocharge.train.training.folded_network import FoldedNetwork
 
 
 @dataclass(frozen=True)

@@ -1,123 +1,152 @@
-"""The inverse in torch: charges in; contact, standard deviations and misfit out.
+"""The network during training, in PyTorch: from charges to contact, standard deviations and misfit.
 
-Features are whitened logarithms of the charges: a force multiplies all charges nearly alike, so ratios carry the
-position and the common factor the force. Charges of any sign have asinh in the logarithm's place, which is linear where
-noise is larger than the charge. One perceptron gives mean and log standard deviation of (x, y, ln F). A second
-one gives the misfit
+The inputs are whitened logarithms of the charges (`isocharge.train.training.features`). The force scales all charges by
+nearly the same factor, so the common factor carries the force and the ratios carry the position. One perceptron gives
+the mean and the logarithm of the standard deviation of (x, y, ln F). A second perceptron gives the misfit
 
-    min over known contacts c of |(Q - Q(c)) / sigma|
+    min over the contacts c of the domain of |(Q - Q(c)) / sigma|
 
-as the length of a vector, (Q - Q(c)) / sigma at the nearest contact: that vector is smooth where its length is not, on
-the image of the forward map. Lengths from a tenth to thousands are brought into reach of a network by asinh.
+as the length of a vector, (Q - Q(c)) / sigma at the nearest contact. Unlike its length, this vector is smooth where the
+charges Q are those of a contact. Its length, which ranges from a tenth to thousands, is compressed by asinh.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from isocharge.common.activations import ACTIVATIONS, TANH, Activation
 from isocharge.common.arrays import Array
+from isocharge.common.perceptron import Layer, Perceptron
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
-from isocharge.train.training.features import MISFIT_UNIT, Features
-from isocharge.train.training.folding import FoldedLayers, FoldedNetwork, PlainPerceptron, answer_units
+from isocharge.train.training.config import NetworkConfig
+from isocharge.train.training.features import WhitenedFeatures
+from isocharge.train.training.folded_network import LOG_STD, MEAN, MISFIT_UNIT, N_CONTACT_ANSWERS, FoldedNetwork
+from isocharge.train.training.folding import answer_units, fold
+from isocharge.train.training.torch_evaluation import evaluate, evaluate_features
 
 LARGEST_INT8 = 127
-"""A rounded weight is a whole number from minus this to this, times the scale of its output."""
+"""Largest absolute value of a weight that is rounded to 8 bits, in units of the scale of its output."""
+
+MIN_LENGTH = 1e-9
+"""Length below which a misfit vector counts as having this length, so that no division by zero occurs."""
 
 
-class Trainable(nn.Module, ABC):
-    """A part of a model that `Descent` trains."""
+class TrainableNetwork(nn.Module, ABC):
+    """A network that `Descent` trains."""
 
     @abstractmethod
     def hidden_matrices(self) -> list[Tensor]:
-        """Weights from one hidden layer to the next, which Muon trains."""
+        """Return the weights between hidden layers, which the optimiser Muon trains."""
 
 
-class Perceptron(Trainable):
-    """Linear layers with tanh between them, and a linear layer that skips them from the inputs to the outputs.
+class TrainablePerceptron(TrainableNetwork):
+    """A perceptron with a skip layer (`isocharge.common.perceptron`).
 
-    The logarithm of the force is nearly linear in those of the charges, and has to be right to a thousandth of its
-    range: with the skip layer the others need only learn what is not linear.
+    The logarithm of the force is nearly linear in the logarithms of the charges and is needed with a relative error of
+    a thousandth of its range. With the skip layer, the hidden layers only need to learn the nonlinear part.
+
+    Args:
+        n_input: Number of inputs.
+        hidden: Widths of the hidden layers.
+        n_output: Number of outputs.
+        activation: Activation of the hidden layers.
     """
 
-    def __init__(self, inputs: int, hidden: tuple[int, ...], outputs: int) -> None:
+    def __init__(self, n_input: int, hidden: tuple[int, ...], n_output: int, activation: Activation = TANH) -> None:
         super().__init__()
-        widths = (inputs, *hidden)
-        layers = [part for sizes in pairwise(widths) for part in (nn.Linear(*sizes), nn.Tanh())]
-        self.mlp = nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
-        self.skip = nn.Linear(inputs, outputs, bias=False)
+        self.activation = activation
+        self.layers = nn.ModuleList([nn.Linear(*sizes) for sizes in pairwise((n_input, *hidden, n_output))])
+        self.skip = nn.Linear(n_input, n_output, bias=False)
         nn.init.zeros_(self.skip.weight)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Shape (n, inputs) to (n, outputs)."""
-        out: Tensor = self.mlp(inputs) + self.skip(inputs)
-        return out
+        """Compute the outputs, shape (n, n_output), of inputs of shape (n, n_input)."""
+        return evaluate(self.definition(), inputs)
 
-    def layers(self) -> list[nn.Linear]:
-        """The linear layers between which tanh stands, first to last."""
-        return [layer for layer in self.mlp if isinstance(layer, nn.Linear)]
+    def definition(self) -> Perceptron[Tensor]:
+        """Return the perceptron with the tensors that are trained."""
+        *hidden, last = (Layer(layer.weight.T, layer.bias) for layer in self.linear_layers())
+        return Perceptron(tuple(hidden), last, self.skip.weight.T, self.activation)
 
-    def plain(self) -> PlainPerceptron:
-        """The same in NumPy, in double precision."""
-        layers = tuple((_matrix(layer), layer.bias.detach().double().numpy()) for layer in self.layers())
-        return PlainPerceptron(layers, _matrix(self.skip))
+    def to_numpy(self) -> Perceptron[Array]:
+        """Return a copy of the perceptron as NumPy arrays in double precision."""
+        return perceptron_to_numpy(self.definition())
+
+    def linear_layers(self) -> list[nn.Linear]:
+        """Return the hidden layers and the output layer, from first to last."""
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def hidden_matrices(self) -> list[Tensor]:
-        """Weights from one hidden layer to the next."""
-        return [layer.weight for layer in self.layers()[1:-1]]
+        """Return the weights between hidden layers, shape (n_output, n_input) each."""
+        _, *between, _ = self.linear_layers()
+        return [layer.weight for layer in between]
 
-    def round_hidden(self) -> None:
-        """Round the hidden matrices to 8 bits, a scale for each output, and train them no further."""
+    def round_hidden_matrices(self) -> None:
+        """Round the weights between hidden layers to 8 bits, one scale for each output, and stop their training."""
         for matrix in self.hidden_matrices():
-            scale = matrix.detach().abs().amax(dim=1, keepdim=True) / LARGEST_INT8
-            matrix.detach().copy_(torch.round(matrix.detach() / scale.clamp(min=1e-30)) * scale)
+            weights = matrix.detach()
+            scale = weights.abs().amax(dim=1, keepdim=True) / LARGEST_INT8
+            weights.copy_(torch.round(weights / scale.clamp(min=1e-30)) * scale)
             matrix.requires_grad_(False)
 
 
 class InverseNetwork(nn.Module):
-    """The whole model.
+    """The whole network.
 
     Args:
-        domain: The contacts it knows.
-        features: Normalisation.
-        hidden: Widths of the contact network.
-        misfit_hidden: Widths of the misfit network.
+        domain: Contacts for which the network is trained.
+        features: Whitened input features.
+        config: Widths and activation of the hidden layers.
     """
 
-    def __init__(
-        self, domain: Domain, features: Features, hidden: tuple[int, ...], misfit_hidden: tuple[int, ...]
-    ) -> None:
+    def __init__(self, domain: Domain, features: WhitenedFeatures, config: NetworkConfig) -> None:
         super().__init__()
-        n_electrode = features.typical.size
-        self.domain, self.features = domain, features
-        self.contact = Perceptron(n_electrode, hidden, 6)
-        self.misfit_vector = Perceptron(n_electrode, misfit_hidden, n_electrode)
-        self.centre, self.scale, self.typical, self.logs_mean, self.whitening = (
-            nn.Buffer(as_tensor(values))
-            for values in (domain.centre, domain.scale, features.typical, features.mean, features.matrix)
-        )
+        self.domain = domain
+        self.features = features
+        n_electrode = features.charge_features.n_electrode
+        activation = ACTIVATIONS[config.activation]
+        self.contact = TrainablePerceptron(n_electrode, config.hidden, N_CONTACT_ANSWERS, activation)
+        self.misfit_vector = TrainablePerceptron(n_electrode, config.misfit_hidden, n_electrode, activation)
+        self.centre = nn.Buffer(as_tensor(domain.centre))
+        self.scale = nn.Buffer(as_tensor(domain.scale))
+        self.features_mean = nn.Buffer(as_tensor(features.mean))
+        self.whitening = nn.Buffer(as_tensor(features.matrix))
 
     def inputs(self, charge: Tensor) -> Tensor:
-        """What both perceptrons see, finite for any charges (n, n_electrode), pC."""
-        if signed := self.features.signed:
-            low, high, mean = (as_tensor(values) for values in (signed.low, signed.high, signed.mean))
-            logs = torch.asinh(charge.clamp(low, high) / self.typical) - mean
-        else:
-            logs = torch.log(charge.clamp(LOWEST_CHARGE, HIGHEST_CHARGE) / self.typical)
-        return (logs - self.logs_mean) @ self.whitening
+        """Compute the inputs of both perceptrons from charges of shape (n, n_electrode), pC.
+
+        Finite charges give finite inputs.
+        """
+        return (evaluate_features(self.features.charge_features, charge) - self.features_mean) @ self.whitening
 
     def posterior(self, charge: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log standard deviation of the unit coordinates, each (n, 3)."""
-        out = self.contact(self.inputs(charge))
-        return out[:, :3], out[:, 3:]
+        """Compute mean and log standard deviation of the unit coordinates.
+
+        Args:
+            charge: Shape (n, n_electrode), pC.
+
+        Returns:
+            Mean and logarithm of the standard deviation, shape (n, 3) each.
+        """
+        outputs = self.contact(self.inputs(charge))
+        return outputs[:, MEAN], outputs[:, LOG_STD]
 
     def forward(self, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Charges (n, n_electrode), pC, to contact (n, 3) in mm and N, contact_std (n, 3), misfit (n, 1)."""
+        """Estimate contacts.
+
+        Args:
+            charge: Shape (n, n_electrode), pC.
+
+        Returns:
+            Contact (x, y, F), shape (n, 3), mm and N; its standard deviations, shape (n, 3); misfit, shape (n, 1).
+        """
         mean, log_std = self.posterior(charge)
-        value, std = mean * self.scale + self.centre, torch.exp(log_std) * self.scale
+        value = mean * self.scale + self.centre
+        std = torch.exp(log_std) * self.scale
         force = torch.exp(value[:, 2:])
         contact = torch.cat([value[:, :2], force], dim=1)
         contact_std = torch.cat([std[:, :2], std[:, 2:] * force], dim=1)
@@ -126,33 +155,47 @@ class InverseNetwork(nn.Module):
 
 
 def compress_length(residual: Tensor) -> Tensor:
-    """What the misfit network learns: residuals (..., n_electrode), their lengths brought to asinh(length / unit)."""
+    """Return the targets of the misfit perceptron: residuals with the length asinh(length / MISFIT_UNIT).
+
+    Args:
+        residual: (Q - Q(c)) / sigma at the nearest contact c, shape (..., n_electrode).
+    """
     length: Tensor = torch.linalg.vector_norm(residual, dim=-1, keepdim=True)
-    return residual * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=1e-9))
+    return residual * (torch.asinh(length / MISFIT_UNIT) / length.clamp(min=MIN_LENGTH))
 
 
 def as_tensor(values: Array) -> Tensor:
-    """In single precision."""
+    """Return a copy of an array as a tensor in single precision."""
     return torch.tensor(values).float()
 
 
+def perceptron_to_numpy(perceptron: Perceptron[Tensor]) -> Perceptron[Array]:
+    """Return a copy of a perceptron as NumPy arrays in double precision."""
+    hidden = tuple(Layer(_to_numpy(layer.weight), _to_numpy(layer.bias)) for layer in perceptron.hidden)
+    last = Layer(_to_numpy(perceptron.last.weight), _to_numpy(perceptron.last.bias))
+    return Perceptron(hidden, last, _to_numpy(perceptron.skip), perceptron.activation)
+
+
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
-    """Both perceptrons, from ln(Q / typical) or what stands for it."""
-    features, n_electrode = network.features, network.features.typical.size
-    perceptrons = [part.plain() for part in (network.contact, network.misfit_vector)]
-    whitening, mean = network.whitening.double().numpy(), network.logs_mean.double().numpy()
-    units = answer_units(network.domain, np.eye(3), np.zeros(3), n_electrode)
-    return FoldedNetwork(FoldedLayers.of(perceptrons, whitening, mean, units), features.typical, features.signed)
+    """Fold both perceptrons of a trained network into one."""
+    charge_features = network.features.charge_features
+    units = answer_units(network.domain, np.eye(3), np.zeros(3), charge_features.n_electrode)
+    perceptrons = [network.contact.to_numpy(), network.misfit_vector.to_numpy()]
+    return _fold(network, perceptrons, units)
 
 
-def contact_alone(network: InverseNetwork) -> FoldedNetwork:
-    """The contact network without standard deviations: its layers give (x_mm, y_mm, ln F) alone."""
-    matrix = np.vstack([np.diag(network.domain.scale), np.zeros((3, 3))])
-    features, contact = network.features, network.contact.plain()
-    layers = FoldedLayers.of((contact,), features.matrix, features.mean, (matrix, network.domain.centre))
-    return FoldedNetwork(layers, features.typical, features.signed)
+def fold_contact_mean(network: InverseNetwork) -> FoldedNetwork:
+    """Fold the contact perceptron of a trained network; the only answers are x and y in mm, and ln F."""
+    weight = np.vstack([np.diag(network.domain.scale), np.zeros((3, 3))])
+    return _fold(network, [network.contact.to_numpy()], Layer(weight, network.domain.centre))
 
 
-def _matrix(layer: nn.Linear) -> Array:
-    """Weights of a layer, shape (inputs, outputs)."""
-    return np.asarray(layer.weight.detach().double().numpy().T)
+def _fold(network: InverseNetwork, perceptrons: Sequence[Perceptron[Array]], units: Layer[Array]) -> FoldedNetwork:
+    """Fold perceptrons of a network, whose outputs `units` maps to the answers."""
+    mean = _to_numpy(network.features_mean)
+    matrix = _to_numpy(network.whitening)
+    return FoldedNetwork(network.features.charge_features, fold(perceptrons, mean, matrix, units))
+
+
+def _to_numpy(tensor: Tensor) -> Array:
+    return np.asarray(tensor.detach().double().numpy())

@@ -1,4 +1,4 @@
-"""The exported graph against the network it was made from, and against the definitions of its outputs."""
+"""The exported graph against the network from which it was written; graphs that the reader refuses."""
 
 import copy
 
@@ -7,10 +7,14 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from onnx import numpy_helper
+from tests.train.random_networks import random_network
 
-from isocharge.common.errors import TrainingError
+from isocharge.common.errors import ModelError, TrainingError
+from isocharge.serve import find_model
 from isocharge.simulate import noise_model
-from isocharge.train.model_release.export import check_graph, export_onnx
+from isocharge.train.model_release.graph_check import check_graph
+from isocharge.train.model_release.onnx_graph import read_graph, write_graph
 from isocharge.train.training import correlation
 from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.network import fold_network
@@ -39,7 +43,7 @@ def held(trained):
 
 @pytest.fixture(scope="module")
 def graph(trained):
-    return export_onnx(turned(trained.network, trained), {"note": "kept"})
+    return write_graph(turned(trained.network, trained), {"note": "kept"})
 
 
 def turned(network, trained):
@@ -102,7 +106,7 @@ def test_a_network_that_runs_off_the_numbers_is_not_released(trained, held, monk
         network.contact.skip.weight *= 1e3
     exact = turned(network, trained)
     with pytest.raises(TrainingError, match=r"answers contact = .* expected finite numbers for any charges"):
-        check_graph(export_onnx(exact, {}), exact.outputs, held, REFERENCE)
+        check_graph(write_graph(exact, {}), exact.outputs, held, REFERENCE)
 
 
 def test_file_and_network_may_differ_by_a_thousandth_of_what_charges_tell(trained, held, graph):
@@ -135,3 +139,78 @@ def test_the_file_is_plain_onnx_that_another_runtime_computes(held, graph, sessi
     contact, std, misfit = answers(session, charge)
     assert max(apart((contact, std), reference[:2])) < CLOSE
     assert np.all(np.abs(misfit - reference[2]) <= CLOSE_MISFIT * np.maximum(misfit, 1.0))
+
+
+@pytest.mark.parametrize("name", ["three-25um-biaxial", "four-25um-uniaxial-films", "four-25um-biaxial-student"])
+def test_the_definition_read_from_a_released_model_writes_the_same_constants(name):
+    released = (find_model(name) / "model.onnx").read_bytes()
+    written = write_graph(read_graph(released, name), {})
+    for before, after in zip(
+        *(onnx.load_from_string(data).graph.initializer for data in (released, written)), strict=True
+    ):
+        np.testing.assert_array_equal(numpy_helper.to_array(before), numpy_helper.to_array(after))
+
+
+def use_relu(model):
+    model.graph.node[4].op_type = "Relu"
+
+
+def bypass_a_layer(model):
+    model.graph.node[5].input[0] = model.graph.node[3].output[0]
+
+
+def split_into_other_widths(model):
+    """Let y be one of the logarithms; all shapes still fit."""
+    sizes = [tensor for tensor in model.graph.initializer if tensor.data_type == onnx.TensorProto.INT64]
+    for tensor, widths in zip(sizes, ([1, 5, 3], [2, 3]), strict=True):
+        tensor.CopyFrom(numpy_helper.from_array(np.array(widths), tensor.name))
+
+
+def set_first_bias(model, values):
+    bias = model.graph.initializer[4]
+    bias.CopyFrom(numpy_helper.from_array(np.array(values, np.float32), bias.name))
+
+
+def use_infinite_bias(model):
+    set_first_bias(model, np.full(16, np.inf))
+
+
+def use_one_bias_for_all_columns(model):
+    set_first_bias(model, np.zeros(1))
+
+
+def use_another_misfit_unit(model):
+    unit = model.graph.initializer[-1]
+    unit.CopyFrom(numpy_helper.from_array(np.float32(6.0), unit.name))
+
+
+def add_a_node(model):
+    model.graph.node.append(onnx.helper.make_node("Abs", ["misfit"], ["size"]))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (use_relu, r"expected one of the activations .* after a Gemm, got \['Relu'\]"),
+        (bypass_a_layer, r"expected the node Gemm\(result 0 of node 4, .*, got the node Gemm\(result 0 of node 3"),
+        (
+            split_into_other_widths,
+            r"expected the node Split\(.*\(3,\), \[2, 4, 3\]\).*got the node Split\(.*\[1, 5, 3\]",
+        ),
+        (use_infinite_bias, "expected finite constants"),
+        (use_one_bias_for_all_columns, r"expected a bias for each column of \(3, 16\), got \(1,\)"),
+        (use_another_misfit_unit, r"expected the node Mul\(.*5\.0\).*got the node Mul\(.*6\.0\)"),
+        (add_a_node, r"expected 16 nodes, got 17"),
+    ],
+)
+def test_a_graph_of_another_program_is_refused(change, message):
+    model = onnx.load_model_from_string(write_graph(random_network(3, (8, 8), (8, 8)), {}))
+    read_graph(model.SerializeToString(), "f")
+    change(model)
+    with pytest.raises(ModelError, match=f"^f: .*{message}.*; only models of isocharge can be read"):
+        read_graph(model.SerializeToString(), "f")
+
+
+def test_a_file_that_is_not_onnx_is_refused():
+    with pytest.raises(ModelError, match="f: not a valid ONNX file"):
+        read_graph(b"nonsense", "f")

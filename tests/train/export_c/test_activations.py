@@ -1,0 +1,127 @@
+"""Every activation of hidden layers: its values, and networks with it in PyTorch, NumPy, ONNX and C."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from msgspec import structs
+from tests.train.random_networks import random_network
+
+from isocharge.common.activations import ACTIVATIONS
+from isocharge.common.errors import ConfigError
+from isocharge.common.perceptron import evaluate
+from isocharge.serve import Predictor, find_model, load_model, write_model
+from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config, release
+from isocharge.train.films.conditional_network import ConditionalPerceptron
+from isocharge.train.films.films_model import ConditionalWeights
+from isocharge.train.model_release.onnx_graph import read_graph, write_graph
+from isocharge.train.training.fit import Split
+from isocharge.train.training.network import TrainablePerceptron
+
+CLOSED_FORMS = {
+    "tanh": lambda x: (np.exp(x) - np.exp(-x)) / (np.exp(x) + np.exp(-x)),
+}
+"""The value of each activation, in double precision."""
+
+CONTACT_FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0])
+"""Values of the outputs, mm, N and the misfit, below which differences count as absolute differences."""
+
+
+def check_close(given, expected):
+    tolerance = 2e-5 * np.maximum(np.abs(expected), CONTACT_FLOORS)
+    np.testing.assert_array_less(np.abs(given - expected), tolerance)
+
+
+def test_every_activation_has_a_closed_form():
+    assert set(CLOSED_FORMS) == set(ACTIVATIONS)
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_numpy_and_torch_compute_the_closed_form(name):
+    activation = ACTIVATIONS[name]
+    x = np.linspace(-5.0, 5.0, 101)
+    expected = CLOSED_FORMS[name](x)
+    torch_function = getattr(torch.nn.functional, activation.torch_name)
+    np.testing.assert_allclose(activation.numpy_function(x), expected, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(torch_function(torch.tensor(x)), expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_a_torch_perceptron_and_its_numpy_copy_agree(name):
+    torch.manual_seed(0)
+    perceptron = TrainablePerceptron(4, (12, 10), 6, ACTIVATIONS[name]).double()
+    torch.nn.init.normal_(perceptron.skip.weight)
+    x = np.random.default_rng(1).standard_normal((50, 4))
+    hidden = x
+    first, second, last = (
+        (layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in perceptron.linear_layers()
+    )
+    for weight, bias in (first, second):
+        hidden = CLOSED_FORMS[name](hidden @ weight.T + bias)
+    expected = hidden @ last[0].T + last[1] + x @ perceptron.skip.weight.detach().numpy().T
+    with torch.no_grad():
+        np.testing.assert_allclose(perceptron(torch.tensor(x)), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(evaluate(perceptron.to_numpy(), x), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_the_network_for_all_films_is_the_perceptron_of_each_film(name):
+    torch.manual_seed(0)
+    activation = ACTIVATIONS[name]
+    conditional = ConditionalPerceptron(4, (12, 10), 6, 5, activation).double()
+    for parameter in conditional.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    inputs = torch.randn(3, 20, 4, dtype=torch.float64)
+    contexts = torch.randn(3, 5, dtype=torch.float64)
+    with torch.no_grad():
+        outputs = conditional(inputs, contexts).numpy()
+    weights = ConditionalWeights(conditional.to_arrays(), activation)
+    for film in range(3):
+        perceptron = weights.perceptron(contexts[film].numpy())
+        np.testing.assert_allclose(evaluate(perceptron, inputs[film].numpy()), outputs[film], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_onnx_and_c_give_the_network(name, build, tmp_path):
+    """Both are compared with the network in double precision, and the graph gives the same network back."""
+    network = random_network(4, (24, 20), (16, 12), activation=ACTIVATIONS[name])
+    electrodes = ("A", "B", "C", "D")
+    released = load_model(find_model("four-25um-biaxial")).metadata
+    metadata = structs.replace(released, name="random", version=1)
+    charge_pC = np.random.default_rng(1).uniform(100.0, 3000.0, (64, len(electrodes))).astype(np.float32)
+    graph = write_graph(network, metadata.to_props())
+    folder = write_model(tmp_path / "random", graph, metadata, charge_pC, "card")
+
+    expected = np.concatenate(network.predict(charge_pC.astype(float)), axis=1)
+    check_close(np.stack(Predictor(folder).predict_batch(charge_pC), axis=1)[:, :7], expected)
+    check_close(build(folder).predict(charge_pC), expected)
+
+    read_network = read_graph(graph, "graph")
+    assert read_network.layers.activation.name == name
+    check_close(np.concatenate(read_network.predict(charge_pC.astype(float)), axis=1), expected)
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_a_student_with_8_bits_is_trained_and_served(name, dataset, fitted, trained, monkeypatch, tmp_path):
+    monkeypatch.setattr(Split, "of", lambda *_: trained.split)  # the search for folds would take most of the time
+    teacher = Teacher("teacher/1", "", lambda charge: fitted.predict(charge)[:2])
+    config = FitConfig(
+        network=NetworkConfig(hidden=(24, 24), misfit_hidden=(16, 16), activation=name, weights="int8"),
+        training=TrainingConfig(steps=400, misfit_steps=100, misfit_charges=1_000, batch=256),
+    )
+    student = fit(replace(TrainingData.of(dataset), teacher=teacher), config)
+    folder = release(student, tmp_path / "student").folder
+    test = student.test
+    contact = np.stack(Predictor(folder).predict_batch(test.charge), axis=1)
+    error_mm = np.hypot(*(contact[:, :2] - test.contact[:, :2]).T)
+    assert np.median(error_mm) < 0.6
+    assert load_model(folder).metadata.made_with["config"]["network"]["activation"] == name
+    assert read_graph((folder / "model.onnx").read_bytes(), "student").layers.activation.name == name
+
+
+def test_an_unknown_activation_is_refused(tmp_path):
+    path = tmp_path / "config.toml"
+    path.write_text('[network]\nactivation = "step"\n', "utf-8")
+    with pytest.raises(ConfigError, match=r"network\.activation: expected one of tanh.*, got 'step'"):
+        load_config(path)

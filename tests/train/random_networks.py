@@ -1,0 +1,53 @@
+"""Networks with random weights, for tests of what a network is written to."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+
+from isocharge.common.activations import TANH
+from isocharge.common.perceptron import Layer, Perceptron
+from isocharge.train.training.features import logarithmic_features
+from isocharge.train.training.folded_network import N_CONTACT_ANSWERS, FoldedNetwork
+from isocharge.train.training.folding import fold
+from isocharge.train.training.network import LARGEST_INT8
+
+TYPICAL_pC = 512.0
+"""Charge by which each charge is divided, pC."""
+
+
+def random_perceptron(rng, widths, activation=TANH):
+    """Return a perceptron with random weights; `widths` are those of the inputs, the hidden layers and the outputs."""
+    layers = []
+    for n_input, n_output in itertools.pairwise(widths):
+        weight = rng.standard_normal((n_input, n_output)) / np.sqrt(n_input)
+        layers.append(Layer(weight, 0.3 * rng.standard_normal(n_output)))
+    *hidden, last = layers
+    skip = 0.1 * rng.standard_normal((widths[0], widths[-1]))
+    return Perceptron(tuple(hidden), last, skip, activation)
+
+
+def random_network(n_electrode, hidden, misfit_hidden, *, is_int8=False, activation=TANH):
+    """Return a network with random weights.
+
+    Args:
+        n_electrode: Number of electrodes.
+        hidden: Widths of the hidden layers of the contact perceptron.
+        misfit_hidden: Widths of the hidden layers of the misfit perceptron.
+        is_int8: Whether the weights between hidden layers are rounded to 8 bits.
+        activation: Activation of the hidden layers.
+    """
+    rng = np.random.default_rng(0)
+    perceptrons = [
+        random_perceptron(rng, (n_electrode, *hidden, N_CONTACT_ANSWERS), activation),
+        random_perceptron(rng, (n_electrode, *misfit_hidden, n_electrode), activation),
+    ]
+    n_answer = N_CONTACT_ANSWERS + n_electrode
+    units = Layer(np.diag([8.0, 8.0, *np.ones(n_answer - 2)]), np.zeros(n_answer))
+    layers = fold(perceptrons, np.zeros(n_electrode), np.eye(n_electrode), units)
+    if is_int8:
+        first, second = layers.hidden
+        scale = np.abs(second.weight).max(axis=0) / LARGEST_INT8
+        rounded = Layer(np.round(second.weight / scale) * scale, second.bias)
+        layers = replace(layers, hidden=(first, rounded))
+    return FoldedNetwork(logarithmic_features(np.full(n_electrode, np.log(TYPICAL_pC))), layers)

@@ -1,0 +1,161 @@
+"""A layer of a network as a C function with constant arrays.
+
+A layer computes y = f(x W + c). Its weights have the shape (inputs, outputs), and a few rows at a time are added to all
+outputs. The inner loop runs over neighbouring outputs with a constant count, so compilers vectorise it from -O2 on
+without changing the order of any sum. If two perceptrons run side by side, the weights are two blocks, and the zeros
+beside the blocks are left out. Weights that training rounded to 8 bits take one byte each.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isocharge.common.activations import Activation
+from isocharge.common.arrays import Singles
+from isocharge.train.export_c.c_text import c_array
+
+N_ROWS = 4
+"""Number of rows of the weights that are added at a time, so that each output is loaded and stored once for all of
+them."""
+
+LARGEST_INT8 = 127
+"""Largest absolute value of a weight that is rounded to 8 bits, in units of the scale of its column."""
+
+INT8_TOLERANCE = 2.0**-21
+"""Relative difference from a multiple of the scale that float32 arithmetic can cause."""
+
+Block = tuple[slice, slice]
+"""Rows and columns of a part of a matrix."""
+
+WHOLE_MATRIX: Block = (slice(0, None), slice(0, None))
+"""The block that contains all rows and columns."""
+
+
+@dataclass(frozen=True)
+class LayerSource:
+    """The C function `void name(x, c, y)`, which computes y = f(x W + c).
+
+    Attributes:
+        name: Name of the function.
+        weight: W, shape (inputs, outputs), float32.
+        bias: c if it is constant, shape (outputs,), written as the array `name_bias`; otherwise None.
+        blocks: Blocks outside which W is zero.
+        activation: The function f; None for the identity.
+    """
+
+    name: str
+    weight: Singles
+    bias: Singles | None = None
+    blocks: tuple[Block, ...] = (WHOLE_MATRIX,)
+    activation: Activation | None = None
+
+    def text(self) -> str:
+        """Return the constant arrays and the function.
+
+        The function adds c last, because intermediate sums would otherwise be rounded to the digits of a large c.
+        """
+        n_input, n_output = self.weight.shape
+        values, scale = round_to_int8(self.weight)
+        block_names = [f"{self.name}_weights_{number}" for number in range(len(self.blocks))]
+        named_blocks = list(zip(block_names, self.blocks, strict=True))
+        arrays = [c_array(name, values[block]) for name, block in named_blocks]
+        if scale is not None:
+            arrays.append(c_array(f"{self.name}_scale", scale))
+        if self.bias is not None:
+            arrays.append(c_array(f"{self.name}_bias", self.bias))
+        answer = "y[j] + c[j]" if scale is None else f"y[j] * {self.name}_scale[j] + c[j]"
+        if self.activation is not None:
+            answer = f"{self.activation.c_function}({answer})"
+        lines = [
+            f"/* {n_input} numbers x to {n_output} numbers y */",
+            f"static void {self.name}(const float *restrict x, const float *restrict c, float *restrict y)",
+            "{",
+            f"    for (int j = 0; j < {n_output}; ++j)",
+            "        y[j] = 0.0f;",
+            *chain.from_iterable(_add_product(name, block, values[block]) for name, block in named_blocks),
+            f"    for (int j = 0; j < {n_output}; ++j)",
+            f"        y[j] = {answer};",
+            "}",
+            "",
+        ]
+        return "\n".join([*arrays, *lines])
+
+
+def find_blocks(weights: Sequence[Singles], first_width: int) -> list[tuple[Block, ...]]:
+    """Find the blocks of consecutive layers: two where two perceptrons run side by side, otherwise one.
+
+    Args:
+        weights: Weights of each layer except the first one, whose inputs both perceptrons share.
+        first_width: Number of outputs of the last layer that belong to the first perceptron.
+
+    Returns:
+        Blocks of each layer.
+    """
+    blocks: list[tuple[Block, ...]] = []
+    column = first_width
+    for matrix in reversed(weights):
+        is_used_by_second = matrix[:, column:].any(axis=1)
+        row = int(is_used_by_second.argmax())
+        is_block_diagonal = row > 0 and not matrix[row:, :column].any()
+        if is_block_diagonal:
+            first = (slice(0, row), slice(0, column))
+            second = (slice(row, None), slice(column, None))
+            blocks.append((first, second))
+            column = row
+        else:
+            blocks.append((WHOLE_MATRIX,))
+            column = 0
+    return blocks[::-1]
+
+
+def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
+    """Return weights as 8-bit integers with a scale for each column, if they are multiples of it.
+
+    Args:
+        values: Weights, shape (inputs, outputs).
+
+    Returns:
+        Integers and the scale, shape (outputs,); or the unchanged weights and None, if some weights are no multiples.
+    """
+    scale = np.abs(values).max(axis=0) / np.float32(LARGEST_INT8)
+    multiples = np.round(values / np.where(scale > 0.0, scale, 1.0))
+    if np.allclose(multiples * scale, values, rtol=INT8_TOLERANCE, atol=0.0):
+        return multiples.astype(np.int8), scale
+    return values, None
+
+
+def _add_product(name: str, block: Block, values: NDArray[Any]) -> list[str]:
+    """Return the lines that add the product of x and one block to y.
+
+    Args:
+        name: Name of the array with the weights of the block.
+        block: Rows and columns of the block.
+        values: Weights of the block.
+    """
+    n_row, width = values.shape
+    rows, columns = block
+    is_int8 = values.dtype == np.int8
+    number_type = "signed char" if is_int8 else "float"
+    cast = "(float)" if is_int8 else ""
+    n_grouped = n_row - n_row % N_ROWS
+    lines = []
+    for begin, end in ((0, n_grouped), (n_grouped, n_row)):
+        count = min(N_ROWS, end - begin)
+        if count == 0:
+            continue
+        loads = ", ".join(f"x{k} = x[{rows.start + k} + i]" for k in range(count))
+        terms = " + ".join(f"x{k} * {cast}w[{k * width} + j]" for k in range(count))
+        lines += [
+            f"    for (int i = {begin}; i < {end}; i += {count}) {{",
+            f"        const {number_type} *w = {name} + {width} * i;",
+            f"        const float {loads};",
+            "",
+            f"        for (int j = 0; j < {width}; ++j)",
+            f"            y[{columns.start} + j] += {terms};",
+            "    }",
+        ]
+    return lines

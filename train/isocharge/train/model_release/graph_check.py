@@ -1,0 +1,143 @@
+"""Comparison of an exported ONNX graph with the network from which it was written."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import onnxruntime as ort
+
+from isocharge.common.arrays import Array, Singles
+from isocharge.common.errors import TrainingError
+from isocharge.serve.model.golden import FLOORS
+from isocharge.serve.model.session import CORRELATION, open_session, run
+from isocharge.serve.prediction.tables.number_table import LARGEST
+from isocharge.train.data.channel_noise import Noise
+from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
+
+OutputFunction = Callable[[Array], tuple[Array, ...]]
+"""Function from charges, shape (n, n_electrode), pC, to the outputs of the graph in their order, as float64."""
+
+N_GOLDEN = 64
+"""Number of golden vectors of a model: half of them without noise, a quarter with noise, a quarter extreme."""
+
+TOLERANCES = {
+    "contact": 1e-5,
+    "contact_std": 1e-5,
+    CORRELATION: 5e-5,
+    "misfit": 2e-4,
+}
+"""Largest relative difference of each output between the graph (float32) and the network."""
+
+N_COMPARED = 10_000
+"""Number of presses with noise on which the graph and the network are compared."""
+
+QUANTILE = 0.999
+"""Fraction of the presses that must meet the tolerances. For the others the position depends so strongly on the charges
+that float32 has too few digits."""
+
+STD_FACTOR = 100.0
+"""Differences of a contact are relative to at least this many standard deviations. A thousandth of a standard deviation
+is negligible."""
+
+EXTREME_FACTOR = 10.0
+"""Factor on the tolerances for the remaining presses and for charges that no film produces."""
+
+
+def check_graph(
+    graph: bytes,
+    exact: OutputFunction,
+    presses: LabelledPresses,
+    noise: Noise,
+    floors: Sequence[float] = FLOORS["contact"],
+) -> Singles:
+    """Compare a graph with the network from which it was written.
+
+    Args:
+        graph: The ONNX file.
+        exact: The outputs of the network in double precision.
+        presses: Presses of the film.
+        noise: Noise of good presses.
+        floors: Values of x and y, mm, and of the force, N, below which differences count as absolute differences.
+
+    Returns:
+        Charges for the golden vectors, float32, shape (N_GOLDEN, n_electrode), pC.
+
+    Raises:
+        TrainingError: If an output is not finite, or the graph and the network disagree.
+    """
+    session = open_session(graph, "the exported graph")
+    ordinary, extreme = _golden_charges(exact, presses, noise)
+    _check_finite(session, presses.charge.shape[1])
+    _compare(session, exact, extreme, floors, EXTREME_FACTOR)
+    rows = np.arange(N_COMPARED) % len(presses)
+    noisy = presses[rows].noisy(noise, seed=3).astype(np.float32)
+    _compare(session, exact, noisy, floors, 1.0)
+    return np.concatenate([ordinary, extreme])
+
+
+def _golden_charges(exact: OutputFunction, presses: LabelledPresses, noise: Noise) -> tuple[Singles, Singles]:
+    """Choose charges for the golden vectors: three quarters from presses, and one quarter of extreme charges.
+
+    Only presses whose position has a standard deviation below the median are used. Where 0.2 % of a charge is a
+    millimetre, the last digit of a float32 is 3e-5 mm, and different runtimes do not agree within the tolerance of
+    golden vectors.
+    """
+    _, std, *_ = exact(presses.charge)
+    position_std = std[:, 0] + std[:, 1]
+    certain = presses[np.flatnonzero(position_std <= np.median(position_std))]
+    clean = certain[np.linspace(0, len(certain) - 1, N_GOLDEN // 2).astype(int)]
+    every_second = clean[np.arange(0, len(clean), 2)]
+    noisy = every_second.noisy(noise, seed=2)
+    extreme = every_second.charge * np.geomspace(1e-3, 1e3, len(every_second))[:, None]
+    extreme[0] = 0.0
+    extreme[1] = -extreme[1]
+    ordinary = np.concatenate([clean.charge, noisy])
+    return ordinary.astype(np.float32), extreme.astype(np.float32)
+
+
+def _check_finite(session: ort.InferenceSession, n_electrode: int) -> None:
+    """Check that the outputs are finite for the largest and smallest charges, where the network extrapolates."""
+    random = np.random.default_rng(4)
+    charges = random.choice([-LARGEST, LOWEST_CHARGE, LARGEST], (N_COMPARED, n_electrode)).astype(np.float32)
+    for name, rows in run(session, charges).items():
+        infinite_rows = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        if infinite_rows.size:
+            row = infinite_rows[0]
+            raise TrainingError(
+                f"the network answers {name} = {rows[row]} to the charges {charges[row]} pC; expected finite "
+                "numbers for any charges: train with more steps or another seed"
+            )
+
+
+def _compare(
+    session: ort.InferenceSession,
+    exact: OutputFunction,
+    charge: Singles,
+    floors: Sequence[float],
+    tolerance_factor: float,
+) -> None:
+    """Check that the graph and the network agree.
+
+    Args:
+        session: The graph.
+        exact: The outputs of the network in double precision.
+        charge: Shape (n, n_electrode), pC.
+        floors: Values of x, y and the force below which differences count as absolute differences.
+        tolerance_factor: Factor on the tolerances.
+
+    Raises:
+        TrainingError: If the graph and the network disagree.
+    """
+    expected_outputs = exact(charge.astype(float))
+    contact_floor = np.maximum(floors, STD_FACTOR * expected_outputs[1])
+    for expected, (name, given) in zip(expected_outputs, run(session, charge).items(), strict=True):
+        floor = contact_floor if name in ("contact", "contact_std") else 1.0
+        difference = np.max(np.abs(expected - given) / np.maximum(np.abs(expected), floor), axis=1)
+        quantile = float(np.quantile(difference, QUANTILE))
+        largest = float(np.max(difference))
+        quantile_tolerance = tolerance_factor * TOLERANCES[name]
+        tolerance = EXTREME_FACTOR * TOLERANCES[name]
+        if not (quantile <= quantile_tolerance and largest <= tolerance):
+            raise TrainingError(
+                f"the exported graph disagrees with the network on {name}: expected at most {quantile_tolerance:g} for "
+                f"{QUANTILE:.1%} of the charges and {tolerance:g} for all, got {quantile:.3g} and {largest:.3g}"
+            )

@@ -1,0 +1,311 @@
+"""ONNX graphs of a network's definition: the writer, and the reader that recovers the definition from a graph.
+
+The reader takes the constants out of a graph, writes the graph of that definition again and compares the two node by
+node. The writer is thus the only description of the graph, and a graph of any other program is refused.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NoReturn
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+from isocharge.common.activations import ACTIVATIONS, Activation
+from isocharge.common.arrays import Array
+from isocharge.common.charge_features import ChargeFeatures
+from isocharge.common.errors import ModelError, cut
+from isocharge.common.perceptron import Layer, Perceptron
+from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS
+from isocharge.train.training.folded_network import (
+    COSINES_TO_CORRELATIONS,
+    LOG_STD,
+    MISFIT_UNIT,
+    N_CONTACT_ANSWERS,
+    POSITION,
+    FoldedNetwork,
+)
+
+OPSET = 17
+"""Version of the ONNX operators; runtimes since 2022 support it."""
+
+IR_VERSION = 8
+"""Version of the ONNX file format that belongs to these operators."""
+
+
+@dataclass
+class GraphBuilder:
+    """Nodes and constants of a graph in the order in which they are added."""
+
+    nodes: list[onnx.NodeProto] = field(default_factory=list)
+    constants: list[onnx.TensorProto] = field(default_factory=list)
+
+    def add(self, operator: str, *inputs: str, to: str = "", **attributes: Any) -> str:
+        """Add a node with one result and return the name of the result, which is `to` if that is given."""
+        (result,) = self.add_many(operator, *inputs, to=(to or f"t{len(self.nodes)}",), **attributes)
+        return result
+
+    def add_many(self, operator: str, *inputs: str, to: tuple[str, ...], **attributes: Any) -> tuple[str, ...]:
+        """Add a node with several results and return their names."""
+        self.nodes.append(helper.make_node(operator, list(inputs), list(to), **attributes))
+        return to
+
+    def constant(self, values: object, dtype: type = np.float32) -> str:
+        """Add a constant tensor and return its name."""
+        name = f"c{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.array(values, dtype=dtype, order="C"), name))
+        return name
+
+    def split(self, data: str, widths: Mapping[str, int]) -> tuple[str, ...]:
+        """Split the columns of a tensor into results with the given names and widths."""
+        return self.add_many("Split", data, self.constant(tuple(widths.values()), np.int64), to=tuple(widths), axis=1)
+
+
+def write_graph(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
+    """Write a network as an ONNX file.
+
+    Args:
+        network: The network.
+        properties: Metadata, which are written into `metadata_props`.
+
+    Returns:
+        The ONNX file: input `charge_pC` [n, n_electrode]; outputs `contact` [n, 3], `contact_std` [n, 3],
+        `contact_correlation` [n, 3] if the network gives it, and `misfit` [n, 1], all float32.
+    """
+    model = _whole_model(network)
+    helper.set_model_props(model, dict(properties))
+    onnx.checker.check_model(model, full_check=True)
+    return bytes(model.SerializeToString())
+
+
+def write_contact_graph(network: FoldedNetwork) -> bytes:
+    """Write a network whose only answers are x, y and ln F as an ONNX file.
+
+    Returns:
+        The ONNX file: input `charge_pC` [n, n_electrode], output `contact` [n, 3], both float32.
+    """
+    build = GraphBuilder()
+    position, log_force = build.split(_add_answers(build, network), {"plane": 2, "log_force": 1})
+    build.add("Concat", position, build.add("Exp", log_force), to="contact", axis=1)
+    model = _make_model(build, "contact", network.features.n_electrode, {"contact": 3})
+    return bytes(model.SerializeToString())
+
+
+def _whole_model(network: FoldedNetwork) -> onnx.ModelProto:
+    """Return the ONNX model of a network, without metadata."""
+    build = GraphBuilder()
+    n_electrode = network.features.n_electrode
+    widths = {"plane": POSITION.stop, "logs": LOG_STD.stop - POSITION.stop}
+    if network.n_angle:
+        widths["angles"] = network.n_angle
+    widths["misfit_vector"] = n_electrode
+    position, logarithms, *angles, misfit_vector = build.split(_add_answers(build, network), widths)
+    force, _ = build.split(build.add("Exp", logarithms), {"force": 1, "contact_std": 3})
+    build.add("Concat", position, force, to="contact", axis=1)
+    for arguments in angles:
+        cosines = build.add("Cos", arguments)
+        build.add("MatMul", cosines, build.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
+    length = build.add("ReduceL2", misfit_vector, axes=[1], keepdims=1)
+    build.add("Mul", build.add("Sinh", length), build.constant(MISFIT_UNIT), to="misfit")
+    outputs = {name: width for name, width in OUTPUTS.items() if network.n_angle or name != CORRELATION}
+    return _make_model(build, "isocharge", n_electrode, outputs, producer_name="isocharge")
+
+
+def _add_answers(build: GraphBuilder, network: FoldedNetwork) -> str:
+    """Add the features and the perceptron of a network and return the name of the answers."""
+    return _add_perceptron(build, _add_features(build, network.features), network.layers)
+
+
+def _add_features(build: GraphBuilder, features: ChargeFeatures) -> str:
+    """Add the input features of the charges and return their name."""
+    factor = 1.0 / features.typical_pC
+    if features.mean is None:
+        clipped = build.add("Clip", INPUT, build.constant(features.low_pC), build.constant(features.high_pC))
+        return build.add("Log", build.add("Mul", clipped, build.constant(factor)))
+    above = build.add("Max", INPUT, build.constant(features.low_pC))
+    clipped = build.add("Min", above, build.constant(features.high_pC))
+    ratio = build.add("Mul", clipped, build.constant(factor))
+    return build.add("Sub", build.add("Asinh", ratio), build.constant(features.mean))
+
+
+def _add_perceptron(build: GraphBuilder, inputs: str, perceptron: Perceptron[Array]) -> str:
+    """Add a perceptron and return the name of its outputs."""
+    value = inputs
+    for layer in perceptron.hidden:
+        linear = build.add("Gemm", value, build.constant(layer.weight), build.constant(layer.bias))
+        value = build.add(perceptron.activation.onnx_operator, linear)
+    last = perceptron.last
+    skipped = build.add("Gemm", inputs, build.constant(perceptron.skip), build.constant(last.bias))
+    return build.add("Gemm", value, build.constant(last.weight), skipped)
+
+
+def _make_model(
+    build: GraphBuilder, name: str, n_electrode: int, outputs: Mapping[str, int], **attributes: Any
+) -> onnx.ModelProto:
+    """Return a model with the input `charge_pC` [n, n_electrode] and outputs [n, width], all float32."""
+
+    def tensors(widths: Mapping[str, int]) -> list[onnx.ValueInfoProto]:
+        return [
+            helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["n", width]) for tensor, width in widths.items()
+        ]
+
+    graph = helper.make_graph(build.nodes, name, tensors({INPUT: n_electrode}), tensors(outputs), build.constants)
+    opset = helper.make_opsetid("", OPSET)
+    return helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, **attributes)
+
+
+def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
+    """Recover the definition of a network from an ONNX file of `write_graph`.
+
+    Args:
+        onnx_model: The ONNX file.
+        where: Name of the file, for error messages.
+
+    Returns:
+        The network. Its numbers are those of the file: float32 numbers in float64 arrays.
+
+    Raises:
+        ModelError: If the file is damaged or was not written by `write_graph`.
+    """
+    try:
+        model = onnx.load_model_from_string(onnx_model)
+        onnx.checker.check_model(model, full_check=True)
+    except Exception as error:  # protobuf's exceptions have no base in onnx
+        raise ModelError(f"{where}: not a valid ONNX file ({cut(str(error))})") from error
+    versions = {entry.domain: entry.version for entry in model.opset_import}
+    if versions != {"": OPSET}:
+        _refuse(where, f"expected ONNX operators of version {OPSET} alone, got {versions}")
+    network = _network_of(model.graph, where)
+    expected = list(_plain_nodes(_whole_model(network).graph))
+    given = list(_plain_nodes(model.graph))
+    for expected_node, given_node in zip(expected, given, strict=False):
+        if expected_node != given_node:
+            _refuse(where, f"expected the node {expected_node}, got the node {given_node}")
+    if len(expected) != len(given):
+        _refuse(where, f"expected {len(expected)} nodes, got {len(given)}")
+    return network
+
+
+def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
+    """Return the network whose constants a graph holds, if the graph is one of `write_graph`."""
+    operators = [node.op_type for node in graph.node]
+    activation = _activation_of(operators, where)
+    constants = _constants_in_order(graph, where)
+    try:
+        features = _take_features(constants, is_signed=operators[:1] == ["Max"])
+        hidden = [Layer(next(constants), next(constants)) for _ in range(operators.count(activation.onnx_operator))]
+        skip = next(constants)
+        bias = next(constants)
+        perceptron = Perceptron(tuple(hidden), Layer(next(constants), bias), skip, activation)
+    except StopIteration:
+        _refuse(where, f"expected more constants than these {len(graph.initializer)}")
+    _check_shapes(features, perceptron, where)
+    return FoldedNetwork(features, perceptron)
+
+
+def _activation_of(operators: Sequence[str], where: str) -> Activation:
+    """Return the activation of the hidden layers, which follows the first linear layer."""
+    by_operator = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
+    first_layer = operators.index("Gemm") if "Gemm" in operators else len(operators)
+    following = operators[first_layer + 1 : first_layer + 2]
+    for operator in following:
+        if operator in by_operator:
+            return by_operator[operator]
+    return _refuse(where, f"expected one of the activations {', '.join(by_operator)} after a Gemm, got {following}")
+
+
+def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
+    """Yield the constants of a graph in the order in which the nodes use them."""
+    constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    for node in graph.node:
+        for name in node.input:
+            if name not in constants:
+                continue
+            if not np.isfinite(constants[name]).all():
+                _refuse(where, f"node {node.op_type} {list(node.output)}: expected finite constants")
+            yield constants[name].astype(float)
+
+
+def _take_features(constants: Iterator[Array], *, is_signed: bool) -> ChargeFeatures:
+    """Return the features whose constants come first."""
+    low = next(constants)
+    high = next(constants)
+    typical = 1.0 / next(constants)
+    return ChargeFeatures(typical, low, high, next(constants) if is_signed else None)
+
+
+def _check_shapes(features: ChargeFeatures, perceptron: Perceptron[Array], where: str) -> None:
+    """Refuse constants whose shapes do not fit each other."""
+    n_electrode = features.n_electrode
+    bounds = [features.low_pC, features.high_pC]
+    expected_bounds: list[tuple[int, ...]] = [(), ()]
+    if features.mean is not None:
+        bounds.append(features.mean)
+        expected_bounds = [(n_electrode,)] * len(bounds)
+    given_bounds = [values.shape for values in bounds]
+    if given_bounds != expected_bounds or features.typical_pC.shape != (n_electrode,):
+        _refuse(
+            where, f"expected limits and means of the charges with the shapes {expected_bounds}, got {given_bounds}"
+        )
+    width = n_electrode
+    for layer in (*perceptron.hidden, perceptron.last):
+        if layer.weight.ndim != 2 or layer.weight.shape[0] != width:
+            _refuse(where, f"expected weights for {width} inputs, got an array of shape {layer.weight.shape}")
+        width = layer.weight.shape[1]
+        if layer.bias.shape != (width,):
+            _refuse(where, f"expected a bias for each column of {layer.weight.shape}, got {layer.bias.shape}")
+    if perceptron.skip.shape != (n_electrode, width):
+        _refuse(where, f"expected a skip layer of shape {(n_electrode, width)}, got {perceptron.skip.shape}")
+    if width < N_CONTACT_ANSWERS + n_electrode:
+        _refuse(where, f"expected at least {N_CONTACT_ANSWERS} + {n_electrode} answers, got {width}")
+
+
+@dataclass(frozen=True)
+class _PlainNode:
+    """A node without arbitrary names: two nodes that compute the same from the same inputs are equal.
+
+    Attributes:
+        operator: The operator.
+        inputs: For each input the graph's input, the number of the result, or the numbers of the constant.
+        outputs: Name of each output of the graph, or None for other results.
+        attributes: Attributes by name.
+    """
+
+    operator: str
+    inputs: tuple[object, ...]
+    outputs: tuple[str | None, ...]
+    attributes: dict[str, object]
+
+    def __str__(self) -> str:
+        inputs = ", ".join(str(value)[:60] for value in self.inputs)
+        outputs = ", ".join(name or "a result" for name in self.outputs)
+        return f"{self.operator}({inputs}) {self.attributes or ''} to {outputs}"
+
+
+def _plain_nodes(graph: onnx.GraphProto) -> Iterator[_PlainNode]:
+    """Yield the nodes of a graph with all arbitrary names replaced by numbers."""
+    values: dict[str, object] = {tensor.name: tensor.name for tensor in graph.input}
+    for tensor in graph.initializer:
+        values[tensor.name] = _plain_constant(numpy_helper.to_array(tensor))
+    graph_outputs = {tensor.name for tensor in graph.output}
+    for number, node in enumerate(graph.node):
+        yield _PlainNode(
+            operator=node.op_type,
+            inputs=tuple(values.get(name) for name in node.input),
+            outputs=tuple(name if name in graph_outputs else None for name in node.output),
+            attributes={entry.name: helper.get_attribute_value(entry) for entry in node.attribute},
+        )
+        for position, name in enumerate(node.output):
+            values[name] = f"result {position} of node {number}"
+
+
+def _plain_constant(values: NDArray[Any]) -> tuple[object, ...]:
+    """Return number type, shape and numbers of a constant."""
+    return values.dtype.str, values.shape, values.tolist()
+
+
+def _refuse(where: str, reason: str) -> NoReturn:
+    """Raise the error of a graph that `write_graph` did not write."""
+    raise ModelError(f"{where}: {reason}; only models of isocharge can be read")

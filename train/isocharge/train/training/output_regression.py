@@ -1,0 +1,124 @@
+"""Changes of the last layer of a trained network by ridge regression, without training the hidden layers again."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.perceptron import Layer, Perceptron, evaluate, evaluate_hidden_layers
+from isocharge.train.training.folded_network import LOG_STD, MEAN, FoldedNetwork, relative_log_std
+from isocharge.train.training.folding import transform_inputs
+
+EXACT_RIDGE = 1e-5
+"""Ridge for targets without noise, relative to the mean square of a feature of unit size."""
+
+NOISY_RIDGE = 0.03
+"""Ridge for targets that contain the squares of single errors, relative to the mean square of a feature of unit
+size."""
+
+MAX_ERROR = 3.0
+"""Largest error, in standard deviations, that the regression of the standard deviations distinguishes. The square of a
+larger error would change the logarithm of the standard deviation too much in one step."""
+
+N_SCORING_STEPS = 3
+"""Number of steps of Fisher's scoring for the standard deviations."""
+
+
+@dataclass(frozen=True)
+class Regression:
+    """One ridge regression of the last layer.
+
+    Attributes:
+        target: Function from the present answers to the wanted answers, both of shape (n, n_answer).
+        ridge: Penalty on the change of the weights.
+    """
+
+    target: Callable[[Array], Array]
+    ridge: float
+
+
+def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, contact: Array) -> FoldedNetwork:
+    """Return a network that answers `charge` as the given network answers `equivalent`.
+
+    A linear map between the features of both charges is folded into the first layer, and the last layer learns what
+    remains. The standard deviations are then fitted to the errors of the new network by maximising the Gaussian
+    likelihood with Fisher's scoring (McCullagh and Nelder 1989, 2.5), which is a regression on the squares of
+    error / standard deviation.
+
+    Args:
+        network: The given network.
+        charge: Charges with noise, shape (n, n_electrode), pC.
+        equivalent: Charges for which the given network is right, shape (n, n_electrode), pC.
+        contact: True contacts (x, y, F) of both, shape (n, 3), mm and N.
+    """
+    features = network.features.evaluate(charge)
+    equivalent_features = network.features.evaluate(equivalent)
+    design = np.column_stack([features, np.ones(len(features))])
+    *matrix, shift = np.linalg.lstsq(design, equivalent_features)[0]
+    answers = evaluate(network.layers, equivalent_features)
+    truth = np.column_stack([contact[:, :2], np.log(contact[:, 2])])
+
+    def equivalent_answers(present: Array) -> Array:
+        target = np.array(answers)
+        target[:, LOG_STD] = present[:, LOG_STD]
+        return target
+
+    def scoring_step(present: Array) -> Array:
+        error = np.abs(present[:, MEAN] - truth) * np.exp(-relative_log_std(present))
+        target = present.copy()
+        target[:, LOG_STD] += 0.5 * (np.minimum(error, MAX_ERROR) ** 2 - 1.0)
+        return target
+
+    transformed = transform_inputs(network.layers, Layer(np.array(matrix), shift))
+    regressions = [Regression(equivalent_answers, EXACT_RIDGE)]
+    regressions += [Regression(scoring_step, NOISY_RIDGE)] * N_SCORING_STEPS
+    return replace(network, layers=refit_last_layer(transformed, features, regressions))
+
+
+def add_variance(network: FoldedNetwork, charge: Array, variance: Array) -> FoldedNetwork:
+    """Return the network with larger standard deviations.
+
+    Args:
+        network: The given network.
+        charge: Charges at which the variances are added, shape (n, n_electrode), pC.
+        variance: Variances of (x, y, ln F) to add there, shape (n, 3), mm^2, mm^2 and 1.
+    """
+
+    def larger_std(present: Array) -> Array:
+        target = present.copy()
+        target[:, LOG_STD] += 0.5 * np.log1p(variance * np.exp(-2.0 * relative_log_std(present)))
+        return target
+
+    features = network.features.evaluate(charge)
+    return replace(network, layers=refit_last_layer(network.layers, features, [Regression(larger_std, EXACT_RIDGE)]))
+
+
+def refit_last_layer(
+    perceptron: Perceptron[Array], features: Array, regressions: list[Regression]
+) -> Perceptron[Array]:
+    """Change the last layer and the skip layer as little as is needed to give other answers.
+
+    Only the weights that are not zero change: an answer keeps using the hidden units that it used before.
+
+    Args:
+        perceptron: The perceptron.
+        features: Inputs of the perceptron, shape (n, n_input).
+        regressions: Regressions, which are done one after the other.
+    """
+    hidden_output = evaluate_hidden_layers(perceptron.hidden, perceptron.activation, features)
+    n_sample, n_hidden = hidden_output.shape
+    n_input = features.shape[1]
+    design = np.column_stack([hidden_output, features, np.ones(n_sample)])
+    weights = np.vstack([perceptron.last.weight, perceptron.skip, perceptron.last.bias])
+    always_used = np.ones(n_input + 1, dtype=bool)
+    for regression in regressions:
+        present = design @ weights
+        change = regression.target(present) - present
+        for column in np.flatnonzero(change.any(axis=0)):
+            used = np.append(weights[:n_hidden, column] != 0.0, always_used)
+            normal = design[:, used].T @ design[:, used]
+            normal += regression.ridge * n_sample * np.eye(len(normal))
+            weights[used, column] += np.linalg.solve(normal, design[:, used].T @ change[:, column])
+    last, skip, bias = np.split(weights, [n_hidden, n_hidden + n_input])
+    return replace(perceptron, last=Layer(last, bias[0]), skip=skip)
