@@ -1,6 +1,7 @@
 """Headers and encodings of other programs: the message names the column to rename, or the encoding to save in."""
 
 import io
+import time
 
 import numpy as np
 import pytest
@@ -75,6 +76,14 @@ def test_other_columns_are_ignored(write, header):
     assert presses.charge_pC.tolist() == [[4.0, 5.0, 6.0]]
 
 
+def test_a_header_with_a_very_long_name_takes_no_time(write):
+    name = "x" + " " * 30_000 + "]"
+    before = time.process_time()
+    with pytest.raises(PressError, match="missing: 'A'"):
+        read_presses(write(f"{name},y_mm,force_N,B,C,D\n{ROW}"), NAMES)
+    assert time.process_time() - before < 1.0
+
+
 def test_headers_where_every_other_column_is_an_electrode(write):
     """A channel may have any name, but not one that stands for position or force."""
     assert read_presses(write(f"x_mm,y_mm,force_N,a,f,Ladung [pC]\n{ROW}")).electrodes == ("a", "f", "Ladung [pC]")
@@ -103,7 +112,7 @@ TEXT = f"# Größe\nx_mm,y_mm,force_N,A,B,C\n{ROW}"
         (b"\xfe\xff" + TEXT.encode("utf-16-be"), "the file is UTF-16"),
         (TEXT.encode("utf-32"), "the file is UTF-32"),
         (TEXT[8:].encode("utf-16-le"), "null characters: the file seems to be UTF-16 without a byte order mark; save"),
-        (TEXT[8:].encode("utf-16-be"), "null characters: the file seems to be UTF-16"),
+        (TEXT[8:].encode("utf-16-be"), "null characters: the file seems to be UTF-16.* iconv -f UTF-16BE -t UTF-8"),
         (TEXT.encode("latin-1"), r"line 1: the byte 0xf6 is not text in UTF-8: .*iconv -f WINDOWS-1252 -t UTF-8"),
         (f"{TEXT}1,2,3,4,5,ü".encode("cp1252"), "line 1: the byte 0xf6"),
         (f"{TEXT[8:]}1,2,3,4,5,ü".encode("cp1252"), "line 3: the byte 0xfc"),

@@ -61,9 +61,10 @@ class CsvTable(NumberTable):
         if header is None:
             raise error(f"{where}: empty; expected {expected}")
         if any("\0" in name for name in header):
+            encoding = "UTF-16BE" if header[0].startswith("\0") else "UTF-16LE"
             raise error(
                 f"{where}: the header has null characters: the file seems to be UTF-16 without a byte order mark; save "
-                "it as UTF-8, as with: iconv -f UTF-16LE -t UTF-8 FILE > NEW.csv"
+                f"it as UTF-8, as with: iconv -f {encoding} -t UTF-8 FILE > NEW.csv"
             )
         super().__init__(header, names, where, error, expected)
 
