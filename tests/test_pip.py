@@ -70,7 +70,7 @@ def test_a_missing_extra_says_so_in_python_too(base, tmp_path, stage):
     [
         ("simulate point three-25um-biaxial", "simulate"),
         ("serve http --port 0", "http"),
-        ("serve stream three-25um-biaxial --port - --mcap touch.mcap", "record"),
+        ("serve stream three-25um-biaxial --port - --output touch.mcap", "record"),
         ("serve check three-25um-biaxial presses.parquet", "parquet"),
     ],
 )

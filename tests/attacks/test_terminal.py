@@ -25,9 +25,9 @@ from isocharge.serve import (
 from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import Heard
 from isocharge.serve.examination.port_check import findings
-from isocharge.serve.live.outputs import csv_header
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import find_model
+from isocharge.serve.record.csv_rows import csv_header
 
 HARMFUL_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 

@@ -20,7 +20,7 @@ EXTRAS = {"serve http": "http", "serve plot": "simulate", "serve virtual": "simu
 OPTIONS = [
     ("demo --live", "simulate,http"),
     ("serve stream three-25um-biaxial --port - --live 0", "http"),
-    ("serve stream three-25um-biaxial --port - --mcap touch.mcap", "record"),
+    ("serve stream three-25um-biaxial --port - --output touch.mcap", "record"),
     ("serve check three-25um-biaxial presses.parquet", "parquet"),
     ("serve predict three-25um-biaxial charges.parquet", "parquet"),
 ]

@@ -3,7 +3,6 @@
 Messages are made from the definitions of ROS 2 that rosbags ships.
 """
 
-import json
 import runpy
 import struct
 import sys
@@ -18,6 +17,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from isocharge.serve.export.record_messages import pose_stamped, time_of, wrench_stamped
+from isocharge.serve.record.record import TrackedContact, Tracking
 
 NODE = Path(__file__).parents[2] / "serve/deploy/ros2/isocharge_ros/isocharge_ros/node.py"
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -81,18 +81,15 @@ def test_the_node_publishes_what_an_mcap_file_holds(published, record):
         "force_std_N": 0.01,
         "xy_correlation": 0.25,
     }
-    followed = {
-        "follows": True,
-        "tracked": {"x_mm": 1.0, "y_mm": -3.0, "force_N": 0.5, "x_std_mm": 0.01, "y_std_mm": 0.02},
-    }
-    records = [record(**press, **followed), record(**press, contact=False), record(contact=False)]
+    tracking = Tracking(TrackedContact(1.0, -3.0, 0.5, 0.01, 0.02, 0.001, 0.0, 0.0, 0.1))
+    records = [record(**press, tracking=tracking), record(**press, contact=False), record(contact=False)]
     module = runpy.run_path(str(NODE))
     module["main"].__globals__.update(Port=lambda *_, **__: nullcontext(), Predictor=str, stream=lambda *_: records)
     module["main"]()
     assert published.pop() == "destroyed"
     expected = []
     for one in records[:2]:
-        fields = {name: getattr(one, name) for name in json.loads(one.to_json())}
+        fields = one.json_values
         expected.append(("/isocharge/wrench", wrench_stamped(fields, time_of(fields))))
         if one.contact:
             expected.append(("/isocharge/pose", pose_stamped(fields, time_of(fields))))

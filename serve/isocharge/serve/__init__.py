@@ -34,8 +34,8 @@ from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses
-from isocharge.serve.prediction.record import PredictionRecord
 from isocharge.serve.prediction.table import read_charges, table_records, write_contacts
+from isocharge.serve.record.record import PredictionRecord
 from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.virtual_sensor.script import Faults, Script, wander
 from isocharge.serve.virtual_sensor.sensor import VirtualSensor

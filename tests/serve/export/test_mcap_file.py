@@ -1,9 +1,11 @@
 """MCAP files: read back by rosbags, which shares no code with the writer, and by the stock readers of MCAP."""
 
 import json
+import pickle
 import signal
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from io import BytesIO
 from itertools import pairwise
@@ -34,12 +36,12 @@ from isocharge.serve.export.record_messages import (
     STRING_DEFINITION,
     WRENCH,
     WRENCH_DEFINITION,
-    record_schema,
 )
+from isocharge.serve.outputs.output import OutputContext
+from isocharge.serve.outputs.targets import Outputs
 from isocharge.serve.prediction.contact import NO_CORRELATION
-from isocharge.serve.prediction.record import FIELDS
-from isocharge.serve.tracking.film_follower import FollowedFilm
-from isocharge.serve.tracking.tracker import Tracked
+from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking, field_names
+from isocharge.serve.record.schema import record_schema
 
 ELECTRODES = ("A", "B", "C")
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -83,7 +85,7 @@ def records(draw):
 
 def press(number, **changes):
     """A plain record."""
-    values = dict.fromkeys(FIELDS) | {
+    values = dict.fromkeys(field_names()) | {
         "timestamp": 1763600000.0 + 0.005 * number,
         "x_mm": 3.0 + 1e-3 * number,
         "y_mm": -2.0,
@@ -101,10 +103,10 @@ def press(number, **changes):
     return PredictionRecord(**(values | changes))
 
 
-def write(path, lines, encoding=RecordEncoding.json):
+def write(path, records, encoding=RecordEncoding.json):
     with McapFile(path, ELECTRODES, encoding) as file:
-        for line in lines:
-            file.write(line)
+        for record in records:
+            file.write(record)
     return path
 
 
@@ -171,8 +173,9 @@ def vector(value):
 @settings(max_examples=15, deadline=None)
 @given(data=st.data())
 def test_rosbags_reads_every_message(tmp_path_factory, encoding, data):
-    lines = [record.to_json() for record in data.draw(st.lists(records(), max_size=20))]
-    path = write(tmp_path_factory.mktemp("bag") / "touch.mcap", lines, encoding)
+    written = data.draw(st.lists(records(), max_size=20))
+    lines = [record.to_json() for record in written]
+    path = write(tmp_path_factory.mktemp("bag") / "touch.mcap", written, encoding)
     topics = read_with_rosbags(path)
     for messages in topics.values():
         messages.sort(key=lambda message: message[0])  # messages of one time may come in any order
@@ -186,8 +189,9 @@ def test_rosbags_reads_every_message(tmp_path_factory, encoding, data):
 
 def test_stock_rosbags_reads_the_file_of_ros_messages(tmp_path):
     """With nothing changed in it, and `ros2 bag` takes such a file, too: one encoding, the definitions of ROS."""
-    lines = [press(number).to_json() for number in range(500)]
-    check_messages(read_with_rosbags(write(tmp_path / "touch.mcap", lines, RecordEncoding.ros2)), lines)
+    written = [press(number) for number in range(500)]
+    lines = [record.to_json() for record in written]
+    check_messages(read_with_rosbags(write(tmp_path / "touch.mcap", written, RecordEncoding.ros2)), lines)
 
 
 @pytest.mark.parametrize(
@@ -200,8 +204,9 @@ def test_definitions_are_those_of_ros(name, definition):
 
 def test_readers_of_mcap_find_schemas_index_and_checksums(tmp_path):
     """What Foxglove, Lichtblick and PlotJuggler need to open a file at any time in it."""
-    lines = [press(number).to_json() for number in range(5000)]
-    path = write(tmp_path / "touch.mcap", lines)
+    written = [press(number) for number in range(5000)]
+    lines = [record.to_json() for record in written]
+    path = write(tmp_path / "touch.mcap", written)
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         assert isinstance(reader, SeekingReader)
@@ -236,17 +241,19 @@ def test_every_record_is_valid_under_its_schema(record):
 def test_the_schema_refuses_what_is_no_record():
     valid, record = jsonschema_rs.Draft7Validator(record_schema(ELECTRODES)).is_valid, json.loads(press(0).to_json())
     assert valid(record)
-    for name in FIELDS:
+    for name in field_names():
         assert not valid({key: value for key, value in record.items() if key != name}), name
         assert not valid(record | {name: [1.0] if name != "contact" else None}), name
 
 
 def test_a_contact_that_is_followed_is_wrench_and_pose_and_the_record_says_both(tmp_path):
-    tracked = Tracked(1.0, -4.0, 0.25, 0.01, 0.02, 0.001, 5.0, 0.0, 0.9)._asdict()
-    film = FollowedFilm(0.7, 0.05, 12)._asdict()
-    records = [press(0, follows=True, tracked=tracked, event="slide", film=film, xy_correlation=0.5)]
-    records.append(press(1, follows=True, tracked=tracked, film=film, x_mm=None, force_N=None, flags=("invalid",)))
-    topics = read_with_rosbags(write(tmp_path / "a.mcap", [one.to_json() for one in records], RecordEncoding.ros2))
+    tracked = TrackedContact(1.0, -4.0, 0.25, 0.01, 0.02, 0.001, 5.0, 0.0, 0.9)
+    film = FollowedFilm(0.7, 0.05, 12)
+    records = [
+        press(0, tracking=Tracking(tracked, "slide"), film=film, xy_correlation=0.5),
+        press(1, tracking=Tracking(tracked), film=film, x_mm=None, force_N=None, flags=("invalid",)),
+    ]
+    topics = read_with_rosbags(write(tmp_path / "a.mcap", records, RecordEncoding.ros2))
     ((_, wrench),), ((_, pose),) = topics["/isocharge/wrench"], topics["/isocharge/pose"]
     assert (wrench.wrench.force.z, wrench.wrench.torque.x) == pytest.approx((-0.25, 1e-3))
     assert (pose.pose.pose.position.x, pose.pose.pose.position.y) == (1e-3, -4e-3)
@@ -255,8 +262,8 @@ def test_a_contact_that_is_followed_is_wrench_and_pose_and_the_record_says_both(
     assert (line["x_mm"], line["tracked"]["x_mm"], line["event"]) == (3.0, 1.0, "slide")
     of_record = record_schema(ELECTRODES)["properties"]
     assert {name: tuple(of_record[name]["properties"]) for name in ("tracked", "film")} == {
-        "tracked": Tracked._fields,
-        "film": FollowedFilm._fields,
+        "tracked": TrackedContact.__struct_fields__,
+        "film": FollowedFilm.__struct_fields__,
     }
     valid = jsonschema_rs.Draft7Validator(record_schema(ELECTRODES)).is_valid
     assert valid(line)
@@ -274,18 +281,19 @@ def whole_messages(data):
 def test_a_process_that_is_killed_leaves_all_but_the_last_second(tmp_path):
     path = tmp_path / "touch.mcap"
     code = f"""
-import os, signal, sys
+import os, pickle, signal, sys
 from pathlib import Path
 from isocharge.serve.export.mcap_file import McapFile
 clock = [0.0]
 with McapFile(Path({str(path)!r}), ("A", "B", "C"), now=lambda: clock[0]) as file:
-    for line in sys.stdin:
-        file.write(line.rstrip())
+    for record in pickle.load(sys.stdin.buffer):
+        file.write(record)
         clock[0] += 0.02
     os.kill(os.getpid(), signal.SIGKILL)
 """
-    lines = [press(number).to_json() for number in range(120)]
-    done = subprocess.run([sys.executable, "-c", code], input="\n".join(lines).encode(), timeout=60, check=False)
+    written = [press(number) for number in range(120)]
+    lines = [record.to_json() for record in written]
+    done = subprocess.run([sys.executable, "-c", code], input=pickle.dumps(written), timeout=60, check=False)
     assert done.returncode == -signal.SIGKILL
     recovered = whole_messages(path.read_bytes())
     assert recovered == lines[: len(recovered)]
@@ -298,39 +306,39 @@ def test_a_disk_that_is_full_from_the_start_is_an_error(tmp_path, fill_disk):
         McapFile(tmp_path / "a.mcap", ("A",)).__enter__()
 
 
-def test_a_full_disk_ends_the_file_and_not_the_stream(tmp_path, fill_disk, caplog):
+def test_a_full_disk_ends_the_file_and_not_the_stream(tmp_path, fill_disk, caplog, monkeypatch):
     path = tmp_path / "touch.mcap"
+    monkeypatch.setattr("isocharge.serve.export.mcap_file.FLUSH_S", 0.01)
     fill_disk(12000)
-    clock, lines = iter(range(10**6)), [press(number, misfit=np.pi * number).to_json() for number in range(2000)]
-    with McapFile(path, ELECTRODES, now=lambda: next(clock) / 50.0) as file:
-        for line in lines:
-            file.write_live(line)
-    assert file.failed
-    assert [entry.getMessage() for entry in caplog.records] == [
-        f"{path}: stopped (No space left on device); what was written until now is whole, but without an index"
-    ]
+    written = [press(number, misfit=np.pi * number) for number in range(2000)]
+    outputs = Outputs([str(path)], OutputContext(electrodes=ELECTRODES, is_live=True))
+    with outputs:
+        for record in written:
+            outputs.write(record)
+            time.sleep(2e-4)
+    assert outputs.not_written == {str(path): None}
+    assert outputs.has_incomplete_file
+    reason = f"{path} cannot be written: No space left on device; choose another output"
+    assert caplog.messages == [f"{path}: stopped ({reason}); the records after that are missing"]
     recovered = whole_messages(path.read_bytes())
     assert 20 < len(recovered) < 2000
-    assert recovered == lines[: len(recovered)]
+    assert recovered == [record.to_json() for record in written[: len(recovered)]]
 
 
 @pytest.mark.parametrize("timestamp", [None, -1.0, 2.0**31, 1e11])
-def test_times_that_ros_has_not(tmp_path, timestamp, caplog):
-    path, line = tmp_path / "touch.mcap", press(0, timestamp=timestamp).to_json()
-    with McapFile(path, ELECTRODES) as file:
+def test_times_that_ros_has_not(tmp_path, timestamp):
+    with McapFile(tmp_path / "touch.mcap", ELECTRODES) as file:
         with pytest.raises(InputError, match=r"timestamp .*: expected unix seconds from 1970 to 2038"):
-            file.write(line)
-        file.write(press(1).to_json())
-        file.write_live(line)
-        file.write_live(press(2).to_json())
-    assert (file.failed, file.records, "expected unix seconds" in caplog.text) == (True, 1, True)
+            file.write(press(0, timestamp=timestamp))
+        file.write(press(1))
+    assert file.records == 1
 
 
 def test_numbers_of_messages_begin_again_after_32_bits(tmp_path):
     with McapFile(tmp_path / "touch.mcap", ELECTRODES) as file:
         file.records = (1 << 32) - 1
-        file.write(press(0).to_json())
-        file.write(press(1).to_json())
+        file.write(press(0))
+        file.write(press(1))
     records = StreamReader(BytesIO((tmp_path / "touch.mcap").read_bytes())).records
     assert {each.sequence for each in records if isinstance(each, Message)} == {(1 << 32) - 1, 0}
 

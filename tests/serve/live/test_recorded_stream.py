@@ -54,7 +54,7 @@ def following(path, chunks, predictor, table):
                     live.request_tare()
                 yield chunk
 
-        yield from (line for _, line in live.follow(asking()))
+        yield from (record.to_json() for record in live.follow(asking()))
 
 
 def record(path, film, predictor):
@@ -65,7 +65,7 @@ def played(path, predictor):
     """Lines of a recording that is played again."""
     recording, clock = Recording(path), RecordedClock()
     stream = TouchStream(predictor, device_from_table(recording.device, "recording"), now_ns=clock)
-    return [line for _, line in replay(recording, stream, clock)]
+    return [record.to_json() for record in replay(recording, stream, clock)]
 
 
 def test_replay_is_the_same_bit_for_bit(tmp_path, film, predictor):
@@ -149,7 +149,7 @@ def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, t
     """Begun and ended on request, with a marker: its replay gives its records, and the totals go on."""
     path, device = tmp_path / "later.rec", device_from_table(DEVICE, "test")
     stream, pieces = TouchStream(predictor, device), chunks(film)
-    live, lines = RecordedStream(stream), []
+    live = RecordedStream(stream)
 
     def asking():
         for number, chunk in enumerate(pieces):
@@ -162,15 +162,13 @@ def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, t
                 live.request_recording(None)
             yield chunk
 
-    for _, line in live.follow(asking()):
-        if live.recorder is not None:
-            lines.append(line)
+    lines = [record.to_json() for record in live.follow(asking()) if live.recorder is not None]
     assert len(lines) > 20
     assert stream.totals().frames == 78  # outage and beginning cut a frame in two each
     clock, markers = RecordedClock(), []
     again = TouchStream(predictor, device, now_ns=clock)
     events = replay(Recording(path), again, clock, on_marker=markers.append, load=lambda _: predictor)
-    replayed = [line for _, line in events]
+    replayed = [record.to_json() for record in events]
     assert [event for event in Recording(path).events() if isinstance(event, NewModel)] == taken_since
     assert (replayed, markers, [*tmp_path.iterdir()]) == (lines, [Marker(1e9, "now")], [path])
 

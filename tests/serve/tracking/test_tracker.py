@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from msgspec import structs
 from scipy.signal import lfilter
 
 from isocharge.serve import Chunk, Contact, Device, Frame, TouchStream, encode_frame
@@ -36,7 +37,8 @@ def followed_all(answers, rate_Hz=1000.0):
     """The same of answers."""
     tracker = Tracker(TrackRule(lasting=0.0))
     answers = [tracker.update(one, k / rate_Hz) for k, one in enumerate(answers)]
-    return np.array([one for one, _ in answers]), [(k, event) for k, (_, event) in enumerate(answers) if event]
+    contacts = np.array([structs.astuple(tracked) for tracked, _ in answers])
+    return contacts, [(k, event) for k, (_, event) in enumerate(answers) if event]
 
 
 def slide(speed, rate_Hz=1000.0, turn=0.7):

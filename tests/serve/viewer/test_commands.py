@@ -90,10 +90,10 @@ def test_the_rate_is_that_of_the_board_however_fast_a_recording_is_read(predicto
     link = SimpleNamespace(put=id, tell=lambda **state: told.append(state), is_open=True, dropped=0)
     feed = live_page_module.PageFeed(link, TouchStream(predictor))
     for k in (0, 0, *range(2, 51)):
-        feed.put(record(timestamp=1e9 + 0.005 * k))
+        feed.write(record(timestamp=1e9 + 0.005 * k))
     assert [state["rate_Hz"] for state in told[:2]] == [None, None]
     monkeypatch.setattr(live_page_module, "STATE_S", 60.0)
-    feed.put(record())
+    feed.write(record())
     assert (len(told), told[-1]["rate_Hz"]) == (51, pytest.approx(200.0, rel=1e-3))
     assert capsys.readouterr().err == ""  # the page is there
 
@@ -104,7 +104,7 @@ def test_a_replay_is_sought_and_played_fast(film, models, start, command, tmp_pa
     rows = [encode_frame(Frame(k, 5000 * k, tuple(row))) for k, row in enumerate(islice(taps(film), 600))]
     (tmp_path / "frames").write_bytes(b"".join(rows))
     command("serve", "stream", "linear", "--models", models, "--port", tmp_path / "frames", "--record", path)
-    process, url = start("replay", path, "--output", "none", "--mcap", mcap)
+    process, url = start("replay", path, "--output", "none", "--output", mcap)
 
     def played(rows, state):
         return rows["records"].sum() >= 600 and state.get("samples") == 600 and state.get("is_complete")

@@ -20,6 +20,7 @@ from isocharge.common.deflection_field import points_mm, read_deflection_field
 from isocharge.common.errors import RequestError
 from isocharge.common.structs import parse_json
 from isocharge.serve import find_model, flags, load_model
+from isocharge.serve.record.record import OtherContact, TrackedContact, Tracking
 from isocharge.serve.viewer.messages import (
     CONTACT_BIT,
     FLAG_BITS,
@@ -109,8 +110,9 @@ def test_what_no_float32_holds_is_clipped(record):
 
 
 def test_a_contact_that_is_followed_is_shown_in_place_of_the_frames(record):
-    followed = record(x_mm=1.0, misfit=0.5, xy_correlation=0.25, follows=True, tracked={"x_mm": 2.0, "x_std_mm": 0.01})
-    followed = followed._replace(other={"x_mm": 5.0, "y_mm": -1.0, "force_N": 1.0, "probability": 0.25})
+    tracked = TrackedContact(2.0, 3.0, 0.4, 0.01, 0.02, 0.001, 0.0, 0.0, 0.1)
+    tracking = Tracking(tracked, None, OtherContact(5.0, -1.0, 1.0, 0.25))
+    followed = record(x_mm=1.0, misfit=0.5, xy_correlation=0.25, tracking=tracking)
     sample = np.frombuffer(FORM.pack(followed), FORM.dtype)[0]
     assert (sample["x_mm"], sample["misfit"], sample["xy_correlation"]) == (2.0, 0.5, 0.25)
     assert sample["x_std_mm"] == np.float32(0.01)
@@ -224,15 +226,17 @@ def test_the_page_reads_what_the_server_writes(record):
         "y_mm": 2.5,
         "flags": ("gap", "misfit"),
         "latency_us": 9.0,
-        "other": {"x_mm": 5.0, "y_mm": -1.5},
+        "tracking": Tracking(other=OtherContact(5.0, -1.5, 1.0, 0.25)),
     }
     data = form.pack(record(**changes)) + form.pack(record(contact=False, x_mm=None, flags=()))
     message = samples_message(77, 123.5, np.frombuffer(data, form.dtype), 4, begin_anew=True)
     got = node(
         f"""import {{ decode }} from "{(VIEWER / "page/decode.js").as_uri()}";
         const bytes = Uint8Array.from([{",".join(map(str, message))}]);
-        console.log(JSON.stringify([decode(bytes.buffer, 3), decode(bytes.buffer.slice(0, 90), 3),
-          decode(new ArrayBuffer(3), 3), decode(bytes.buffer, 6)]));"""
+        const layout = {json.dumps(form.describe())};
+        const other = {json.dumps(SampleFormat(tuple("ABCDEF")).describe())};
+        console.log(JSON.stringify([decode(bytes.buffer, layout, 3), decode(bytes.buffer.slice(0, 90), layout, 3),
+          decode(new ArrayBuffer(3), layout, 3), decode(bytes.buffer, other, 6)]));"""
     )
     whole, *broken = got
     assert broken == [None, None, None]

@@ -41,7 +41,7 @@ def show_live_film(address: Address, seconds: float | None) -> None:
         stack.enter_context(answering(link, live, ("every", {}, "")))
         say("Ctrl-C stops")
         feed = PageFeed(link, touch, live)
-        for record, _ in stack.enter_context(closing(live.follow(port))):
-            feed.put(record)
+        for record in stack.enter_context(closing(live.follow(port))):
+            feed.write(record)
             if seconds is not None and touch.counts.records > seconds * RATE_HZ:
                 break

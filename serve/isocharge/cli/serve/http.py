@@ -14,7 +14,7 @@ from isocharge.cli.shared.live_page import TokenOption, given_token
 from isocharge.cli.shared.terminal import announce, say, write_stderr
 from isocharge.common.errors import InputError
 from isocharge.common.extras import require
-from isocharge.serve.live.outputs import LineQueue
+from isocharge.common.writer_queue import WriterQueue
 from isocharge.serve.network.address import Address, Tls, Token, check_exposure
 from isocharge.serve.network.browser_check import BrowserCheck
 from isocharge.serve.network.http import HttpServer
@@ -105,7 +105,7 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
     if log is LogFormat.text:
         yield Traffic()
         return
-    with LineQueue(write_stderr) as lines:
+    with WriterQueue(write_stderr) as lines:
         lines_of_json = RequestLog(lines.put, secret=token)
         logging.basicConfig(level=logging.WARNING, handlers=[lines_of_json], force=True)
         logging.captureWarnings(True)

@@ -14,13 +14,13 @@ import typer
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
-from msgspec import Struct
+from msgspec import defstruct
 
 from isocharge.cli.shared.options import ModelsOption
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import InputError, RecordingError
-from isocharge.serve import Recording, find_labelled_model, find_model, load_model
+from isocharge.serve import PredictionRecord, Recording, find_labelled_model, find_model, load_model
 from isocharge.serve.flags import BLIND, INVALID, MEANINGS, MISFIT, OUTSIDE, SATURATED
 from isocharge.simulate import Sensor
 from isocharge.simulate.plots.figure import FELT, INK, check_picture, new_figure, save_picture
@@ -70,7 +70,7 @@ def plot_command(
     check_picture(output)
     recording = Recording(file)
     with shown_progress():
-        traces = traces_of(recording.records(RecordFields), str(file))
+        traces = traces_of(recording.records(PlottedRecord), str(file))
     sensor = working_area = None
     try:
         folder = find_model(model, models) if model else find_labelled_model(recording.model, models)
@@ -84,25 +84,17 @@ def plot_command(
     say(f"drawn in {output}: {len(traces['timestamp'])} records")
 
 
-class RecordFields(Struct):
-    """What is drawn of a record."""
+NUMBERS = ("timestamp", "x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N")
+"""Numbers of a record that are drawn."""
 
-    timestamp: float
-    x_mm: float | None
-    y_mm: float | None
-    force_N: float | None
-    x_std_mm: float | None
-    y_std_mm: float | None
-    force_std_N: float | None
-    charge_pC: dict[str, float | None] | None
-    charge_raw_pC: dict[str, float | None] | None
-    flags: tuple[str, ...]
+PlottedRecord = defstruct(
+    "PlottedRecord",
+    [(name, PredictionRecord.__annotations__[name]) for name in (*NUMBERS, "charge_pC", "charge_raw_pC", "flags")],
+)
+"""A record that is read from a recording: only the fields that are drawn, with the types of the record."""
 
 
-NUMBERS = RecordFields.__struct_fields__[:7]
-
-
-def traces_of(records: Iterator[RecordFields], where: str) -> dict[str, Array]:
+def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
     """Columns of n records, each of shape (n,), NaN for null.
 
     Numbers and flags (1 where one is set) by their names in a record, charges (pC) as `charge_pC.A`; flags that are
@@ -116,7 +108,7 @@ def traces_of(records: Iterator[RecordFields], where: str) -> dict[str, Array]:
         raise RecordingError(f"{where}: expected at least one record, got none; replay or record it again")
     electrodes = tuple(first.charge_raw_pC or ())
 
-    def row(record: RecordFields) -> tuple[Any, ...]:
+    def row(record: Any) -> tuple[Any, ...]:
         numbers = (getattr(record, name) for name in NUMBERS)
         charges = record.charge_pC or {}
         return *numbers, *(charges.get(name) for name in electrodes), *(word in record.flags for word in MEANINGS)

@@ -12,15 +12,11 @@ import typer
 
 from isocharge.cli.serve.records import (
     LATENCIES,
-    Lines,
-    McapOption,
-    McapOutput,
-    McapRecordsOption,
-    Output,
     OutputOption,
-    UdpOption,
+    RecordWriter,
     WaitOption,
-    record_writer,
+    outputs_of,
+    say_missing_records,
     summary,
     write_records,
 )
@@ -30,14 +26,11 @@ from isocharge.cli.shared.port_hints import doctor_is_named, no_frames_hint
 from isocharge.cli.shared.terminal import (
     on_signal,
     say,
-    stdout_is_ready,
-    stdout_writer,
     stop_after,
     unless_hung_up,
     until_stopped,
 )
 from isocharge.common.errors import InputError, ModelError, shown
-from isocharge.common.files import new_file
 from isocharge.common.printable_text import is_printable
 from isocharge.serve import (
     Policy,
@@ -54,9 +47,7 @@ from isocharge.serve import (
     load_model,
     open_source,
 )
-from isocharge.serve.export.record_messages import RecordEncoding
 from isocharge.serve.live.device import with_settings
-from isocharge.serve.live.outputs import LineQueue
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 
 LONGEST_NAME = 100
@@ -75,8 +66,7 @@ def stream_command(
     ],
     models: ModelsOption = None,
     device: DeviceOption = None,
-    output: OutputOption = Output.json,
-    udp: UdpOption = None,
+    output: OutputOption = None,
     record: Annotated[
         Path | None,
         typer.Option(
@@ -94,8 +84,6 @@ def stream_command(
             "(default: name of the model's sensor)",
         ),
     ] = None,
-    mcap: McapOption = None,
-    mcap_records: McapRecordsOption = RecordEncoding.json,
     policy: Annotated[
         Policy,
         typer.Option(
@@ -177,19 +165,13 @@ def stream_command(
         renew = partial(recorded.request_model, partial(_load, model, models))
         stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(renew)))
         stack.enter_context(stop_after(seconds))
-        lines = stack.enter_context(LineQueue(stdout_writer(), stdout_is_ready))
-        put = lines.put if source.is_live else stdout_writer()  # a file waits for a slow reader, a sensor does not
-        writers = [record_writer(stack, output, udp, predictor.metadata.electrodes, put, path.fields)]
+        outputs = stack.enter_context(outputs_of(output, path, is_live=source.is_live))
+        writers: list[RecordWriter] = [outputs.write]
         if page is not None:
             header = None if recorder else (policy.value, board.table, name)
             stack.enter_context(answering(page, recorded, header))
             feed = PageFeed(page, path, recorded)
-            writers.append(lambda record, _: feed.put(record))
-        mcap_output = None
-        if mcap is not None:
-            mcap_output = McapOutput(mcap, predictor.metadata.electrodes, mcap_records, source.is_live)
-            put_line = stack.enter_context(mcap_output).put
-            writers.insert(0, lambda _, line: put_line(line))
+            writers.append(feed.write)
         if recorder:
             stack.enter_context(recorder)
         records = stack.enter_context(closing(recorded.follow(source)))  # closed before the recorder
@@ -198,11 +180,14 @@ def stream_command(
             with doctor_is_named(port, device):
                 write_records(islice(records, count), writers, latencies)
         finally:
-            lines.close()
-            say(summary(path, latencies, lines.lost))
+            if source.is_live:
+                outputs.close()
+            say(summary(path, latencies))
     if path.totals().frames == 0:
         say(f"no frames were recognised; {no_frames_hint(port, device)}")
-    if (recorder and recorder.failed) or (mcap_output and not mcap_output.is_whole):
+    say_missing_records(outputs)
+    is_recording_incomplete = recorder is not None and recorder.failed
+    if is_recording_incomplete or outputs.has_incomplete_file:
         raise typer.Exit(1)
 
 
@@ -231,9 +216,7 @@ def replay_command(
     real_time: Annotated[
         bool, typer.Option("--real-time/--fast", help="Play at the pace of the recording, or as fast as possible.")
     ] = False,
-    output: OutputOption = Output.json,
-    mcap: McapOption = None,
-    mcap_records: McapRecordsOption = RecordEncoding.json,
+    output: OutputOption = None,
     live: LiveOption = None,
     token: TokenOption = None,
 ) -> None:
@@ -255,10 +238,8 @@ def replay_command(
     latencies: deque[float] = deque(maxlen=LATENCIES)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
-        writers = [record_writer(stack, output, None, predictor.metadata.electrodes, stdout_writer(), path.fields)]
-        file_output = stack.enter_context(ExitStack())
-        if mcap is not None:
-            writers.insert(0, _mcap_writer(file_output, mcap, mcap_records, predictor.metadata.electrodes))
+        outputs = stack.enter_context(outputs_of(output, path, is_live=False))
+        writers: list[RecordWriter] = [outputs.write]
         if address is None:
             write_records(played(), writers, latencies)
         else:
@@ -266,22 +247,14 @@ def replay_command(
                 live_page(address, token, file.name, predictor.metadata, folder, is_recording=True)
             )
             feed = PageFeed(link, path)
-            writers.append(lambda record, _: feed.put(record))
+            writers.append(feed.write)
             write_records(played(on_marker=lambda marker: link.tell(marker=[*marker])), writers, latencies)
-            file_output.close()  # now, as Ctrl-C, the only end of the page, would throw the file away
+            outputs.close()  # now, because Ctrl-C, which is the only end of the page, would discard the files
             link.tell(is_complete=True)
             while link.request() is not None:  # until the page's process ends, or Ctrl-C
                 pass
     say(summary(path, latencies))
-    if mcap is not None and not mcap.exists():
-        say(f"{mcap} was not written, because the replay was stopped before its end")
+    if outputs.has_incomplete_file:
+        incomplete = ", ".join(outputs.not_written)
+        say(f"{incomplete}: not written, because the replay was stopped before its end")
         raise typer.Exit(1)
-
-
-def _mcap_writer(stack: ExitStack, path: Path, records: RecordEncoding, electrodes: tuple[str, ...]) -> Lines:
-    """What writes a record into the MCAP file, which exists once all of them are in it."""
-    from isocharge.serve.export.mcap_file import McapFile  # needs the extra `record`
-
-    draft = stack.enter_context(new_file(path))
-    file = stack.enter_context(McapFile(draft, electrodes, records))
-    return lambda _, line: file.write(line)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from msgspec import structs
 
 from isocharge.cli.shared.optional_values import DEFAULT_LIVE_ADDRESS
 from isocharge.cli.shared.terminal import say
@@ -131,8 +132,8 @@ class PageFeed:
         self._told_s = 0.0
         self._times: deque[float] = deque(maxlen=RATE_RECORDS)
 
-    def put(self, record: PredictionRecord) -> None:
-        """Hand over a record; does not wait."""
+    def write(self, record: PredictionRecord) -> None:
+        """Hand over a record without waiting."""
         was_open, now_s = self._link.is_open, time.monotonic()
         self._link.put(self._pack(record))
         self._times.append(math.nan if record.timestamp is None else record.timestamp)
@@ -150,7 +151,7 @@ class PageFeed:
             counters=self._touch.totals()._asdict() | more,
             rate_Hz=rate_Hz,
             model=record.model,
-            film=record.film,
+            film=None if record.film is None else structs.asdict(record.film),
             tare_pC=record.tare_pC,
             recording=None if recorder is None else str(recorder.path.name),
             recording_failed=recorder is not None and recorder.failed,

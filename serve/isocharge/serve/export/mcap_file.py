@@ -12,7 +12,6 @@ second.
 """
 
 import json
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -20,11 +19,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import Self
 
-from isocharge.common.errors import InputError
 from isocharge.common.extras import require
 from isocharge.common.files import WholeWrites, refusals_explained
 from isocharge.serve.export.record_messages import (
-    NAME,
     POSE,
     POSE_DEFINITION,
     STRING,
@@ -33,11 +30,12 @@ from isocharge.serve.export.record_messages import (
     WRENCH_DEFINITION,
     RecordEncoding,
     pose_stamped,
-    record_schema,
     string_message,
     time_of,
     wrench_stamped,
 )
+from isocharge.serve.record.record import PredictionRecord
+from isocharge.serve.record.schema import SCHEMA_NAME, record_schema
 
 with require("record"):
     from mcap.writer import Writer
@@ -50,8 +48,6 @@ FLUSH_S = 1.0
 LARGEST_COUNT = 0xFFFFFFFF
 """Largest sequence number of a message, after which it begins again at 0."""
 
-log = logging.getLogger(__name__)
-
 
 class McapFile:
     """Writes an MCAP file; a context manager.
@@ -59,7 +55,7 @@ class McapFile:
     Attributes:
         path: The file.
         records: Number of records written.
-        failed: Whether `write_live` has given up. What was written before is whole, but has no index.
+        is_abandoned: Whether the file is closed without an index. Set it after an error of `write`.
     """
 
     def __init__(
@@ -78,8 +74,12 @@ class McapFile:
                 refuse a file with any other (`ros2 bag`, rosbags).
             now: A clock that never goes back, s.
         """
-        self.path, self.records, self.failed = path, 0, False
-        self._electrodes, self._encoding, self._now = electrodes, encoding, now
+        self.path = path
+        self.records = 0
+        self.is_abandoned = False
+        self._electrodes = electrodes
+        self._encoding = encoding
+        self._now = now
         self._flushed = 0.0
         self._lock = threading.Lock()
 
@@ -109,44 +109,27 @@ class McapFile:
             OSError: If the disk is full, or gone.
         """
         with self._lock, closing(self._file):
-            if not self.failed:
+            if not self.is_abandoned:
                 self._writer.finish()  # type: ignore[no-untyped-call]
 
-    def write(self, line: str) -> None:
+    def write(self, record: PredictionRecord) -> None:
         """Write a record.
 
-        Args:
-            line: The record's line of JSON.
-
         Raises:
-            InputError: If its time is none that ROS 2 has.
-            OSError: If the disk is full, or gone.
+            InputError: If ROS 2 has no time stamp for the time of the record.
+            OSError: If the disk is full, or was removed.
         """
-        record = json.loads(line)
-        time_ns = time_of(record)
+        values = record.json_values
+        time_ns = time_of(values)
+        line = record.to_json()
         is_json = self._encoding is RecordEncoding.json
         messages = {
             RECORD_TOPIC: line.encode() if is_json else string_message(line),
-            WRENCH_TOPIC: wrench_stamped(record, time_ns),
-            POSE_TOPIC: pose_stamped(record, time_ns),
+            WRENCH_TOPIC: wrench_stamped(values, time_ns),
+            POSE_TOPIC: pose_stamped(values, time_ns),
         }
         with self._lock:
             self._add(messages, time_ns)
-
-    def write_live(self, line: str) -> None:
-        """As `write`, but an error ends the file with a message in the log, and not the stream."""
-        if self.failed:
-            return
-        try:
-            self.write(line)
-        except (InputError, OSError) as error:
-            self.give_up(error)
-
-    def give_up(self, error: InputError | OSError) -> None:
-        """Write no more, and say in the log why."""
-        self.failed = True
-        reason = error.strerror if isinstance(error, OSError) else error
-        log.error("%s: stopped (%s); what was written until now is whole, but without an index", self.path, reason)
 
     def _add(self, messages: dict[str, bytes | None], time_ns: int) -> None:
         for topic, data in messages.items():
@@ -164,7 +147,7 @@ class McapFile:
             return self._ros_channel(RECORD_TOPIC, STRING, STRING_DEFINITION)
         schema = json.dumps(record_schema(self._electrodes)).encode()
         return self._writer.register_channel(
-            RECORD_TOPIC, "json", self._writer.register_schema(NAME, "jsonschema", schema)
+            RECORD_TOPIC, "json", self._writer.register_schema(SCHEMA_NAME, "jsonschema", schema)
         )
 
     def _ros_channel(self, topic: str, kind: str, definition: str) -> int:

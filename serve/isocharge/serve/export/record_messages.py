@@ -1,9 +1,4 @@
-"""A prediction record as messages: JSON with its schema, and the wrench of the press and its pose for ROS 2, in CDR.
-
-Foxglove and Lichtblick take the fields of a topic from `properties` of the schema and read one `type` for each, so that
-a number that may be null has to be a plain "number" there. Validators of draft 7 pass over everything beside a `$ref`
-and check `definitions/record`, which allows null wherever a record has it. So viewers list all fields, and all records
-are valid.
+"""A prediction record as messages for ROS 2, encoded in CDR: the wrench of the press, its pose, and the record as text.
 
 The frame is `frame_id`, the name of the sensor. Origin, x and y are those of README.md, Coordinates. ROS requires
 right-handed frames, so z points towards the probe, against the push. The wrench is the load of the probe on the film: a
@@ -145,105 +140,8 @@ def _string(text: str) -> bytes:
     return struct.pack("<I", len(data)) + data
 
 
-NAME = "isocharge.PredictionRecord"
-"""Name of the schema."""
-
-NUMBERS = {
-    "timestamp": "Time of the reading, unix seconds.",
-    "x_mm": "Position x in the frame frame_id, mm; null out of contact.",
-    "y_mm": "Position y, mm; null out of contact.",
-    "force_N": "Force, N; 0 out of contact.",
-    "x_std_mm": "Standard deviation of x, mm.",
-    "y_std_mm": "Standard deviation of y, mm.",
-    "force_std_N": "Standard deviation of the force, N.",
-    "misfit": "Distance from the nearest single contact, in standard deviations.",
-    "xy_correlation": "Correlation of the errors of x and y, -1 to 1; null from a model that gives none.",
-    "xF_correlation": "Correlation of the errors of x and the force.",
-    "yF_correlation": "Correlation of the errors of y and the force.",
-    "latency_us": "From the last byte of the reading to this record, us.",
-}
-"""Fields that are a number or null, with what they mean."""
-
-WHOLES = {
-    "t_device_us": "Clock of the device, us, without its wraps.",
-    "seq": "Sequence number, as the device sent it.",
-}
-"""Fields that are a whole number or null."""
-
-CHARGES = {
-    "charge_pC": "Touch charges by electrode, the model's input, pC.",
-    "charge_raw_pC": "Charges by electrode as the device sent them, pC.",
-    "tare_pC": "Charges at rest that were subtracted, by electrode, pC.",
-}
-"""Fields that are an object of charges or null."""
-
-FOLLOWED = {
-    "tracked": (
-        "The contact by all frames up to now, where contacts are followed.",
-        ("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "vx_mm_s", "vy_mm_s", "moving"),
-    ),
-    "other": (
-        "Another contact with the same charges, where a film folds and it is not known which touches.",
-        ("x_mm", "y_mm", "force_N", "probability"),
-    ),
-    "film": (
-        "The film for which the model answered, where it is followed.",
-        ("pretension_MPa", "pretension_std_MPa", "touches"),
-    ),
-}
-"""Objects of numbers that only records of what is followed have, with what they mean and their parts."""
-
-EVENT = "What begins with this record: press, hold, slide, tap or release."
-
-OTHERS: dict[str, dict[str, Any]] = {
-    "contact": {"type": "boolean", "description": "Whether something touches."},
-    "flags": {"type": "array", "items": {"type": "string"}, "description": "Words, each one a reason for care."},
-    "model": {"type": "string", "description": "The model, name/version."},
-    "frame_id": {"type": "string", "description": "Name of the sensor, the frame of x and y."},
-}
-"""Fields that always have a value."""
-
-
 class RecordEncoding(StrEnum):
     """How an MCAP file holds the records themselves: JSON with this schema, or the same text in ROS 2 messages."""
 
     json = "json"
     ros2 = "ros2"
-
-
-def record_schema(electrodes: tuple[str, ...]) -> dict[str, Any]:
-    """The schema of the records of a sensor with these electrodes.
-
-    Further fields are allowed: a later version may add some.
-    """
-    return {
-        "$schema": "http://json-schema.org/draft-07/schema#",
-        "title": NAME,
-        "$ref": "#/definitions/record",
-        "definitions": {"record": _object(electrodes, or_null=True)},
-        **_object(electrodes, or_null=False),
-    }
-
-
-def _object(electrodes: tuple[str, ...], *, or_null: bool) -> dict[str, Any]:
-    """A record whose fields have one type each, or may be null where a record's may."""
-
-    def kind(name: str) -> Any:
-        return [name, "null"] if or_null else name
-
-    number = {"type": kind("number")}
-    properties: dict[str, dict[str, Any]] = {
-        **{name: {"type": kind("number"), "description": text} for name, text in NUMBERS.items()},
-        **{name: {"type": kind("integer"), "description": text} for name, text in WHOLES.items()},
-        **{
-            name: {"type": kind("object"), "properties": dict.fromkeys(electrodes, number), "description": text}
-            for name, text in CHARGES.items()
-        },
-        **OTHERS,
-    }
-    followed: dict[str, dict[str, Any]] = {
-        name: {"type": kind("object"), "properties": dict.fromkeys(parts, number), "description": text}
-        for name, (text, parts) in FOLLOWED.items()
-    }
-    followed["event"] = {"type": kind("string"), "description": EVENT}
-    return {"type": "object", "properties": properties | followed, "required": sorted(properties)}

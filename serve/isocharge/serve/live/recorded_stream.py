@@ -16,7 +16,7 @@ from isocharge.serve.live.stream import TouchStream
 from isocharge.serve.port.recording import Back, Event, Marker, NewModel, RecordedClock, Recorder, Recording
 from isocharge.serve.port.source import Chunk
 from isocharge.serve.prediction.predictor import Predictor
-from isocharge.serve.prediction.record import PredictionRecord
+from isocharge.serve.record.record import PredictionRecord
 
 Load = Callable[[], Predictor]
 
@@ -82,8 +82,8 @@ class RecordedStream:
         """
         self._load_requested = load
 
-    def follow(self, chunks: Iterable[Chunk]) -> Generator[tuple[PredictionRecord, str]]:
-        """Records, each with its line of JSON, until the chunks end.
+    def follow(self, chunks: Iterable[Chunk]) -> Generator[PredictionRecord]:
+        """Yield the records until the chunks end.
 
         A chunk is recorded when its last record was taken. Close the generator before the recorder: so the chunk that
         is under way is written, too, wherever Ctrl-C came.
@@ -101,7 +101,7 @@ class RecordedStream:
                 self._under_way = (chunk, lines)
                 for record in self._stream.feed(chunk):
                     lines.append(record.to_json())
-                    yield record, lines[-1]
+                    yield record
                 self._record_chunk()
             self._stream.finish()
         finally:
@@ -179,8 +179,8 @@ def replay(
     real_time: bool = False,
     load: Callable[[str], Predictor] | None = None,
     on_marker: Callable[[Marker], object] = lambda _: None,
-) -> Iterator[tuple[PredictionRecord, str]]:
-    """The records of a recording, each with its line of JSON; as many for each chunk as were taken then.
+) -> Iterator[PredictionRecord]:
+    """Yield the records of a recording: for each chunk as many as were taken when it was recorded.
 
     Args:
         recording: What was recorded.
@@ -214,4 +214,4 @@ def replay(
                     time.sleep(max(0.0, chunk.timestamp + delay_s - time.time()))
                 for number, record in enumerate(stream.feed(chunk)):
                     if number < len(latencies_us):
-                        yield record, record.to_json()
+                        yield record

@@ -16,14 +16,13 @@ from isocharge.serve.live.reading_stream import ReadingStream, TimedReading
 from isocharge.serve.port.source import Chunk
 from isocharge.serve.prediction.contact import Contact, Sensitivity
 from isocharge.serve.prediction.predictor import Predictor
-from isocharge.serve.prediction.record import (
-    FIELDS,
-    OF_FILM,
-    OF_TRACKING,
-    OUT_OF_CONTACT,
-    UNKNOWN,
+from isocharge.serve.record.record import (
+    NO_CONTACT,
+    NO_TRACKING,
+    UNKNOWN_CONTACT,
     Charges,
     PredictionRecord,
+    Tracking,
 )
 from isocharge.serve.signal_chain.chain import Chain, Reading
 from isocharge.serve.tracking.branches import branches_of
@@ -188,9 +187,14 @@ class TouchStream:
         self._use(predictor)
 
     @property
-    def fields(self) -> tuple[str, ...]:
-        """Names of the fields that its records are written with."""
-        return FIELDS + OF_TRACKING * (self._tracker is not None) + OF_FILM * (self._follow is not None)
+    def has_tracking(self) -> bool:
+        """Whether contacts are tracked, so that records have the fields of a `Tracking`."""
+        return self._tracker is not None
+
+    @property
+    def has_film(self) -> bool:
+        """Whether the film is followed, so that records have the field `film`."""
+        return self._follow is not None
 
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
@@ -269,7 +273,7 @@ class TouchStream:
         contact, flags = self._contact(reading)
         film = None
         if self._follower is not None:
-            film = self._follower.film._asdict()
+            film = self._follower.film
             self._follower.see(reading.charge_pC, contact, flags, when.clock_s)
             flags += (FILM,) * (contact is not None and self._follower.is_lost)
         tracked, event, other, charge_pC = None, None, None, reading.charge_pC
@@ -285,11 +289,21 @@ class TouchStream:
                 contact, reading.doubt, lambda: self._answers.predict(charge_pC * (1.0 + DOUBT))
             )
             contact, tracked = contact.widened(shift), tracked and tracked.widened(shift)
+        if contact is not None:
+            contact_values = contact.fields()
+        elif INVALID in flags:
+            contact_values = UNKNOWN_CONTACT
+        else:
+            contact_values = NO_CONTACT
+        tracking = None
+        if self._tracker is not None:
+            found_nothing = tracked is None and event is None and other is None
+            tracking = NO_TRACKING if found_nothing else Tracking(tracked, event, other)
         return PredictionRecord(
             timestamp=when.host_s,
             t_device_us=when.device_us,
             seq=frame.seq,
-            **(contact.fields() if contact else UNKNOWN if INVALID in flags else OUT_OF_CONTACT),
+            **contact_values,
             contact=reading.contact,
             charge_pC=self._by_electrode(reading.charge_pC),
             charge_raw_pC=self._by_electrode(reading.raw_pC),
@@ -298,10 +312,7 @@ class TouchStream:
             latency_us=(self._now_ns() - chunk.clock_ns) / 1e3,
             model=self._label,
             frame_id=self.frame_id,
-            tracked=None if tracked is None else tracked._asdict(),
-            event=event,
-            other=None if other is None else other._asdict(),
-            follows=self._tracker is not None,
+            tracking=tracking,
             film=film,
         )
 

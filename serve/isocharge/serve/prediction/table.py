@@ -17,10 +17,10 @@ from isocharge.common.errors import ChargeError
 from isocharge.serve.model.session import SEVEN
 from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 from isocharge.serve.prediction.predictor import Predictor
-from isocharge.serve.prediction.record import OUT_OF_CONTACT, PredictionRecord
 from isocharge.serve.prediction.tables.csv_table import CsvTable
 from isocharge.serve.prediction.tables.number_table import CHARGE_RULE, NumberTable, ignored_words
 from isocharge.serve.prediction.tables.table_file import open_table
+from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
 
 BLOCK = 4096
 """Rows that are worked on at a time."""
@@ -147,7 +147,7 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
                 timestamp=None,
                 t_device_us=None,
                 seq=None,
-                **(contact.fields() if is_touch else OUT_OF_CONTACT),
+                **(contact.fields() if is_touch else NO_CONTACT),
                 contact=is_touch,
                 charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
                 charge_raw_pC=None,

@@ -14,7 +14,6 @@ them.
 import math
 from collections import deque
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from isocharge.serve.flags import BEYOND, GAP, MISFIT, OUTSIDE, REPEAT, STRESS
 from isocharge.serve.model.pretensions import read_pretensions
 from isocharge.serve.prediction.contact import Contact, Sensitivity
 from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.rule import Rule, Setting
 
 STEP_MPa = 0.01
@@ -81,14 +81,6 @@ class FollowRule(Rule, frozen=True, kw_only=True):
     """
 
     drift_MPa_per_root_hour: Setting = 0.35
-
-
-class FollowedFilm(NamedTuple):
-    """For the record: the pretension for which the model answers, its deviation, and the touches that told it."""
-
-    pretension_MPa: float
-    pretension_std_MPa: float
-    touches: int
 
 
 class FilmFollower:

@@ -9,11 +9,11 @@ Where the map from contacts to charges folds, `branches` follow the contact by i
 """
 
 import math
-from typing import NamedTuple
 
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import BEYOND, INVALID, MISFIT, SATURATED
 from isocharge.serve.prediction.contact import Contact
+from isocharge.serve.record.record import OtherContact, TrackedContact
 from isocharge.serve.signal_chain.rule import Rule, Share
 from isocharge.serve.tracking.branches import Branch, Branches
 from isocharge.serve.tracking.modes import Modes, Movement
@@ -60,48 +60,6 @@ class TrackRule(Rule, frozen=True, kw_only=True):
     lasting: Share = 0.12
 
 
-class Tracked(NamedTuple):
-    """A contact by all frames up to now.
-
-    Attributes:
-        x_mm, y_mm, force_N: Estimates.
-        x_std_mm, y_std_mm, force_std_N: Standard deviations; correlations are those of the frame.
-        vx_mm_s, vy_mm_s: Velocity; 0 while the contact is held.
-        moving: Probability that it moves.
-    """
-
-    x_mm: float
-    y_mm: float
-    force_N: float
-    x_std_mm: float
-    y_std_mm: float
-    force_std_N: float
-    vx_mm_s: float
-    vy_mm_s: float
-    moving: float
-
-    def widened(self, shift: tuple[float, float, float]) -> "Tracked":
-        """With an error more, which moves x and y, mm, and force, N, by so much, and is the same in every frame."""
-        x, y, force, x_std, y_std, force_std, *motion = self
-        by_x, by_y, by_F = shift
-        stds = math.hypot(x_std, by_x), math.hypot(y_std, by_y), math.hypot(force_std, by_F)
-        return Tracked(x, y, force, *stds, *motion)
-
-
-class Other(NamedTuple):
-    """Another contact with the same charges, where it is not known which of them touches.
-
-    Attributes:
-        x_mm, y_mm, force_N: Estimates.
-        probability: That it is this one.
-    """
-
-    x_mm: float
-    y_mm: float
-    force_N: float
-    probability: float
-
-
 class Tracker:
     """Follows one contact at a time; belongs to one thread. The same frames give the same answers, bit for bit.
 
@@ -119,9 +77,9 @@ class Tracker:
     def forget(self) -> None:
         """Forget the contact, as after an outage or a new tare."""
         self._of_place, self._of_force = Modes.start(0j, 1.0, PLACE), Modes.start(0.0, 1.0, FORCE)
-        self._last: Tracked | None = None
+        self._last: TrackedContact | None = None
         self.answer: Contact | None = None
-        self.other: Other | None = None
+        self.other: OtherContact | None = None
         if self.branches is not None:
             self.branches.forget()
         self._far, self._t_s = 0, 0.0
@@ -130,7 +88,7 @@ class Tracker:
 
     def update(
         self, contact: Contact | None, t_s: float, flags: tuple[str, ...] = (), charge_pC: Array | None = None
-    ) -> tuple[Tracked | None, str | None]:
+    ) -> tuple[TrackedContact | None, str | None]:
         """Take the next frame in.
 
         Args:
@@ -164,12 +122,12 @@ class Tracker:
         else:
             self.answer, self.other = found[0].contact, _other(found)
             vx, vy = found[0].mean[3:5].tolist()
-            tracked = Tracked(*self.answer[:6], vx, vy, found[0].moves)
+            tracked = TrackedContact(*self.answer[:6], vx, vy, found[0].moves)
         event = self._event(tracked, t_s, began=began)
         self._last = tracked
         return tracked, event
 
-    def _advance(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> Tracked:
+    def _advance(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> TrackedContact:
         x, y, force, x_std, y_std, force_std, _, correlation, _, _ = contact
         place, force = complex(x, y), force if force > 1e-6 else 1e-6
         log_force, relative = math.log(force), force_std / force
@@ -199,7 +157,7 @@ class Tracker:
         (place, spread), (mean, force_spread) = by_place, by_force
         share, force = math.sqrt(spread / variance + self._lasting), math.exp(mean.real)
         velocity = of_place.moving * of_place.velocity
-        return Tracked(
+        return TrackedContact(
             place.real,
             place.imag,
             force,
@@ -211,7 +169,7 @@ class Tracker:
             of_place.moving,
         )
 
-    def _event(self, tracked: Tracked, t_s: float, *, began: bool) -> str | None:
+    def _event(self, tracked: TrackedContact, t_s: float, *, began: bool) -> str | None:
         """What begins with this frame."""
         place = complex(tracked.x_mm, tracked.y_mm)
         if began:
@@ -230,7 +188,7 @@ class Tracker:
         return None
 
 
-def _other(found: list[Branch]) -> Other | None:
+def _other(found: list[Branch]) -> OtherContact | None:
     if found[0].probability > KNOWN or len(found) == 1:
         return None
-    return Other(*found[1].contact[:3], found[1].probability)
+    return OtherContact(*found[1].contact[:3], found[1].probability)

@@ -10,23 +10,18 @@ forget what was shown before); then the samples. The page confirms what it has d
 as a binary message of its own.
 
 A sample is a prediction record of fixed size, with the tracked contact in place of the frame's where contacts are
-followed; many are coalesced to as few as a browser can show:
-
-    offset 0   timestamp, unix seconds, f64
-           8   x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_std_N, misfit, latency_us, xy_correlation, and place of
-               the other contact where it is not known which touches, x and y, mm, f32 each
-          52   flags, u32: a bit for each word of `isocharge.serve.flags`, the highest one for contact
-          56   number of records that the sample stands for, u32
-          60   touch charges, pC, f32 for each electrode; zeros up to a multiple of eight bytes
-
-All little-endian; what is unknown is NaN.
+tracked; many are coalesced to as few as a browser can show. It contains, little-endian: the timestamp (unix seconds,
+f64); the numbers that the declaration of the record marks for the live page (f32 each), then those of the other
+contact; the flags (u32, a bit for each word of `isocharge.serve.flags`, the highest bit for contact); the number of
+records that the sample stands for (u32); and the touch charges (pC, f32 for each electrode). Zeros fill it up to a
+multiple of eight bytes. An unknown number is NaN. The description of the film tells the page the offset of each number.
 
 A request of the page is JSON, as {"do": "marker", "text": "here"}: the classes below by their names in lower case.
 """
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import as_file, files
 from itertools import pairwise
 from pathlib import Path
@@ -41,23 +36,8 @@ from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, WrongKey, convert
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.prediction.record import PredictionRecord
-
-NUMBERS = (
-    "x_mm",
-    "y_mm",
-    "force_N",
-    "x_std_mm",
-    "y_std_mm",
-    "force_std_N",
-    "misfit",
-    "latency_us",
-    "xy_correlation",
-)
-"""Fields of a record that a sample has as numbers."""
-
-OF_OTHER = ("x_mm", "y_mm")
-"""Those of its `other`."""
+from isocharge.serve.record.fields import Field
+from isocharge.serve.record.record import RECORD_FIELDS, PredictionRecord
 
 FLAG_BITS = {word: 1 << position for position, word in enumerate(MEANINGS)}
 """The bit of each word."""
@@ -70,35 +50,70 @@ Samples = np.ndarray[Any, np.dtype[np.void]]
 """Samples in their order, shape (n,), of a `SampleFormat`."""
 
 
+OTHER_PREFIX = "other_"
+"""Beginning of the names of the values of the other contact in a sample."""
+
+
+def _live_numbers() -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of the numbers of a record, and of its `other` contact, that the samples contain."""
+
+    def names(fields: Sequence[Field]) -> tuple[str, ...]:
+        return tuple(field.name for field in fields if field.meaning.is_shown_live and field.kind == "number")
+
+    (other,) = (field for field in RECORD_FIELDS if field.name == "other")
+    numbers = tuple(name for name in names(RECORD_FIELDS) if name != "timestamp")
+    return numbers, names(other.parts)
+
+
+RECORD_NUMBERS, OTHER_NUMBERS = _live_numbers()
+
+
 class SampleFormat:
-    """Samples of a sensor with these electrodes.
+    """The layout of the samples of a sensor with these electrodes.
 
     Attributes:
-        electrodes: Their names, in the order of the charges.
+        electrodes: Names of the electrodes, in the order of the charges.
         dtype: A sample as a NumPy record.
     """
 
     def __init__(self, electrodes: tuple[str, ...]) -> None:
-        """Lay the sample out."""
+        """Compute the layout."""
         self.electrodes = electrodes
-        count = len(electrodes)
-        padding = -4 * (count + 1) % 8
-        self._struct = struct.Struct(f"<d{len(NUMBERS) + len(OF_OTHER)}fII{count}f{padding}x")
-        numbers = [(name, "<f4") for name in (*NUMBERS, *(f"other_{name}" for name in OF_OTHER))]
-        counts = [("flags", "<u4"), ("records", "<u4")]
-        fields: list[Any] = [("timestamp", "<f8"), *numbers, *counts, ("charge_pC", "<f4", (count,))]
-        self.dtype = np.dtype([*fields, ("padding", f"V{padding}")] if padding else fields)
+        n_electrode = len(electrodes)
+        n_number = len(RECORD_NUMBERS) + len(OTHER_NUMBERS)
+        padding = -(8 + 4 * (n_number + 2 + n_electrode)) % 8
+        self._struct = struct.Struct(f"<d{n_number}fII{n_electrode}f{padding}x")
+        names = (*RECORD_NUMBERS, *(f"{OTHER_PREFIX}{name}" for name in OTHER_NUMBERS))
+        fields: list[Any] = [
+            ("timestamp", "<f8"),
+            *((name, "<f4") for name in names),
+            ("flags", "<u4"),
+            ("records", "<u4"),
+            ("charge_pC", "<f4", (n_electrode,)),
+        ]
+        if padding:
+            fields.append(("padding", f"V{padding}"))
+        self.dtype = np.dtype(fields)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the layout for the page: the size of a sample, and the place of each number in it, bytes."""
+        offsets = {name: self.dtype.fields[name][1] for name in self.dtype.names or () if self.dtype.fields}
+        offsets.pop("padding", None)
+        return {"bytes": self.dtype.itemsize, "offsets": offsets}
 
     def pack(self, record: PredictionRecord) -> bytes:
-        """A record as a sample."""
+        """Return a record as a sample."""
         bits = CONTACT_BIT if record.contact else 0
         for word in record.flags:
             bits |= FLAG_BITS[word]
-        charges = record.charge_pC or {}
-        followed = record.tracked or {}
-        values = [followed[name] if name in followed else getattr(record, name) for name in NUMBERS]
-        values += [None if record.other is None else record.other[name] for name in OF_OTHER]
+        values = [getattr(record, name) for name in RECORD_NUMBERS]
+        tracked = record.tracked
+        if tracked is not None:
+            values = [getattr(tracked, name, value) for name, value in zip(RECORD_NUMBERS, values, strict=True)]
+        other = record.other
+        values += [None if other is None else getattr(other, name) for name in OTHER_NUMBERS]
         numbers = [math.nan if value is None else value for value in values]
+        charges = record.charge_pC or {}
         charge_pC = [math.nan if (q := charges.get(name)) is None else q for name in self.electrodes]
         timestamp = math.nan if record.timestamp is None else record.timestamp
         try:
@@ -265,6 +280,7 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
         "force_range_N": list(metadata.force_range_N),
         "probes": list(metadata.probes),
         "deflection": None if field is None else field.to_json(),
+        "sample": SampleFormat(metadata.electrodes).describe(),
         **({"more_mm": more} if more else {}),
     }
 

@@ -23,7 +23,7 @@ class TouchNode(Node):
     def publish(self, record):
         if record.force_N is None:  # the board sent something that is no number
             return
-        touch = contact_of({name: getattr(record, name) for name in record.written})
+        touch = contact_of(record.json_values)
         force, x, y = touch["force_N"], 1e-3 * (touch["x_mm"] or 0.0), 1e-3 * (touch["y_mm"] or 0.0)
         message = self.stamped(WrenchStamped(), record)
         message.wrench.force.z = -force

@@ -4,30 +4,51 @@ export const HEADER_BYTES = 24;
 export const CONTACT = 0x80000000;
 const SAMPLES = 1, BEGIN_ANEW = 1;
 
-/** @returns {{number, sent_s, missed, beginsAnew, samples}} null for a message of another kind or length */
-export function decode(buffer, electrodes) {
+/** Short names that the page uses for some numbers of a record; the other numbers keep the names of the record. */
+const SHORT_NAMES = {
+  x_mm: "x", y_mm: "y", force_N: "force", x_std_mm: "xStd", y_std_mm: "yStd", force_std_N: "forceStd",
+  latency_us: "latency", xy_correlation: "correlation", other_x_mm: "otherX", other_y_mm: "otherY",
+};
+
+/** Values of a sample that are not single numbers of 32 bits. */
+const SPECIAL = new Set(["timestamp", "flags", "records", "charge_pC"]);
+
+/**
+ * @param layout {{bytes, offsets}} size of a sample and place of each value in it, from the description of the film
+ * @returns {{number, sent_s, missed, beginsAnew, samples}} null for a message of another kind or length
+ */
+export function decode(buffer, layout, electrodes) {
   if (buffer.byteLength < HEADER_BYTES) return null;
   const head = new DataView(buffer);
   const count = head.getUint16(2, true);
   if (head.getUint8(0) !== SAMPLES) return null;
-  const size = 8 * Math.ceil((60 + 4 * electrodes) / 8);
-  if (buffer.byteLength !== HEADER_BYTES + count * size) return null;
+  if (buffer.byteLength !== HEADER_BYTES + count * layout.bytes) return null;
   const samples = [];
-  for (let k = 0; k < count; k++) samples.push(sample(head, HEADER_BYTES + k * size, electrodes));
+  for (let k = 0; k < count; k++) samples.push(decodeSample(head, HEADER_BYTES + k * layout.bytes, layout, electrodes));
   return {
     samples, number: head.getUint32(4, true), sent_s: head.getFloat64(8, true), missed: head.getUint32(16, true),
     beginsAnew: (head.getUint32(20, true) & BEGIN_ANEW) !== 0,
   };
 }
 
-function sample(view, at, electrodes) {
-  const number = (place) => { const v = view.getFloat32(at + place, true); return Number.isNaN(v) ? null : v; };
-  const bits = view.getUint32(at + 52, true), charges = [];
-  for (let e = 0; e < electrodes; e++) charges.push(number(60 + 4 * e));
-  return {
-    t: view.getFloat64(at, true), x: number(8), y: number(12), force: number(16),
-    xStd: number(20), yStd: number(24), forceStd: number(28), misfit: number(32), latency: number(36), correlation: number(40),
-    otherX: number(44), otherY: number(48),
-    contact: (bits & CONTACT) !== 0, bits: bits & ~CONTACT, records: view.getUint32(at + 56, true), charges,
+function decodeSample(view, start, { offsets }, electrodes) {
+  const numberAt = (place) => {
+    const value = view.getFloat32(start + place, true);
+    return Number.isNaN(value) ? null : value;
   };
+  const bits = view.getUint32(start + offsets.flags, true);
+  const sample = {
+    t: view.getFloat64(start + offsets.timestamp, true),
+    contact: (bits & CONTACT) !== 0,
+    bits: bits & ~CONTACT,
+    records: view.getUint32(start + offsets.records, true),
+    charges: [],
+  };
+  for (let electrode = 0; electrode < electrodes; electrode++) {
+    sample.charges.push(numberAt(offsets.charge_pC + 4 * electrode));
+  }
+  for (const [name, place] of Object.entries(offsets)) {
+    if (!SPECIAL.has(name)) sample[SHORT_NAMES[name] ?? name] = numberAt(place);
+  }
+  return sample;
 }

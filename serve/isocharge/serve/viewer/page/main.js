@@ -23,7 +23,7 @@ function session(content, isNew) {
 }
 
 function samples(buffer) {
-  const message = page.film && decode(buffer, page.film.description.electrodes.length);
+  const message = page.film && decode(buffer, page.film.description.sample, page.film.description.electrodes.length);
   if (!message) return;
   page.unconfirmed = message.number;
   page.film.take(message, nowMs());

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 import socket
 import time
 from contextlib import closing
@@ -9,17 +10,17 @@ from contextlib import closing
 import pytest
 
 from isocharge.common.errors import InputError
-from isocharge.serve.live.outputs import LineQueue, UdpSink, csv_header, csv_line
-from isocharge.serve.prediction.record import FIELDS, OF_FILM, OF_TRACKING
-from isocharge.serve.tracking.film_follower import FollowedFilm
-from isocharge.serve.tracking.tracker import Tracked
+from isocharge.common.writer_queue import WriterQueue
+from isocharge.serve.outputs.udp_output import UdpOutput
+from isocharge.serve.record.csv_rows import csv_header, csv_row
+from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking
 
 ELECTRODES = ("A", "B")
 
 
 def test_csv_has_the_fields_of_a_record(contract, record):
     row_of = record(tare_pC={"A": 1.0, "B": -2.5}, contact=True, seq=7, flags=("gap", "outside"))
-    table = io.StringIO(csv_header(ELECTRODES) + "\n" + csv_line(row_of, ELECTRODES) + "\n")
+    table = io.StringIO(csv_header(ELECTRODES) + "\n" + csv_row(row_of, ELECTRODES) + "\n")
     (row,) = csv.DictReader(table)
     flat = [name for name in contract if not name.endswith("_pC")]
     assert [name for name in row if "." not in name] == flat
@@ -33,59 +34,62 @@ def test_csv_takes_any_name(name, record):
     """Electrodes too may have any name."""
     electrodes = ("A", name)
     charges = {"A": 1.0, name: 2.0}
-    lines = csv_header(electrodes) + "\n" + csv_line(record(frame_id=name, charge_pC=charges), electrodes) + "\n"
+    lines = csv_header(electrodes) + "\n" + csv_row(record(frame_id=name, charge_pC=charges), electrodes) + "\n"
     (row,) = csv.DictReader(io.StringIO(lines, newline=""), strict=True)
     assert (row["frame_id"], row[f"charge_pC.{name}"], row["model"]) == (name, "2.000000", "linear/1")
     assert None not in row
 
 
 def test_csv_has_no_quotes_in_an_ordinary_row(record):
-    assert csv_line(record(charge_pC={"A": 1.0, "B": 2.0}), ELECTRODES) == (
+    assert csv_row(record(charge_pC={"A": 1.0, "B": 2.0}), ELECTRODES) == (
         "1763600000.123457,,,1.234568,,,,,,,,,,true,1.000000,2.000000,,,,,gap,,linear/1,linear-film"
     )
 
 
 def test_contacts_and_films_that_are_followed_are_the_last_columns(record):
-    tracked, film = Tracked(*map(float, range(9)))._asdict(), FollowedFilm(0.7, 0.05, 12)._asdict()
-    followed = record(follows=True, event="tap", tracked=tracked, film=film)
-    header = csv_header(ELECTRODES, FIELDS + OF_TRACKING + OF_FILM)
-    (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_line(followed, ELECTRODES) + "\n"))
+    film = FollowedFilm(0.7, 0.05, 12)
+    followed = record(tracking=Tracking(TrackedContact(*map(float, range(9))), "tap"), film=film)
+    header = csv_header(ELECTRODES, with_tracking=True, with_film=True)
+    (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_row(followed, ELECTRODES) + "\n"))
     assert header.removeprefix(csv_header(ELECTRODES)).startswith(",tracked.x_mm,tracked.y_mm,")
     assert (row["tracked.vy_mm_s"], row["tracked.moving"], row["event"]) == ("7.000000", "8.000000", "tap")
     assert (row["film.pretension_MPa"], row["film.touches"]) == ("0.700000", "12")
-    untouched = record(follows=True, film=film)
-    (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_line(untouched, ELECTRODES) + "\n"), strict=True)
+    untouched = record(tracking=Tracking(), film=film)
+    (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_row(untouched, ELECTRODES) + "\n"), strict=True)
     assert (row["tracked.x_mm"], row["event"], row["film.pretension_std_MPa"]) == ("", "", "0.050000")
 
 
 def test_the_end_waits_for_a_consumer_that_takes_its_time():
     """It takes longer for all lines than it may take for one."""
     written = []
-    with LineQueue(lambda line: written.append(time.sleep(0.4) or line)) as queue:
+    with WriterQueue(lambda line: written.append(time.sleep(0.4) or line)) as queue:
         for line in "abcd":
             queue.put(line)
     assert (written, queue.lost) == (list("abcd"), 0)
 
 
-def test_datagrams_to_nobody_are_dropped():
+def test_datagrams_to_nobody_are_dropped(record):
     """A refused datagram shows up as an error of the next one: it is dropped, and later ones arrive all the same."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         address = taken.getsockname()
-    with closing(UdpSink(f"127.0.0.1:{address[1]}")) as sink:
-        for _ in range(3):
-            sink.send("{}")
+    with closing(UdpOutput(f"127.0.0.1:{address[1]}")) as output:
+        for number in range(3):
+            output.write(record(seq=number))
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
             listener.bind(address)
             listener.settimeout(5.0)
-            sink.send("lost or not")
-            sink.send("heard")
-            assert set(iter(lambda: listener.recv(100), b"heard")) <= {b"lost or not"}
+            output.write(record(seq=3))
+            output.write(record(seq=4))
+            received = []
+            while 4 not in received:
+                received.append(json.loads(listener.recv(10_000))["seq"])
+            assert set(received) <= {3, 4}
 
 
 @pytest.mark.parametrize(
-    "address", ["127.0.0.1", "127.0.0.1:x", "127.0.0.1:70000", "no.such.host.invalid:1", f"{'a' * 70}.com:9"]
+    "address", ["127.0.0.1", "127.0.0.1:x", "127.0.0.1:70000", "no.such.host.invalid:1", f"{'a' * 70}.com:9", ""]
 )
 def test_datagrams_need_an_address(address):
-    with pytest.raises(InputError, match="expected HOST:PORT, as in 127"):
-        UdpSink(address)
+    with pytest.raises(InputError, match=r"expected udp://HOST:PORT, as in udp://127"):
+        UdpOutput(address)

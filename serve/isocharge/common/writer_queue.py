@@ -1,0 +1,124 @@
+"""A queue with a thread that writes its items, so that the caller never waits for a slow consumer.
+
+The thread writes the items that wait, the oldest first. If the consumer is so slow that too many items wait, the oldest
+are dropped and counted: the next item that the consumer gets is as new as possible.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from typing import Generic, Self, TypeVar
+
+T = TypeVar("T")
+
+MAX_WAITING = 10_000
+"""Number of items that may wait: ten seconds of records at 1 kHz, about 10 MB."""
+
+CLOSE_TIMEOUT_s = 1.0
+"""Time at the end in which a consumer has to take at least one item; otherwise the rest counts as lost."""
+
+
+class WriterQueue(Generic[T]):
+    """A bounded queue and the thread that writes its items; a context manager.
+
+    Attributes:
+        lost: Number of items that were never written, the oldest of those that waited.
+    """
+
+    def __init__(self, write: Callable[[T], object], is_ready: Callable[[], bool] = lambda: True) -> None:
+        """Start the thread.
+
+        Args:
+            write: Function that is called in the thread with each item.
+            is_ready: Function that is called in the thread before an item is written. It waits a short time and
+                returns whether the consumer would accept an item.
+        """
+        self.lost = 0
+        self._write = write
+        self._is_ready = is_ready
+        self._waiting: deque[T] = deque()
+        self._change = threading.Condition()
+        self._taken = 0  # number of items that the thread has taken from the queue
+        self._is_closed = False
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="writer", daemon=True)  # a write may hang forever
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        """Return the queue itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the queue."""
+        self.close()
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether the thread still runs after `close`, because the consumer does not take the last item."""
+        return self._is_closed and self._thread.is_alive()
+
+    def put(self, item: T) -> None:
+        """Append an item; the oldest one is dropped if too many wait.
+
+        Raises:
+            Exception: What `write` has raised in the thread.
+        """
+        with self._change:
+            self._raise_error()
+            if len(self._waiting) >= MAX_WAITING:
+                self._waiting.popleft()
+                self.lost += 1
+            self._waiting.append(item)
+            self._change.notify_all()
+
+    def close(self) -> None:
+        """Write the waiting items for as long as the consumer accepts them, and count the rest as lost.
+
+        Raises:
+            Exception: As `put`, once.
+        """
+        with self._change:
+            while self._waiting and self._thread.is_alive():
+                if not self._change.wait_for(partial(self._makes_progress, self._taken), CLOSE_TIMEOUT_s):
+                    break
+            self.lost += len(self._waiting)
+            self._waiting.clear()
+            self._is_closed = True
+            self._change.notify_all()
+        self._thread.join(CLOSE_TIMEOUT_s)  # the last item may be on its way
+        if self._thread.is_alive():
+            self.lost += 1
+        self._raise_error()
+
+    def _makes_progress(self, taken: int) -> bool:
+        """Return whether an item was taken since `taken` were counted, or none will be taken any more."""
+        return self._taken > taken or self._error is not None
+
+    def _raise_error(self) -> None:
+        error = self._error
+        self._error = None
+        if error is not None:
+            raise error
+
+    def _run(self) -> None:
+        try:
+            while (item := self._next()) is not None:
+                self._write(item)
+        except Exception as error:  # raised again by `put` and `close`
+            with self._change:
+                self._error = error
+                self._change.notify_all()
+
+    def _next(self) -> T | None:
+        """Return the next item when the consumer would accept it; None at the end."""
+        while True:
+            with self._change:
+                self._change.wait_for(lambda: self._waiting or self._is_closed)
+            if self._is_ready() or self._is_closed:
+                with self._change:
+                    if not self._waiting:
+                        return None
+                    self._taken += 1
+                    self._change.notify_all()
+                    return self._waiting.popleft()

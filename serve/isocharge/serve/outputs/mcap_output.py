@@ -1,0 +1,81 @@
+"""Records as an MCAP file, for Foxglove, PlotJuggler and ROS 2."""
+
+from contextlib import ExitStack
+from pathlib import Path
+
+from isocharge.common.errors import OutputError
+from isocharge.common.files import new_file, refusals_explained
+from isocharge.serve.export.record_messages import RecordEncoding
+from isocharge.serve.outputs.output import Output, OutputContext, OutputKind
+from isocharge.serve.record.record import PredictionRecord
+
+SUFFIX = ".mcap"
+ROS2_SUFFIX = ".ros2.mcap"
+"""End of the name of a file whose records are ROS 2 messages instead of JSON with a schema."""
+
+
+class McapOutput:
+    """Writes records into a new MCAP file.
+
+    On the live path the file has its name from the beginning. In a replay it gets its name when it is complete.
+    """
+
+    def __init__(self, path: Path, electrodes: tuple[str, ...], encoding: RecordEncoding, *, is_live: bool) -> None:
+        """Create the file.
+
+        Args:
+            path: The file; it must not exist.
+            electrodes: Names of the electrodes.
+            encoding: How the records are written.
+            is_live: Whether the records come from a sensor.
+
+        Raises:
+            OutputExists: If the file exists already.
+            OutputError: If the file cannot be created.
+            MissingExtra: If the extra `record` is not installed.
+        """
+        from isocharge.serve.export.mcap_file import McapFile  # needs the extra `record`
+
+        self._path = path
+        self._stack = ExitStack()
+        draft = path if is_live else self._stack.enter_context(new_file(path))
+        self._file = self._stack.enter_context(McapFile(draft, electrodes, encoding))
+
+    def write(self, record: PredictionRecord) -> None:
+        """Write a record.
+
+        Raises:
+            InputError: If ROS 2 has no time stamp for the time of the record.
+            OutputError: If the disk is full.
+        """
+        with refusals_explained(self._path):
+            self._file.write(record)
+
+    def close(self) -> None:
+        """Write the index and close the file; in a replay it gets its name now."""
+        with refusals_explained(self._path):
+            self._stack.close()
+
+    def discard(self) -> None:
+        """Close the file without an index; in a replay it is removed."""
+        self._file.is_abandoned = True
+        stopped = OutputError(f"{self._path}: incomplete")
+        try:
+            self._stack.__exit__(OutputError, stopped, None)
+        except OutputError as error:
+            if error is not stopped:
+                raise
+
+
+def _open_mcap(target: str, context: OutputContext) -> Output:
+    return McapOutput(Path(target), context.electrodes, RecordEncoding.json, is_live=context.is_live)
+
+
+def _open_ros2_mcap(target: str, context: OutputContext) -> Output:
+    return McapOutput(Path(target), context.electrodes, RecordEncoding.ros2, is_live=context.is_live)
+
+
+ROS2_MCAP_FILE = OutputKind(
+    form=f"FILE{ROS2_SUFFIX}", accepts=lambda target: target.endswith(ROS2_SUFFIX), open=_open_ros2_mcap
+)
+MCAP_FILE = OutputKind(form=f"FILE{SUFFIX}", accepts=lambda target: target.endswith(SUFFIX), open=_open_mcap)

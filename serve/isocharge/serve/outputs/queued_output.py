@@ -1,0 +1,75 @@
+"""An output with a queue and a thread of its own, so that the live path never waits for a slow consumer."""
+
+import logging
+from collections.abc import Callable
+
+from isocharge.common.writer_queue import WriterQueue
+from isocharge.serve.outputs.output import Output, discard
+from isocharge.serve.record.record import PredictionRecord
+
+log = logging.getLogger(__name__)
+
+
+class QueuedOutput:
+    """Writes records to another output in a thread.
+
+    Attributes:
+        has_failed: Whether the other output raised an error. It gets no more records then.
+    """
+
+    def __init__(
+        self, output: Output, target: str, *, is_ready: Callable[[], bool] = lambda: True, ends_stream: bool = False
+    ) -> None:
+        """Start the thread.
+
+        Args:
+            output: The other output.
+            target: Its target, for messages.
+            is_ready: Function that waits a short time and returns whether the consumer would accept a record.
+            ends_stream: Whether an error of the other output is raised by the next call of `write`, and so ends the
+                stream. Otherwise it is written to the log.
+        """
+        self.has_failed = False
+        self._output = output
+        self._target = target
+        self._ends_stream = ends_stream
+        self._queue = WriterQueue(self._write, is_ready)
+
+    @property
+    def lost(self) -> int:
+        """Number of records that were never written, because the consumer was too slow."""
+        return self._queue.lost
+
+    def write(self, record: PredictionRecord) -> None:
+        """Append a record to the queue; raise the error of the other output if it ends the stream."""
+        self._queue.put(record)
+
+    def close(self) -> None:
+        """Write the waiting records for as long as the consumer accepts them, and close the other output."""
+        self._queue.close()
+        if self._queue.is_stuck:
+            return
+        try:
+            if self.has_failed:
+                discard(self._output)
+            else:
+                self._output.close()
+        except Exception as error:
+            self._handle(error)
+
+    def _write(self, record: PredictionRecord) -> None:
+        if self.has_failed:
+            return
+        try:
+            self._output.write(record)
+        except Exception as error:
+            self._handle(error)
+
+    def _handle(self, error: Exception) -> None:
+        """Raise an error that ends the stream, or write the first error of the output to the log."""
+        is_first = not self.has_failed
+        self.has_failed = True
+        if self._ends_stream:
+            raise error
+        if is_first:
+            log.error("%s: stopped (%s); the records after that are missing", self._target, error)

@@ -1,0 +1,177 @@
+"""The registered kinds of outputs, and the outputs of a command."""
+
+from collections.abc import Iterator, Sequence
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Self
+
+from isocharge.common.errors import InputError, IsochargeError, OutputError, shown
+from isocharge.serve.outputs.mcap_output import MCAP_FILE, ROS2_MCAP_FILE
+from isocharge.serve.outputs.output import Output, OutputContext, OutputKind, discard
+from isocharge.serve.outputs.queued_output import QueuedOutput
+from isocharge.serve.outputs.text_outputs import CSV_FILE, JSON_FILE, NO_OUTPUT, STDOUT_CSV, STDOUT_JSON
+from isocharge.serve.outputs.udp_output import UDP
+from isocharge.serve.record.record import PredictionRecord
+
+OUTPUT_KINDS: tuple[OutputKind, ...] = (
+    STDOUT_JSON,
+    STDOUT_CSV,
+    NO_OUTPUT,
+    JSON_FILE,
+    CSV_FILE,
+    ROS2_MCAP_FILE,
+    MCAP_FILE,
+    UDP,
+)
+"""The kinds of outputs of this package. The first kind that accepts a target opens it."""
+
+ENTRY_POINTS = "isocharge.outputs"
+"""Group of the entry points through which other packages add kinds of outputs."""
+
+
+def target_forms() -> str:
+    """Return the forms of the targets of this package, separated by commas, for help and messages."""
+    return ", ".join(kind.form for kind in OUTPUT_KINDS)
+
+
+def kind_of(target: str) -> OutputKind:
+    """Return the kind of output that a target names.
+
+    Raises:
+        InputError: If no kind accepts the target, or the package that should is broken.
+    """
+    for kind in OUTPUT_KINDS:
+        if kind.accepts(target):
+            return kind
+    names = []
+    for entry_point in entry_points(group=ENTRY_POINTS):
+        kind = _loaded(entry_point)
+        if kind.accepts(target):
+            return kind
+        names.append(kind.form)
+    forms = ", ".join([target_forms(), *names])
+    raise InputError(f"output {shown(target)}: expected one of the forms {forms}")
+
+
+def _loaded(entry_point: EntryPoint) -> OutputKind:
+    try:
+        kind = entry_point.load()
+    except Exception as error:
+        raise InputError(
+            f"output {entry_point.name} ({entry_point.value}): cannot be loaded ({type(error).__name__}: {error}); "
+            "reinstall or remove the package that adds it"
+        ) from error
+    if not isinstance(kind, OutputKind):
+        raise InputError(
+            f"output {entry_point.name} ({entry_point.value}): expected an OutputKind, got {shown(kind)}; correct the "
+            "package that adds it"
+        )
+    return kind
+
+
+def _failure(target: str, error: Exception) -> OutputError:
+    """Return the error for people that stands for an unexpected one, such as one of another package."""
+    return OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
+
+
+class Outputs:
+    """The outputs of a command; a context manager that closes them.
+
+    Attributes:
+        not_written: For each target that did not get all records, the number of records that are missing, or None if an
+            error ended the output.
+    """
+
+    def __init__(self, targets: Sequence[str], context: OutputContext) -> None:
+        """Find the kind of each target; nothing is opened yet.
+
+        Args:
+            targets: Targets, such as `json` or `touch.csv`.
+            context: Description of the stream.
+
+        Raises:
+            InputError: If a target has none of the forms, or two targets write to standard output.
+        """
+        kinds = [(target, kind_of(target)) for target in targets]
+        standard = [target for target, kind in kinds if kind.is_standard_output]
+        if len(standard) > 1:
+            raise InputError(f"outputs {shown(standard)}: expected at most one on standard output; remove one of them")
+        if len(set(targets)) < len(targets):
+            raise InputError(f"outputs {shown(list(targets))}: expected targets that differ; remove one of them")
+        # Standard output comes last: if its reader goes away, the other outputs have the record.
+        self._kinds = sorted(kinds, key=lambda pair: pair[1].is_standard_output)
+        self._context = context
+        self._outputs: dict[str, Output] = {}
+        self.not_written: dict[str, int | None] = {}
+
+    def __enter__(self) -> Self:
+        """Open the outputs.
+
+        Raises:
+            IsochargeError: If an output cannot be opened. Those that were opened before are discarded.
+        """
+        for target, kind in self._kinds:
+            try:
+                output = kind.open(target, self._context)
+            except (IsochargeError, OSError, KeyboardInterrupt):
+                self._discard()
+                raise
+            except Exception as error:
+                self._discard()
+                raise _failure(target, error) from error
+            if self._context.is_live and kind.may_block:
+                is_ready = self._context.stdout_is_ready if kind.is_standard_output else lambda: True
+                output = QueuedOutput(output, target, is_ready=is_ready, ends_stream=kind.is_standard_output)
+            self._outputs[target] = output
+        return self
+
+    def __exit__(self, error: type[BaseException] | None, *_: Any) -> None:
+        """Close the outputs. If a replay was stopped, its files are removed."""
+        if error is not None and not self._context.is_live:
+            self._discard()
+        else:
+            self.close()
+
+    @property
+    def has_incomplete_file(self) -> bool:
+        """Whether an output other than standard output did not get all records; known when the outputs are closed."""
+        return any(not kind_of(target).is_standard_output for target in self.not_written)
+
+    def write(self, record: PredictionRecord) -> None:
+        """Write a record to every output.
+
+        Raises:
+            Exception: In a replay, the error of any output; on the live path, only an error of standard output.
+        """
+        for target, output in self._outputs.items():
+            try:
+                output.write(record)
+            except (IsochargeError, OSError):
+                raise
+            except Exception as error:
+                raise _failure(target, error) from error
+
+    def close(self) -> None:
+        """Close the outputs, once, and count the records that are missing in each."""
+        errors: list[BaseException] = []
+        for target, output in self._taken():
+            try:
+                output.close()
+            except (OSError, IsochargeError) as error:
+                errors.append(error)
+            if isinstance(output, QueuedOutput):
+                if output.has_failed:
+                    self.not_written[target] = None
+                elif output.lost:
+                    self.not_written[target] = output.lost
+        if errors:
+            raise errors[0]
+
+    def _discard(self) -> None:
+        for target, output in self._taken():
+            discard(output)
+            self.not_written[target] = None
+
+    def _taken(self) -> Iterator[tuple[str, Output]]:
+        """Yield the open outputs, each once."""
+        while self._outputs:
+            yield self._outputs.popitem()

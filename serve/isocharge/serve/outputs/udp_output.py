@@ -1,0 +1,61 @@
+"""Records as UDP datagrams, one JSON object in each.
+
+The UDP server of PlotJuggler with the JSON protocol takes one object per datagram, uses its number `timestamp`, makes a
+series of every number by the path to it, as in `charge_pC/A`, and ignores nulls: it reads a record as it is.
+"""
+
+import socket
+from contextlib import suppress
+
+from isocharge.common.errors import InputError, shown
+from isocharge.serve.outputs.output import Output, OutputContext, OutputKind
+from isocharge.serve.record.record import PredictionRecord
+
+SCHEME = "udp://"
+
+MAX_PORT = 65535
+
+
+class UdpOutput:
+    """Sends each record as a datagram, whether a program receives it or not."""
+
+    def __init__(self, address: str) -> None:
+        """Look up the receiver, and open the socket.
+
+        Args:
+            address: `HOST:PORT`.
+
+        Raises:
+            InputError: If the address has another form, or the host is unknown.
+        """
+        host, _, port = address.rpartition(":")
+        try:
+            if not 0 < int(port) <= MAX_PORT:
+                raise ValueError(f"a port is a number from 1 to {MAX_PORT}")
+            family, _, _, _, socket_address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        except (OSError, ValueError) as error:  # ValueError: a part of the name is too long
+            example = f"{SCHEME}127.0.0.1:9870"
+            raise InputError(
+                f"output {shown(SCHEME + address)}: expected {SCHEME}HOST:PORT, as in {example} ({error})"
+            ) from error
+        self._address = socket_address
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+
+    def write(self, record: PredictionRecord) -> None:
+        """Send a record, or drop it if the network is not ready, because the live path never waits."""
+        with suppress(OSError):  # the receiver is unreachable, or the buffer is full
+            self._socket.sendto(record.to_json().encode(), self._address)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+def _open_udp(target: str, _: OutputContext) -> Output:
+    return UdpOutput(target.removeprefix(SCHEME))
+
+
+UDP = OutputKind(
+    form=f"{SCHEME}HOST:PORT", accepts=lambda target: target.startswith(SCHEME), open=_open_udp, may_block=False
+)

@@ -1,0 +1,252 @@
+"""The prediction record: one reading of a sensor and the answer of a model.
+
+The fields are declared here and nowhere else. JSON, CSV, the JSON Schema, the samples of the live page and the table in
+the documentation are derived from the declaration. An unknown value is None, which is `null` in JSON: a CSV file of
+charges has no time of the device, and a film that nobody touches has no position.
+"""
+
+import json
+import math
+from functools import cached_property
+from typing import Annotated, Any
+
+from msgspec import Struct, structs
+
+from isocharge.serve.record.fields import Field, Meaning, fields_of
+
+DECIMALS = 6
+"""Number of decimals in JSON and CSV: 1 nm, 1 uN, 1 aC and 1 us, which no sensor resolves."""
+
+Charges = dict[str, float | None]
+"""Charges by the name of the electrode, pC; None if the device sent no number."""
+
+
+class TrackedContact(Struct, frozen=True):
+    """A contact as estimated from all frames up to now. The correlations are those of the latest frame."""
+
+    x_mm: Annotated[float, Meaning("Position x.", "mm")]
+    y_mm: Annotated[float, Meaning("Position y.", "mm")]
+    force_N: Annotated[float, Meaning("Force.", "N")]
+    x_std_mm: Annotated[float, Meaning("Standard deviation of x.", "mm")]
+    y_std_mm: Annotated[float, Meaning("Standard deviation of y.", "mm")]
+    force_std_N: Annotated[float, Meaning("Standard deviation of the force.", "N")]
+    vx_mm_s: Annotated[float, Meaning("Velocity along x; 0 while the contact is held.", "mm/s")]
+    vy_mm_s: Annotated[float, Meaning("Velocity along y; 0 while the contact is held.", "mm/s")]
+    moving: Annotated[float, Meaning("Probability that the contact moves, 0 to 1.")]
+
+    def widened(self, shift: tuple[float, float, float]) -> "TrackedContact":
+        """Return the contact with the standard deviations increased by an error that all frames have in common.
+
+        Args:
+            shift: Changes of x and y, mm, and of the force, N, by one standard deviation of the error.
+        """
+        x_shift_mm, y_shift_mm, force_shift_N = shift
+        return structs.replace(
+            self,
+            x_std_mm=math.hypot(self.x_std_mm, x_shift_mm),
+            y_std_mm=math.hypot(self.y_std_mm, y_shift_mm),
+            force_std_N=math.hypot(self.force_std_N, force_shift_N),
+        )
+
+
+class OtherContact(Struct, frozen=True):
+    """Another contact that explains the charges as well, while it is not known which of the two touches."""
+
+    x_mm: Annotated[float, Meaning("Position x.", "mm", is_shown_live=True)]
+    y_mm: Annotated[float, Meaning("Position y.", "mm", is_shown_live=True)]
+    force_N: Annotated[float, Meaning("Force.", "N")]
+    probability: Annotated[float, Meaning("Probability that this contact is the one that touches.")]
+
+
+class FollowedFilm(Struct, frozen=True):
+    """The film as estimated from the touches up to now."""
+
+    pretension_MPa: Annotated[float, Meaning("Pretension for which the model answered.", "MPa")]
+    pretension_std_MPa: Annotated[float, Meaning("Standard deviation of the pretension.", "MPa")]
+    touches: Annotated[int, Meaning("Number of touches from which the pretension was estimated.")]
+
+
+class Tracking(Struct, frozen=True):
+    """What the tracking of contacts adds to a record."""
+
+    tracked: Annotated[
+        TrackedContact | None,
+        Meaning("The contact by all frames up to now, where contacts are followed."),
+    ] = None
+    event: Annotated[
+        str | None,
+        Meaning("What begins with this record: press, hold, slide, tap or release."),
+    ] = None
+    other: Annotated[
+        OtherContact | None,
+        Meaning("Another contact with the same charges, where a film folds and it is not known which touches."),
+    ] = None
+
+
+NO_TRACKING = Tracking()
+"""Tracking while nothing touches."""
+
+
+class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
+    """One reading of a sensor and the answer of a model.
+
+    The meanings and units of the fields are in their annotations; `serve/docs/record.md` shows them as a table.
+    """
+
+    timestamp: Annotated[
+        float | None,
+        Meaning("Time of the reading, unix seconds.", "s", is_shown_live=True),
+    ]
+    t_device_us: Annotated[int | None, Meaning("Clock of the device, us, without its wraps.", "us")]
+    seq: Annotated[int | None, Meaning("Sequence number, as the device sent it.")]
+    x_mm: Annotated[
+        float | None,
+        Meaning("Position x in the frame frame_id, mm; null out of contact.", "mm", is_shown_live=True),
+    ]
+    y_mm: Annotated[float | None, Meaning("Position y, mm; null out of contact.", "mm", is_shown_live=True)]
+    force_N: Annotated[float | None, Meaning("Force, N; 0 out of contact.", "N", is_shown_live=True)]
+    x_std_mm: Annotated[float | None, Meaning("Standard deviation of x, mm.", "mm", is_shown_live=True)]
+    y_std_mm: Annotated[float | None, Meaning("Standard deviation of y, mm.", "mm", is_shown_live=True)]
+    force_std_N: Annotated[float | None, Meaning("Standard deviation of the force, N.", "N", is_shown_live=True)]
+    misfit: Annotated[
+        float | None,
+        Meaning("Distance from the nearest single contact, in standard deviations.", is_shown_live=True),
+    ]
+    xy_correlation: Annotated[
+        float | None,
+        Meaning(
+            "Correlation of the errors of x and y, -1 to 1; null from a model that gives none.", is_shown_live=True
+        ),
+    ]
+    xF_correlation: Annotated[float | None, Meaning("Correlation of the errors of x and the force.")]
+    yF_correlation: Annotated[float | None, Meaning("Correlation of the errors of y and the force.")]
+    contact: Annotated[bool, Meaning("Whether something touches.")]
+    charge_pC: Annotated[
+        Charges | None,
+        Meaning("Touch charges by electrode, the model's input, pC.", "pC", is_shown_live=True),
+    ]
+    charge_raw_pC: Annotated[
+        Charges | None,
+        Meaning("Charges by electrode as the device sent them, pC.", "pC"),
+    ]
+    tare_pC: Annotated[
+        Charges | None,
+        Meaning("Charges at rest that were subtracted, by electrode, pC.", "pC"),
+    ]
+    flags: Annotated[tuple[str, ...], Meaning("Words, each one a reason for care.")]
+    latency_us: Annotated[
+        float | None,
+        Meaning("From the last byte of the reading to this record, us.", "us", is_shown_live=True),
+    ]
+    model: Annotated[str, Meaning("The model, name/version.")]
+    frame_id: Annotated[str, Meaning("Name of the sensor, the frame of x and y.")]
+    tracking: Annotated[Tracking | None, Meaning("", is_flattened=True)] = None
+    film: Annotated[
+        FollowedFilm | None,
+        Meaning("The film for which the model answered, where it is followed."),
+    ] = None
+
+    @property
+    def tracked(self) -> TrackedContact | None:
+        """The tracked contact; None if contacts are not tracked, or nothing touches."""
+        return None if self.tracking is None else self.tracking.tracked
+
+    @property
+    def event(self) -> str | None:
+        """What begins with this record; None if contacts are not tracked, or nothing begins."""
+        return None if self.tracking is None else self.tracking.event
+
+    @property
+    def other(self) -> OtherContact | None:
+        """Another contact with the same charges; None if there is none."""
+        return None if self.tracking is None else self.tracking.other
+
+    @property
+    def field_names(self) -> tuple[str, ...]:
+        """Names of the fields that this record is written with, in their order."""
+        return field_names(with_tracking=self.tracking is not None, with_film=self.film is not None)
+
+    @cached_property
+    def json_values(self) -> dict[str, Any]:
+        """The values of the record by name as JSON shows them, numbers rounded to six decimals."""
+        return {name: _json_value(getattr(self, name)) for name in self.field_names}
+
+    def to_json(self) -> str:
+        """Return the record as one line of strictly valid JSON, numbers rounded to six decimals.
+
+        The text is computed once for each record.
+
+        Raises:
+            ValueError: If a number is not finite.
+        """
+        return self._json
+
+    @cached_property
+    def _json(self) -> str:
+        return _ENCODE(self.json_values)
+
+
+RECORD_FIELDS: tuple[Field, ...] = fields_of(PredictionRecord)
+"""All fields of a record, in their order."""
+
+CONTACT_FIELDS = (
+    "x_mm",
+    "y_mm",
+    "force_N",
+    "x_std_mm",
+    "y_std_mm",
+    "force_std_N",
+    "misfit",
+    "xy_correlation",
+    "xF_correlation",
+    "yF_correlation",
+)
+"""Names of the fields that a model computes, in the order of its outputs."""
+
+UNKNOWN_CONTACT: dict[str, Any] = dict.fromkeys(CONTACT_FIELDS)
+"""Values of these fields if nothing was computed."""
+
+NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
+"""Values of these fields if nothing touches."""
+
+
+def selected_fields(*, with_tracking: bool, with_film: bool) -> tuple[Field, ...]:
+    """Return the fields of records with or without tracking and the following of the film."""
+    groups = {""}
+    if with_tracking:
+        groups.add("tracking")
+    if with_film:
+        groups.add("film")
+    return tuple(field for field in RECORD_FIELDS if field.group in groups)
+
+
+_NAMES = {
+    (with_tracking, with_film): tuple(
+        field.name for field in selected_fields(with_tracking=with_tracking, with_film=with_film)
+    )
+    for with_tracking in (False, True)
+    for with_film in (False, True)
+}
+
+
+def field_names(*, with_tracking: bool = False, with_film: bool = False) -> tuple[str, ...]:
+    """Return the names of the fields of records with or without tracking and the following of the film."""
+    return _NAMES[with_tracking, with_film]
+
+
+_ENCODE = json.JSONEncoder(allow_nan=False).encode
+
+
+def _json_value(value: Any) -> Any:
+    """Return a value as JSON shows it.
+
+    The class is compared by identity, because the function is called 20 times for each record.
+    """
+    kind = value.__class__
+    if kind is float:
+        return round(value, DECIMALS)
+    if kind is dict:
+        return {name: charge if charge is None else round(charge, DECIMALS) for name, charge in value.items()}
+    if isinstance(value, Struct):
+        return {name: _json_value(getattr(value, name)) for name in value.__struct_fields__}
+    return value

@@ -1,0 +1,44 @@
+"""The table of the record's fields for the documentation, in Markdown.
+
+python -m isocharge.serve.record.reference
+"""
+
+from collections.abc import Iterable, Iterator
+
+from isocharge.serve.record.fields import Field
+from isocharge.serve.record.record import RECORD_FIELDS
+
+TYPES = {
+    "number": "number",
+    "integer": "integer",
+    "boolean": "boolean",
+    "text": "text",
+    "words": "list of texts",
+    "charges": "object: a number for each electrode",
+    "object": "object",
+}
+"""Words for the kinds of values."""
+
+GROUPS = {"tracking": "with `[track]`", "film": "with `[follow]`"}
+"""When a record has the fields of a group."""
+
+
+def record_table() -> str:
+    """Return the table of all fields of a record, with the fields of nested objects below their object."""
+    header = ["| field | type | unit | meaning | present |", "|---|---|---|---|---|"]
+    return "\n".join([*header, *_rows(RECORD_FIELDS)]) + "\n"
+
+
+def _rows(fields: Iterable[Field], prefix: str = "", group: str = "") -> Iterator[str]:
+    for field in fields:
+        present = GROUPS.get(field.group or group, "always")
+        value_type = TYPES[field.kind]
+        if field.may_be_null:
+            value_type += " or null"
+        cells = (f"`{prefix}{field.name}`", value_type, field.meaning.unit, field.meaning.text, present)
+        yield f"| {' | '.join(cells)} |"
+        yield from _rows(field.parts, f"{prefix}{field.name}.", field.group or group)
+
+
+if __name__ == "__main__":
+    print(record_table(), end="")

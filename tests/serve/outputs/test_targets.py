@@ -1,0 +1,130 @@
+"""Outputs by the form of their target, those of other packages among them."""
+
+import csv
+
+import pytest
+
+from isocharge.common.errors import InputError, OutputError, OutputExists
+from isocharge.serve.outputs.output import OutputContext, OutputKind
+from isocharge.serve.outputs.targets import OUTPUT_KINDS, Outputs, kind_of, target_forms
+
+ELECTRODES = ("A", "B")
+
+
+def context(**changes):
+    return OutputContext(**({"electrodes": ELECTRODES} | changes))
+
+
+@pytest.mark.parametrize(
+    ("target", "form"),
+    [
+        ("json", "json"),
+        ("csv", "csv"),
+        ("none", "none"),
+        ("a/touch.jsonl", "FILE.jsonl"),
+        ("touch.csv", "FILE.csv"),
+        ("touch.mcap", "FILE.mcap"),
+        ("touch.ros2.mcap", "FILE.ros2.mcap"),
+        ("udp://127.0.0.1:9870", "udp://HOST:PORT"),
+    ],
+)
+def test_form_of_a_target_chooses_the_output(target, form):
+    assert kind_of(target).form == form
+
+
+@pytest.mark.parametrize("target", ["touch.txt", "", "tcp://127.0.0.1:9", "JSON", "touch"])
+def test_target_of_no_form_is_refused_with_the_known_forms(target):
+    with pytest.raises(InputError, match=r"expected one of the forms json, csv, none, FILE\.jsonl"):
+        Outputs([target], context())
+
+
+def test_two_outputs_on_standard_output_are_refused():
+    with pytest.raises(InputError, match="at most one on standard output"):
+        Outputs(["json", "csv"], context())
+
+
+def test_repeated_target_is_refused():
+    with pytest.raises(InputError, match="expected targets that differ"):
+        Outputs(["a.csv", "a.csv"], context())
+
+
+def test_help_lists_the_forms_of_all_kinds():
+    assert all(kind.form in target_forms() for kind in OUTPUT_KINDS)
+
+
+@pytest.mark.parametrize("is_live", [True, False], ids=["live", "replay"])
+def test_same_records_go_to_every_output(record, tmp_path, is_live):
+    records = [record(seq=number, charge_pC={"A": 1.0, "B": 2.0}) for number in range(50)]
+    printed = []
+    targets = ["json", str(tmp_path / "touch.jsonl"), str(tmp_path / "touch.csv")]
+    with Outputs(targets, context(is_live=is_live, write_stdout=printed.append)) as outputs:
+        for one in records:
+            outputs.write(one)
+    lines = [one.to_json() for one in records]
+    assert "".join(printed).splitlines() == lines
+    assert (tmp_path / "touch.jsonl").read_text("utf-8").splitlines() == lines
+    with (tmp_path / "touch.csv").open(newline="") as file:
+        assert [int(row["seq"]) for row in csv.DictReader(file)] == list(range(50))
+    assert outputs.not_written == {}
+
+
+def test_replay_that_is_stopped_leaves_no_files(record, tmp_path):
+    outputs = Outputs([str(tmp_path / name) for name in ("a.jsonl", "b.csv", "c.mcap")], context())
+    outputs.__enter__()
+    outputs.write(record())
+    outputs.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
+    assert list(tmp_path.iterdir()) == []
+    assert outputs.has_incomplete_file
+
+
+def test_live_stream_that_is_stopped_keeps_its_files(record, tmp_path):
+    path = tmp_path / "a.jsonl"
+    outputs = Outputs([str(path)], context(is_live=True)).__enter__()
+    outputs.write(record())
+    outputs.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
+    assert path.read_text("utf-8") == record().to_json() + "\n"
+    assert not outputs.has_incomplete_file
+
+
+def test_file_that_exists_is_not_overwritten_and_nothing_else_is_left(tmp_path):
+    (tmp_path / "b.csv").write_text("mine")
+    targets = [str(tmp_path / "a.jsonl"), str(tmp_path / "b.csv")]
+    with pytest.raises(OutputExists, match=r"b\.csv"), Outputs(targets, context()):
+        pass
+    assert (tmp_path / "b.csv").read_text() == "mine"
+    assert not (tmp_path / "a.jsonl").exists()
+
+
+class Failing:
+    """An output that fails at once."""
+
+    def write(self, _):
+        raise RuntimeError("no such table")
+
+    def close(self):
+        raise RuntimeError("not open")
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    kind = OutputKind(form="broken", accepts="broken".__eq__, open=lambda *_: Failing())
+    monkeypatch.setattr("isocharge.serve.outputs.targets.OUTPUT_KINDS", (*OUTPUT_KINDS, kind))
+
+
+@pytest.mark.usefixtures("failing")
+def test_output_that_fails_ends_a_replay_with_its_name(record):
+    outputs = Outputs(["broken"], context()).__enter__()
+    with pytest.raises(OutputError, match=r"broken: the output failed \(RuntimeError: no such table\)"):
+        outputs.write(record())
+
+
+@pytest.mark.usefixtures("failing")
+def test_output_that_fails_does_not_end_the_live_stream(record, caplog):
+    printed = []
+    targets = ["json", "broken"]
+    with Outputs(targets, context(is_live=True, write_stdout=printed.append)) as outputs:
+        for number in range(100):
+            outputs.write(record(seq=number))
+    assert len(printed) == 100
+    assert outputs.not_written == {"broken": None}
+    assert "broken: stopped (no such table); the records after that are missing" in caplog.text

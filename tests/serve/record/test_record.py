@@ -1,0 +1,83 @@
+"""The declaration of the record, and the forms that are derived from it."""
+
+import json
+
+import jsonschema_rs
+import pytest
+from msgspec import structs
+
+from isocharge.serve.record.fields import fields_of
+from isocharge.serve.record.record import (
+    CONTACT_FIELDS,
+    RECORD_FIELDS,
+    FollowedFilm,
+    OtherContact,
+    PredictionRecord,
+    TrackedContact,
+    Tracking,
+    field_names,
+)
+from isocharge.serve.record.reference import record_table
+from isocharge.serve.record.schema import record_schema
+
+TRACKED = TrackedContact(1.0, 2.0, 0.5, 0.01, 0.02, 0.001, 3.0, 0.0, 0.25)
+
+
+def test_every_field_of_a_record_is_declared_with_its_meaning():
+    for field in RECORD_FIELDS:
+        assert field.meaning.text.endswith("."), field.name
+        assert all(part.meaning.text.endswith(".") for part in field.parts), field.name
+
+
+def test_field_without_a_meaning_is_refused():
+    class Undocumented(PredictionRecord, frozen=True, kw_only=True, dict=True):
+        speed: float
+
+    with pytest.raises(TypeError, match=r"Undocumented\.speed: expected Annotated"):
+        fields_of(Undocumented)
+
+
+def test_json_has_the_fields_of_tracking_and_film_after_the_others(contract, record):
+    tracking = Tracking(TRACKED, "slide", OtherContact(5.0, -1.0, 1.0, 0.25))
+    written = json.loads(record(tracking=tracking, film=FollowedFilm(0.71234567, 0.05, 12)).to_json())
+    assert list(written) == [*contract, "tracked", "event", "other", "film"]
+    assert written["tracked"] == structs.asdict(TRACKED)
+    assert written["event"] == "slide"
+    assert written["other"] == {"x_mm": 5.0, "y_mm": -1.0, "force_N": 1.0, "probability": 0.25}
+    assert written["film"] == {"pretension_MPa": 0.712346, "pretension_std_MPa": 0.05, "touches": 12}
+
+
+def test_json_of_a_tracked_record_without_a_contact_has_nulls(record):
+    written = json.loads(record(tracking=Tracking()).to_json())
+    assert [written[name] for name in ("tracked", "event", "other")] == [None, None, None]
+    assert "film" not in written
+
+
+def test_record_that_is_not_a_number_has_no_json(record):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        record(misfit=float("nan")).to_json()
+
+
+def test_names_of_the_fields_follow_from_the_groups(contract):
+    assert field_names() == tuple(contract)
+    assert field_names(with_film=True) == (*contract, "film")
+    assert set(CONTACT_FIELDS) < set(contract)
+
+
+def test_deviations_of_a_tracked_contact_grow_with_a_common_error():
+    wider = TRACKED.widened((0.03, 0.0, 0.002))
+    assert wider.x_std_mm == pytest.approx((0.01**2 + 0.03**2) ** 0.5)
+    assert (wider.x_mm, wider.y_std_mm) == (TRACKED.x_mm, TRACKED.y_std_mm)
+
+
+def test_schema_accepts_null_only_where_a_value_may_be_unknown(record):
+    validator = jsonschema_rs.Draft7Validator(record_schema(("A", "B")))
+    values = json.loads(record().to_json())
+    for field in RECORD_FIELDS:
+        if field.name in values:
+            assert validator.is_valid(values | {field.name: None}) == field.may_be_null, field.name
+
+
+def test_table_of_the_documentation_is_the_one_that_the_declaration_gives(pytestconfig):
+    page = (pytestconfig.rootpath / "serve" / "docs" / "record.md").read_text("utf-8")
+    assert record_table() in page
