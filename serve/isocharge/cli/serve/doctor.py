@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from shlex import join
 from typing import Annotated, Any
 
 import typer
@@ -144,7 +145,7 @@ def doctor_command(
         say(f"{not_written}the film was touched: take the finger away, and try again")
         raise typer.Exit(1)
     if write is not None:
-        _write(write, examination)
+        _write(write, examination, model or "MODEL")
 
 
 def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> ElectrodeCheck:
@@ -223,8 +224,13 @@ def _request(text: str | None, rate_Hz: float) -> Request | None:
     return Request(data, rate_Hz)
 
 
-def _write(path: Path, examination: Examination) -> None:
-    """Write the device file, and print how to use it.
+def _write(path: Path, examination: Examination, model: str) -> None:
+    """Write the device file, and print the command that uses it.
+
+    Args:
+        path: The file.
+        examination: Result of the port check.
+        model: Model that is to be used.
 
     Raises:
         InputError: If it cannot be written.
@@ -238,7 +244,8 @@ def _write(path: Path, examination: Examination) -> None:
         return
     if "offset" in examination.device.get("gain", {}):
         say("the offsets are right only if nothing lay on the film; a steady weight cannot be noticed")
-    say(f"{path} written; use it with: isocharge serve stream MODEL --port {examination.url} --device {path}")
+    command = join(["isocharge", "serve", "stream", model, "--port", examination.url, "--device", str(path)])
+    say(f"{path} written; use it with: {command}")
 
 
 def report_lines(examination: Examination) -> Iterator[str]:
