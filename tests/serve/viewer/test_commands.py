@@ -85,14 +85,14 @@ def test_a_press_is_on_the_page_where_it_is_and_the_stream_goes_on_without_it(bo
 
 def test_the_rate_is_that_of_the_board_however_fast_a_recording_is_read(predictor, record, monkeypatch, capsys):
     """Unknown until time has passed between two frames."""
-    monkeypatch.setattr(live_page_module, "STATE_S", -1.0)
+    monkeypatch.setattr(live_page_module, "STATE_INTERVAL_S", -1.0)
     told = []
     link = SimpleNamespace(put=id, tell=lambda **state: told.append(state), is_open=True, dropped=0)
     feed = live_page_module.PageFeed(link, TouchStream(predictor))
     for k in (0, 0, *range(2, 51)):
         feed.write(record(timestamp=1e9 + 0.005 * k))
     assert [state["rate_Hz"] for state in told[:2]] == [None, None]
-    monkeypatch.setattr(live_page_module, "STATE_S", 60.0)
+    monkeypatch.setattr(live_page_module, "STATE_INTERVAL_S", 60.0)
     feed.write(record())
     assert (len(told), told[-1]["rate_Hz"]) == (51, pytest.approx(200.0, rel=1e-3))
     assert capsys.readouterr().err == ""  # the page is there

@@ -1,4 +1,4 @@
-"""The live page in commands: its options, and what a stream and its page tell each other."""
+"""The live page in commands: its options, and the messages between a stream and its page."""
 
 import logging
 import math
@@ -36,7 +36,7 @@ from isocharge.serve.viewer.messages import (
 )
 
 RATE_RECORDS = 400
-"""Records, the latest, over whose times the rate is taken: that of the board, however fast a recording is read."""
+"""Number of the latest records from whose times the frame rate of the board is computed."""
 
 LOOPBACK = "127.0.0.1"
 """Host of the page if `--live` contains only a port."""
@@ -44,7 +44,7 @@ LOOPBACK = "127.0.0.1"
 LARGEST_PORT = 65535
 """Largest number of a TCP port."""
 
-STATE_S = 0.25
+STATE_INTERVAL_S = 0.25
 """Time between two messages with the counters, s."""
 
 LiveOption = Annotated[
@@ -70,7 +70,10 @@ TokenOption = Annotated[
 
 
 def given_token(token: str | None) -> str | None:
-    """The token of the option; of the environment also an empty one, which the option takes for none."""
+    """Return the token of the option or of the environment.
+
+    An empty token in the environment is returned as it is, although Typer treats it as absent.
+    """
     return os.environ.get("ISOCHARGE_TOKEN") if token is None else token
 
 
@@ -99,15 +102,22 @@ def page_address(live: str, token: str | None) -> Address:
 def live_page(
     address: Address, token: str | None, name: str, metadata: ModelMetadata, model: Path, *, is_recording: bool = False
 ) -> Iterator[ReaderEnd]:
-    """The page of a stream in a process of its own; says where it is. Yields the reader's end of the link.
+    """Run the page of a stream in a process of its own, and print its address.
 
     Args:
-        address: Where it listens.
-        token: As the option.
-        name: Of the stream, for people.
-        metadata: Of the model that answers.
-        model: Folder of its version.
-        is_recording: Whether the stream is a recording, which waits for its page.
+        address: Address at which the page listens.
+        token: Value of `--token`.
+        name: Name of the stream, for people.
+        metadata: Metadata of the model that estimates the contacts.
+        model: Folder of the version of the model.
+        is_recording: Whether the stream is a recording, which waits until its page reads.
+
+    Yields:
+        The reader's end of the link to the page.
+
+    Raises:
+        MissingExtra: If the extra `http` is not installed.
+        ListenError: If the address is in use or impossible.
     """
     with require("http"):
         from isocharge.serve.viewer.process import Page, page_process
@@ -123,33 +133,47 @@ def live_page(
 
 
 class PageFeed:
-    """What a stream tells its page: each record, and a few times a second its counters."""
+    """Sends the records of a stream to its page, and its counters a few times per second.
+
+    Args:
+        link: The reader's end of the link to the page.
+        touch: The stream.
+        live: The stream with its recording; None for a replay.
+    """
 
     def __init__(self, link: ReaderEnd, touch: TouchStream, live: RecordedStream | None = None) -> None:
-        """Feed a page; `live` is the stream with its recording, None for a replay."""
-        self._link, self._touch, self._live = link, touch, live
+        self._link = link
+        self._touch = touch
+        self._live = live
         self._pack = SampleFormat(touch.predictor.metadata.electrodes).pack
-        self._told_s = 0.0
-        self._times: deque[float] = deque(maxlen=RATE_RECORDS)
+        self._last_state_s = 0.0
+        self._timestamps_s: deque[float] = deque(maxlen=RATE_RECORDS)
 
     def write(self, record: PredictionRecord) -> None:
-        """Hand over a record without waiting."""
-        was_open, now_s = self._link.is_open, time.monotonic()
+        """Send a record without waiting for the page."""
+        was_open = self._link.is_open
         self._link.put(self._pack(record))
-        self._times.append(math.nan if record.timestamp is None else record.timestamp)
+        self._timestamps_s.append(math.nan if record.timestamp is None else record.timestamp)
         if was_open and not self._link.is_open:
             say("the process of the live page has ended; the stream goes on without it")
-        if now_s - self._told_s > STATE_S:
-            self._told_s = now_s
-            self._tell_state(record, self._times[-1] - self._times[0])
+        now_s = time.monotonic()
+        if now_s - self._last_state_s > STATE_INTERVAL_S:
+            self._last_state_s = now_s
+            self._send_state(record)
 
-    def _tell_state(self, record: PredictionRecord, elapsed_s: float) -> None:
-        rate_Hz = (len(self._times) - 1) / elapsed_s if len(self._times) > 1 and elapsed_s > 0.0 else None
+    def _rate_Hz(self) -> float | None:
+        """Compute the frame rate of the board from the times of the latest records, Hz; None if it is not known."""
+        elapsed_s = self._timestamps_s[-1] - self._timestamps_s[0]
+        if not elapsed_s > 0.0:
+            return None
+        return (len(self._timestamps_s) - 1) / elapsed_s
+
+    def _send_state(self, record: PredictionRecord) -> None:
         recorder = self._live.recorder if self._live else None
-        more = {"reconnects": self._touch.counts.outages, "not_shown": self._link.dropped}
+        page_counters = {"reconnects": self._touch.counts.outages, "not_shown": self._link.dropped}
         self._link.tell(
-            counters=self._touch.totals()._asdict() | more,
-            rate_Hz=rate_Hz,
+            counters=self._touch.totals()._asdict() | page_counters,
+            rate_Hz=self._rate_Hz(),
             model=record.model,
             film=None if record.film is None else structs.asdict(record.film),
             tare_pC=record.tare_pC,
@@ -160,35 +184,41 @@ class PageFeed:
 
 @contextmanager
 def answering(link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str | None] | None) -> Iterator[None]:
-    """Do what the page asks of a live stream while the block runs, and show warnings of the live path on the page.
+    """Carry out the requests of the page during the block, and show warnings of the live path on the page.
 
     Args:
-        link: The reader's end.
+        link: The reader's end of the link to the page.
         live: The stream.
-        header: Policy, device table and name of the film, for recordings that the page begins; None forbids them.
+        header: Policy, device table and name of the film, for recordings that the page begins. None refuses such
+            requests.
     """
 
-    def follow() -> None:
+    def answer_requests() -> None:
         while (request := link.request()) is not None:
             try:
-                _do(request, link, live, header)
+                _carry_out(request, link, live, header)
             except IsochargeError as error:
-                _show(link, str(error))
+                _show_note(link, str(error))
 
     handler = logging.Handler()
-    handler.emit = lambda record: _show(link, record.getMessage())  # type: ignore[method-assign]
+    handler.emit = lambda record: _show_note(link, record.getMessage())  # type: ignore[method-assign]
     logger = logging.getLogger("isocharge.serve")
     logger.addHandler(handler)
-    threading.Thread(target=follow, name="page requests", daemon=True).start()
+    threading.Thread(target=answer_requests, name="page requests", daemon=True).start()
     try:
         yield
     finally:
         logger.removeHandler(handler)
 
 
-def _do(
+def _carry_out(
     request: LiveRequest, link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str | None] | None
 ) -> None:
+    """Carry out one request of the page.
+
+    Raises:
+        InputError: If the page asks for a recording while the command makes one.
+    """
     match request:
         case Marker(text=text):
             marker = recording.Marker(time.time(), text)
@@ -207,6 +237,6 @@ def _do(
             live.request_back()
 
 
-def _show(link: ReaderEnd, text: str) -> None:
-    """Show a message on the page for a while."""
+def _show_note(link: ReaderEnd, text: str) -> None:
+    """Show a message on the page for some seconds."""
     link.tell(note={"text": text, "at": time.time()})
