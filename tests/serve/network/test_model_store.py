@@ -26,7 +26,8 @@ from isocharge.serve.network.grpc import grpc_server
 from isocharge.serve.network.grpc.service import SERVICE
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.protocol.describe import page
+from isocharge.serve.network.protocol.page import page
+from isocharge.serve.network.protocol.routes import ROUTES
 from isocharge.serve.network.traffic import LONGEST_TEXT, RequestLog, Traffic
 
 
@@ -247,9 +248,7 @@ def test_no_client_can_forge_a_line_or_plant_a_secret(released, method, path, he
     content = json.loads(line)
     assert set(content) == NAMES
     assert SECRET not in str(content)
-    assert content["route"] in {"unknown", *handler._fixed} | {
-        f"/v2/models/{{model}}{tail}" for tail in ("", "/infer", "/ready", "/config", "/stats")
-    } | {f"/v2/repository/models/{{model}}/{verb}" for verb in ("load", "unload")}
+    assert content["route"] in {"unknown", *(route.paths[0] for route in ROUTES)}
 
 
 def test_messages_of_loggers_are_lines_too(lines):

@@ -34,7 +34,7 @@ from isocharge.serve.flags import MEANINGS
 from isocharge.serve.network.address import Token
 from isocharge.serve.network.browser_check import BrowserCheck
 from isocharge.serve.network.protocol import Response
-from isocharge.serve.network.protocol.describe import PAGE_HEADERS
+from isocharge.serve.network.protocol.page import PAGE_HEADERS
 from isocharge.serve.network.protocol.response import error_response, json_response, response_of
 from isocharge.serve.viewer.hub import Hub, Viewer
 from isocharge.serve.viewer.messages import FLAG_BITS, confirmed_number

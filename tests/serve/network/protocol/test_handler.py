@@ -28,7 +28,7 @@ from schemathesis.specs.openapi.checks import (
 
 from isocharge.common.errors import InputError
 from isocharge.serve.network.address import ServerLimits
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol import Handler, routes
 from isocharge.serve.network.protocol.response import compress, decompress
 
 INFER = "/v2/models/linear/infer"
@@ -438,7 +438,8 @@ def operations(handler, start_http):
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", GenerationMode, ids=lambda mode: mode.value)
 def test_the_server_does_what_its_document_says(operations, mode):
-    assert len(operations) == 17
+    listed = {path for route in routes.ROUTES if route.summary for path in route.paths}
+    assert {operation.path for operation in operations} == {path for path in listed if "unload" not in path}
     answered = set()
     for operation in operations:
         if mode is GenerationMode.NEGATIVE and not (operation.path_parameters or operation.body):

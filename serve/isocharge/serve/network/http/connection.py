@@ -286,7 +286,7 @@ class Connection(asyncio.Protocol):
         head = self._head = Head(method, _path(self._url), self._headers, not self._parser.should_keep_alive())
         if self._answering:
             self._waiting.append((head, bytes(self._body)))
-        elif self._handler.blocks(head.path):
+        elif self._handler.may_block(head.path):
             self._answer_in_thread(head, bytes(self._body))
         else:
             self._has_answered = True
@@ -307,7 +307,7 @@ class Connection(asyncio.Protocol):
         self._write(response, head)
         while self._waiting and self._answering is None:
             head, body = self._waiting.popleft()
-            if self._handler.blocks(head.path):
+            if self._handler.may_block(head.path):
                 self._answer_in_thread(head, body)
             else:
                 self._answer(head, body)

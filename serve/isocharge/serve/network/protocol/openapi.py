@@ -1,0 +1,86 @@
+"""The OpenAPI document of the HTTP server, derived from its routes."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+
+from isocharge.serve.network.model_store import ModelStore
+from isocharge.serve.network.protocol.describe import server_metadata
+from isocharge.serve.network.protocol.routes import Json, Route, Schema, object_schema
+
+ERROR = Schema("error", object_schema({"error": {"type": "string"}}))
+"""The answer of every route if a request is refused."""
+
+DESCRIPTION = (
+    "Computes contacts on a piezoelectric tactile film from the charges of its electrodes, with the Open Inference "
+    "Protocol, version 2. The input `charge_pC` has one row for each press and one column for each electrode: the "
+    "charge under load minus the charge without load, in pC. Bodies may be compressed with gzip or deflate, and "
+    "tensors may follow the JSON in binary, as in the binary tensor extension of the protocol."
+)
+
+REFERENCE = "#/components/schemas/{name}"
+
+
+def openapi_document(routes: Iterable[Route], store: ModelStore) -> Json:
+    """Return the document, OpenAPI 3.1, for the routes that have a summary and the models that are loaded."""
+    listed = [route for route in routes if route.summary]
+    models = {loaded.metadata.name for loaded in store.all()}
+    versions = {loaded.version for loaded in store.all()}
+    return {
+        "openapi": "3.1.0",
+        "info": {"title": "isocharge", "version": server_metadata()["version"], "description": DESCRIPTION},
+        "paths": {path: _path_item(path, route) for route in listed for path in route.paths},
+        "components": {
+            "parameters": {"model": _path_parameter("model", models), "version": _path_parameter("version", versions)},
+            "schemas": _schemas(listed),
+            "responses": {"error": {"description": "Why not", "content": _content(ERROR, "application/json")}},
+            "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
+        },
+        "security": [{}, {"token": []}],
+    }
+
+
+def _path_item(path: str, route: Route) -> Json:
+    operation: Json = {
+        "summary": route.summary,
+        "responses": {
+            "200": {"description": route.summary, "content": _content(route.answer, route.answer_type)},
+            "4XX": {"$ref": "#/components/responses/error"},
+        },
+    }
+    if route.body is not None:
+        content = _content(route.body.schema, "application/json")
+        if route.body.example is not None:
+            content["application/json"]["example"] = route.body.example
+        operation["requestBody"] = {"content": content}
+        if route.body.is_required:
+            operation["requestBody"]["required"] = True
+    parameters = [{"$ref": f"#/components/parameters/{name}"} for name in ("model", "version") if f"{{{name}}}" in path]
+    return {"parameters": parameters, route.method.lower(): operation}
+
+
+def _content(schema: Schema, media_type: str) -> Json:
+    return {media_type: {"schema": {"$ref": REFERENCE.format(name=schema.name)}}}
+
+
+def _path_parameter(name: str, values: set[str]) -> Json:
+    schema = {"type": "string", "enum": sorted(values) or ["none"]}
+    return {"name": name, "in": "path", "required": True, "schema": schema}
+
+
+def _schemas(routes: Iterable[Route]) -> dict[str, Any]:
+    """Return the schemas of all bodies and answers by name."""
+    used = [ERROR]
+    for route in routes:
+        used.append(route.answer)
+        if route.body is not None:
+            used.append(route.body.schema)
+    schemas: dict[str, Any] = {}
+    for schema in used:
+        if isinstance(schema.content, type):
+            _, derived = msgspec.json.schema_components([schema.content], ref_template=REFERENCE)
+            schemas |= derived
+        else:
+            schemas[schema.name] = schema.content
+    return schemas

@@ -1,0 +1,372 @@
+"""The routes of the HTTP server. Each route is one entry of `ROUTES`.
+
+The entry has the method, the paths, the summary, the schemas of request and answer, and the function that answers. The
+dispatch of the requests and the OpenAPI document are derived from it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+from isocharge.common.errors import RequestError
+from isocharge.serve.model.session import OUTPUT_MEANINGS, OUTPUTS
+from isocharge.serve.network.address import ServerLimits
+from isocharge.serve.network.metrics import CONTENT_TYPE, Metrics
+from isocharge.serve.network.model_store import LoadedVersion, ModelStore
+from isocharge.serve.network.protocol import describe
+from isocharge.serve.network.protocol.inference import (
+    FLAGS,
+    InferBody,
+    answer_inference,
+    read_infer,
+    read_object,
+    write_answer,
+)
+from isocharge.serve.network.protocol.page import PAGE_HEADERS, page
+from isocharge.serve.network.protocol.response import Response, compress, json_response, response_of
+
+Json = dict[str, Any]
+
+
+class Service(NamedTuple):
+    """What the functions that answer need.
+
+    Attributes:
+        store: The models.
+        limits: Limits of the body and of the batch.
+        metrics: Counters in the format of Prometheus.
+        openapi: Function that returns the OpenAPI document.
+    """
+
+    store: ModelStore
+    limits: ServerLimits
+    metrics: Metrics
+    openapi: Callable[[], Json]
+
+
+class Request(NamedTuple):
+    """A request with its body decompressed.
+
+    Attributes:
+        service: The server.
+        headers: Headers of the request, names in lower case.
+        body: Body of the request.
+        model: Name of the model in the path; empty if the path names none.
+        version: Version in the path; empty if the path names none.
+    """
+
+    service: Service
+    headers: Mapping[bytes, bytes]
+    body: bytes
+    model: str = ""
+    version: str = ""
+
+    @property
+    def loaded(self) -> LoadedVersion:
+        """The model that the path names; raises ModelNotFound if it is not loaded."""
+        return self.service.store.get(self.model, self.version)
+
+
+class Schema(NamedTuple):
+    """A schema of the OpenAPI document: its name there, and its content or the type that it is derived from."""
+
+    name: str
+    content: Json | type
+
+
+class Body(NamedTuple):
+    """The body of a request: its schema, whether it is required, and an example."""
+
+    schema: Schema
+    is_required: bool = False
+    example: Json | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Route:
+    """A route of the server.
+
+    Attributes:
+        method: Method of the request. A route with the method GET also answers HEAD, without a body.
+        paths: Templates of the paths. The log and the counters use the first one.
+        respond: Function that answers a request.
+        summary: What the route is for; empty if the OpenAPI document does not list it.
+        answer: Schema of the answer.
+        answer_type: Media type of the answer.
+        body: Body of the request; None if the route has no body.
+        needs_token: Whether a request needs the token of the server. Programs that start and watch servers have none.
+        may_block: Whether an answer may take so long that the server should use another thread.
+    """
+
+    method: str
+    paths: tuple[str, ...]
+    respond: Callable[[Request], Response]
+    summary: str = ""
+    answer: Schema
+    answer_type: str = "application/json"
+    body: Body | None = None
+    needs_token: bool = True
+    may_block: bool = False
+
+
+def object_schema(properties: Json, required: list[str] | None = None) -> Json:
+    """Return the schema of an object; all properties are required unless `required` lists them."""
+    return {"type": "object", "properties": properties, "required": required or list(properties)}
+
+
+def list_schema(items: Json) -> Json:
+    """Return the schema of a list."""
+    return {"type": "array", "items": items}
+
+
+_TEXT = {"type": "string"}
+_SHAPE = list_schema({"type": "integer"})
+_TENSORS = list_schema(object_schema({"name": _TEXT, "datatype": _TEXT, "shape": _SHAPE}))
+_NUMBER = {"type": ["number", "null"], "description": "null: not finite, which JSON has no number for"}
+
+_OUTPUT_NAMES = "; ".join(f"`{name}`: {meaning}" for name, meaning in OUTPUT_MEANINGS.items())
+
+_OUTPUT = object_schema(
+    {
+        "name": {
+            "enum": [*OUTPUTS, FLAGS],
+            "description": f"{_OUTPUT_NAMES}; `{FLAGS}`: reasons not to trust the contact, separated by commas",
+        },
+        "datatype": {"enum": ["FP32", "BYTES"]},
+        "shape": _SHAPE | {"description": "number of presses, and numbers for each press"},
+        "data": {"anyOf": [list_schema(_NUMBER), list_schema(_TEXT)]},
+    },
+    ["name", "datatype", "shape"],
+)
+
+ANY = Schema("any", {"type": "object"})
+PLAIN_TEXT = Schema("text", _TEXT)
+SERVER = Schema("server", object_schema({"name": _TEXT, "version": _TEXT, "extensions": list_schema(_TEXT)}))
+MODEL = Schema(
+    "model",
+    object_schema(
+        {
+            "name": _TEXT,
+            "versions": list_schema(_TEXT),
+            "platform": _TEXT,
+            "inputs": _TENSORS,
+            "outputs": _TENSORS,
+            "properties": {"type": "object", "additionalProperties": _TEXT},
+        }
+    ),
+)
+STATISTICS = Schema(
+    "stats", object_schema({"model_stats": list_schema(object_schema({"name": _TEXT, "version": _TEXT}))})
+)
+REPOSITORY = Schema(
+    "rows", list_schema(object_schema({"name": _TEXT, "version": _TEXT, "state": _TEXT, "reason": _TEXT}))
+)
+INFERENCE = Schema(
+    "answer",
+    object_schema(
+        {"model_name": _TEXT, "model_version": _TEXT, "id": _TEXT, "outputs": list_schema(_OUTPUT)},
+        ["model_name", "model_version", "outputs"],
+    ),
+)
+
+INDEX_BODY = Schema("index", {"type": "object", "properties": {"ready": {"type": "boolean"}}})
+LOAD_BODY = Schema("load", {"type": "object", "properties": {"parameters": {"type": "object", "maxProperties": 0}}})
+UNLOAD_BODY = Schema("unload", {"type": "object"})
+INFER_BODY = Schema("InferBody", InferBody)
+
+EXAMPLE = {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [942.9, 910.4, 690.8]}]}
+"""Example of the body of an inference."""
+
+
+def _show_page(request: Request) -> Response:
+    response = response_of(200, b"text/html; charset=utf-8", page(request.service.store).encode())
+    response.headers.extend(PAGE_HEADERS)
+    return response
+
+
+def _show_openapi(request: Request) -> Response:
+    return json_response(request.service.openapi())
+
+
+def _show_metrics(request: Request) -> Response:
+    return response_of(200, CONTENT_TYPE, request.service.metrics.text())
+
+
+def _show_server(_: Request) -> Response:
+    return json_response(describe.server_metadata())
+
+
+def _is_live(_: Request) -> Response:
+    return json_response({"live": True})
+
+
+def _is_ready(request: Request) -> Response:
+    request.service.store.check_ready()
+    return json_response({"ready": True})
+
+
+def _show_statistics(request: Request) -> Response:
+    return json_response(describe.statistics_of(request.service.store, request.model, request.version))
+
+
+def _show_index(request: Request) -> Response:
+    ready = read_object(request.body).get("ready", False)
+    if not isinstance(ready, bool):
+        raise RequestError(f"ready: expected true or false, got {ready!r:.100}")
+    return json_response(describe.repository_index(request.service.store, ready=ready))
+
+
+def _load(request: Request) -> Response:
+    if read_object(request.body).get("parameters", {}) != {}:
+        raise RequestError(describe.NO_LOAD_PARAMETERS)
+    request.service.store.load(request.model)
+    return json_response({})
+
+
+def _unload(request: Request) -> Response:
+    read_object(request.body)
+    request.service.store.unload(request.model)
+    return json_response({})
+
+
+def _show_model(request: Request) -> Response:
+    return json_response(describe.model_metadata(request.loaded, request.service.store))
+
+
+def _is_model_ready(request: Request) -> Response:
+    return json_response({"ready": bool(request.loaded)})
+
+
+def _show_config(request: Request) -> Response:
+    return json_response(describe.model_config(request.loaded, request.service.limits))
+
+
+def _infer(request: Request) -> Response:
+    """Compute an inference.
+
+    Only this answer is compressed, because the asyncio client of Triton decompresses no other.
+    """
+    loaded = request.loaded
+    headers = request.headers
+    length = headers.get(b"inference-header-content-length")
+    read = partial(read_infer, request.body, length, loaded, request.service.limits.batch)
+    body, json_length = answer_inference(loaded, read, write_answer)
+    accepted = headers.get(b"accept-encoding")
+    encoding = b""
+    if accepted:
+        body, encoding = compress(body, accepted)
+    response = response_of(200, b"application/json" if json_length is None else b"application/octet-stream", body)
+    if json_length is not None:
+        response.headers.append((b"inference-header-content-length", b"%d" % json_length))
+    if encoding:
+        response.headers.append((b"content-encoding", encoding))
+    return response
+
+
+def of_model(tail: str = "") -> tuple[str, str]:
+    """Return the paths of a route that belongs to a model: with its name, and with its name and version."""
+    return f"/v2/models/{{model}}{tail}", f"/v2/models/{{model}}/versions/{{version}}{tail}"
+
+
+ROUTES: tuple[Route, ...] = (
+    Route(method="GET", paths=("/",), respond=_show_page, answer=PLAIN_TEXT, answer_type="text/html"),
+    Route(method="GET", paths=("/openapi.json",), respond=_show_openapi, answer=ANY),
+    Route(
+        method="GET",
+        paths=("/v2/health/live",),
+        respond=_is_live,
+        summary="Whether the server runs",
+        answer=ANY,
+        needs_token=False,
+    ),
+    Route(
+        method="GET",
+        paths=("/v2/health/ready",),
+        respond=_is_ready,
+        summary="Whether a model is loaded",
+        answer=ANY,
+        needs_token=False,
+    ),
+    Route(
+        method="GET",
+        paths=("/metrics",),
+        respond=_show_metrics,
+        summary="Counters of all models and requests, in the text format of Prometheus",
+        answer=PLAIN_TEXT,
+        answer_type="text/plain",
+    ),
+    Route(
+        method="GET",
+        paths=("/v2",),
+        respond=_show_server,
+        summary="Name, version and extensions of the server",
+        answer=SERVER,
+    ),
+    Route(
+        method="GET",
+        paths=("/v2/models/stats",),
+        respond=_show_statistics,
+        summary="Counters of all models",
+        answer=STATISTICS,
+    ),
+    Route(
+        method="POST",
+        paths=("/v2/repository/index",),
+        respond=_show_index,
+        summary="Every version in the repository",
+        answer=REPOSITORY,
+        body=Body(INDEX_BODY),
+    ),
+    Route(
+        method="POST",
+        paths=("/v2/repository/models/{model}/load",),
+        respond=_load,
+        summary="Read a model's files again and swap it in",
+        answer=ANY,
+        body=Body(LOAD_BODY),
+        may_block=True,
+    ),
+    Route(
+        method="POST",
+        paths=("/v2/repository/models/{model}/unload",),
+        respond=_unload,
+        summary="Take a model off",
+        answer=ANY,
+        body=Body(UNLOAD_BODY),
+        may_block=True,
+    ),
+    Route(
+        method="GET",
+        paths=of_model(),
+        respond=_show_model,
+        summary="Tensors of a model and what its file says about itself",
+        answer=MODEL,
+    ),
+    Route(
+        method="GET", paths=of_model("/ready"), respond=_is_model_ready, summary="Whether a model serves", answer=ANY
+    ),
+    Route(
+        method="GET",
+        paths=of_model("/config"),
+        respond=_show_config,
+        summary="A model's configuration, as Triton words it",
+        answer=ANY,
+    ),
+    Route(
+        method="GET",
+        paths=of_model("/stats"),
+        respond=_show_statistics,
+        summary="A model's counters",
+        answer=STATISTICS,
+    ),
+    Route(
+        method="POST",
+        paths=of_model("/infer"),
+        respond=_infer,
+        summary="Charges to contacts",
+        answer=INFERENCE,
+        body=Body(INFER_BODY, is_required=True, example=EXAMPLE),
+    ),
+)
+"""The routes. A path that fits several templates belongs to the first one."""
