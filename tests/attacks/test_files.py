@@ -388,7 +388,7 @@ def test_parts_of_runs_with_faults(tmp_path, attack):
         attack("files checkpoint", read_state, lambda rng: mutated(rng, state.getvalue()), 2_000)
 
 
-NOTATIONS = ("circle:1.0", "rectangle:4.0x2.0@30", "triangle:4.0@-3", "polygon:0,0;1,0;1,1;0,1")
+NOTATIONS = ("circle:1.0", "rectangle:4.0x2.0@30", "triangle:4.0@-3", "ellipse:4.0x2.0@30", "polygon:0,0;1,0;1,1;0,1")
 
 
 def test_probes_with_faults(attack):

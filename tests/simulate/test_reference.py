@@ -15,6 +15,7 @@ import pytest
 
 from isocharge.simulate import (
     Circle,
+    Ellipse,
     Equilibrium,
     Film,
     Polygon,
@@ -78,6 +79,8 @@ def probe_of(about: dict) -> Probe:
     angle = np.deg2rad(about.get("turn_deg", 0.0))
     if about["shape"] == "circle":
         return Circle(about["radius_mm"])
+    if about["shape"] == "ellipse":
+        return Ellipse(about["width_mm"], about["height_mm"], angle)
     if about["shape"] == "rectangle":
         return Polygon.rectangle(about["width_mm"], about["height_mm"], angle)
     return Polygon.triangle(about["side_mm"], angle)

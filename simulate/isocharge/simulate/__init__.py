@@ -36,7 +36,7 @@ with require("simulate"):
     from isocharge.simulate.mesh.blocks import Resolution
     from isocharge.simulate.sensor.film import Film, Piezo
     from isocharge.simulate.sensor.film_prior import FilmPrior, virtual_film
-    from isocharge.simulate.sensor.probe import Circle, Polygon, Probe, parse_probe
+    from isocharge.simulate.sensor.probe import Circle, Ellipse, Polygon, Probe, parse_probe
     from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor
     from isocharge.simulate.sensor.sensor_file import built_in_sensors, load_sensor, write_sensor
     from isocharge.simulate.solver.equilibrium import Equilibrium, deflection, touch_stress
@@ -53,6 +53,7 @@ __all__ = [
     "DesignCase",
     "Domain",
     "Electrode",
+    "Ellipse",
     "Equilibrium",
     "Film",
     "FilmPrior",

@@ -10,6 +10,7 @@ from isocharge.simulate import (
     Circle,
     Domain,
     Electrode,
+    Ellipse,
     ForwardMap,
     Polygon,
     Resolution,
@@ -31,10 +32,10 @@ TRACED = Electrode.of_square("A", (5.0, 0.0), 3.0).with_trace(((5.0, 0.0), (-2.0
 """Its trace runs through the presses."""
 
 
-@pytest.fixture(scope="module")
-def oriented_map(near_electrodes) -> ForwardMap:
-    """A probe whose orientation matters; on the electrodes, for these are moved inwards."""
-    return kept(ForwardMap.build, near_electrodes, Polygon.triangle(2.5), **QUICK)
+@pytest.fixture(params=[Polygon.triangle(2.5), Ellipse(2.0, 1.4)], ids=["triangle", "ellipse"])
+def oriented_map(near_electrodes, request) -> ForwardMap:
+    """A map of a probe whose orientation matters, for a sensor whose electrodes lie near the centre."""
+    return kept(ForwardMap.build, near_electrodes, request.param, **QUICK)
 
 
 def errors(forward_map: ForwardMap, contact: np.ndarray, rotation: np.ndarray | float = 0.0) -> np.ndarray:

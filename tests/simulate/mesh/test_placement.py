@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate import Circle, Film, Polygon, Probe, Resolution, SolveSettings, Theory
+from isocharge.simulate import Circle, Ellipse, Film, Polygon, Probe, Resolution, SolveSettings, Theory
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, template_for
@@ -22,11 +22,13 @@ COMMON = settings(derandomize=True, deadline=None, max_examples=15)
 
 @st.composite
 def probes(draw) -> Probe:
-    """Circles, rectangles, triangles and other convex polygons, rotated by any angle."""
-    kind = draw(st.sampled_from(["circle", "rectangle", "triangle", "polygon"]))
+    """Circles, ellipses, rectangles, triangles and other convex polygons, rotated by any angle."""
+    kind = draw(st.sampled_from(["circle", "ellipse", "rectangle", "triangle", "polygon"]))
     size, angle = RADIUS * 10.0 ** draw(st.floats(-3.0, -0.7)), draw(st.floats(0.0, 2.0 * np.pi))
     if kind == "circle":
         return Circle(size)
+    if kind == "ellipse":
+        return Ellipse(2.0 * size, 2.0 * size * draw(st.floats(0.2, 1.0)), angle)
     if kind == "rectangle":
         return Polygon.rectangle(2.0 * size, 2.0 * size * draw(st.floats(0.1, 1.0)), angle)
     if kind == "triangle":

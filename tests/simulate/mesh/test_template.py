@@ -1,16 +1,21 @@
-"""The mesh's topology: what Euler and counting know of it."""
+"""Topology of the mesh template: Euler characteristic, rotations and split elements."""
 
 import numpy as np
 import pytest
 
-from isocharge.simulate import Film, Polygon, Resolution
+from isocharge.simulate import Circle, Ellipse, Film, Polygon, Resolution
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.refinement import RefinedTemplate
-from isocharge.simulate.mesh.template import Template, template
+from isocharge.simulate.mesh.template import Template, template_for
 
 FILM = Film(45.0, 0.025, 3000.0, 0.34)
 RESOLUTIONS = (Resolution(2, 8, 1), Resolution(4, 16, 3, 2))
-CORNERS = (0, 3, 5)
+PROBES = {
+    "circle": Circle(1.0),
+    "triangle": Polygon.triangle(3.0),
+    "pentagon": Polygon.of(np.stack([np.cos(0.4 * np.pi * np.arange(5)), np.sin(0.4 * np.pi * np.arange(5))], axis=1)),
+    "ellipse": Ellipse(4.0, 2.0),
+}
 
 
 @pytest.fixture(params=RESOLUTIONS, ids=str)
@@ -18,13 +23,13 @@ def resolution(request) -> Resolution:
     return request.param
 
 
-@pytest.fixture(params=CORNERS, ids=lambda corners: f"{corners} corners" if corners else "circle")
+@pytest.fixture(params=PROBES.values(), ids=PROBES)
 def built(request, resolution) -> Template:
-    return template(resolution, request.param)
+    return template_for(request.param, resolution)
 
 
 @pytest.mark.parametrize("wrong", [(1, 8, 4, 0), (4, 3, 4, 0), (4, 8, 0, 0), (4, 8, 4, -1)])
-def test_impossible_resolution_is_refused(wrong):
+def test_resolution_rejects_values_out_of_range(wrong):
     with pytest.raises(ValueError, match=f"got {wrong[0]}, {wrong[1]}, {wrong[2]}, {wrong[3]}"):
         Resolution(*wrong)
 
@@ -36,22 +41,25 @@ def edges_of(mesh: Template) -> list[frozenset]:
 
 
 def test_euler_characteristic_of_a_disk(built):
-    """Vertices - edges + faces = 1, counted from the numbers that the corners of the elements got."""
+    """The number of vertices minus edges plus faces is 1, counted from the node numbers of the corners."""
     edges = set(edges_of(built))
     assert len(set().union(*edges)) - len(edges) + built.n_element == 1
 
 
-def test_a_rotation_by_a_corner_puts_elements_in_the_place_of_others(resolution):
-    """Of a triangle in the middle of the film: their nodes lie a third of a turn on."""
-    mesh = place(FILM, Polygon.triangle(4.0), (0.0, 0.0), resolution, 0.1)
-    for fold in range(3):
-        there = mesh.points[mesh.template.rotated(fold, 3)] * np.exp(-2j * np.pi * fold / 3)
-        np.testing.assert_allclose(there, mesh.points, atol=1e-12)
+@pytest.mark.parametrize(
+    ("probe", "folds"), [(Polygon.triangle(4.0), 3), (Ellipse(4.0, 2.0), 2)], ids=["triangle", "ellipse"]
+)
+def test_rotation_by_the_period_maps_elements_onto_elements(probe, folds, resolution):
+    """At the centre of the film, the nodes of a rotated element lie 1 / folds of a turn after those of the element."""
+    mesh = place(FILM, probe, (0.0, 0.0), resolution, 0.1)
+    for fold in range(folds):
+        rotated_back = mesh.points[mesh.template.rotated(fold, folds)] * np.exp(-2j * np.pi * fold / folds)
+        np.testing.assert_allclose(rotated_back, mesh.points, atol=1e-12)
 
 
-def test_points_lie_in_the_parts_of_a_split_element():
-    """Quarters of the first, one of them halved across xi; a part's coordinates lead back to the point."""
-    base = template(Resolution(2, 8, 1), 3)
+def test_refined_template_locates_points_in_split_elements():
+    """The first element is split into quarters, and one of the quarters is split across xi."""
+    base = template_for(PROBES["triangle"], Resolution(2, 8, 1))
     low = np.vstack([[(-1, -1), (0, -1), (-1, 0), (0, 0), (0.5, 0)], np.full((base.n_element - 1, 2), -1.0)])
     size = np.vstack([np.ones((3, 2)), [(0.5, 1.0)] * 2, np.full((base.n_element - 1, 2), 2.0)])
     parent = np.concatenate([np.zeros(5, dtype=int), np.arange(1, base.n_element)])

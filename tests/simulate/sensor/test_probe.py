@@ -1,4 +1,4 @@
-"""Footprints and their notation."""
+"""Notation of probes: parsing, writing and error messages."""
 
 from contextlib import suppress
 
@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate import Circle, Polygon, Probe, parse_probe
+from isocharge.simulate import Circle, Ellipse, Polygon, Probe, parse_probe
+from isocharge.simulate.sensor.probe import PROBE_HELP
 
 SIZES = st.floats(0.05, 1e6)
 COMMON = settings(derandomize=True)
@@ -19,7 +20,7 @@ HOUSE = np.array([(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 2.0), (0.0, 1.0)])
     ("text", "radius"),
     [("circle:1", 1.0), ("circle:.5", 0.5), ("circle:2.", 2.0), ("circle:5e-1", 0.5), (" circle:1.5@-12.5 ", 1.5)],
 )
-def test_circle(text, radius):
+def test_parse_probe_reads_circles(text, radius):
     assert parse_probe(text) == Circle(radius)
 
 
@@ -34,45 +35,64 @@ def test_circle(text, radius):
         ("polygon:-1,-1;1,-1;1,1;-1,1@45", np.sqrt(2) * np.array([-1j, 1, 1j, -1])),
     ],
 )
-def test_corners(text, outline):
-    """About the centroid, anticlockwise, rotated by the angle after the @."""
+def test_parse_probe_reads_the_corners_of_polygons(text, outline):
+    """Corners are relative to the centroid, anticlockwise and rotated by the angle after the @."""
     np.testing.assert_allclose(parse_probe(text).outline, outline, atol=1e-12)
 
 
-def again(probe: Probe) -> Probe:
-    """Written and read; the angle is not part of the notation."""
+def parsed_again(probe: Probe) -> Probe:
+    """Return the probe that is parsed from the notation and the angle of a probe."""
     return parse_probe(f"{probe.notation}@{np.rad2deg(probe.angle):.15g}")
 
 
 @given(width=SIZES, height=SIZES, angle=st.floats(-10.0, 10.0))
 @COMMON
-def test_round_trip(width, height, angle):
-    """To twelve digits, and stable: reading and writing again changes nothing."""
-    for probe in (Polygon.rectangle(width, height, angle), Polygon.triangle(width, angle), Circle(width)):
-        read = again(probe)
+def test_notation_round_trip(width, height, angle):
+    """Parsing the notation of a probe returns the probe to twelve digits."""
+    for probe in (
+        Polygon.rectangle(width, height, angle),
+        Polygon.triangle(width, angle),
+        Circle(width),
+        Ellipse(width, height, angle),
+    ):
+        read = parsed_again(probe)
         assert read.notation == probe.notation
         assert read.reach == pytest.approx(probe.reach, rel=1e-11)
-        if isinstance(probe, Polygon):
-            np.testing.assert_allclose(read.outline, probe.outline, rtol=0.0, atol=1e-10 * probe.reach)
+        np.testing.assert_allclose(read.outline, probe.outline, rtol=0.0, atol=1e-10 * probe.reach)
 
 
-def test_notation_is_in_mm():
-    probes = Circle(0.3), Polygon.rectangle(4.0, 2.0, 1.0), Polygon.triangle(4.0), parse_probe("polygon:0,0;3,0;0,3")
-    three = "polygon:-1.0,-1.0;2.0,-1.0;-1.0,2.0"
-    assert [probe.notation for probe in probes] == ["circle:0.3", "rectangle:4.0x2.0", "triangle:4.0", three]
+@pytest.mark.parametrize(
+    ("probe", "notation"),
+    [
+        (Circle(0.3), "circle:0.3"),
+        (Ellipse(4.0, 2.0, 1.0), "ellipse:4.0x2.0"),
+        (Polygon.rectangle(4.0, 2.0, 1.0), "rectangle:4.0x2.0"),
+        (Polygon.triangle(4.0), "triangle:4.0"),
+        (parse_probe("polygon:0,0;3,0;0,3"), "polygon:-1.0,-1.0;2.0,-1.0;-1.0,2.0"),
+    ],
+    ids=["circle", "ellipse", "rectangle", "triangle", "polygon"],
+)
+def test_notation_is_in_mm(probe, notation):
+    assert probe.notation == notation
+
+
+@pytest.mark.parametrize("name", ["circle:RADIUS", "ellipse:WIDTHxHEIGHT", "rectangle:WIDTHxHEIGHT", "triangle:SIDE"])
+def test_help_text_lists_every_probe_notation(name):
+    assert name in PROBE_HELP
 
 
 @pytest.mark.parametrize(
     "text",
     ["", "circle:", "circle:1x2", "circle:1.0mm", "Circle:1", "circle:1@", "circle:nan", "1.0",
-     "rectangle:4", "rectangle:4X2", "triangle:4x2", "polygon:1,2", "polygon:0,0;1,0;1", "square:1"],
+     "rectangle:4", "rectangle:4X2", "triangle:4x2", "polygon:1,2", "polygon:0,0;1,0;1",
+     "ellipse:4", "ellipse:4x2x1", "square:1"],
 )  # fmt: skip
-def test_wrong_notation_is_shown(text):
-    with pytest.raises(SceneError, match=f"probe '{text}': expected 'circle:R', 'rectangle:WxH', 'triangle:S'"):
+def test_error_message_shows_the_wrong_notation(text):
+    with pytest.raises(SceneError, match=f"probe '{text}': expected 'circle:RADIUS', 'rectangle:WIDTHxHEIGHT',"):
         parse_probe(text)
 
 
-NEARLY = st.from_regex(r"(circle|rectangle|triangle|polygon):[0-9.,;x@e+-]{0,14}", fullmatch=True)
+NEARLY = st.from_regex(r"(circle|ellipse|rectangle|triangle|polygon):[0-9.,;x@e+-]{0,14}", fullmatch=True)
 
 
 @given(text=st.text(max_size=12) | NEARLY)
@@ -107,31 +127,12 @@ CORNERS = "expected 3 to 64 corners"
         (Polygon.of, np.stack([np.cos(np.arange(65) / 11), np.sin(np.arange(65) / 11)], axis=1), CORNERS),
         (Polygon, tuple(map(tuple, HOUSE.tolist())), r"corners relative to their centroid, got .*; use Polygon\.of"),
         (Polygon.triangle(1.0).rotated, np.nan, "probe angle: expected a finite number, got nan"),
+        (Ellipse(2.0, 1.0).rotated, np.nan, "probe angle: expected a finite number, got nan"),
+        (parse_probe, "ellipse:0x2", "^probe width: expected at least 0.001 mm, got 0 mm"),
+        (parse_probe, "ellipse:4x1e999", "^probe height: expected at least 0.001 mm, got inf mm"),
     ],
 )
-def test_impossible_probes(make, given, message):
-    """Sizes in metres among them: the message names the likely value."""
+def test_impossible_probes_raise_scene_error(make, given, message):
+    """For sizes that are probably in metres, the message gives the size in mm."""
     with pytest.raises(SceneError, match=message):
         make(given)
-
-
-@pytest.mark.parametrize(
-    ("probe", "area", "reach", "period"),
-    [
-        (Circle(2.0), 4.0 * np.pi, 2.0, 0.0),
-        (Polygon.rectangle(4.0, 2.0), 8.0, np.sqrt(5.0), np.pi),
-        (Polygon.rectangle(2.0, 2.0), 4.0, np.sqrt(2.0), np.pi / 2),
-        (Polygon.triangle(2.0), np.sqrt(3.0), 2.0 / np.sqrt(3.0), 2 * np.pi / 3),
-        (Polygon.of(HOUSE), 3.0, None, 2 * np.pi),
-    ],
-)
-def test_measures(probe, area, reach, period):
-    """Closed forms; a rotation changes none of them, one by the period not even the outline, as a set of corners."""
-    assert (probe.area, probe.period) == pytest.approx((area, period), rel=1e-12)
-    assert reach is None or probe.reach == pytest.approx(reach, rel=1e-12)
-    rotated = probe.rotated(0.3)
-    assert (rotated.area, rotated.reach, rotated.period) == (probe.area, probe.reach, probe.period)
-    if isinstance(probe, Polygon):
-        full = probe.rotated(probe.period).outline
-        assert np.abs(full[:, None] - probe.outline).min(axis=0).max() < 1e-12 * probe.reach
-        np.testing.assert_allclose(rotated.outline, probe.outline * np.exp(0.3j), atol=1e-15)

@@ -4,13 +4,19 @@ import numpy as np
 import pytest
 from tests.simulate.conftest import assembled
 
-from isocharge.simulate import Resolution
+from isocharge.simulate import Circle, Ellipse, Polygon, Resolution
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.mesh.template import Template, template
+from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.solver.assembly import Assembly
 
-SMALL = ((Resolution(2, 8, 1), 0), (Resolution(3, 8, 2, 1), 0), (Resolution(3, 8, 1), 3), (Resolution(2, 8, 1, 2), 4))
+SMALL = (
+    (Resolution(2, 8, 1), Circle(1.0)),
+    (Resolution(3, 8, 2, 1), Circle(1.0)),
+    (Resolution(3, 8, 1), Polygon.triangle(3.0)),
+    (Resolution(2, 8, 1, 2), Polygon.rectangle(4.0, 2.0)),
+    (Resolution(2, 8, 1), Ellipse(4.0, 2.0)),
+)
 
 
 def dense_solution(mesh: Template, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -35,9 +41,9 @@ def random_matrices(mesh: Template, components: int, seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("components", [3, 4])
-@pytest.mark.parametrize(("resolution", "corners"), SMALL, ids=str)
-def test_solution_is_the_dense_one(resolution, corners, components):
-    mesh = template(resolution, corners)
+@pytest.mark.parametrize(("resolution", "probe"), SMALL, ids=str)
+def test_sparse_solution_equals_dense_solution(resolution, probe, components):
+    mesh = template_for(probe, resolution)
     matrix, right = random_matrices(mesh, components, 1), np.random.default_rng(1).standard_normal((mesh.n_node, 3))
     solution = Assembly(mesh, components).factor(matrix).solve(right)
     np.testing.assert_allclose(solution, dense_solution(mesh, matrix, right), atol=1e-12)
@@ -45,7 +51,7 @@ def test_solution_is_the_dense_one(resolution, corners, components):
 
 
 @pytest.mark.parametrize("bending", [0.0, 1e-7, 1e-3, 10.0])
-def test_tangent_of_a_film_is_solved_like_the_dense_one(mesh, bending):
+def test_sparse_solution_with_the_tangent_of_a_film_equals_dense_solution(mesh, bending):
     """Badly scaled and, with bending, indefinite: a matrix that is factorised without pivoting."""
     elastic = ElasticFilm(mesh.geometry, DimensionlessGroups(0.01, 1.0, 5.0 if bending == 0.0 else 0.0, bending, 0.34))
     field = 0.01 * mesh.random_field(1)

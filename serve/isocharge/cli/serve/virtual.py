@@ -12,7 +12,8 @@ import numpy as np
 import typer
 
 from isocharge.cli.shared.forward_maps import SLACK
-from isocharge.cli.shared.options import ProbeOption, SensorArgument
+from isocharge.cli.shared.options import SensorArgument
+from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import announce, say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import film_charges, measuring, random_script
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS

@@ -9,18 +9,11 @@ import typer
 from isocharge.common.errors import InputError
 from isocharge.common.number_text import number_of
 
-PROBE_HELP = (
-    "Footprint, mm: circle:RADIUS, rectangle:WIDTHxHEIGHT, triangle:SIDE or polygon:X,Y;X,Y;...; @DEGREES at the end "
-    "turns it."
-)
-
 SensorArgument = Annotated[
     str, typer.Argument(metavar="SENSOR", help="Name of a built-in sensor, or a TOML file that describes one.")
 ]
 
 ModelArgument = Annotated[str, typer.Argument(metavar="MODEL", help="Name of a model, or path of a model folder.")]
-
-ProbeOption = Annotated[str, typer.Option("--probe", metavar="SHAPE", help=PROBE_HELP)]
 
 ForceOption = Annotated[float, typer.Option("--force", metavar="N", help="Force of the press, N; positive pushes.")]
 

@@ -10,11 +10,11 @@ from isocharge.cli.shared.options import (
     FreshOption,
     NewFolderOption,
     NoiseOption,
-    ProbeOption,
     SensorArgument,
     StressLimitOption,
     WorkersOption,
 )
+from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError

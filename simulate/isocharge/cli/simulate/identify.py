@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from isocharge.cli.shared.options import ForceRangeOption, JsonOption, NoiseOption, ProbeOption, SensorArgument
+from isocharge.cli.shared.options import ForceRangeOption, JsonOption, NoiseOption, SensorArgument
+from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json, shown_progress
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import InputError

@@ -5,7 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from isocharge.cli.shared.options import ForceOption, JsonOption, ProbeOption, SensorArgument, position_of
+from isocharge.cli.shared.options import ForceOption, JsonOption, SensorArgument, position_of
+from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json
 from isocharge.common.errors import InputError
 from isocharge.simulate import Equilibrium, SolveSettings, load_sensor, parse_probe, press, touch_charge

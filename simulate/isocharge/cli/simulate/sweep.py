@@ -10,7 +10,6 @@ import typer
 
 from isocharge.cli.shared.forward_maps import caution_of_stress, executor_for, shown_run, sweep_radius
 from isocharge.cli.shared.options import (
-    PROBE_HELP,
     ClusterOption,
     ForceRangeOption,
     FreshOption,
@@ -28,6 +27,7 @@ from isocharge.common.resumable_run import refuse_finished
 from isocharge.serve import MeasuredPresses, write_presses
 from isocharge.serve.prediction.measured_presses import MOST_ROWS
 from isocharge.simulate import Dataset, Sweep, load_sensor, parse_probe, read_dataset, run_sweep
+from isocharge.simulate.sensor.probe import PROBE_HELP
 
 TABLES = (".csv", ".parquet")
 """Ends of the names of tables of presses."""

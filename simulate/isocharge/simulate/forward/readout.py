@@ -18,14 +18,8 @@ import numpy as np
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import SensorError
 from isocharge.simulate.numerics.interpolation import gauss_line, gauss_square
-from isocharge.simulate.numerics.polygon import (
-    area_in_disk,
-    gauss_polygon,
-    gauss_quadrilateral,
-    shared_area,
-    to_complex,
-)
-from isocharge.simulate.sensor.probe import Circle, Probe
+from isocharge.simulate.numerics.polygon import gauss_polygon, gauss_quadrilateral
+from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import LONGEST_PART, Electrode, Readout, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
 
@@ -142,15 +136,10 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     covered = []
     for electrode, (centre, reach) in zip(sensor.electrodes, sensor.discs, strict=True):
         near = np.flatnonzero(np.abs(complex(*at) - centre) < reach + probe.reach)
-        covered.append(sum(_covered(sensor.calibration.place(electrode.parts[i]), probe, complex(*at)) for i in near))
+        covered.append(
+            sum(probe.covered_area(sensor.calibration.place(electrode.parts[i]), complex(*at)) for i in near)
+        )
     return np.asarray(-0.5 * sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered))
-
-
-def _covered(corners: Array, probe: Probe, at: complex) -> float:
-    """Area of a part of an electrode under a footprint, mm^2."""
-    if isinstance(probe, Circle):
-        return float(area_in_disk(to_complex(corners), at, probe.radius))
-    return shared_area(to_complex(corners), at + probe.outline)
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:

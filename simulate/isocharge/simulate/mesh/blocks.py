@@ -1,15 +1,19 @@
-"""The blocks of the mesh: one topology for all positions, thicknesses and forces.
+"""The elements of the mesh and their adjacency, which do not depend on the position of the probe or the film.
 
-Seen from the probe, the mesh is a footprint's worth of blocks inside a circle and rings from that circle to the rim:
+The innermost circle of the mesh encloses the footprint. The mesh consists of three parts:
 
-    a polygon of n corners  is split into n quadrilaterals about its hub,
-    2 n blocks              lie between the polygon's half edges and the circle,
-    rings of 2 n sectors    carry on to the rim, the last ones thin where bending needs it.
+    1. The core polygon (n corners) is divided into n quadrilaterals that meet at its centroid.
+    2. 2 n blocks, or two layers of 2 n blocks, lie between the core polygon and the innermost circle.
+    3. Rings of 2 n sectors lie between the innermost circle and the rim of the film. The last rings are thin if the
+    film
+       resists bending.
 
-A circular footprint is the same with a virtual square as its polygon and the circle as its edge; since it is
-symmetric about the line through the film's centre, only the upper half is meshed if the film is, too. Each block may
-be subdivided.
-`Placement` says where the blocks lie, `Template` numbers their nodes.
+A polygonal footprint is its own core polygon. A circular footprint has a virtual square as its core polygon, and its
+boundary is the innermost circle. Any other curved footprint has a core polygon, one layer of blocks up to its boundary
+and a second layer up to the innermost circle. Each block can be subdivided.
+
+A press by a circular probe is symmetric about the line through the centre of the film, so only the upper half is meshed
+if the film is symmetric too. `Placement` computes the positions of the elements, and `Template` numbers their nodes.
 """
 
 from dataclasses import asdict, dataclass
@@ -20,20 +24,19 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.numerics.interpolation import lobatto_nodes
-
-SQUARE = 4
-"""Corners of the virtual polygon inside a circular footprint."""
+from isocharge.simulate.sensor.probe_shapes.base import FootprintTopology
 
 
 @dataclass(frozen=True)
 class Resolution:
-    """How fine the mesh is.
+    """Fineness of the mesh.
 
     Attributes:
         order: Polynomial order of the elements.
-        around: Elements round the circle; a polygon of n corners takes the nearest multiple of 2 n.
-        rings: Rings between the circle and the rim, in equal steps of the logarithm.
-        rim: Thin rings at the rim, for bending's boundary layer.
+        around: Number of elements round the innermost circle. A core polygon of n corners takes the nearest multiple of
+            2 n.
+        rings: Number of rings between the innermost circle and the rim, in equal steps of the logarithm of the radius.
+        rim: Number of thin rings at the rim, which resolve the boundary layer of bending.
     """
 
     order: int = 4
@@ -43,7 +46,7 @@ class Resolution:
 
     @property
     def description(self) -> str:
-        """The four numbers as a dataset's manifest names them: "order 4, around 8, rings 5, rim 0"."""
+        """The four numbers as in the manifest of a dataset: "order 4, around 8, rings 5, rim 0"."""
         return ", ".join(f"{name} {value}" for name, value in asdict(self).items())
 
     def __post_init__(self) -> None:
@@ -55,107 +58,147 @@ class Resolution:
 
 
 class Blocks:
-    """The elements and how they join; nothing in it depends on where the probe is.
+    """The elements of the mesh for one resolution and one topology of the footprint.
 
-    Element e has (order + 1)^2 nodes in tensor order (xi fast, outwards; eta anticlockwise); local coordinates lie in
-    [-1, 1]^2. Elements come as quadrilaterals of the polygon, blocks up to the circle, rings from the inside out.
+    An element has (order + 1)^2 nodes in tensor order: the local coordinate xi, which points outwards, changes fastest;
+    the local coordinate eta points anticlockwise. Both lie in [-1, 1]. The elements are ordered from the inside out:
+    the quadrilaterals of the core polygon, the layers up to the innermost circle, the rings.
 
     Attributes:
-        resolution: How fine.
-        corners: Corners of the probe's polygon, or 0 for a circle.
-        half: Whether only the upper half is meshed.
-        n_corner: Corners of the polygon, the virtual one of a circle included.
-        split: Elements along half an edge of the polygon.
-        n_meshed: Corners of the polygon that are meshed.
-        n_sector: Elements round the circle.
-        n_quad: Elements of the polygon.
-        n_inner: Elements inside the circle.
-        n_ring: Rings between the circle and the rim.
-        n_element: All elements.
-        xi: Local coordinate of an element's nodes, shape ((order + 1)^2,).
-        eta: Local coordinate of an element's nodes, shape ((order + 1)^2,).
+        resolution: Fineness of the mesh.
+        topology: Number and kind of the blocks in and around the footprint.
+        half: Whether only the upper half of the film is meshed.
+        n_corner: Number of corners of the core polygon.
+        split: Number of elements along half an edge of the core polygon.
+        n_meshed: Number of corners of the core polygon in the meshed part of the film.
+        n_sector: Number of elements round the innermost circle.
+        n_quad: Number of elements in the core polygon.
+        n_layer: Number of layers between the core polygon and the innermost circle.
+        n_inner: Number of elements inside the innermost circle.
+        n_ring: Number of rings between the innermost circle and the rim.
+        n_element: Number of all elements.
+        xi: Local coordinate xi of the nodes of an element, shape ((order + 1)^2,).
+        eta: Local coordinate eta of the nodes of an element, shape ((order + 1)^2,).
     """
 
-    def __init__(self, resolution: Resolution, corners: int, whole: bool = False) -> None:
+    def __init__(self, resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> None:
+        """Count the elements.
+
+        Args:
+            resolution: Fineness of the mesh.
+            topology: Number and kind of the blocks in and around the footprint.
+            whole: Whether to mesh the whole film although the footprint is symmetric.
+        """
         self.resolution = resolution
-        self.corners = corners
-        self.half = corners == 0 and not whole
-        self.n_corner = corners or SQUARE
+        self.topology = topology
+        self.half = topology.fills_circle and not whole
+        self.n_corner = topology.n_corner
         self.split = max(1, round(resolution.around / (2 * self.n_corner)))
         self.n_meshed = self.n_corner // 2 if self.half else self.n_corner
         self.n_sector = 2 * self.n_meshed * self.split
         self.n_quad = self.n_meshed * self.split**2
-        self.n_inner = self.n_quad + self.n_sector
+        self.n_layer = 2 if topology.is_curved and not topology.fills_circle else 1
+        self.n_inner = self.n_quad + self.n_layer * self.n_sector
         self.n_ring = resolution.rings + resolution.rim
         self.n_element = self.n_inner + self.n_sector * self.n_ring
         line = lobatto_nodes(resolution.order)
         xi, eta = np.meshgrid(line, line, indexing="xy")
-        self.xi, self.eta = xi.ravel(), eta.ravel()
+        self.xi = xi.ravel()
+        self.eta = eta.ravel()
 
     @property
     def footprint(self) -> slice | Integers:
-        """The elements that fill the footprint."""
-        return slice(0, self.n_quad if self.corners else self.n_inner)
+        """Indices of the elements that fill the footprint."""
+        if self.topology.is_curved:
+            return slice(0, self.n_quad + self.n_sector)
+        return slice(0, self.n_quad)
 
     @property
     def copies(self) -> int:
-        """How many copies of the template make up the film."""
+        """Number of copies of the mesh that cover the whole film."""
         return 2 if self.half else 1
 
     @cached_property
-    def boundary(self) -> Array:
-        """Points along the polygon's boundary as weights of its corners and hub, shape (n_sector + 1, n_corner + 1).
+    def boundary_parameter(self) -> Array:
+        """Boundary parameters of a curved footprint at the sides of the sectors, shape (n_sector + 1,)."""
+        return np.linspace(0.0, 2.0 * np.pi / self.copies, self.n_sector + 1)
 
-        From the middle of the edge before the first corner, anticlockwise.
+    @cached_property
+    def boundary(self) -> Array:
+        """Points along the edges of the core polygon as weights of its corners and its centroid.
+
+        Shape (n_sector + 1, n_corner + 1). The points go anticlockwise from the middle of the edge before the first
+        corner.
         """
-        unit = np.eye(self.n_corner + 1)[:-1]
-        middle = 0.5 * (unit + np.roll(unit, -1, axis=0))
-        stops = [middle[-1]]
+        corners = np.eye(self.n_corner + 1)[:-1]
+        middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
+        stops = [middles[-1]]
         for i in range(self.n_meshed):
-            stops += [unit[i], middle[i]]
+            stops += [corners[i], middles[i]]
         share = np.arange(self.split)[:, None] / self.split
-        parts = [a + share * (b - a) for a, b in pairwise(stops)]
+        parts = [start + share * (end - start) for start, end in pairwise(stops)]
         return np.concatenate([*parts, stops[-1][None]])
 
     @cached_property
     def straight(self) -> Array:
-        """Corners (a, b, c, d) of the elements inside the circle as weights of the polygon's corners and its hub.
+        """Corners (a, b, c, d) of the elements inside the innermost circle, shape (n_inner, 4, n_corner + 1).
 
-        The element is (1 - v) (a + t (b - a)) + v (c + t (d - c)); blocks up to the circle have their outer side on it
-        and no c and d of their own: zeros stand for them. Shape (n_inner, 4, n_corner + 1).
+        The corners are weights of the corners of the core polygon and its centroid. An element with straight sides is
+        (1 - v) (a + t (b - a)) + v (c + t (d - c)) with v and t from 0 to 1. The weights of corners on a curved side
+        are zero, and `Placement` adds the curved side.
         """
-        k, hub = self.split, np.eye(self.n_corner + 1)[-1]
-        parts = []
-        for i in range(self.n_meshed):
-            before, corner, after = (
-                self.boundary[2 * k * i],
-                self.boundary[2 * k * i + k],
-                self.boundary[2 * k * (i + 1)],
-            )
-            grid = np.array(
-                [[_bilinear(hub, after, before, corner, v / k, t / k) for t in range(k + 1)] for v in range(k + 1)]
-            )
-            parts += [
-                [grid[v, t], grid[v, t + 1], grid[v + 1, t], grid[v + 1, t + 1]] for v in range(k) for t in range(k)
-            ]
-        void = np.zeros(self.n_corner + 1)
-        parts += [[a, b, void, void] for a, b in pairwise(self.boundary)]
-        return np.array(parts)
+        quads = [
+            self._quad(corner, v, t)
+            for corner in range(self.n_meshed)
+            for v in range(self.split)
+            for t in range(self.split)
+        ]
+        zero = np.zeros(self.n_corner + 1)
+        first_layer = [[a, b, zero, zero] for a, b in pairwise(self.boundary)]
+        second_layer = [[zero] * 4] * (self.n_sector * (self.n_layer - 1))
+        return np.array(quads + first_layer + second_layer)
+
+    def _quad(self, corner: int, v: int, t: int) -> list[Array]:
+        """Return the corners (a, b, c, d) of one element of the core polygon, each of shape (n_corner + 1,).
+
+        Args:
+            corner: Index of the corner of the core polygon whose quadrilateral contains the element.
+            v: Index of the element along the side from the centroid to the middle of the edge after the corner.
+            t: Index of the element along the side from the centroid to the middle of the edge before the corner.
+        """
+        centroid = np.eye(self.n_corner + 1)[-1]
+        first = 2 * self.split * corner
+        before = self.boundary[first]
+        at_corner = self.boundary[first + self.split]
+        after = self.boundary[first + 2 * self.split]
+        return [
+            _bilinear(centroid, after, before, at_corner, (v + dv) / self.split, (t + dt) / self.split)
+            for dv in (0, 1)
+            for dt in (0, 1)
+        ]
 
     def rotated(self, fold: int, folds: int) -> Integers:
-        """For each element, the one that takes its place when the probe is rotated by fold / folds of a full turn."""
+        """Return the element that takes the place of each element after fold / folds of a full turn of the probe."""
         shift = fold * self.n_corner // folds
         quads = np.arange(self.n_quad).reshape(self.n_meshed, -1)
         sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)
-        return np.concatenate(
-            [np.roll(quads, -shift, axis=0).ravel(), np.roll(sectors, -2 * self.split * shift, axis=1).ravel()]
-        )
+        rotated_quads = np.roll(quads, -shift, axis=0)
+        rotated_sectors = np.roll(sectors, -2 * self.split * shift, axis=1)
+        return np.concatenate([rotated_quads.ravel(), rotated_sectors.ravel()])
 
-    def into_meshed_half(self, film: Complexes) -> tuple[Complexes, Booleans]:
-        """Film points where they lie in the meshed part, and which of them were mirrored to get there."""
-        mirrored = (film.imag < 0.0) & self.half
-        return np.where(self.half, film.real + 1j * np.abs(film.imag), film), mirrored
+    def into_meshed_half(self, points: Complexes) -> tuple[Complexes, Booleans]:
+        """Reflect film points into the meshed part of the film.
+
+        Args:
+            points: Film points x + iy, any shape.
+
+        Returns:
+            The points in the meshed part, and whether each of them was reflected. Both have the shape of `points`.
+        """
+        mirrored = (points.imag < 0.0) & self.half
+        return np.where(self.half, points.real + 1j * np.abs(points.imag), points), mirrored
 
 
 def _bilinear(a: Array, b: Array, c: Array, d: Array, v: float, t: float) -> Array:
+    """Return the point (v, t) of the quadrilateral with the corners a, b (v = 0) and c, d (v = 1)."""
     return (1.0 - v) * (a + t * (b - a)) + v * (c + t * (d - c))

@@ -1,4 +1,7 @@
-"""The disk automorphism of `placement`: its parameters for a probe, and how sectors and rings are graded on it."""
+"""Parameters of the disk automorphism of `placement`, and the grading of sectors and rings.
+
+All lengths are in film radii. Angles are in radians.
+"""
 
 import numpy as np
 
@@ -6,90 +9,167 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
 
 CLEARANCE = 0.4
-"""Gap between a polygon's farthest corner and the circle round it, in units of that corner's distance."""
+"""Gap between the farthest point of a footprint and the circle that encloses it, in units of that point's distance."""
 
-LARGEST_TURN = 0.2
-"""Largest angle, rad, between a sector's side and the ray through its corner: clustered corners would fold more."""
+MAX_TURN = 0.2
+"""Largest angle between the side of a sector and the ray through its corner, rad. With larger angles, elements at
+corners that lie close together would fold."""
 
-INNER_SHARE, OUTER_SHARE = 0.25, 0.35
-"""Next to the rim: the gap between polygon and circle, and that between circle and rim, over that between polygon and
-rim, dimensionless."""
+INNER_GAP_SHARE = 0.25
+"""Largest gap between the footprint and the enclosing circle, over the gap between the footprint and the rim."""
+
+OUTER_GAP_SHARE = 0.35
+"""Smallest gap between the enclosing circle and the rim, over the gap between the footprint and the rim."""
 
 GRADING = 0.65
-"""Share of the map's stretching round the rim that the sectors take up there: 0 none, 1 all."""
+"""Share of the stretching of the conformal map along the rim that the sectors compensate: 0 none, 1 all."""
+
+BISECTION_STEPS = 40
+"""Number of bisection steps for the centre of the enclosing circle."""
 
 
-def automorphism_onto(at: Array, radius: Array) -> tuple[Array, Array]:
-    """(c, rho) that carry |z| = rho onto the circle of this centre and radius (film radius one); see `placement`."""
-    outer, inner = np.arctanh(at + radius), np.arctanh(at - radius)
+def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
+    """Compute the disk automorphism that maps the circle |z| = rho onto a given circle; see `placement`.
+
+    Args:
+        centre: Centre of the circle on the x axis, any shape, in film radii.
+        radius: Radius of the circle, same shape, in film radii.
+
+    Returns:
+        The parameter c of the map and rho, each of the shape of `centre`.
+    """
+    outer = np.arctanh(centre + radius)
+    inner = np.arctanh(centre - radius)
     return np.tanh(0.5 * (outer + inner)), np.tanh(0.5 * (outer - inner))
 
 
-def enclosing_circle(corners: Complexes, at: Array) -> tuple[Array, Array]:
-    """Centre and radius of a circle inside the film round each polygon: about the centroid if it fits."""
-    gap = 1.0 - np.abs(corners).max(axis=-1)
+def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]:
+    """Compute a circle on the film that encloses each footprint at a distance.
+
+    The centre is the centroid if that circle keeps its distance from the rim. Otherwise the centre moves towards the
+    centre of the film.
+
+    Args:
+        outline: Points along the boundary of each footprint, shape (..., n), in film radii.
+        centroid: Distance of the centroid from the centre of the film, on the x axis, shape (...), in film radii.
+
+    Returns:
+        Centre (on the x axis) and radius of the circles, each of shape (...), in film radii.
+    """
+    rim_gap = 1.0 - np.abs(outline).max(axis=-1)
+    largest_extent = 1.0 - OUTER_GAP_SHARE * rim_gap
 
     def radius(centre: Array) -> Array:
-        reach = np.abs(corners - centre[..., None]).max(axis=-1)
-        return np.asarray(reach + np.minimum(CLEARANCE * reach, INNER_SHARE * gap))
+        reach = np.abs(outline - centre[..., None]).max(axis=-1)
+        return np.asarray(reach + np.minimum(CLEARANCE * reach, INNER_GAP_SHARE * rim_gap))
 
-    fits = at + radius(at) <= 1.0 - OUTER_SHARE * gap
+    fits = centroid + radius(centroid) <= largest_extent
     if np.all(fits):
-        return at, radius(at)
-    low, high = np.zeros(at.shape), at.copy()
-    for _ in range(40):
+        return centroid, radius(centroid)
+
+    low = np.zeros(centroid.shape)
+    high = centroid.copy()
+    for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
-        inside = middle + radius(middle) <= 1.0 - OUTER_SHARE * gap
-        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
-    centre = np.where(fits, at, low)
+        inside = middle + radius(middle) <= largest_extent
+        low = np.where(inside, middle, low)
+        high = np.where(inside, high, middle)
+    centre = np.where(fits, centroid, low)
     return centre, radius(centre)
 
 
-def sector_angles(blocks: Blocks, corners: Complexes, centre: Array, radius: Array, pull: Array) -> Array:
-    """Angles on the template's circle, where rays from the polygon's hub meet it.
+def sector_angles(
+    blocks: Blocks, stops: Complexes, reach: Array, centroid: Array, centre: Array, radius: Array, pull: Array
+) -> Array:
+    """Compute the angles of the sides of the sectors on the innermost circle.
 
-    Their directions lie between those of the polygon's corners and an even spread. The narrower the gap between polygon
-    and circle, the nearer they are to the corners: else elements would fold. `pull` is c rho.
+    Rays from the centroid of the footprint meet the circle at these angles. The directions of the rays lie between the
+    directions of the stops and an even distribution. The narrower the gap between the footprint and the circle, the
+    closer the rays are to the stops, because elements would fold otherwise.
+
+    Args:
+        blocks: The elements.
+        stops: Points on the inner side of the outermost layer of blocks: at the corners of the footprint and half-way
+            between them, shape (..., 2 * n_meshed + 1), in film radii.
+        reach: Distance of the farthest point of the inner side from the centre of the circle, shape (...), in film
+            radii.
+        centroid: Position of the centroid on the x axis, shape (...), in film radii.
+        centre: Centre of the circle on the x axis, shape (...), in film radii.
+        radius: Radius of the circle, shape (...), in film radii.
+        pull: Product of the parameters c and rho of the conformal map, shape (...).
+
+    Returns:
+        Angles in the template plane, increasing, shape (..., n_sector + 1).
     """
-    hub = corners[..., -1:]
-    stops = corners @ blocks.boundary[:: blocks.split].T
-    angle = np.unwrap(np.angle(stops - hub), axis=-1)
-    even = np.linspace(0.0, 2.0 * np.pi / blocks.copies, angle.shape[-1])
-    even = even + np.mean(angle[..., :-1] - even[:-1], axis=-1)[..., None]
-    reach = np.abs(corners - centre[..., None]).max(axis=-1)
+    hub = centroid[..., None] + 0j
+    stop_angle = np.unwrap(np.angle(stops - hub), axis=-1)
+    even_angle = np.linspace(0.0, 2.0 * np.pi / blocks.copies, stop_angle.shape[-1])
+    even_angle = even_angle + np.mean(stop_angle[..., :-1] - even_angle[:-1], axis=-1)[..., None]
     evenness = 0.5 * np.minimum((radius / reach - 1.0) / CLEARANCE, 1.0)[..., None]
-    mixed = angle + LARGEST_TURN * np.tanh(evenness * (even - angle) / LARGEST_TURN)
+    mixed = stop_angle + MAX_TURN * np.tanh(evenness * (even_angle - stop_angle) / MAX_TURN)
+
     share = np.arange(blocks.split) / blocks.split
     steps = (mixed[..., :-1, None] + share * np.diff(mixed, axis=-1)[..., None]).reshape(*mixed.shape[:-1], -1)
     ray = np.exp(1j * np.concatenate([steps, mixed[..., -1:]], axis=-1))
-    away = hub - centre[..., None]
-    along = (away * np.conj(ray)).real
-    point = away + ray * (np.sqrt(along**2 + radius[..., None] ** 2 - np.abs(away) ** 2) - along)
+
+    # The intersections of the rays from the centroid with the circle, relative to the centre of the circle.
+    offset = hub - centre[..., None]
+    along = (offset * np.conj(ray)).real
+    distance = np.sqrt(along**2 + radius[..., None] ** 2 - np.abs(offset) ** 2) - along
+    point = offset + ray * distance
     first = np.angle(point[..., :1])
-    rotated = np.cumsum(np.mod(np.angle(point[..., 1:] / point[..., :-1]), 2.0 * np.pi), axis=-1)
-    return stretch_angles(np.concatenate([first, first + rotated], axis=-1), (1.0 + pull) / (1.0 - pull))
+    turned = np.cumsum(np.mod(np.angle(point[..., 1:] / point[..., :-1]), 2.0 * np.pi), axis=-1)
+    film_angle = np.concatenate([first, first + turned], axis=-1)
+    return stretch_angles(film_angle, (1.0 + pull) / (1.0 - pull))
 
 
 def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
-    """Angles on the rim, from those on the circle: moved towards pi, where the map compresses the far side of the film.
+    """Compute the angles of the sides of the sectors on the rim.
 
-    Even spacing on the circle already does some of it.
+    The sides move towards the angle pi, where the conformal map compresses the far side of the film. Even spacing on
+    the innermost circle already moves them part of the way.
+
+    Args:
+        angle: Angles on the innermost circle, in the template plane, shape (..., n_sector + 1).
+        c: Parameter of the conformal map, shape (...).
+        rho: Radius of the innermost circle in the template plane, shape (...).
+
+    Returns:
+        Angles in the template plane, shape (..., n_sector + 1).
     """
     stretch = ((1.0 + c) / (1.0 - c)) ** GRADING * (1.0 - c * rho) / (1.0 + c * rho)
     return stretch_angles(angle, np.maximum(stretch, 1.0))
 
 
 def stretch_angles(angle: Array, factor: Array) -> Array:
-    """Angles whose half has its tangent multiplied: what the map does to angles on a circle about its centre.
+    """Multiply the tangent of half of each angle by a factor, as the conformal map does on a circle about its centre.
 
-    |z| = rho is carried onto its circle with the factor (1 - c rho) / (1 + c rho), rho = 1 onto the rim.
+    The map carries |z| = rho onto its image with the factor (1 - c rho) / (1 + c rho), and the rim is the case rho = 1.
+
+    Args:
+        angle: Angles, shape (..., n).
+        factor: Factor, shape (...).
+
+    Returns:
+        Angles in the same turn as the given ones, shape (..., n).
     """
-    turns = 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
-    return np.asarray(turns + 2.0 * np.arctan(factor[..., None] * np.tan(0.5 * (angle - turns))))
+    full_turns = 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
+    return np.asarray(full_turns + 2.0 * np.arctan(factor[..., None] * np.tan(0.5 * (angle - full_turns))))
 
 
 def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
-    """Edges of the rings: even steps, then thin rings, each a third of what is left of the layer."""
+    """Compute the depths of the edges of the rings: 0 on the innermost circle, 1 on the rim.
+
+    The edges follow in even steps, then at the thin rings, each of which is a third as wide as the one before.
+
+    Args:
+        resolution: Fineness of the mesh.
+        rho: Radius of the innermost circle in the template plane, shape (...).
+        layer: Width of all thin rings together, in the template plane, shape (...).
+
+    Returns:
+        Shape (..., n_ring + 1).
+    """
     even = np.linspace(0.0, 1.0, resolution.rings + 1)
     if resolution.rim == 0:
         return np.broadcast_to(even, (*rho.shape, even.size))

@@ -1,22 +1,23 @@
-"""Where the mesh lies: a conformal map of the disk carries the rings, straight blocks fill the footprint.
+"""Positions of the elements on the film: a conformal map for the rings, and blended blocks in and around the footprint.
 
 The disk automorphism
 
     Z = (z + c) / (1 + c z),   0 <= c < 1,
 
-carries rings about the template's centre onto the film (Z in units of the film's radius, the probe on the positive x
-axis), circles to circles, so that with
+maps rings about the origin of the template plane (z) onto the film (Z, in film radii, with the probe on the positive x
+axis). It maps circles to circles. With
 
     al = (atanh(p + R) + atanh(p - R)) / 2,   be = (atanh(p + R) - atanh(p - R)) / 2,   c = tanh al,   rho = tanh be
 
-the circle |z| = rho becomes the circle of radius R about p, exactly. Inside that circle blocks are blended between the
-straight edges of the footprint's polygon and the circle, on the film itself, so that the edges stay straight and the
-load is integrated over the footprint and nothing else. Nodal fields are smooth functions of the position, and points
-of the film are found in the mesh by closed formulas and, inside the circle, a few steps of Newton.
+the circle |z| = rho becomes exactly the circle of radius R about p. Inside this circle, the blocks are linear blends
+between the edges of the core polygon, the boundary of the footprint and the circle. The edges of a polygon stay
+straight, so the load is integrated over exactly the footprint. Nodal fields are smooth functions of the position of the
+probe. A film point is located in the mesh by closed formulas outside the circle, and by Newton's method inside.
 """
 
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -29,33 +30,42 @@ from isocharge.simulate.mesh.conformal_map import (
     ring_edges,
     sector_angles,
 )
-from isocharge.simulate.sensor.probe import Circle, Probe
-
-CORE = 0.45
-"""Half side of the virtual square in a circular footprint, in units of its radius: the corners lie at 0.64 of it."""
-
-DIAGONALS = np.array([0.25, 0.75, 1.25, 1.75])
-"""Directions of the corners of that square, in units of pi."""
+from isocharge.simulate.sensor.probe import Probe
 
 NEWTON_STEPS = 20
-"""Steps of Newton to find a point inside the circle; six are enough where blocks are well shaped."""
+"""Number of Newton steps to locate a point inside the innermost circle. Six suffice in well-shaped blocks."""
 
 OVERSHOOT = 0.1
-"""Largest distance outside its element at which Newton looks for a point, in local coordinates from 0 to 1."""
+"""Largest distance outside its element at which Newton's method evaluates a point, in local coordinates from 0 to 1."""
+
+PARAMETER_STEP = 1e-5
+"""Step of the boundary parameter for the derivative of a curved boundary by central differences."""
+
+
+class QuadCorners(NamedTuple):
+    """Corners of blocks, on the film: a and b on the inner side, c and d on the outer side, in film radii."""
+
+    a: Complexes
+    b: Complexes
+    c: Complexes
+    d: Complexes
 
 
 @dataclass(frozen=True)
 class Placement:
-    """A template's place on the film; the attributes may have leading axes, one placement per press.
+    """Position of a template on the film. The arrays may have leading axes, for one placement per press.
 
     Attributes:
-        c: The map's parameter, shape (...).
-        rho: Radius of the circle in the template, shape (...).
-        corners: Corners of the footprint's polygon and, last, its centroid, the hub, on the film, in units of its
-            radius, shape (..., n_corner + 1).
-        start: Angles of the sectors on the circle, shape (..., n_sector + 1).
-        end: Angles of the sectors on the rim, shape (..., n_sector + 1).
-        depth: Edges of the rings, 0 on the circle and 1 on the rim, shape (..., n_ring + 1).
+        c: Parameter of the conformal map, shape (...).
+        rho: Radius of the innermost circle in the template plane, shape (...).
+        corners: Corners of the core polygon and, last, its centroid, on the film, in film radii, shape
+            (..., n_corner + 1).
+        start: Angles of the sides of the sectors on the innermost circle, shape (..., n_sector + 1).
+        end: Angles of the sides of the sectors on the rim, shape (..., n_sector + 1).
+        depth: Edges of the rings, 0 on the innermost circle and 1 on the rim, shape (..., n_ring + 1).
+        rotation_and_scale: Complex factor that converts points relative to the centroid from mm before the further
+            rotation to film radii, shape (...).
+        probe: The probe.
     """
 
     c: Array
@@ -64,6 +74,8 @@ class Placement:
     start: Array
     end: Array
     depth: Array
+    rotation_and_scale: Complexes
+    probe: Probe
 
     @classmethod
     def of(
@@ -78,131 +90,230 @@ class Placement:
         """Place a template under a press on the positive x axis.
 
         Args:
-            blocks: The blocks; their number of corners must be the probe's.
-            probe: The footprint, rotated as it is when the press lies on the x axis.
-            distance: Distance of the footprint's centroid from the film's centre, mm, any shape.
-            film_radius: mm.
-            layer: Width of the thin rings at the rim over the film's radius.
-            rotation: Further rotation of the footprint, rad, the shape of `distance` or a number.
+            blocks: The elements, whose topology must be the topology of the probe.
+            probe: The probe, rotated as it is when the press lies on the x axis.
+            distance: Distance of the centroid of the footprint from the centre of the film, any shape, mm.
+            film_radius: Radius of the film, mm.
+            layer: Width of the thin rings at the rim, in film radii.
+            rotation: Further rotation of the footprint, a number or of the shape of `distance`, rad.
         """
-        at = np.asarray(distance, dtype=float) / film_radius
-        if isinstance(probe, Circle):
-            centre, radius = at, np.full(at.shape, probe.radius / film_radius)
-            corners = at[..., None] + radius[..., None] * CORE * np.sqrt(2.0) * np.exp(1j * np.pi * DIAGONALS)
+        centroid = np.asarray(distance, dtype=float) / film_radius
+        if probe.is_axisymmetric:
+            rotation = 0.0
+        turn: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
+        core = centroid[..., None] + probe.core(film_radius) * turn[..., None]
+        corners = np.concatenate([core, centroid[..., None]], axis=-1)
+        stops: Complexes = np.asarray(corners @ blocks.boundary[:: blocks.split].T)
+        if probe.topology.fills_circle:
+            centre = centroid
+            radius = np.full(centroid.shape, probe.reach / film_radius)
+            reach = np.abs(corners - centre[..., None]).max(axis=-1)
         else:
-            rotated = np.exp(1j * np.broadcast_to(rotation, at.shape))[..., None]
-            corners = at[..., None] + probe.outline / film_radius * rotated
-            centre, radius = enclosing_circle(corners, at)
-        corners = np.concatenate([corners, at[..., None]], axis=-1)
+            outline = centroid[..., None] + probe.outline / film_radius * turn[..., None]
+            centre, radius = enclosing_circle(outline, centroid)
+            reach = np.abs(outline - centre[..., None]).max(axis=-1)
+            if probe.topology.is_curved:
+                boundary = probe.boundary(blocks.boundary_parameter[:: blocks.split])
+                stops = np.asarray(centroid[..., None] + boundary / film_radius * turn[..., None])
         c, rho = automorphism_onto(centre, radius)
-        start = sector_angles(blocks, corners, centre, radius, c * rho)
+        start = sector_angles(blocks, stops, reach, centroid, centre, radius, c * rho)
         depth = ring_edges(blocks.resolution, rho, layer * (1.0 + c) / (1.0 - c))
-        return cls(c, rho, corners, start, rim_angles(start, c, rho), depth)
+        return cls(c, rho, corners, start, rim_angles(start, c, rho), depth, np.asarray(turn / film_radius), probe)
 
     def __getitem__(self, which: Integers) -> "Placement":
-        """Some of the placements."""
-        return Placement(**{name: value[which] for name, value in vars(self).items()})
+        """Return the placements with the indices `which` along the first axis."""
+        return self._with_arrays(lambda values: values[which])
 
     def batch(self) -> "Placement":
-        """One placement as a batch of one."""
-        return Placement(**{name: np.asarray(value)[None] for name, value in vars(self).items()})
+        """Return a single placement as a batch of one placement."""
+        return self._with_arrays(lambda values: np.asarray(values)[None])
+
+    def _with_arrays(self, change: Callable[[Any], Any]) -> "Placement":
+        """Return the placement with a function applied to every array."""
+        changed: dict[str, Any] = {
+            field.name: change(getattr(self, field.name)) for field in fields(self) if field.name != "probe"
+        }
+        return replace(self, **changed)
 
     def to_film(self, z: Complexes) -> Complexes:
-        """Template points, shape (..., n), to film points (unit radius)."""
+        """Map points of the template plane, shape (..., n), to film points in film radii."""
         c = self.c[..., None]
         return np.asarray((z + c) / (1.0 + c * z))
 
     def to_template(self, points: Complexes) -> Complexes:
-        """Film points (unit radius), shape (..., n), to template points."""
+        """Map film points in film radii, shape (..., n), to points of the template plane."""
         c = self.c[..., None]
         return np.asarray((points - c) / (1.0 - c * points))
 
-    def element_points(self, blocks: Blocks) -> Complexes:
-        """Film points of every element's nodes for one placement, shape (n_element, (order + 1)^2), unit radius."""
-        v, t = 0.5 * (blocks.xi + 1.0), 0.5 * (blocks.eta + 1.0)
-        a, b, c, d = (blocks.straight @ self.corners).T[:, :, None]
-        inner = (1.0 - v) * (a + t * (b - a)) + v * (c + t * (d - c))
-        sector = np.arange(blocks.n_sector)[:, None]
-        low, high = self.start[sector], self.start[sector + 1]
-        arc = self.to_film(self.rho * np.exp(1j * (low + t * (high - low))))
-        inner[blocks.n_quad :] += v * arc
-        depth = self.depth[:-1, None] + v * np.diff(self.depth)[:, None]
-        swept = depth[:, None]
-        angles = (1.0 - swept) * (low + t * (high - low)) + swept * (self.end[sector] + t * np.diff(self.end)[:, None])
-        outside = self.to_film(np.exp((1.0 - swept) * np.log(self.rho) + 1j * angles))
-        return np.concatenate([inner, outside.reshape(-1, v.size)])
-
-    def locate(self, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
-        """Find film points in the blocks, n points for each placement.
+    def boundary(self, parameter: Array) -> Complexes:
+        """Return points of the boundary of the footprint on the film, in film radii.
 
         Args:
-            blocks: The blocks.
-            points: Film points (unit radius), shape (k, n) where the attributes have one leading axis of length k; in
-                the upper half where only that is meshed.
+            parameter: Boundary parameters, from 0 to 2 pi, shape (..., n).
+        """
+        centroid = self.corners[..., -1:]
+        return np.asarray(centroid + self.rotation_and_scale[..., None] * self.probe.boundary(parameter))
+
+    def element_points(self, blocks: Blocks) -> Complexes:
+        """Compute the film points of the nodes of every element for a single placement.
 
         Returns:
-            Element, xi and eta, each of shape (k, n).
+            Shape (n_element, (order + 1)^2), in film radii.
+        """
+        v = 0.5 * (blocks.xi + 1.0)
+        t = 0.5 * (blocks.eta + 1.0)
+        sector = np.arange(blocks.n_sector)[:, None]
+        start_angle = self.start[sector] + t * (self.start[sector + 1] - self.start[sector])
+
+        a, b, c, d = (blocks.straight @ self.corners).T[:, :, None]
+        inside = (1.0 - v) * (a + t * (b - a)) + v * (c + t * (d - c))
+        innermost_circle = self.to_film(self.rho * np.exp(1j * start_angle))
+        inside[blocks.n_inner - blocks.n_sector :] += v * innermost_circle
+        if blocks.n_layer == 2:
+            parameter = blocks.boundary_parameter
+            boundary = self.boundary(parameter[sector] + t * (parameter[sector + 1] - parameter[sector]))
+            inside[blocks.n_quad : blocks.n_quad + blocks.n_sector] += v * boundary
+            inside[blocks.n_quad + blocks.n_sector :] += (1.0 - v) * boundary
+
+        depth = (self.depth[:-1, None] + v * np.diff(self.depth)[:, None])[:, None]
+        end_angle = self.end[sector] + t * np.diff(self.end)[:, None]
+        angle = (1.0 - depth) * start_angle + depth * end_angle
+        rings = self.to_film(np.exp((1.0 - depth) * np.log(self.rho) + 1j * angle))
+        return np.concatenate([inside, rings.reshape(-1, v.size)])
+
+    def locate(self, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
+        """Find the elements that contain film points, n points for each of k placements.
+
+        Args:
+            blocks: The elements.
+            points: Film points, shape (k, n), in film radii. They lie in the upper half if only that half is meshed.
+
+        Returns:
+            Index of the element, xi and eta, each of shape (k, n).
         """
         z = self.to_template(points)
-        element, v, t = self._locate_rings(blocks, z)
+        element, v, t = self._locate_in_rings(blocks, z)
         inside = np.nonzero(np.abs(z) <= self.rho[:, None])
         if inside[0].size:
-            element[inside], v[inside], t[inside] = self[inside[0]]._locate_inner(blocks, points[inside])
+            element[inside], v[inside], t[inside] = self[inside[0]]._locate_inside(blocks, points[inside])
         return element, 2.0 * v - 1.0, 2.0 * t - 1.0
 
-    def _locate_rings(self, blocks: Blocks, z: Complexes) -> tuple[Integers, Array, Array]:
+    def _locate_in_rings(self, blocks: Blocks, z: Complexes) -> tuple[Integers, Array, Array]:
+        """Locate points between the innermost circle and the rim.
+
+        Args:
+            blocks: The elements.
+            z: Points of the template plane, shape (k, n).
+
+        Returns:
+            Index of the element and its coordinates v and t from 0 to 1, each of shape (k, n).
+        """
         with np.errstate(divide="ignore"):
             depth = np.clip(1.0 - np.log(np.abs(z)) / np.log(self.rho)[:, None], 0.0, 1.0)
         ring = np.sum(self.depth[:, None, 1:-1] <= depth[..., None], axis=-1)
-        low, high = (np.take_along_axis(self.depth, ring + i, axis=1) for i in (0, 1))
+        inner_edge = np.take_along_axis(self.depth, ring, axis=1)
+        outer_edge = np.take_along_axis(self.depth, ring + 1, axis=1)
 
-        def edge(number: Integers) -> Array:
-            start, end = (np.take_along_axis(angles, number, axis=1) for angles in (self.start, self.end))
+        def side_angle(number: Integers) -> Array:
+            """Return the angle of a side of the sectors at the depth of each point, shape (k, n)."""
+            start = np.take_along_axis(self.start, number, axis=1)
+            end = np.take_along_axis(self.end, number, axis=1)
             return np.asarray(start + depth * (end - start))
 
         angle = np.angle(z)
         if not blocks.half:
-            first = edge(np.zeros_like(ring))
+            first = side_angle(np.zeros_like(ring))
             angle = first + np.mod(angle - first, 2.0 * np.pi)
         turn = (self.end - self.start)[:, None, 1:-1]
         sector = np.sum(self.start[:, None, 1:-1] + depth[..., None] * turn <= angle[..., None], axis=-1)
-        before, after = edge(sector), edge(sector + 1)
+        before = side_angle(sector)
+        after = side_angle(sector + 1)
         return (
             blocks.n_inner + ring * blocks.n_sector + sector,
-            (depth - low) / (high - low),
+            (depth - inner_edge) / (outer_edge - inner_edge),
             (angle - before) / (after - before),
         )
 
-    def _locate_inner(self, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
-        """Points inside the circle, one for each placement; all of shape (n,)."""
+    def _locate_inside(self, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
+        """Locate points inside the innermost circle, one point for each placement.
+
+        Args:
+            blocks: The elements.
+            points: Film points, shape (n,), in film radii.
+
+        Returns:
+            Index of the element and its coordinates v and t from 0 to 1, each of shape (n,).
+        """
+        corners = self._inner_corners(blocks)
+        at = points[:, None]
+        before = _distance_to_left(corners.a, corners.c, at)
+        after = _distance_to_left(corners.d, corners.b, at)
+        inner = _distance_to_left(corners.b, corners.a, at)
+        outer = _distance_to_left(corners.c, corners.d, at)
+        outer[:, blocks.n_quad :] = np.inf
+        if blocks.n_layer == 2:
+            outside = ~self.probe.contains((points - self.corners[:, -1]) / self.rotation_and_scale)
+            second_layer = blocks.n_quad + blocks.n_sector
+            inner[:, second_layer:] = np.inf
+            outer[outside, :second_layer] = -np.inf
+            outer[~outside, second_layer:] = -np.inf
+        element = np.argmax(np.min([before, after, inner, outer], axis=0), axis=1)
+        pick = np.arange(points.size), element
+        v, t = self._invert_blend(blocks, points, element, QuadCorners(*(corner[pick] for corner in corners)))
+        return element, v, t
+
+    def _inner_corners(self, blocks: Blocks) -> QuadCorners:
+        """Return the corners of all elements inside the innermost circle, each of shape (n_placement, n_inner)."""
         a, b, c, d = np.moveaxis(np.einsum("ekn,pn->pek", blocks.straight, self.corners), -1, 0)
         circle = self.to_film(self.rho[:, None] * np.exp(1j * self.start))
-        c[:, blocks.n_quad :], d[:, blocks.n_quad :] = circle[:, :-1], circle[:, 1:]
-        at = points[:, None]
-        sides = [_left(a, c, at), _left(d, b, at), _left(b, a, at), _left(c, d, at)]
-        sides[3][:, blocks.n_quad :] = np.inf
-        element = np.argmax(np.min(sides, axis=0), axis=1)
-        pick = np.arange(points.size), element
-        return element, *self._invert(blocks, points, element, tuple(corner[pick] for corner in (a, b, c, d)))
+        outermost = slice(blocks.n_inner - blocks.n_sector, blocks.n_inner)
+        c[:, outermost] = circle[:, :-1]
+        d[:, outermost] = circle[:, 1:]
+        if blocks.n_layer == 2:
+            boundary = self.boundary(blocks.boundary_parameter)
+            first_layer = slice(blocks.n_quad, blocks.n_quad + blocks.n_sector)
+            c[:, first_layer] = a[:, outermost] = boundary[:, :-1]
+            d[:, first_layer] = b[:, outermost] = boundary[:, 1:]
+        return QuadCorners(a, b, c, d)
 
-    def _invert(
-        self, blocks: Blocks, points: Complexes, element: Integers, corners: tuple[Complexes, ...]
+    def _invert_blend(
+        self, blocks: Blocks, points: Complexes, element: Integers, corners: QuadCorners
     ) -> tuple[Array, Array]:
-        """(v, t) of points in given elements inside the circle, whose corners are (a, b, c, d), each of shape (n,).
+        """Compute the coordinates of points in given elements inside the innermost circle, by Newton's method.
 
-        Newton on two equations, to round-off in a few steps.
+        Args:
+            blocks: The elements.
+            points: Film points, shape (n,), in film radii.
+            element: Index of the element that contains each point, shape (n,).
+            corners: Corners of these elements, each of shape (n,).
+
+        Returns:
+            Coordinates v and t from 0 to 1, each of shape (n,).
         """
         a, b, c, d = corners
-        arc = element >= blocks.n_quad
-        sector = np.where(arc, element - blocks.n_quad, 0)
-        v, t = np.full(points.shape, 0.5), np.full(points.shape, 0.5)
-        low, high = (np.take_along_axis(self.start, (sector + i)[:, None], axis=1)[:, 0] for i in (0, 1))
+        in_outermost = element >= blocks.n_inner - blocks.n_sector
+        in_sector = element >= blocks.n_quad
+        sector = np.where(in_sector, (element - blocks.n_quad) % blocks.n_sector, 0)
+        low = np.take_along_axis(self.start, sector[:, None], axis=1)[:, 0]
+        high = np.take_along_axis(self.start, (sector + 1)[:, None], axis=1)[:, 0]
+        v = np.full(points.shape, 0.5)
+        t = np.full(points.shape, 0.5)
         for _ in range(NEWTON_STEPS):
             z = self.rho * np.exp(1j * (low + t * (high - low)))
-            rotated = 1j * (high - low) * z * (1.0 - self.c**2) / (1.0 + self.c * z) ** 2
-            outer = np.where(arc, (z + self.c) / (1.0 + self.c * z), c + t * (d - c))
-            by_t = (1.0 - v) * (b - a) + v * np.where(arc, rotated, d - c)
+            circle = (z + self.c) / (1.0 + self.c * z)
+            circle_by_t = 1j * (high - low) * z * (1.0 - self.c**2) / (1.0 + self.c * z) ** 2
+            outer = np.where(in_outermost, circle, c + t * (d - c))
+            outer_by_t = np.where(in_outermost, circle_by_t, d - c)
             inner = a + t * (b - a)
+            inner_by_t = b - a
+            if blocks.n_layer == 2:
+                boundary, boundary_by_t = self._boundary_in_sector(blocks, sector, t)
+                in_first_layer = in_sector & ~in_outermost
+                outer = np.where(in_first_layer, boundary, outer)
+                outer_by_t = np.where(in_first_layer, boundary_by_t, outer_by_t)
+                inner = np.where(in_outermost, boundary, inner)
+                inner_by_t = np.where(in_outermost, boundary_by_t, inner_by_t)
+            by_t = (1.0 - v) * inner_by_t + v * outer_by_t
             by_v = outer - inner
             residual = inner + v * by_v - points
             determinant = (np.conj(by_v) * by_t).imag
@@ -210,8 +321,27 @@ class Placement:
             t = np.clip(t - (np.conj(by_v) * residual).imag / determinant, -OVERSHOOT, 1.0 + OVERSHOOT)
         return v, t
 
+    def _boundary_in_sector(self, blocks: Blocks, sector: Integers, t: Array) -> tuple[Complexes, Complexes]:
+        """Return boundary points of a curved footprint and their derivatives with respect to t.
 
-def _left(start: Complexes, end: Complexes, at: Complexes) -> Array:
-    """Distance of points to the left of directed lines."""
+        Args:
+            blocks: The elements.
+            sector: Index of the sector of each point, shape (n,).
+            t: Position in the sector, from 0 to 1, shape (n,).
+
+        Returns:
+            Points and derivatives, each of shape (n,), in film radii.
+        """
+        low = blocks.boundary_parameter[sector]
+        width = blocks.boundary_parameter[sector + 1] - low
+        parameter = (low + t * width)[:, None]
+        after = self.boundary(parameter + PARAMETER_STEP)
+        before = self.boundary(parameter - PARAMETER_STEP)
+        by_parameter = (after - before)[:, 0] / (2.0 * PARAMETER_STEP)
+        return self.boundary(parameter)[:, 0], by_parameter * width
+
+
+def _distance_to_left(start: Complexes, end: Complexes, points: Complexes) -> Array:
+    """Return the distances of points to the left of directed lines from `start` to `end`."""
     direction = end - start
-    return np.asarray(((at - start) * np.conj(direction)).imag / np.maximum(np.abs(direction), 1e-300))
+    return np.asarray(((points - start) * np.conj(direction)).imag / np.maximum(np.abs(direction), 1e-300))

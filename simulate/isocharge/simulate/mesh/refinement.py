@@ -49,7 +49,7 @@ class RefinedTemplate(Template):
     """
 
     def __init__(self, base: Template, parent: Integers, low: Array, size: Array) -> None:
-        super().__init__(base.resolution, base.corners, not base.half)
+        super().__init__(base.resolution, base.topology, not base.half)
         self.base, self.parent, self.low, self.size = base, parent, low, size
         self.n_element, self.splits = parent.size, np.column_stack([parent, low, size])
         points = self.from_base(sample_points(base)).ravel()

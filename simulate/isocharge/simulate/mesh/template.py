@@ -1,76 +1,148 @@
-"""The mesh as a template: its blocks, and one number for each node."""
+"""The mesh template: the elements and the numbers of their nodes, for all positions of a probe."""
 
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from isocharge.common.arrays import Array, Complexes, Integers
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.probe import Circle, Polygon, Probe
+from isocharge.simulate.sensor.probe_shapes.base import CurvedProbe, FootprintTopology
 
-SAMPLE_REACH, SAMPLE_DISTANCE, SAMPLE_LAYER = 0.1, 0.1, 0.05
-"""A press that shows which nodes coincide, in film radii: any on which no elements fold would do."""
+SAMPLE_REACH = 0.1
+"""Reach of the footprint of the sample press, from which coinciding nodes are found, in film radii."""
+
+SAMPLE_DISTANCE = 0.1
+"""Distance of the sample press from the centre of the film, in film radii."""
+
+SAMPLE_LAYER = 0.05
+"""Width of the thin rings at the rim under the sample press, in film radii."""
 
 
 class Template(Blocks):
-    """Blocks whose nodes are numbered: elements that touch share the nodes between them.
+    """Elements with numbered nodes. Adjacent elements share the nodes on their common side.
 
     Attributes:
-        nodes: Node number of each element's nodes, shape (n_element, (order + 1)^2).
+        nodes: Node number of each node of each element, shape (n_element, (order + 1)^2).
         n_node: Number of nodes.
-        first_seen: Place of each node among all elements' nodes where it comes first, shape (n_node,).
+        first_seen: Index of the first occurrence of each node among the nodes of all elements, shape (n_node,).
         on_rim: Whether a node lies on the rim, shape (n_node,).
         on_axis: Whether a node lies on the line of symmetry of a half template, shape (n_node,).
-        splits: Where the elements lie in the blocks if some are split, a row each; empty if none is.
-        constraint: Values at all nodes from those that do not hang, shape (n_node, n_node); None if none hangs.
+        splits: Parent and position of each element in the original elements, one row per element. Empty if no element
+            is split.
+        constraint: Matrix that computes the values at all nodes from the values at the nodes that do not hang, shape
+            (n_node, n_node). None if no node hangs.
     """
 
     splits: Array = np.empty(0)
     constraint: csr_array | None = None
 
-    def __init__(self, resolution: Resolution, corners: int, whole: bool = False) -> None:
-        super().__init__(resolution, corners, whole)
+    def __init__(self, resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> None:
+        super().__init__(resolution, topology, whole)
         points = sample_points(self)
-        z = points.ravel()
-        _, self.first_seen, number = np.unique(np.round(z, 9), return_index=True, return_inverse=True)
+        flat = points.ravel()
+        _, self.first_seen, number = np.unique(np.round(flat, 9), return_index=True, return_inverse=True)
         self.nodes: Integers = number.reshape(points.shape)
         self.n_node = self.first_seen.size
-        self.on_rim = np.abs(z[self.first_seen]) > 1.0 - 1e-9
-        self.on_axis = (np.abs(z[self.first_seen].imag) < 1e-9) & self.half
+        node_points = flat[self.first_seen]
+        self.on_rim = np.abs(node_points) > 1.0 - 1e-9
+        self.on_axis = (np.abs(node_points.imag) < 1e-9) & self.half
 
     def from_base(self, values: np.ndarray) -> np.ndarray:
-        """Values at the elements' nodes, shape (n_element, n_local, ...), from those of the blocks'."""
+        """Return values at the nodes of the elements, from values at the nodes of the original (unsplit) elements.
+
+        Args:
+            values: Shape (n_original_element, n_local, ...).
+
+        Returns:
+            Shape (n_element, n_local, ...).
+        """
         return values
 
     def within(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
-        """Element, xi and eta of points that are given by those of the blocks."""
+        """Convert positions in the original (unsplit) elements into positions in the elements.
+
+        Args:
+            element: Index of the original element, shape (n,).
+            xi: First local coordinate, shape (n,).
+            eta: Second local coordinate, shape (n,).
+
+        Returns:
+            Index of the element, xi and eta, each of shape (n,).
+        """
         return element, xi, eta
 
 
+class SampleCurve(CurvedProbe):
+    """A circular footprint with the topology of another curved footprint, used to number the nodes of a template."""
+
+    angle = 0.0
+    notation = "sample"
+    area = np.pi * SAMPLE_REACH**2
+    reach = SAMPLE_REACH
+    period = 2.0 * np.pi
+
+    def __init__(self, topology: FootprintTopology) -> None:
+        self._topology = topology
+
+    @property
+    def topology(self) -> FootprintTopology:
+        """The topology of the other footprint."""
+        return self._topology
+
+    def boundary(self, parameter: Array) -> Complexes:
+        """Return points of the circle."""
+        return np.asarray(SAMPLE_REACH * np.exp(1j * parameter))
+
+    def contains(self, points: Complexes) -> Booleans:
+        """Return whether points lie in the circle."""
+        return np.asarray(np.abs(points) <= SAMPLE_REACH)
+
+    def rotated(self, angle: float) -> Self:
+        """Return the same footprint."""
+        del angle
+        return self
+
+
 def sample_points(blocks: Blocks) -> Complexes:
-    """Film points of every element's nodes under one press, shape (n_element, (order + 1)^2)."""
-    turn = np.linspace(0.0, 2.0 * np.pi, max(blocks.corners, 3), endpoint=False)
-    outline = SAMPLE_REACH * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    probe: Probe = Polygon.of(outline) if blocks.corners else Circle(SAMPLE_REACH)
-    return Placement.of(blocks, probe, np.array(SAMPLE_DISTANCE), 1.0, SAMPLE_LAYER).element_points(blocks)
+    """Return the film points of the nodes of every element under a sample press.
+
+    No element is folded under the sample press, so nodes coincide only if they are the same node.
+
+    Returns:
+        Shape (n_element, (order + 1)^2), in film radii.
+    """
+    probe = _sample_probe(blocks.topology)
+    placement = Placement.of(blocks, probe, np.array(SAMPLE_DISTANCE), 1.0, SAMPLE_LAYER)
+    return placement.element_points(blocks)
 
 
-def corners_of(probe: Probe) -> int:
-    """Corners of a probe's outline, 0 for a circle: all that a template has to know of the probe."""
-    return len(probe.corners) if isinstance(probe, Polygon) else 0
+def _sample_probe(topology: FootprintTopology) -> Probe:
+    """Return a probe of the sample size (film radius 1 mm) with this topology."""
+    if topology.fills_circle:
+        return Circle(SAMPLE_REACH)
+    if topology.is_curved:
+        return SampleCurve(topology)
+    angle = np.linspace(0.0, 2.0 * np.pi, topology.n_corner, endpoint=False)
+    return Polygon.of(SAMPLE_REACH * np.stack([np.cos(angle), np.sin(angle)], axis=1))
 
 
 @lru_cache(maxsize=16)
-def template(resolution: Resolution, corners: int, whole: bool = False) -> Template:
-    """The template of a resolution for a polygon with this number of corners, 0 for a circle; built once.
+def template(resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> Template:
+    """Return the template for a resolution and a topology. Templates are cached.
 
-    `whole` meshes both halves under a circle, too.
+    Args:
+        resolution: Fineness of the mesh.
+        topology: Number and kind of the blocks in and around the footprint.
+        whole: Whether to mesh the whole film although the footprint is symmetric.
     """
-    return Template(resolution, corners, whole)
+    return Template(resolution, topology, whole)
 
 
 def template_for(probe: Probe, resolution: Resolution, whole: bool = False) -> Template:
-    """The template that follows a probe's outline; `whole` as above."""
-    return template(resolution, corners_of(probe), whole and corners_of(probe) == 0)
+    """Return the template for the footprint of a probe; the arguments are those of `template`."""
+    topology = probe.topology
+    return template(resolution, topology, whole and topology.fills_circle)

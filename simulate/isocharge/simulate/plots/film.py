@@ -12,7 +12,7 @@ from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.plots.figure import FELT, INK
-from isocharge.simulate.sensor.probe import Circle, Probe
+from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
 
@@ -37,10 +37,7 @@ def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool 
 def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "") -> None:
     """The footprint of a press at (x, y), mm."""
     style: dict[str, Any] = {"fill": True, "fc": FELT, "ec": FELT, "alpha": 0.35, "zorder": 2, "label": label}
-    if isinstance(probe, Circle):
-        axes.add_patch(Disk(at, probe.radius, **style))
-    else:
-        axes.add_patch(Patch(to_corners(complex(*at) + probe.outline), **style))
+    axes.add_patch(Patch(to_corners(complex(*at) + probe.outline), **style))
 
 
 def draw_circle(axes: Any, radius: float, **style: Any) -> None:

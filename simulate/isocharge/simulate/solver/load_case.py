@@ -17,10 +17,9 @@ from isocharge.simulate.mesh.conformal_map import CLEARANCE
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.refinement import coated
-from isocharge.simulate.mesh.template import corners_of
 from isocharge.simulate.numerics.polygon import to_complex
 from isocharge.simulate.sensor.film import Film
-from isocharge.simulate.sensor.probe import Polygon, Probe, farthest
+from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.solver.error_estimate import shape_error
 
 TOLERANCE = 1e-7
@@ -93,10 +92,10 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
             f"probe: expected a reach of at least {SMALLEST_PROBE:g} of the film's radius ({film.radius:.4g} mm), got "
             f"{probe.reach:.4g} mm"
         )
-    if not farthest(probe, at) < film.radius * (1.0 - 1e-6):
+    if not probe.farthest_distance(at) < film.radius * (1.0 - 1e-6):
         raise SceneError(
             f"probe off the film: centre ({at[0]:.4g}, {at[1]:.4g}) mm, farthest point of {probe.notation} "
-            f"{farthest(probe, at):.4g} mm from the film's centre, film radius {film.radius:.4g} mm"
+            f"{probe.farthest_distance(at):.4g} mm from the film's centre, film radius {film.radius:.4g} mm"
         )
     amplitude2 = amplitude_squared(film, force)
     if amplitude2 > LARGEST_AMPLITUDE2:
@@ -180,7 +179,7 @@ def _layer(film: Film, force: float, probe: Probe, settings: SolveSettings, star
     layer = layer_for(film, force)
     if start is None or not LAYER_REUSE[0] < start.layer / layer < LAYER_REUSE[1]:
         return layer
-    same_mesh = settings.resolution in ("auto", start.resolution) and corners_of(probe) == start.template.corners
+    same_mesh = settings.resolution in ("auto", start.resolution) and probe.topology == start.template.topology
     return start.layer if same_mesh else layer
 
 
@@ -205,15 +204,15 @@ def choose_mesh(case: LoadCase) -> PlacedMesh:
 def needs_second_mesh(case: LoadCase) -> bool:
     """Whether a press must be solved on two meshes to know its error; see `error_estimate`."""
     radius = case.film.radius
-    large = isinstance(case.probe, Polygon) and case.probe.reach > LARGE * radius
-    return large or farthest(case.probe, case.at) > INNER * radius or case.accuracy < ACCURACY
+    large = not case.probe.topology.fills_circle and case.probe.reach > LARGE * radius
+    return large or case.probe.farthest_distance(case.at) > INNER * radius or case.accuracy < ACCURACY
 
 
 def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
     """The error for a press whose mesh is too distorted."""
     return SceneError(
         f"press at ({case.at[0]:.4g}, {case.at[1]:.4g}) mm comes within "
-        f"{case.film.radius - farthest(case.probe, case.at):.3g} mm of the rim, too near for a mesh of order "
+        f"{case.film.radius - case.probe.farthest_distance(case.at):.3g} mm of the rim, too near for a mesh of order "
         f"{resolution.order} with {resolution.around} elements round the circle; press farther inside"
     )
 
@@ -223,7 +222,7 @@ def _ladder(case: LoadCase) -> Iterator[Resolution]:
     film, probe, at = case.film, case.probe, case.at
     placement = place(film, probe, at, Resolution(2, 8, 1), 0.1).placement
     stretch = float((1.0 + placement.c) / (1.0 - placement.c))
-    crowded = isinstance(probe, Polygon) and farthest(probe, at) + CLEARANCE * probe.reach > film.radius
+    crowded = not probe.topology.fills_circle and probe.farthest_distance(at) + CLEARANCE * probe.reach > film.radius
     sharper = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.accuracy)))
     base = Resolution(
         order=(5 if case.theory.bending and film.coat is None else 4) + sharper,

@@ -188,7 +188,7 @@ def _by_load_steps(
 
 def _start_field(start: Equilibrium | None, template: Template, cold: Array) -> Array:
     """The field of a neighbour on the same mesh, perhaps of another order; else the cold start."""
-    if start is None or (start.mesh.template.corners, start.mesh.template.half) != (template.corners, template.half):
+    if start is None or (start.mesh.template.topology, start.mesh.template.half) != (template.topology, template.half):
         return cold
     before, order = start.mesh.template, template.resolution.order
     is_other = replace(before.resolution, order=order) != template.resolution

@@ -14,10 +14,10 @@ from isocharge.cli.shared.options import (
     FreshOption,
     JsonOption,
     ModelsOption,
-    ProbeOption,
     StressLimitOption,
     refuse,
 )
+from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json, this_command
 from isocharge.cli.train.press_session import PressPort, calibrate_at_port
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT

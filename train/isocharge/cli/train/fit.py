@@ -10,7 +10,6 @@ import typer
 from isocharge.cli.shared.forward_maps import caution_of_stress, shown_run, simulated_presses, sweep_radius
 from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
 from isocharge.cli.shared.options import (
-    PROBE_HELP,
     ConfigOption,
     FreshOption,
     JsonOption,
@@ -27,6 +26,7 @@ from isocharge.common.resumable_run import ResumableRun, resume_parts
 from isocharge.serve import MeasuredPresses
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import Circle, FilmPrior, load_sensor, local_workers, parse_probe, read_dataset
+from isocharge.simulate.sensor.probe import PROBE_HELP
 from isocharge.train import (
     FilmsConfig,
     FilmsModel,

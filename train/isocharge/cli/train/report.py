@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.measured_presses import read_presses_of
-from isocharge.cli.shared.options import FreshOption, JsonOption, NewFolderOption, ProbeOption
+from isocharge.cli.shared.options import FreshOption, JsonOption, NewFolderOption
+from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.errors import InputError, ModelError
 from isocharge.common.resumable_run import refuse_finished

@@ -1,0 +1,1 @@
+"""Probe shapes: one module for each shape, with the base classes that every shape implements."""

@@ -1,0 +1,266 @@
+"""Base classes of the probe shapes: the methods that meshing, loading, reading out and drawing call.
+
+A footprint is the area on which a probe presses. Points of a footprint are complex numbers x + iy in mm, relative to
+the centroid of the footprint.
+
+A polygonal footprint is filled with straight mesh blocks. A footprint with a smooth boundary derives from
+`CurvedProbe`: the mesh has straight blocks in a core polygon inside the footprint, and blocks with one curved side
+between the core polygon and the boundary.
+"""
+
+import math
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Booleans, Complexes
+from isocharge.common.errors import SceneError
+from isocharge.simulate.numerics.polygon import shared_area, to_complex
+from isocharge.simulate.sensor.size_check import check_length
+
+NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+"""Regular expression of a decimal number in the notation of a probe."""
+
+MIN_REACH = 0.02
+"""Smallest accepted distance of the farthest point of a footprint from its centroid, mm."""
+
+MIN_SIDE = 1e-3
+"""Smallest side or axis of a footprint, mm."""
+
+CORE_SHARE = 0.45 * math.sqrt(2.0)
+"""Distance of the corners of the core polygon from the centroid, relative to that of the boundary, dimensionless."""
+
+OUTLINE_POINTS = 180
+"""Number of points of the outline of a curved footprint."""
+
+FINE_OUTLINE_POINTS = 1024
+"""Number of boundary points from which the reach and the covered area of a curved footprint are computed."""
+
+
+@dataclass(frozen=True)
+class ProbeNotation:
+    """One notation of a probe shape on the command line and in files, such as `rectangle:WIDTHxHEIGHT`.
+
+    Attributes:
+        name: Word before the colon.
+        parameters: Text after the colon, in which each word of capital letters stands for a number (mm).
+        build: Function that creates the probe from the numbers and the rotation (rad, anticlockwise).
+        pattern: Regular expression of the text after the colon. If empty, it is derived from `parameters`.
+    """
+
+    name: str
+    parameters: str
+    build: Callable[[list[float], float], "Probe"]
+    pattern: str = ""
+
+    @property
+    def form(self) -> str:
+        """The notation with placeholders for the numbers, as help texts and error messages show it."""
+        return f"{self.name}:{self.parameters}"
+
+    def parse(self, text: str) -> "Probe | None":
+        """Return the probe that `text` describes, or None if the text has another notation.
+
+        Raises:
+            SceneError: If the notation is correct but no such footprint can exist.
+        """
+        pattern = self.pattern or re.sub("[A-Z]+", lambda _: NUMBER, self.parameters)
+        match = re.fullmatch(rf"{self.name}:(?P<parameters>{pattern})(?:@(?P<degrees>{NUMBER}))?", text)
+        if match is None:
+            return None
+        numbers = [float(number) for number in re.findall(NUMBER, match["parameters"])]
+        return self.build(numbers, float(np.deg2rad(float(match["degrees"] or 0.0))))
+
+
+@dataclass(frozen=True)
+class FootprintTopology:
+    """Number and kind of the mesh blocks that a footprint needs. Probes with equal topologies share a mesh template.
+
+    Attributes:
+        n_corner: Number of corners of the core polygon. The core polygon of a polygonal footprint is the footprint.
+        is_curved: Whether a layer of blocks with a curved outer side lies between the core polygon and the boundary of
+            the footprint.
+        fills_circle: Whether the boundary of the footprint is the innermost circle of the mesh. Otherwise that circle
+            encloses the footprint at a distance.
+    """
+
+    n_corner: int
+    is_curved: bool
+    fills_circle: bool
+
+
+class Probe(ABC):
+    """A rigid object that presses on the film with uniform pressure over its footprint.
+
+    Subclasses are frozen dataclasses. `Circle`, `Ellipse` and `Polygon` are examples.
+    """
+
+    notations: ClassVar[tuple[ProbeNotation, ...]]
+    """Notations that `parse_probe` accepts for this shape."""
+
+    @property
+    @abstractmethod
+    def angle(self) -> float:
+        """Rotation of the footprint about its centroid, anticlockwise, rad."""
+
+    @property
+    @abstractmethod
+    def notation(self) -> str:
+        """Text that `parse_probe` converts back into this probe, lengths in mm, without the rotation."""
+
+    @property
+    @abstractmethod
+    def area(self) -> float:
+        """Area of the footprint, mm^2."""
+
+    @property
+    @abstractmethod
+    def reach(self) -> float:
+        """Distance of the farthest point of the footprint from its centroid, mm."""
+
+    @property
+    @abstractmethod
+    def period(self) -> float:
+        """Smallest rotation that maps the footprint onto itself, rad; zero if every rotation does."""
+
+    @property
+    @abstractmethod
+    def topology(self) -> FootprintTopology:
+        """Number and kind of the mesh blocks for this footprint."""
+
+    @property
+    @abstractmethod
+    def outline(self) -> Complexes:
+        """Points along the boundary, anticlockwise, shape (n,), mm: all corners of a polygon, samples of a curve."""
+
+    @abstractmethod
+    def core(self, unit: float) -> Complexes:
+        """Return the corners of the core polygon, anticlockwise, shape (topology.n_corner,), in multiples of `unit` mm.
+
+        The first corner of the core polygon of a curved footprint lies at half a step of the boundary parameter.
+        """
+
+    @abstractmethod
+    def boundary(self, parameter: Array) -> Complexes:
+        """Return points of the boundary, relative to the centroid, rotated by `angle`, mm.
+
+        Args:
+            parameter: Values from 0 to 2 pi, any shape. The points go round the centroid anticlockwise as the parameter
+                increases. A rotation of the footprint by `period` must be equivalent to an increase of the parameter by
+                `period`.
+
+        Returns:
+            Points x + iy, of the shape of `parameter`.
+        """
+
+    @abstractmethod
+    def contains(self, points: Complexes) -> Booleans:
+        """Return whether points lie in the footprint or on its boundary.
+
+        Args:
+            points: Points x + iy relative to the centroid, any shape, mm.
+        """
+
+    def rotated(self, angle: float) -> Self:
+        """Return the probe after a further rotation about its centroid by `angle` (rad, anticlockwise)."""
+        return replace(self, angle=self.angle + angle)  # type: ignore[type-var]
+
+    @abstractmethod
+    def farthest_distance(self, at: tuple[float, float]) -> float:
+        """Return the distance of the farthest point of the footprint from the centre of the film, mm.
+
+        Args:
+            at: Position (x, y) of the centroid, relative to the centre of the film, mm.
+        """
+
+    @abstractmethod
+    def covered_area(self, corners: Array, at: complex) -> float:
+        """Return the area of a convex polygon that lies under the footprint, mm^2.
+
+        Args:
+            corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
+            at: Position of the centroid as x + iy, mm.
+        """
+
+    @property
+    def is_axisymmetric(self) -> bool:
+        """Whether every rotation maps the footprint onto itself."""
+        return self.period == 0.0
+
+
+class CurvedProbe(Probe):
+    """A convex footprint with a smooth boundary that is described by a parameter from 0 to 2 pi.
+
+    A subclass implements `boundary`, `contains`, `notation`, `area`, `reach` and `period`, and has a field `angle`. The
+    other methods follow from these; a subclass may override them with closed formulas.
+    """
+
+    @property
+    def topology(self) -> FootprintTopology:
+        """A core polygon with the rotational symmetry of the footprint, and a layer up to its boundary."""
+        folds = round(math.tau / self.period)
+        n_corner = 4 if folds in (1, 2) else folds
+        return FootprintTopology(n_corner, is_curved=True, fills_circle=False)
+
+    @property
+    def outline(self) -> Complexes:
+        """Evenly spaced boundary points, shape (OUTLINE_POINTS,), mm."""
+        return self._boundary_points(OUTLINE_POINTS)
+
+    def core(self, unit: float) -> Complexes:
+        """Return the corners of the core polygon, in multiples of `unit` mm."""
+        n_corner = self.topology.n_corner
+        parameter = 2.0 * np.pi * (np.arange(n_corner) + 0.5) / n_corner
+        return np.asarray(CORE_SHARE * self.boundary(parameter) / unit)
+
+    def farthest_distance(self, at: tuple[float, float]) -> float:
+        """Return the distance of the farthest boundary point from the centre of the film, mm."""
+        return float(np.abs(complex(*at) + self._boundary_points(FINE_OUTLINE_POINTS)).max())
+
+    def covered_area(self, corners: Array, at: complex) -> float:
+        """Return the area of a convex polygon under the footprint, whose boundary is replaced by a polygon, mm^2."""
+        return shared_area(to_complex(corners), at + self._boundary_points(FINE_OUTLINE_POINTS))
+
+    def _boundary_points(self, count: int) -> Complexes:
+        """Return boundary points at evenly spaced parameters, shape (count,), mm."""
+        return self.boundary(2.0 * np.pi * np.arange(count) / count)
+
+
+def check_angle(angle: float) -> None:
+    """Raise an error if the rotation of a footprint is not a finite number.
+
+    Raises:
+        SceneError: If `angle` (rad) is infinite or not a number.
+    """
+    if not np.isfinite(angle):
+        raise SceneError(f"probe angle: expected a finite number, got {angle}")
+
+
+def check_reach(reach: float, what: str = "probe reach") -> None:
+    """Raise an error if a footprint is too small to be meant in millimetres.
+
+    Args:
+        reach: Distance of the farthest point of the footprint from its centroid, mm.
+        what: Name of this distance in the error message.
+
+    Raises:
+        SceneError: If `reach` is below `MIN_REACH` or infinite.
+    """
+    check_length(what, reach, MIN_REACH, SceneError)
+
+
+def check_side(what: str, length: float) -> None:
+    """Raise an error if a side or an axis of a footprint is too short.
+
+    Args:
+        what: Name of the side in the error message.
+        length: Length of the side, mm.
+
+    Raises:
+        SceneError: If `length` is below `MIN_SIDE` or infinite.
+    """
+    check_length(what, length, MIN_SIDE, SceneError)

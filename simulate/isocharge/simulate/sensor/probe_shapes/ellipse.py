@@ -1,0 +1,78 @@
+"""Elliptical probe."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Booleans, Complexes
+from isocharge.simulate.numerics.polygon import area_in_disk, to_complex
+from isocharge.simulate.sensor.probe_shapes.base import (
+    CurvedProbe,
+    ProbeNotation,
+    check_angle,
+    check_reach,
+    check_side,
+)
+from isocharge.simulate.sensor.size_check import tidy
+
+
+@dataclass(frozen=True)
+class Ellipse(CurvedProbe):
+    """An elliptical footprint.
+
+    Attributes:
+        width: Length of the axis along x before the rotation, mm.
+        height: Length of the axis along y before the rotation, mm.
+        angle: Rotation about the centre, anticlockwise, rad.
+    """
+
+    width: float
+    height: float
+    angle: float = 0.0
+
+    notations = (ProbeNotation("ellipse", "WIDTHxHEIGHT", lambda axes, angle: Ellipse(axes[0], axes[1], angle)),)
+
+    def __post_init__(self) -> None:
+        check_side("probe width", self.width)
+        check_side("probe height", self.height)
+        check_angle(self.angle)
+        check_reach(self.reach)
+
+    @property
+    def notation(self) -> str:
+        """Text that `parse_probe` converts back into this probe, without the rotation."""
+        return f"ellipse:{tidy(self.width)}x{tidy(self.height)}"
+
+    @property
+    def area(self) -> float:
+        """Area, mm^2."""
+        return float(0.25 * np.pi * self.width * self.height)
+
+    @property
+    def reach(self) -> float:
+        """Half of the longer axis, mm."""
+        return 0.5 * max(self.width, self.height)
+
+    @property
+    def period(self) -> float:
+        """Half a turn, rad."""
+        return float(np.pi)
+
+    def boundary(self, parameter: Array) -> Complexes:
+        """Return points of the boundary, mm; the parameter is the eccentric angle."""
+        before_rotation = 0.5 * self.width * np.cos(parameter) + 0.5j * self.height * np.sin(parameter)
+        return np.asarray(before_rotation * np.exp(1j * self.angle))
+
+    def contains(self, points: Complexes) -> Booleans:
+        """Return whether points lie in the ellipse."""
+        return np.asarray(np.abs(self._on_unit_disk(points)) <= 1.0)
+
+    def covered_area(self, corners: Array, at: complex) -> float:
+        """Return the area of a polygon that lies in the ellipse, mm^2."""
+        share = area_in_disk(self._on_unit_disk(to_complex(corners) - at), 0.0, 1.0)
+        return float(share) * 0.25 * self.width * self.height
+
+    def _on_unit_disk(self, points: Complexes) -> Complexes:
+        """Map points (relative to the centre, mm) by the affine map that takes the ellipse to the unit disk."""
+        unrotated = points * np.exp(-1j * self.angle)
+        return np.asarray(2.0 * unrotated.real / self.width + 2.0j * unrotated.imag / self.height)

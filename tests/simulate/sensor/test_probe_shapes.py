@@ -1,0 +1,175 @@
+"""Properties that every probe shape must have, compared with closed forms, grids of points and polygons."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from isocharge.simulate import (
+    Circle,
+    Ellipse,
+    Polygon,
+    Probe,
+    Resolution,
+    SolveSettings,
+    Theory,
+    load_sensor,
+    parse_probe,
+    press,
+    touch_charge,
+)
+from isocharge.simulate.forward.readout import contact_charge
+from isocharge.simulate.mesh.placed_mesh import place
+from isocharge.simulate.numerics.polygon import area_of, to_corners
+from isocharge.simulate.plots.film import draw_probe
+
+SENSOR = load_sensor("three-25um-biaxial")
+MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
+HOUSE = np.array([(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 2.0), (0.0, 1.0)])
+
+
+class ShapeCase(NamedTuple):
+    """A probe and its measures in closed form.
+
+    Attributes:
+        probe: The probe.
+        area: Area, mm^2.
+        reach: Distance of the farthest point from the centroid, mm.
+        period: Smallest rotation that maps the footprint onto itself, rad.
+    """
+
+    probe: Probe
+    area: float
+    reach: float
+    period: float
+
+
+SHAPES = {
+    "circle": ShapeCase(Circle(2.0), 4.0 * np.pi, 2.0, 0.0),
+    "rectangle": ShapeCase(Polygon.rectangle(4.0, 2.0, 0.5), 8.0, np.sqrt(5.0), np.pi),
+    "square": ShapeCase(Polygon.rectangle(2.0, 2.0), 4.0, np.sqrt(2.0), np.pi / 2),
+    "triangle": ShapeCase(Polygon.triangle(2.0), np.sqrt(3.0), 2.0 / np.sqrt(3.0), 2 * np.pi / 3),
+    "polygon": ShapeCase(Polygon.of(HOUSE), 3.0, np.sqrt(130.0) / 9.0, 2 * np.pi),
+    "ellipse": ShapeCase(Ellipse(4.0, 2.0, 0.5), 2.0 * np.pi, 2.0, np.pi),
+}
+
+
+@pytest.fixture(params=SHAPES.values(), ids=SHAPES)
+def shape(request) -> ShapeCase:
+    return request.param
+
+
+def boundary_points(probe: Probe, count: int) -> np.ndarray:
+    """Return boundary points at evenly spaced parameters, shape (count,), mm."""
+    return probe.boundary(2.0 * np.pi * np.arange(count) / count)
+
+
+def grid_of(probe: Probe, count: int = 801) -> np.ndarray:
+    """Return the points of a square grid round the footprint, shape (count^2,), mm."""
+    line = 1.01 * probe.reach * np.linspace(-1.0, 1.0, count)
+    return (line[:, None] + 1j * line).ravel()
+
+
+def test_area_reach_and_period_are_the_closed_forms(shape):
+    assert (shape.probe.area, shape.probe.period) == pytest.approx((shape.area, shape.period), rel=1e-12)
+    assert shape.probe.reach == pytest.approx(shape.reach, rel=1e-12)
+
+
+def test_rotation_changes_neither_area_nor_reach_nor_period(shape):
+    rotated = shape.probe.rotated(0.3)
+    assert (rotated.area, rotated.reach, rotated.period) == (shape.probe.area, shape.probe.reach, shape.probe.period)
+    if not shape.probe.is_axisymmetric:
+        np.testing.assert_allclose(rotated.outline, shape.probe.outline * np.exp(0.3j), atol=1e-14)
+
+
+def test_rotation_by_the_period_shifts_the_boundary_parameter(shape):
+    parameter = np.linspace(0.0, 2.0 * np.pi, 41)
+    rotated = shape.probe.rotated(shape.period).boundary(parameter)
+    np.testing.assert_allclose(rotated, shape.probe.boundary(parameter + shape.period), atol=1e-12)
+
+
+def test_boundary_goes_round_the_area_anticlockwise(shape):
+    points = boundary_points(shape.probe, 4000)
+    assert area_of(to_corners(points)) == pytest.approx(shape.area, rel=1e-3)
+    assert np.abs(points).max() == pytest.approx(shape.reach, rel=1e-3)
+
+
+def test_footprint_contains_the_points_inside_its_boundary(shape):
+    points = boundary_points(shape.probe, 97)
+    assert shape.probe.contains((1.0 - 1e-9) * points).all()
+    assert not shape.probe.contains((1.0 + 1e-9) * points).any()
+
+
+def test_area_of_the_points_that_the_footprint_contains(shape):
+    share = shape.probe.contains(grid_of(shape.probe)).mean()
+    assert share * (2.02 * shape.reach) ** 2 == pytest.approx(shape.area, rel=5e-3)
+
+
+def test_covered_area_of_a_triangle_is_that_of_a_grid(shape):
+    """The triangle is the half-plane below a line through the footprint."""
+    at = 0.3 - 0.2j
+    size = 10.0 * shape.reach
+    corners = np.array([(at.real - size, at.imag - size), (at.real + size, at.imag - size), (at.real, at.imag + 0.2)])
+    grid = grid_of(shape.probe)
+    left = np.interp(grid.real, [-size, 0.0, size], [-size, 0.2, -size])
+    share = (shape.probe.contains(grid) & (grid.imag < left)).mean()
+    expected = share * (2.02 * shape.reach) ** 2
+    assert shape.probe.covered_area(corners, at) == pytest.approx(expected, rel=5e-3)
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.0), (5.0, -3.0)], ids=["centre", "off centre"])
+def test_farthest_distance_is_that_of_the_farthest_boundary_point(shape, at):
+    expected = np.abs(complex(*at) + boundary_points(shape.probe, 20000)).max()
+    assert shape.probe.farthest_distance(at) == pytest.approx(expected, rel=3e-5)
+
+
+def test_notation_and_angle_describe_the_probe(shape):
+    read = parse_probe(f"{shape.probe.notation}@{np.rad2deg(shape.probe.angle)}")
+    np.testing.assert_allclose(read.outline, shape.probe.outline, atol=1e-9)
+
+
+@pytest.mark.parametrize("distance", [0.0, 20.0, 40.0], ids=["centre", "half-way", "rim"])
+def test_mesh_elements_of_the_footprint_have_its_area_and_centroid(shape, distance):
+    mesh = place(SENSOR.film, shape.probe, (0.0, distance), Resolution(5, 16, 3), 0.05)
+    weights = mesh.geometry.weights[mesh.template.footprint]
+    assert mesh.geometry.weights.min() > 0.0
+    assert mesh.template.copies * weights.sum() * SENSOR.film.radius**2 == pytest.approx(shape.area, rel=1e-5)
+    centroid = mesh.template.copies * mesh.geometry.load @ mesh.node_points
+    assert centroid.real * SENSOR.film.radius == pytest.approx(distance, abs=1e-4)
+
+
+CURVED = {name: shape for name, shape in SHAPES.items() if shape.probe.topology.is_curved}
+
+
+@pytest.mark.parametrize("shape", CURVED.values(), ids=CURVED)
+def test_curved_probe_has_the_charges_of_a_polygon_with_many_corners(shape):
+    """The corners lie on the boundary, and the polygon is enlarged to the area of the footprint."""
+    corners = to_corners(boundary_points(shape.probe, 24))
+    polygon = Polygon.of(corners * np.sqrt(shape.area / area_of(corners)))
+    settings = SolveSettings(theory=MEMBRANE)
+    curved_charge = touch_charge(SENSOR, press(SENSOR.film, shape.probe, (5.0, 3.0), 1.0, settings))
+    polygon_charge = touch_charge(SENSOR, press(SENSOR.film, polygon, (5.0, 3.0), 1.0, settings))
+    np.testing.assert_allclose(curved_charge, polygon_charge, rtol=3e-4)
+
+
+def test_outline_is_drawn_where_the_probe_presses(shape):
+    axes = Figure().subplots()
+    draw_probe(axes, shape.probe, (2.0, -1.0))
+    drawn = axes.patches[0].get_xy()[:-1] @ [1.0, 1.0j]
+    np.testing.assert_allclose(drawn, 2.0 - 1.0j + shape.probe.outline)
+
+
+def test_ellipse_with_equal_axes_has_the_charges_of_a_circle():
+    uniaxial = load_sensor("three-25um-uniaxial")
+    ellipse = touch_charge(uniaxial, press(uniaxial.film, Ellipse(4.0, 4.0), (5.0, 3.0), 1.0))
+    circle = touch_charge(uniaxial, press(uniaxial.film, Circle(2.0), (5.0, 3.0), 1.0))
+    np.testing.assert_allclose(ellipse, circle, rtol=2e-5)
+
+
+def test_pressure_charge_of_an_ellipse_on_an_electrode():
+    """The ellipse lies wholly on electrode A. The mean stress is minus half of the pressure, so Q = -d33 F / 2."""
+    sensor = replace(SENSOR, piezo=replace(SENSOR.piezo, d33=-20.0))
+    charge = contact_charge(sensor, Ellipse(2.0, 1.0, 0.7), sensor.electrodes[0].centre, 0.5)
+    np.testing.assert_allclose(charge, [5.0, 0.0, 0.0], atol=1e-9)
