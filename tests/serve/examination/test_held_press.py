@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame
-from isocharge.serve.examination.held_press import LEARNS_S, held_press
+from isocharge.serve.examination.held_press import LEARNING_TAU_s, held_press
 from isocharge.serve.examination.listening import Heard
 from isocharge.serve.examination.port_check import findings
 
@@ -53,7 +53,7 @@ def still(t):
         (
             still,
             -8.0,
-            {"leak": {"tau_s": LEARNS_S}},
+            {"leak": {"tau_s": LEARNING_TAU_s}},
             r"the rest drifts, by -1.6 % .*keeps its charge .*\[leak\] tau_s = 100000",
         ),
         (lambda t: 1.0 + 0.1 * np.sin(t), 0.0, {}, "by no law that is clear"),

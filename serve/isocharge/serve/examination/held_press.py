@@ -1,8 +1,8 @@
 """A press that is held while a board is listened to: whether its charge stays, leaks, creeps, or drifts as at rest.
 
-Nothing is known of the board yet, so a press is no level in pC. It is the first of the largest steps that the channels
-make within two tenths of a second; its size is what they show along that step, above the straight line of the rest
-before it.
+Nothing is known about the board, so no level in pC defines a press. The press is the first of the largest steps that
+the channels make within two tenths of a second. Its size is the component of the channels along that step, above the
+straight line that the rest before the step follows.
 """
 
 from dataclasses import dataclass
@@ -15,30 +15,39 @@ from isocharge.serve.live.fading import law_of_fading
 BLOCK_S = 0.1
 """Time over which values are averaged, s."""
 
-LEAST_REST_S, SETTLE_S, LEAST_HELD_S = 1.0, 0.5, 4.0
-"""Rest before the press that is needed; time after the step that does not count; time from there on, s."""
+MIN_REST_S = 1.0
+"""Shortest rest before the press, s."""
 
-STEP = 20.0
-"""Size of a step over the usual one from which it is a press, dimensionless."""
+SETTLE_S = 0.5
+"""Time after the step that is left out, s, because the force is still changing."""
 
-STEADY = 0.02
-"""Share of its charge that a press may lose or gain and still have kept it, dimensionless."""
+MIN_HELD_S = 4.0
+"""Shortest time for which the press must be held afterwards, s."""
+
+STEP_RATIO = 20.0
+"""Smallest size of the step of a press, as a multiple of the usual change, dimensionless."""
+
+RELEASE_SHARE = 0.3
+"""Share of the step by which the charge must fall at once when the press ends, dimensionless."""
+
+STEADY_SHARE = 0.02
+"""Share of its charge that a press may lose or gain and still count as steady, dimensionless."""
 
 DRIFT_SIGMAS = 4.0
-"""Slope of the rest from which it drifts, in its standard errors."""
+"""Slope of the rest above which it drifts, in standard errors of the slope."""
 
-LEARNS_S = 1e5
-"""A time constant that undoes nothing, s: the stage `[leak]` still learns the drift at rest, and takes it off."""
+LEARNING_TAU_s = 1e5
+"""Time constant for `[leak]` that undoes no leak, s. The stage still learns the drift at rest and removes it."""
 
 
 @dataclass(frozen=True)
 class HeldPress:
-    """What a held press says.
+    """What a held press shows about the board.
 
     Attributes:
-        begin_s: When it began, s since the first frame.
-        sections: What to put into a device file.
-        says: A sentence.
+        begin_s: Time at which the press began, s since the first frame.
+        sections: Sections for a device file.
+        says: Description of the press, a sentence.
     """
 
     begin_s: float
@@ -46,62 +55,106 @@ class HeldPress:
     says: str
 
 
-def held_press(values: Array, t_s: Array) -> HeldPress | None:
-    """The press in what came, None if none was held for `LEAST_HELD_S`.
+def held_press(values: Array, times_s: Array) -> HeldPress | None:
+    """Find a press that is held for at least `MIN_HELD_S`, and describe how its charge changes.
 
     Args:
-        values: Shape (n, channels), in any unit.
-        t_s: Times from the first frame on, shape (n,), s.
+        values: Values of the channels, shape (n, channels), in any unit.
+        times_s: Times since the first frame, shape (n,), s.
+
+    Returns:
+        The press; None if there is none.
     """
-    blocks = (t_s / BLOCK_S).astype(int)
-    count = np.bincount(blocks)[:-1]  # the last one may not be whole
-    if len(count) * BLOCK_S < LEAST_REST_S + SETTLE_S + LEAST_HELD_S or not (count.all() and np.isfinite(values).all()):
+    levels = _block_means(values, times_s)
+    if levels is None or len(levels) * BLOCK_S < MIN_REST_S + SETTLE_S + MIN_HELD_S:
         return None
-    mean = np.stack([np.bincount(blocks, column)[:-1] for column in values.T], axis=1) / count[:, None]
-    step = mean[2:] - mean[:-2]
-    size = np.linalg.norm(step, axis=1)
-    first = int(np.argmax(size > 0.5 * size.max()))
-    along = mean @ (step[first] / max(size[first], 1e-30))
-    begin, settled = first + 1, first + 1 + round(SETTLE_S / BLOCK_S)
-    leaves = np.flatnonzero(along[settled + 2 :] - along[settled:-2] < -0.3 * size[first])
-    held = slice(settled, settled + int(leaves[0]) if leaves.size else len(along))
-    at_s = BLOCK_S * (np.arange(len(along)) + 0.5)
-    if (
-        size[first] < STEP * np.median(size)
-        or first * BLOCK_S < LEAST_REST_S
-        or (held.stop - settled) * BLOCK_S < LEAST_HELD_S
-    ):
+    steps = levels[2:] - levels[:-2]
+    step_sizes = np.linalg.norm(steps, axis=1)
+    first = int(np.argmax(step_sizes > 0.5 * step_sizes.max()))
+    step_size = step_sizes[first]
+    component = levels @ (steps[first] / max(step_size, 1e-30))
+
+    begin = first + 1
+    settled = begin + round(SETTLE_S / BLOCK_S)
+    end = _end_of_press(component, settled, step_size)
+    is_large = step_size >= STEP_RATIO * np.median(step_sizes)
+    has_rest = first * BLOCK_S >= MIN_REST_S
+    is_long = (end - settled) * BLOCK_S >= MIN_HELD_S
+    if not (is_large and has_rest and is_long):
         return None
-    (slope, level), spread = np.polyfit(at_s[:first], along[:first], 1, cov=True)
-    drifts = abs(slope) > DRIFT_SIGMAS * np.sqrt(spread[0, 0]) and abs(slope) * LEAST_HELD_S > STEADY * size[first]
-    rest = level + slope * at_s if drifts else np.full(len(along), along[:first].mean())
-    says, sections = _words(at_s[held] - BLOCK_S * begin, (along - rest)[held])
-    if drifts:
-        remedy = f"[leak] tau_s = {LEARNS_S:g} in a device file lets the drift be learned at rest and taken off"
-        if "leak" in sections:
-            remedy = "leave the board alone until the rest stands still, and measure again"
-        says = f"the rest drifts, by {100.0 * slope / size[first]:.2g} % of the press in a second; {says}; {remedy}"
-        sections = {"leak": {"tau_s": LEARNS_S}} | sections
+
+    block_times_s = BLOCK_S * (np.arange(len(component)) + 0.5)
+    rest_times_s = block_times_s[:first]
+    (slope, level), covariance = np.polyfit(rest_times_s, component[:first], 1, cov=True)
+    is_significant = abs(slope) > DRIFT_SIGMAS * np.sqrt(covariance[0, 0])
+    has_drift = bool(is_significant and abs(slope) * MIN_HELD_S > STEADY_SHARE * step_size)
+    rest = np.full(len(component), component[:first].mean())
+    if has_drift:
+        rest = level + slope * block_times_s
+    held_s = block_times_s[settled:end] - BLOCK_S * begin
+    says, sections = _describe(held_s, (component - rest)[settled:end])
+    if has_drift:
+        says, sections = _with_drift(says, sections, percent_per_s=100.0 * slope / step_size)
     return HeldPress(BLOCK_S * begin, sections, says)
 
 
-def _words(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, float]]]:
-    """What a press does beside any drift, and what to put into a device file."""
-    lost = 1.0 - float(size[-5:].mean() / size[:5].mean())
-    if abs(lost) < STEADY:
+def _block_means(values: Array, times_s: Array) -> Array | None:
+    """Compute the means of the channels over whole blocks, shape (blocks, channels); None if a block has no value."""
+    if not np.isfinite(values).all():
+        return None
+    block = (times_s / BLOCK_S).astype(int)
+    counts = np.bincount(block)[:-1]  # The last block may be incomplete.
+    if not counts.all():
+        return None
+    sums = np.stack([np.bincount(block, column)[:-1] for column in values.T], axis=1)
+    return np.asarray(sums / counts[:, None])
+
+
+def _end_of_press(component: Array, settled: int, step_size: float) -> int:
+    """Return the first block after the press, or the number of blocks if the press is held to the end."""
+    changes = component[settled + 2 :] - component[settled:-2]
+    releases = np.flatnonzero(changes < -RELEASE_SHARE * step_size)
+    if releases.size == 0:
+        return len(component)
+    return settled + int(releases[0])
+
+
+def _with_drift(
+    says: str, sections: dict[str, dict[str, float]], percent_per_s: float
+) -> tuple[str, dict[str, dict[str, float]]]:
+    """Add the drift of the rest to the description and the sections of a press."""
+    remedy = f"[leak] tau_s = {LEARNING_TAU_s:g} in a device file lets the drift be learned at rest and taken off"
+    if "leak" in sections:
+        remedy = "leave the board alone until the rest stands still, and measure again"
+    sentence = f"the rest drifts, by {percent_per_s:.2g} % of the press in a second; {says}; {remedy}"
+    return sentence, {"leak": {"tau_s": LEARNING_TAU_s}} | sections
+
+
+def _describe(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, float]]]:
+    """Describe how the charge of a press changes, without the drift of the rest.
+
+    Args:
+        held_s: Times since the begin of the press, shape (n,), s.
+        size: Size of the press at these times, shape (n,), any unit.
+
+    Returns:
+        A sentence, and sections for a device file.
+    """
+    lost_share = 1.0 - float(size[-5:].mean() / size[:5].mean())
+    if abs(lost_share) < STEADY_SHARE:
         return f"a held press keeps its charge for {held_s[-1]:.0f} s", {}
     law = law_of_fading(list(zip(held_s.tolist(), np.maximum(size, 1e-9).tolist(), strict=True)))
     if law.tau_s is not None:
         tau_s = float(f"{law.tau_s:.2g}")
         return f"a held press leaks: [leak] tau_s = {tau_s:g} in a device file undoes it", {"leak": {"tau_s": tau_s}}
     if law.creep is not None:
-        return (
+        sentence = (
             f"a held press creeps by {100.0 * law.creep:.2g} % in each decade of time: the film does, so set no [leak] "
-            f"for it, and {law.remedy}",
-            {} if law.memory is None else {"memory": law.memory},
+            f"for it, and {law.remedy}"
         )
-    return (
-        f"a held press changes by {-100.0 * lost:.2g} % in {held_s[-1]:.0f} s, by no law that is clear: hold one "
-        "longer, with a weight",
-        {},
+        return sentence, {} if law.memory is None else {"memory": law.memory}
+    sentence = (
+        f"a held press changes by {-100.0 * lost_share:.2g} % in {held_s[-1]:.0f} s, by no law that is clear: hold one "
+        "longer, with a weight"
     )
+    return sentence, {}

@@ -1,6 +1,6 @@
-"""The device file that fits what was heard: its frames, which channels are electrodes, and their rest.
+"""The device file that fits a board: its frames, the channels of the electrodes, and their rest.
 
-What cannot be seen from outside, the charge of one count, is asked for and never made up.
+The charge of one count cannot be found from the bytes. The user has to state it, and it is never guessed.
 """
 
 import math
@@ -19,50 +19,58 @@ from isocharge.serve.recognition.recognise import recognise
 from isocharge.serve.signal_chain.tare import TareRule
 
 QUIET_SHARE = 0.1
-"""A channel with less noise than this share of the others' is not connected, dimensionless."""
+"""Share of the usual noise below which a channel is not connected to an electrode, dimensionless."""
 
 HALF_SCALE_SHARE = 0.05
-"""Largest distance of a rest from half of a converter's range, in that half, that is taken for it, dimensionless."""
+"""Largest distance of a rest from half of a converter's range, as a share of that half, dimensionless. A rest within
+this distance is replaced by half of the range."""
 
-BITS = range(8, 32)
-"""Bits of converters."""
+CONVERTER_BITS = range(8, 32)
+"""Possible resolutions of converters, bits."""
 
 REST_SIGMAS = 20.0
-"""A rest that is farther from zero than this is an offset, in standard deviations of the noise."""
+"""Distance of a rest from zero above which it is an offset, in standard deviations of the noise."""
 
 LARGEST_STILL_PC = 20.0
-"""Largest whole number that never changes and is taken for a charge, pC."""
+"""Largest whole number that is taken for a charge in pC if no channel ever changes."""
 
-LARGEST_V, LARGEST_NOISE_V = 12.0, 0.02
-"""Largest value and noise of a board that sends volts, V: charges of a film have more noise, in pC."""
+LARGEST_V = 12.0
+"""Largest value of a board that sends volts, V."""
+
+LARGEST_NOISE_V = 0.02
+"""Largest noise of a board that sends volts, V. Charges of a film in pC have more noise."""
 
 ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-"""Names of electrodes where no model says them."""
+"""Names of the electrodes if there is no model."""
 
 
 def rest_of(values: Array) -> float:
-    """The level at which a channel rests: the median of its values; 0 without a finite one."""
+    """Compute the level at which a channel rests: the median of its finite values, or 0 if there is none."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else 0.0
 
 
 def noise_of(values: Array) -> float:
-    """Standard deviation of a channel, from the median size of its steps, which presses hardly change.
+    """Estimate the standard deviation of a channel from the sizes of its steps, on which presses have little influence.
 
-    Coarse counts that stand still most of the time have a median step of 0; their mean step decides.
+    The median step of normally distributed noise is 0.6745 * sqrt(2) standard deviations. If the median step of coarse
+    counts is 0, the mean step is used, which is 2 / sqrt(pi) standard deviations.
     """
-    step = np.abs(np.diff(values[np.isfinite(values)].astype(float)))
-    if not len(step):
+    steps = np.abs(np.diff(values[np.isfinite(values)].astype(float)))
+    if not len(steps):
         return 0.0
-    return float(np.median(step) / (0.6745 * np.sqrt(2.0)) or step.mean() * np.sqrt(np.pi) / 2.0)
+    median_step = float(np.median(steps))
+    if median_step > 0.0:
+        return median_step / (0.6745 * math.sqrt(2.0))
+    return float(steps.mean()) * math.sqrt(math.pi) / 2.0
 
 
 class Proposal(NamedTuple):
-    """A device file.
+    """A proposed device file.
 
     Attributes:
-        table: Its content; empty if the frames are not recognised.
-        electrodes: Those of the model, or as many names as channels are alive.
+        table: Content of the file; empty if the frames are not recognised.
+        electrodes: Electrodes of the model, or as many names as there are live channels.
     """
 
     table: dict[str, Any]
@@ -70,11 +78,11 @@ class Proposal(NamedTuple):
 
 
 def propose(heard: Heard, electrodes: tuple[str, ...], gain: Mapping[str, Any]) -> Proposal:
-    """The device file for a board.
+    """Propose the device file for a board.
 
     Args:
-        heard: What it sent.
-        electrodes: Those of the model; empty if any will do.
+        heard: What the board sent.
+        electrodes: Electrodes of the model; empty for any model.
         gain: What the user knows of the amplifier: pC_per_unit, or V_per_unit and feedback_pF; empty for nothing.
     """
     frames = recognise(heard.data, heard.span_s, are_datagrams=heard.are_datagrams)
@@ -82,7 +90,8 @@ def propose(heard: Heard, electrodes: tuple[str, ...], gain: Mapping[str, Any]) 
         return Proposal({}, electrodes)
     if heard.request is not None:
         frames |= {"request": heard.request.data.hex(" ").upper(), "request_Hz": heard.request.rate_Hz}
-        frames |= {"echo": True} if heard.request.echo else {}
+        if heard.request.echo:
+            frames["echo"] = True
     table: dict[str, Any] = {"name": "board", "frames": frames}
     capture = read_frames(heard, device_from_table(table, "board"))
     if not capture.frames:
@@ -96,15 +105,18 @@ def propose(heard: Heard, electrodes: tuple[str, ...], gain: Mapping[str, Any]) 
     columns = {electrode: at_rest[:, position] for electrode, position in chosen.items()}
     is_far = any(abs(rest_of(column)) > TareRule().offset_limit_pC for column in columns.values())
     if gain or is_far or unit_of(capture) != "pC":
-        known = gain or ({"pC_per_unit": 1.0} if unit_of(capture) == "pC" else {})
-        table["gain"] = _offsets(columns, known) | dict(known)
+        known_gain = dict(gain)
+        if not known_gain and unit_of(capture) == "pC":
+            known_gain = {"pC_per_unit": 1.0}
+        table["gain"] = _offsets(columns, known_gain) | known_gain
     return Proposal(table, electrodes or tuple(chosen))
 
 
 def unit_of(capture: Capture) -> str:
-    """The unit of the values where nothing is known of the gain: "pC", "counts" or "V".
+    """Return the unit of the values if nothing is known of the gain: "pC", "counts" or "V".
 
-    Our binary frames hold pC, and numbers with a fraction are taken for it.
+    The binary frames of isocharge contain pC. Whole numbers are counts, small numbers with little noise are volts, and
+    all other numbers are taken for pC.
     """
     if not capture.frames or capture.parser.format == BINARY or all(name.endswith("_pC") for name in capture.names):
         return "pC"
@@ -121,7 +133,7 @@ def unit_of(capture: Capture) -> str:
 
 
 def _chosen(capture: Capture, values: Array, electrodes: tuple[str, ...]) -> dict[str, int]:
-    """The position of each electrode's channel; empty if there are too few."""
+    """Choose the channel of each electrode, and return its position; empty if there are too few channels."""
     names = capture.names
     by_electrode = {electrode_of(channel): position for position, channel in enumerate(names)}
     if electrodes and set(electrodes) <= set(by_electrode):
@@ -131,14 +143,14 @@ def _chosen(capture: Capture, values: Array, electrodes: tuple[str, ...]) -> dic
         named = [electrode_of(names[position]) for position in alive]
         electrodes = tuple(named if set(named) <= set(ELECTRODES) else ELECTRODES[: len(alive)])
     if len(alive) < len(electrodes) == len(names):
-        alive = list(range(len(names)))  # a channel without life stays what it is, and is complained of
+        alive = list(range(len(names)))  # A channel that never changes keeps its place and is reported.
     if len(alive) < len(electrodes):
         return {}
     return dict(zip(electrodes, _most_alike(values, alive, len(electrodes)), strict=True))
 
 
 def _alive(values: Array) -> list[int]:
-    """Positions of the channels that vary as the others do; all of them where nothing varies."""
+    """Return the positions of the channels that vary like the others; all positions if no channel varies."""
     columns = [column if np.isfinite(column).all() else np.zeros(1) for column in values.T]
     varying = [k for k, column in enumerate(columns) if np.ptp(column) > 0.0]
     if not varying:
@@ -149,16 +161,22 @@ def _alive(values: Array) -> list[int]:
 
 
 def _most_alike(values: Array, alive: list[int], count: int) -> list[int]:
-    """As many channels side by side as there are electrodes, whose noise is most alike; of equal ones the first."""
-    level = np.log10([max(noise_of(values[:, k]), 1e-12) for k in alive])
-    runs = range(len(alive) - count + 1)
-    spread = [round(float(np.ptp(level[begin : begin + count])), 0) for begin in runs]
-    begin = int(np.argmin(spread))
-    return alive[begin : begin + count]
+    """Choose the adjacent channels whose noise is most similar; of several choices the first.
+
+    Args:
+        values: Values of all channels, shape (n, channels).
+        alive: Positions of the channels to choose from.
+        count: Number of channels to choose.
+    """
+    noise_decades = np.log10([max(noise_of(values[:, position]), 1e-12) for position in alive])
+    begins = range(len(alive) - count + 1)
+    spreads = [round(float(np.ptp(noise_decades[begin : begin + count]))) for begin in begins]
+    best_begin = int(np.argmin(spreads))
+    return alive[best_begin : best_begin + count]
 
 
 def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, Any]:
-    """The key `offset` of the section `[gain]`, one for all electrodes if they are alike; nothing if they rest at 0."""
+    """Return the key `offset` of the section `[gain]`: one value if all electrodes agree; empty if they rest at 0."""
     rests = {electrode: rest_of(column) for electrode, column in columns.items()}
     offsets = {electrode: _offset(column) for electrode, column in columns.items()}
     if gain:
@@ -171,27 +189,35 @@ def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str,
         is_offset = any(abs(rest) > max(REST_SIGMAS * noise[electrode], 1e-9) for electrode, rest in rests.items())
     if not is_offset:
         return {}
-    alike = set(offsets.values())
-    return {"offset": alike.pop() if len(alike) == 1 else offsets}
+    different_offsets = set(offsets.values())
+    if len(different_offsets) == 1:
+        return {"offset": different_offsets.pop()}
+    return {"offset": offsets}
 
 
 def _largest_pC(gain: Mapping[str, Any]) -> float:
-    """Largest magnitude of the charge of one unit, pC."""
-    each = (setting.values() if isinstance(setting, Mapping) else [setting] for setting in gain.values())
-    return math.prod(max(abs(float(number)) for number in numbers) for numbers in each)
+    """Compute the largest magnitude of the charge of one unit, pC."""
+    largest_pC = 1.0
+    for setting in gain.values():
+        numbers = setting.values() if isinstance(setting, Mapping) else [setting]
+        largest_pC *= max(abs(float(number)) for number in numbers)
+    return largest_pC
 
 
 def _offset(column: Array) -> float | int:
-    """What a channel shows without charge: half of a converter's range if it is near it, else its rest."""
+    """Return the value of a channel without charge: half of a converter's range if the rest is near, else the rest."""
     rest = rest_of(column)
-    for bits in BITS:
-        half = 1 << (bits - 1)
-        if abs(rest - half) <= HALF_SCALE_SHARE * half and bool((column == np.round(column)).all()):
-            return half
+    is_whole = bool((column == np.round(column)).all())
+    for bits in CONVERTER_BITS:
+        half_range = 1 << (bits - 1)
+        if is_whole and abs(rest - half_range) <= HALF_SCALE_SHARE * half_range:
+            return half_range
     return _rounded(rest)
 
 
 def _rounded(rest: float) -> float | int:
-    """A rest to six digits; whole if it is large."""
+    """Round a rest to six digits, or to a whole number if it is large."""
     value = float(f"{rest:.6g}")
-    return round(rest) if abs(rest) >= 1000.0 or value.is_integer() else value
+    if abs(rest) >= 1000.0 or value.is_integer():
+        return round(rest)
+    return value
