@@ -21,7 +21,7 @@ from isocharge.train import CalibrationProblem, calibrate, write_calibration
 sensor, presses = load_sensor("four-25um-biaxial"), read_presses(Path(sys.argv[0]).parent / "presses.csv")
 result = calibrate(presses, CalibrationProblem.of(sensor, Circle(1.0)))
 print(f"{len(presses)} presses: {result.film[0].film.pretension:.2f} MPa of pretension")
-print(f"left by not knowing the film: {result.left.position_mm:.2f} mm, {result.left.force_percent:.1f} %")
+print(f"left by not knowing the film: {result.error_left.position_mm:.2f} mm, {result.error_left.force_percent:.1f} %")
 for caution in result.cautions:
     print("caution:", caution)
 with tempfile.TemporaryDirectory() as temporary:
