@@ -18,6 +18,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from boards import TcpBoard, taps
 from isocharge.serve import ModelMetadata, PredictionRecord, Predictor, write_model
+from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import HttpServer
 from isocharge.serve.network.model_store import open_model_store
@@ -59,7 +60,7 @@ class LinearFilm:
             "working_area_mm": tuple((RADIUS_MM * np.cos(a), RADIUS_MM * np.sin(a)) for a in angle.tolist()),
             "probes": ("circle:1.0",),
             "force_range_N": (0.05, 2.0),
-            "noise": {"name": "reference", "white_pC": 1.0, "gain": 0.002},
+            "noise": ModelNoise(name="reference", white_pC=1.0, gain=0.002),
             "dataset_sha256": "0" * 64,
             "errors": {"position_median_mm": 0.0},
             "made_with": {"command": "pytest"},

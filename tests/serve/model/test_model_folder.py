@@ -38,6 +38,11 @@ def test_a_file_with_the_name_of_the_model(film, tmp_path):
         film.write(tmp_path)
 
 
+def noise_text(white_pC="1", gain="0.002"):
+    """The noise of a model as it stands in its metadata; the values are JSON."""
+    return f'{{"name": "mine", "white_pC": {white_pC}, "gain": {gain}}}'
+
+
 def write(film, folder, *, onnx=None, metadata=None, golden=None):
     metadata = metadata or film.metadata()
     onnx = film.onnx(film.metadata().to_props()) if onnx is None else onnx
@@ -314,11 +319,28 @@ def test_missing_key_is_named(film, key):
         ("probes", '"circle:1.0"', "expected a list of texts, 1 or more, got 'circle"),
         ("noise", "{", "noise: expected JSON, got '{' "),
         ("noise", "[" * 100_000, "noise: expected JSON"),
+        ("noise", "{}", "key 'noise.name' is missing"),
+        ("noise", '{"name": "mine", "gain": 0.002}', "key 'noise.white_pC' is missing"),
+        ("noise", '{"name": "mine", "white_pC": 1.0}', "key 'noise.gain' is missing"),
+        ("noise", noise_text(white_pC="-1"), "noise.white_pC: expected a number from 0, .*, got -1"),
+        ("noise", noise_text(white_pC="NaN"), "noise: expected JSON"),
+        ("noise", noise_text(white_pC='"loud"'), "noise.white_pC: expected a number from 0, .*, got 'loud'"),
+        ("noise", noise_text(white_pC="[1, 1, -1]"), "noise.white_pC"),
+        ("noise", noise_text(gain="[0.1, 0.1]"), r"noise.gain: expected one number for each of 3 electrodes, got .0.1"),
+        ("noise", noise_text(gain="null"), "noise.gain: expected a number from 0, .*, got None"),
     ],
 )
 def test_wrong_value_is_shown(film, key, text, said):
     with pytest.raises(ModelError, match=rf"^{WHERE}: metadata: (?=.*{key}).*{said}.*; export the model again$"):
         ModelMetadata.from_props(film.metadata().to_props() | {key: text}, WHERE)
+
+
+@pytest.mark.parametrize("extra", ["", ', "tau_s": 3.0'])
+def test_noise_of_each_electrode_and_of_older_models_is_read(film, extra):
+    text = f'{{"name": "rig", "white_pC": [1, 2, 3], "gain": 0.002{extra}}}'
+    noise = ModelMetadata.from_props(film.metadata().to_props() | {"noise": text}, WHERE).noise
+    variance = noise.variance(np.array([[100.0, 0.0, -50.0]]))
+    np.testing.assert_allclose(variance, [[1.0 + 0.04, 4.0, 9.0 + 0.01]])
 
 
 @pytest.mark.parametrize("value", [{"median_mm": float("nan")}, {"median_mm": object()}])

@@ -142,6 +142,12 @@ def test_light_press_that_exceeds_the_noise_has_a_position():
     assert Predictor("three-25um-biaxial").validity.is_touch(charges).all()
 
 
+def test_noise_may_differ_between_electrodes():
+    corners = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+    validity = Validity(corners, (0.1, 1.0), white_pC=(1.0, 10.0))
+    assert validity.is_touch(np.array([[20.0, 0.0], [0.0, 20.0]])).tolist() == [True, False]
+
+
 def test_record_has_the_fields_in_their_order(contract, record):
     assert list(json.loads(record().to_json())) == contract
 

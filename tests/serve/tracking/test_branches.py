@@ -13,10 +13,12 @@ from isocharge.common.files import sha256_of
 from isocharge.serve import Chunk, Frame, Predictor, TouchStream, encode_frame
 from isocharge.serve.live.device import device_from_table
 from isocharge.serve.model.charge_series import ChargeSeries, Series, read_charges
+from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.tracking.branches import GAIN, Branches
 from isocharge.serve.tracking.tracker import Tracker
 
-RADIUS, FOLD, FORCES, NOISE = 6.0, 2.0, (0.05, 2.0), (1.0, 0.002)
+RADIUS, FOLD, FORCES = 6.0, 2.0, (0.05, 2.0)
+NOISE = ModelNoise(name="reference", white_pC=1.0, gain=0.002)
 
 
 def charges(x, y, force):
@@ -39,12 +41,12 @@ def folded():
 def readings(x, y=1.0, force=0.5, seed=0, gains=(1.0, 1.0, 1.0)):
     """Noisy charges of places x, shape (n,), mm, to (n, 3)."""
     clean, rng = charges(x, y + 0.0 * x, force + 0.0 * x) * gains, np.random.default_rng(seed)
-    return clean + np.hypot(NOISE[0], NOISE[1] * clean) * rng.standard_normal(clean.shape)
+    return clean + np.sqrt(NOISE.variance(clean)) * rng.standard_normal(clean.shape)
 
 
 def followed(x, rate_Hz=1000.0, **options):
     """What a tracker says, and what other contact, of each frame."""
-    tracker = Tracker(branches=Branches(folded(), *NOISE))
+    tracker = Tracker(branches=Branches(folded(), NOISE))
     return [
         (tracker.update(ANY, k / rate_Hz, (), row)[0], tracker.other) for k, row in enumerate(readings(x, **options))
     ]
@@ -98,7 +100,7 @@ def test_a_contact_that_turns_back_stays_on_its_side():
 
 
 def test_charges_that_no_contact_has_are_no_contact():
-    tracker = Tracker(branches=Branches(folded(), *NOISE))
+    tracker = Tracker(branches=Branches(folded(), NOISE))
     for k in range(20):
         assert tracker.update(ANY, k / 1000.0, (), np.array([1e3, 1e6, 10.0])) == (None, None)
     assert tracker.update(None, 0.05) == (None, None)

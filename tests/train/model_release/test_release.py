@@ -13,6 +13,7 @@ from scipy.stats import chi2, halfnorm
 
 from isocharge.common.errors import DatasetError, ModelError
 from isocharge.serve import Predictor, find_model
+from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.model_folder import model_names
 from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor, noise_model, press
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
@@ -116,7 +117,7 @@ def test_the_folder_is_complete_and_says_what_it_holds(released, dataset, sensor
     assert (metadata.dataset_sha256, metadata.force_range_N) == (dataset.sha256, (LOW, HIGH))
     at_yield = press(sensor.film, Circle(1.0), (0.0, 0.0), metadata.yield_force_N)
     assert principal_stress(at_yield)[1] == pytest.approx(45.0, rel=0.01)
-    assert metadata.noise == {"name": "reference", "white_pC": 1.0, "gain": 0.002}
+    assert metadata.noise == ModelNoise(name="reference", white_pC=1.0, gain=0.002)
     assert sensor_from_dict(json.loads(json.dumps(metadata.sensor))) == sensor
     corners = np.array(metadata.working_area_mm)
     middle = 0.5 * (corners + np.roll(corners, -1, axis=0))

@@ -9,18 +9,52 @@ import json
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from msgspec import Meta, Struct
+import numpy as np
+from msgspec import Meta, Struct, to_builtins
 
+from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, shown
 from isocharge.common.model_labels import ModelName
 from isocharge.common.printable_text import is_printable
-from isocharge.common.structs import Finite, Positive, Settings, Text, WrongKey, convert, parse_json
+from isocharge.common.structs import Finite, NotNegative, Positive, Settings, Text, WrongKey, convert, parse_json
 
 FORMAT_VERSION = 1
 """Version of the metadata."""
 
 
 Names = Annotated[tuple[Text, ...], Meta(min_length=1)]
+
+NoiseLevel = Annotated[
+    NotNegative | tuple[NotNegative, ...],
+    Meta(extra_json_schema={"description": "a number from 0, or a list with one for each electrode"}),
+]
+"""Standard deviation of the noise of all electrodes, or of each."""
+
+
+class ModelNoise(Struct, frozen=True, kw_only=True):
+    """The noise of the charges that a model was trained for.
+
+    The standard deviation of a charge q is the root of `white_pC`^2 + (`gain` * q)^2.
+
+    Attributes:
+        name: Name of the noise model.
+        white_pC: Standard deviation that does not depend on the charge, pC.
+        gain: Standard deviation in proportion to the charge, dimensionless.
+    """
+
+    name: Text
+    white_pC: NoiseLevel
+    gain: NoiseLevel
+
+    def of_each(self, electrodes: int) -> tuple[Array, Array]:
+        """Return `white_pC` and `gain` of each electrode, both of shape (electrodes,)."""
+        return np.broadcast_to(self.white_pC, electrodes), np.broadcast_to(self.gain, electrodes)
+
+    def variance(self, charge_pC: Array) -> Array:
+        """Return the variance of the noise of charges, both of shape (..., n_electrode), in pC and pC^2."""
+        white_pC = np.asarray(self.white_pC)
+        gain = np.asarray(self.gain)
+        return np.asarray(white_pC**2 + (gain * charge_pC) ** 2)
 
 
 class ModelMetadata(Settings, frozen=True, kw_only=True):
@@ -34,7 +68,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         working_area_mm: Polygon (x, y), mm, inside which the model was trained.
         probes: Notations of the probes in the training.
         force_range_N: Smallest and largest force in the training, N.
-        noise: The noise model of the training, with its parameters.
+        noise: The noise of the training.
         dataset_sha256: Checksum of the dataset.
         errors: Measured errors, by names that carry the unit.
         made_with: The command and the package versions.
@@ -50,7 +84,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
     working_area_mm: Annotated[tuple[tuple[Finite, Finite], ...], Meta(min_length=3)]
     probes: Names
     force_range_N: tuple[Finite, Finite]
-    noise: dict[str, Any]
+    noise: ModelNoise
     dataset_sha256: Text
     errors: dict[str, Finite]
     made_with: dict[str, Any]
@@ -69,6 +103,9 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
                 raise WrongKey(key, "printable characters", texts)
         if self.force_range_N[0] > self.force_range_N[1]:
             raise WrongKey("force_range_N", "a smaller and a larger number", list(self.force_range_N))
+        for key, level in (("white_pC", self.noise.white_pC), ("gain", self.noise.gain)):
+            if isinstance(level, tuple) and len(level) != len(self.electrodes):
+                raise WrongKey(f"noise.{key}", f"one number for each of {len(self.electrodes)} electrodes", level)
 
     @property
     def label(self) -> str:
@@ -123,6 +160,6 @@ class _Version(Struct):
 
 def _to_json(key: str, value: Any) -> str:
     try:
-        return json.dumps(value, allow_nan=False)
+        return json.dumps(value, allow_nan=False, default=to_builtins)
     except (TypeError, ValueError) as error:
         raise ModelError(f"model metadata {key!r}: expected a JSON value, got {shown(value)} ({error})") from error

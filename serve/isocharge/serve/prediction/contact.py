@@ -160,22 +160,26 @@ class Validity:
         force_range_N: Smallest and largest force, N.
         misfit_limit: Largest misfit of a single contact, in standard deviations.
         yield_force_N: Force beyond which the film yields, N.
-        white_pC: Standard deviation of the white noise of each charge, pC.
+        white_pC: Standard deviation of the white noise of each charge, or one for each electrode, pC.
     """
 
     corners_mm: Array
     force_range_N: tuple[float, float]
     misfit_limit: float = MISFIT_LIMIT
     yield_force_N: float = math.inf
-    white_pC: float = 0.0
+    white_pC: float | tuple[float, ...] = 0.0
 
     @classmethod
     def of(cls, metadata: ModelMetadata) -> "Validity":
-        """What a model's metadata state."""
-        limit = max(MISFIT_LIMIT, metadata.errors.get("misfit_p999", MISFIT_LIMIT))
-        yields_N = math.inf if metadata.yield_force_N is None else metadata.yield_force_N
-        white_pC = metadata.noise.get("white_pC", 0.0)
-        return cls(np.array(metadata.working_area_mm), metadata.force_range_N, limit, yields_N, white_pC)
+        """Return the limits that a model's metadata state."""
+        measured_limit = metadata.errors.get("misfit_p999", MISFIT_LIMIT)
+        return cls(
+            corners_mm=np.array(metadata.working_area_mm),
+            force_range_N=metadata.force_range_N,
+            misfit_limit=max(MISFIT_LIMIT, measured_limit),
+            yield_force_N=math.inf if metadata.yield_force_N is None else metadata.yield_force_N,
+            white_pC=metadata.noise.white_pC,
+        )
 
     @cached_property
     def reach_mm(self) -> float:
@@ -199,7 +203,7 @@ class Validity:
 
         Charges that do not rise out of the noise on any electrode determine no position.
         """
-        return np.asarray(np.abs(charge_pC).max(axis=1) > TOUCH_LIMIT * self.white_pC)
+        return np.asarray((np.abs(charge_pC) > TOUCH_LIMIT * np.asarray(self.white_pC)).any(axis=1))
 
     @property
     def is_centred(self) -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.model.charge_series import ChargeSeries, read_charges
+from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.prediction.contact import Contact
 from isocharge.serve.prediction.predictor import Predictor
 
@@ -122,9 +123,15 @@ class Branch(NamedTuple):
 class Branches:
     """Follows one contact; belongs to one thread. The same frames give the same answers, bit for bit."""
 
-    def __init__(self, charges: ChargeSeries, white_pC: float, gain: float) -> None:
-        """Begin without a contact; the noise of a frame is that of the model's training."""
-        self.charges, self._white, self._gain = charges, white_pC, gain
+    def __init__(self, charges: ChargeSeries, noise: ModelNoise) -> None:
+        """Begin without a contact.
+
+        Args:
+            charges: The charges of every contact.
+            noise: Noise of a frame, that of the model's training.
+        """
+        self.charges = charges
+        self._noise = noise
         angle, share = TURNS * np.arange(STARTS), np.sqrt((np.arange(STARTS) + 0.5) / STARTS)
         places = charges.radius_mm * share * np.array([np.cos(angle), np.sin(angle)])
         self._places = np.column_stack([*places, np.full(STARTS, np.log(charges.force_N).mean())])
@@ -149,7 +156,7 @@ class Branches:
             charges, times = zip(*self._block, strict=True)
             charge_pC, middle_s, count = np.mean(charges, axis=0), sum(times) / len(times), len(times)
             self._block, self._began_s, dt_s, self._t_s = [], t_s, middle_s - self._t_s, middle_s
-            variance = (self._white**2 + (self._gain * charge_pC) ** 2) / count + (COLOURED * charge_pC) ** 2
+            variance = self._noise.variance(charge_pC) / count + (COLOURED * charge_pC) ** 2
             follows = self._weight.size > 0 and 0.0 < dt_s < LONGEST_STEP_s
             if not (follows and self._advance(charge_pC, variance, dt_s)):
                 self._weight = np.zeros(0)
@@ -303,5 +310,4 @@ def branches_of(predictor: Predictor) -> Branches | None:
         ModelError: If the file is damaged.
     """
     charges = read_charges(predictor.folder, len(predictor.metadata.electrodes))
-    noise = predictor.metadata.noise
-    return None if charges is None else Branches(charges, noise["white_pC"], noise["gain"])
+    return None if charges is None else Branches(charges, predictor.metadata.noise)

@@ -38,7 +38,7 @@ def measured_card(metadata: ModelMetadata) -> str:
     channels = ", ".join(metadata.electrodes)
     levels = "\n".join(
         f"| noise of {name} | {white:g} and {100 * gain:.3g} % of the charge |"
-        for name, white, gain in zip(metadata.electrodes, noise["white_pC"], noise["gain"], strict=True)
+        for name, white, gain in zip(metadata.electrodes, *noise.of_each(len(metadata.electrodes)), strict=True)
     )
     position, force = measured["std_factors"]
     how = f"""\

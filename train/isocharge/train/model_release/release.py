@@ -14,9 +14,10 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
-from isocharge.common.errors import SceneError, SolveError
+from isocharge.common.errors import ModelError, SceneError, SolveError
+from isocharge.common.structs import convert
 from isocharge.serve.model.golden import contact_floors
-from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
 from isocharge.serve.model.model_folder import check_target, write_model
 from isocharge.simulate import parse_probe
 from isocharge.simulate.forward.charge_map import Domain
@@ -171,7 +172,7 @@ Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of o
 | working area | within {fitted.domain.radius:g} mm of the centre{folded if fitted.asked != fitted.domain else ""} |
 | forces | {low:g} to {high:g} N{yield_words(metadata)} |
 | probes | {", ".join(metadata.probes)}{unknown_probe} |
-| trained for the noise | {noise["name"]}: {noise["white_pC"]:g} pC and {100 * float(noise["gain"]):g} % |
+| trained for the noise | {noise.name}: {noise.white_pC:g} pC and {100 * noise.gain:g} % |
 """
 
 
@@ -256,7 +257,7 @@ def release(
         else _disk_polygon(fitted.domain.radius),
         probes=fitted.probes,
         force_range_N=fitted.domain.force_range,
-        noise=fitted.noise.to_dict(),
+        noise=convert(fitted.noise.to_dict(), ModelNoise, "noise of the training", ModelError),
         dataset_sha256=fitted.sha256,
         errors=evaluate(fitted) if errors is None else dict(errors),
         made_with={

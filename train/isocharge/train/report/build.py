@@ -270,7 +270,7 @@ class _Subject:
             "model": {
                 "label": model.label,
                 "probes": list(model.probes),
-                "noise": model.noise["name"],
+                "noise": model.noise.name,
                 "dataset_sha256": model.dataset_sha256,
                 "card_errors": dict(model.errors),
             },
