@@ -26,7 +26,7 @@ from isocharge.serve.flags import FILM
 from isocharge.serve.live import recorded_stream
 from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.model.pretensions import read_pretensions
-from isocharge.serve.tracking.film_follower import FilmFollower
+from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
 from isocharge.train.data.presses import draw_contacts
@@ -117,32 +117,34 @@ def rms(errors):
 
 
 def test_it_follows_a_degree_and_goes_back_when_asked(mine, problem, film):
-    """Issue 29's numbers: 0.19 mm and 3 % after 60 touches, where the calibration is then wrong by 0.3 mm and 14 %."""
-    back = lambda stream, touch: touch == 110 and stream.back()  # noqa: E731
+    """After 60 touches errors are below 0.19 mm and 3 %; as calibrated they would be 0.3 mm and 14 %."""
+    back = lambda stream, touch: touch == 110 and stream.reset_film()  # noqa: E731
     records, errors = follow(mine, problem, film, [1.0 + DEGREE_MPa] * 118, ask=back)
     start, still = rms(errors[:8]), rms(errors[60:110])
     assert start[1] > 10.0
     assert still[0] < 0.19
     assert still[1] < 3.0
     before, after, last = (records[n].film for n in (0, 109, 111))
-    change = after["pretension_MPa"] - before["pretension_MPa"]
-    assert change == pytest.approx(DEGREE_MPa, abs=2.0 * after["pretension_std_MPa"])
-    assert after["pretension_std_MPa"] < 0.09  # computed limit after 30 touches on this layout
-    assert (after["touches"], before["touches"]) == (pytest.approx(95, abs=15), 0)
+    change = after.pretension_MPa - before.pretension_MPa
+    assert change == pytest.approx(DEGREE_MPa, abs=2.0 * after.pretension_std_MPa)
+    assert after.pretension_std_MPa < 0.09  # computed limit after 30 touches on this layout
+    assert after.touches == pytest.approx(95, abs=15)
+    assert before.touches == 0
     force_std = [record.force_std_N / record.force_N for record in records[60:110]]
     assert np.mean(np.abs(errors[60:110, 1]) < 2.0 * np.array(force_std)) > 0.9  # 0.84 without the pretension's
-    assert last == before | {"touches": last["touches"]}
+    assert last.pretension_MPa == before.pretension_MPa
+    assert last.pretension_std_MPa == before.pretension_std_MPa
     assert rms(errors[111:])[1] > 10.0
 
 
 def test_it_follows_a_drift_that_lasts(mine, problem, film):
     _, errors = follow(mine, problem, film, 1.0 + DEGREE_MPa * np.linspace(0.0, 1.0, 100))
-    assert rms(errors[50:])[1] < 4.0
+    assert rms(errors[50:])[1] < 5.5  # 12 % as calibrated; a slow drift could also be an offset that grows
 
 
 def test_a_film_that_stays_is_left_as_it_is(mine, problem, film):
     _, errors = follow(mine, problem, film, [1.0] * 80)
-    _, alone = follow(mine, problem, film, [1.0] * 80, ask=lambda stream, _: stream.back())
+    _, alone = follow(mine, problem, film, [1.0] * 80, ask=lambda stream, _: stream.reset_film())
     followed, alone = rms(errors), rms(alone)
     np.testing.assert_array_less(followed, np.hypot(1.05 * alone, [0.0, 0.75]))  # each gain may drift by 1 %; F ~ Q^1.5
 
@@ -156,23 +158,23 @@ def test_a_replay_follows_and_goes_back_as_the_stream_did(mine, problem, film, t
         def asking():
             for number, chunk in enumerate(chunks):
                 if number == 110 + 36 * PERIOD:
-                    live.request_back()
+                    live.request_film_reset()
                 yield chunk
 
-        lines = [line for _, line in live.follow(asking())]
+        lines = [record.to_json() for record in live.follow(asking())]
     pretensions = [json.loads(line)["film"]["pretension_MPa"] for line in lines]
     assert max(pretensions) > pretensions[0] + 0.2
     assert pretensions[-1] == pretensions[0]
     recording = Recording(path)
     again = TouchStream(Predictor(mine), device_from_table(recording.device, "test"), now_ns=clock)
-    assert [line for _, line in recorded_stream.replay(recording, again, clock)] == lines
+    assert [record.to_json() for record in recorded_stream.replay(recording, again, clock)] == lines
 
 
 @pytest.mark.parametrize(("electrode", "change", "flagged"), [(0, -0.03, True), (3, 0.015, False)])
 def test_a_gain_that_is_wrong_is_not_followed(mine, problem, film, electrode, change, flagged):
     """The charges could nearly be those of a film 0.2 to 0.3 MPa from this one, and the force wrong by 8 to 14 %."""
     records, _ = follow(mine, problem, film, [1.0] * 80, gain=1.0 + change * np.eye(4)[electrode])
-    apart = [record.film["pretension_MPa"] - records[0].film["pretension_MPa"] for record in records]
+    apart = [record.film.pretension_MPa - records[0].film.pretension_MPa for record in records]
     assert max(map(abs, apart[40:])) < 0.06
     assert (FILM in records[-1].flags) == flagged
 
@@ -183,9 +185,111 @@ def test_a_gain_that_goes_off_late_is_not_followed(mine, problem, film):
     charge = problem.noise.add(film(1.0).charges(draw_contacts(rng, problem.domain, 360)), rng)
     charge[300:, 0] *= 0.985
     for number, row in enumerate(charge):
-        follower.take(row, 5.0 * number)
+        follower.observe_touch(row, 5.0 * number)
         pretensions.append(follower.film.pretension_MPa)
     assert np.ptp(pretensions[299:]) < 0.1
+
+
+def follow_touches(follower, charges, interval_s=5.0):
+    """Let a follower observe the hardest frames of touches, charges of shape (n, 4), pC, with the model's flags."""
+    for number, charge in enumerate(charges):
+        contact = follower.predictor.predict(charge)
+        flags = follower.predictor.flags(contact)
+        follower.observe_frame(charge, contact, flags, interval_s * number)
+        follower.observe_frame(None, None, (), interval_s * (number + 0.5))
+
+
+def touch_charges(problem, film, predictor, pretension, count, seed):
+    """Contacts below the yield force, shape (n, 3), and their noisy charges, shape (n, 4), pC."""
+    rng = np.random.default_rng(seed)
+    contact = draw_contacts(rng, problem.domain, count)
+    contact[:, 2] = np.minimum(contact[:, 2], 0.95 * predictor.validity.yield_force_N)
+    return contact, problem.noise.add(film(pretension).charges(contact), rng)
+
+
+WARM_TOUCHES = np.arange(120)
+
+OFFSETS = {
+    "constant": np.ones(WARM_TOUCHES.size),
+    "varying": 1.0 + 0.5 * np.random.default_rng(9).standard_normal(WARM_TOUCHES.size),
+    "decaying": np.exp(-WARM_TOUCHES / 30.0),
+    "warming": 1.0 - np.exp(-WARM_TOUCHES / 30.0),
+}
+"""Offset of each touch over the largest offset of the session."""
+
+
+@pytest.mark.parametrize("size_pC", [-30.0, -10.0, 10.0, 30.0])
+@pytest.mark.parametrize("kind", OFFSETS)
+def test_common_offset_of_warm_fingers_is_not_taken_for_pretension(mine, problem, film, kind, size_pC):
+    """Without an offset among its unknowns the follower moved by 0.3 to 1.2 MPa, up to six standard deviations."""
+    model = Predictor(mine)
+    follower = FilmFollower(model)
+    calibrated_MPa = follower.film.pretension_MPa
+    contact, charge = touch_charges(problem, film, model, 1.0, 130, seed=8)
+    warm = slice(0, 120)
+    cold = slice(120, None)
+    follow_touches(follower, charge[warm] + size_pC * OFFSETS[kind][:, None])
+
+    change_MPa = follower.film.pretension_MPa - calibrated_MPa
+    assert follower.is_lost or abs(change_MPa) < 2.0 * follower.film.pretension_std_MPa
+    for (x_mm, y_mm, force_N), row in zip(contact[cold], charge[cold], strict=True):
+        answer = follower.add_pretension_error(follower.predictor.predict(row), row)
+        assert follower.is_lost or abs(answer.x_mm - x_mm) < 4.0 * answer.x_std_mm
+        assert follower.is_lost or abs(answer.y_mm - y_mm) < 4.0 * answer.y_std_mm
+        assert follower.is_lost or abs(answer.force_N - force_N) < 4.0 * answer.force_std_N
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_changed_film_is_followed_although_offsets_are_possible(mine, problem, film, sign):
+    follower = FilmFollower(Predictor(mine))
+    calibrated_MPa = follower.film.pretension_MPa
+    _, charge = touch_charges(problem, film, follower.predictor, 1.0 + sign * DEGREE_MPa, 60, seed=8)
+    follow_touches(follower, charge)
+    change_MPa = follower.film.pretension_MPa - calibrated_MPa
+    assert not follower.is_lost
+    assert change_MPa == pytest.approx(sign * DEGREE_MPa, abs=0.15)
+
+
+def test_offset_beyond_the_setting_stops_the_following(mine, problem, film):
+    follower = FilmFollower(Predictor(mine), FollowRule(largest_offset_pC=3.0))
+    _, charge = touch_charges(problem, film, follower.predictor, 1.0, 60, seed=8)
+    follow_touches(follower, charge + 15.0)
+    assert follower.is_lost
+
+
+def test_without_an_offset_setting_warmth_is_taken_for_pretension(mine, problem, film):
+    """`largest_offset_pC = 0` assumes that there are no offsets, as the follower once did."""
+    follower = FilmFollower(Predictor(mine), FollowRule(largest_offset_pC=0.0))
+    calibrated_MPa = follower.film.pretension_MPa
+    _, charge = touch_charges(problem, film, follower.predictor, 1.0, 60, seed=8)
+    follow_touches(follower, charge + 10.0)
+    assert abs(follower.film.pretension_MPa - calibrated_MPa) > 0.25
+
+
+def test_offset_that_differs_between_electrodes_is_recognised_by_its_ratio(mine, problem, film):
+    ratio = np.array([1.4, 0.6, 1.4, 0.6])
+    follower = FilmFollower(Predictor(mine), offset_ratio=ratio)
+    calibrated_MPa = follower.film.pretension_MPa
+    _, charge = touch_charges(problem, film, follower.predictor, 1.0, 60, seed=8)
+    follow_touches(follower, charge + 10.0 * ratio)
+    assert abs(follower.film.pretension_MPa - calibrated_MPa) < 2.0 * follower.film.pretension_std_MPa
+
+
+def test_common_mode_estimates_warming_by_the_followed_film(mine, problem, film):
+    """With the model as calibrated, a film that is a degree tauter shows 19 pC of warming that is not there."""
+    device = device_from_table({"follow": {"on": True}, "common_mode": {"on": True}}, "test")
+    stream = TouchStream(Predictor(mine), device)
+    _, charge = touch_charges(problem, film, stream.predictor, 1.0 + DEGREE_MPa, 60, seed=8)
+    follow_touches(stream._follower, charge)
+    held = film(1.0 + DEGREE_MPa).charges(np.array([[4.0, 3.0, 0.5]]))
+    clean = np.vstack([np.zeros((110, 4)), np.tile(held, (400, 1))])
+    raw = problem.noise.add(clean, np.random.default_rng(0))
+    frames = [Frame(number, 5000 * number, tuple(row.tolist())) for number, row in enumerate(raw)]
+    records = [
+        record for frame in frames for record in stream.feed(Chunk(encode_frame(frame), 1.7e9 + 0.005 * frame.seq, 0))
+    ]
+    warming_pC = [record.charge_raw_pC["A"] - record.charge_pC["A"] for record in records[300:]]
+    assert np.abs(warming_pC).max() < 10.0
 
 
 def test_between_its_pretensions_it_is_the_network_for_all_films(mine, problem):
@@ -216,8 +320,8 @@ def test_touches_that_do_not_count(mine, flags, counted):
     follower, charge = FilmFollower(Predictor(mine)), np.array([500.0, 480.0, 520.0, 510.0])
     contact = follower.predictor.predict(charge)
     for frame in (("outside", "misfit"), (), flags):
-        follower.see(charge, contact, frame, 0.0)
-    follower.see(charge, None, (), 0.1)
+        follower.observe_frame(charge, contact, frame, 0.0)
+    follower.observe_frame(charge, None, (), 0.1)
     assert follower.film.touches == counted
 
 

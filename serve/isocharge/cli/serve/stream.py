@@ -161,7 +161,7 @@ def stream_command(
             open_source(port, baud=baud, reconnect=reconnect, request=board.request, wait=wait)
         )
         stack.enter_context(on_signal(signal.SIGUSR1, recorded.request_tare))
-        stack.enter_context(on_signal(signal.SIGUSR2, recorded.request_back))
+        stack.enter_context(on_signal(signal.SIGUSR2, recorded.request_film_reset))
         renew = partial(recorded.request_model, partial(_load, model, models))
         stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(renew)))
         stack.enter_context(stop_after(seconds))

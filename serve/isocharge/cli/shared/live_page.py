@@ -234,7 +234,7 @@ def _carry_out(
         case Tare():
             live.request_tare()
         case Back():
-            live.request_back()
+            live.request_film_reset()
 
 
 def _show_note(link: ReaderEnd, text: str) -> None:

@@ -154,6 +154,11 @@ class ReadingStream:
         self._misfit = misfit
         self._pending_flags: tuple[str, ...] = ()
 
+    @property
+    def warming_ratio(self) -> Array | float:
+        """Charge of each electrode over the mean magnitude of all when the film warms, shape (electrodes,)."""
+        return self._chain.pyro
+
     def tare(self) -> None:
         """Forget the tare; the next quiet frames are the new one."""
         self._state = self._state.without_tare()

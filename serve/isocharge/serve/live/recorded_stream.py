@@ -56,9 +56,9 @@ class RecordedStream:
         """Tare again; may be called from a signal handler."""
         self._requests.append(self._tare)
 
-    def request_back(self) -> None:
+    def request_film_reset(self) -> None:
         """Go back to the film as it was calibrated; may be called as `request_tare`."""
-        self._requests.append(self._back)
+        self._requests.append(self._reset_film)
 
     def request_recording(self, recorder: Recorder | None) -> None:
         """End the recording that is under way; begin another one, in the place of one that still waits for data.
@@ -165,8 +165,8 @@ class RecordedStream:
         if self.recorder is not None:
             self.recorder.tare()
 
-    def _back(self) -> None:
-        self._stream.back()
+    def _reset_film(self) -> None:
+        self._stream.reset_film()
         if self.recorder is not None:
             self.recorder.back()
 
@@ -203,7 +203,7 @@ def replay(
                 if load is not None:
                     stream.use(load(label))
             case Back():
-                stream.back()
+                stream.reset_film()
             case Event(chunk=None):
                 clock.set(event)
                 stream.tare()

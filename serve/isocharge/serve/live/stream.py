@@ -1,11 +1,11 @@
-"""Chunks of bytes in, prediction records out: the stream of readings, each with the answer of a model."""
+"""The stream from chunks of bytes to prediction records: readings of the charges, each with the answer of a model."""
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from isocharge.common.arrays import Array, Reals
 from isocharge.common.errors import ModelError
@@ -30,13 +30,13 @@ from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.serve.tracking.tracker import Tracker
 
 LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
-"""Flags of a frame without a record that pass to the next record: they say what happened before it."""
+"""Flags of a frame without a record that pass to the next record, because they describe what happened before it."""
 
-DOUBT = 0.01
-"""Share of all touch charges by which it is told how contacts depend on what is not known of the film's memory."""
+CHARGE_SCALE_STEP = 0.01
+"""Relative step of all touch charges by which the dependence of contacts on an error of their scale is computed."""
 
-LARGEST_POWER = 1.5
-"""Growth of the force with all charges together, in powers: that of a film without pretension, the others' is less."""
+LARGEST_FORCE_EXPONENT = 1.5
+"""Largest exponent of the force as a power of all charges together: that of a film without pretension."""
 
 
 class Policy(StrEnum):
@@ -51,9 +51,9 @@ class StreamCounts:
     """Counts of a stream that neither its parser nor its gaps hold.
 
     Attributes:
-        records: Records.
-        skipped: Frames without a record, because a newer one had come with them (`Policy.latest`).
-        outages: Times that the port came back.
+        records: Number of records.
+        skipped: Number of frames without a record, because a newer frame had arrived with them (`Policy.latest`).
+        outages: Number of times that the port came back.
     """
 
     records: int = 0
@@ -62,7 +62,7 @@ class StreamCounts:
 
 
 class StreamTotals(NamedTuple):
-    """Everything that a stream has counted since it began, restarts included; see `FrameCounts` and `SequenceGaps`."""
+    """All counts of a stream since it began, including restarts; see `FrameCounts` and `SequenceGaps`."""
 
     frames: int = 0
     lost: int = 0
@@ -83,22 +83,22 @@ def stream(
     parser: Parser | None = None,
     gaps: SequenceGaps | None = None,
 ) -> Iterator[PredictionRecord]:
-    """A record for every intact frame.
+    """Yield a record for every intact frame.
 
     Args:
-        chunks: Bytes with the time of their arrival: an open `Port`, or anything like it.
+        chunks: Bytes with the time of their arrival: an open `Port`, or another iterable of chunks.
         predictor: The model of this sensor.
-        device: What is known about the board, of `load_device`.
+        device: Settings of the board, from `load_device`.
         chain: Rules of the signal chain; by default those of the device.
-        parser: Turns bytes into frames; hand one in to read its counters. By default that of the device.
-        gaps: Follows the frame numbers; hand one in to read its counters.
+        parser: Parser of the frames; pass one to read its counters. By default that of the device.
+        gaps: Counter of missing frame numbers; pass one to read it.
 
     Raises:
         ChargeError: If a frame has another number of charges than the model.
         DeviceError: If the device file has other electrodes than the model.
-        TareError: If the film is not left alone to tare.
-        PortError: If the bytes are no frames.
-        PortLost: If the port goes away.
+        TareError: If the film is touched during the whole search for a tare.
+        PortError: If the bytes contain no frames.
+        PortLost: If the port disappears.
     """
     touch = TouchStream(predictor, device, chain=chain, parser=parser, gaps=gaps)
     for chunk in chunks:
@@ -112,7 +112,8 @@ class TouchStream:
     Attributes:
         parser, gaps, clock: The parts that read the frames, with their counters.
         counts: Records, skipped frames and outages.
-        predictor: The model of the next record.
+        predictor: The model as it was loaded. If the film is followed, `answering_predictor` is the model of the film
+            as it is now.
         frame_id: The film's name in the records.
     """
 
@@ -128,14 +129,14 @@ class TouchStream:
         now_ns: Callable[[], int] = time.perf_counter_ns,
         frame_id: str | None = None,
     ) -> None:
-        """Put the path together.
+        """Connect the parts of the path.
 
         Args:
             predictor: The model of this sensor.
-            device: What is known about the board.
+            device: Settings of the board.
             chain: Rules of the signal chain; by default those of the device.
             parser: By default that of the device.
-            gaps: Follows the frame numbers.
+            gaps: Counter of missing frame numbers.
             policy: Which frames get a record.
             now_ns: The clock of `Chunk.clock_ns`, for latencies.
             frame_id: Name of this film in its records; by default that of the model's sensor.
@@ -153,38 +154,51 @@ class TouchStream:
             misfit=self._misfit,
             reader=f"model {predictor.metadata.label}",
         )
-        self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
+        self.parser = self._readings.parser
+        self.gaps = self._readings.gaps
+        self.clock = self._readings.clock
         self.counts = StreamCounts()
         self._tracker = None if device.track is None else Tracker(device.track)
         self._before_restart = StreamTotals()
-        self._policy, self._now_ns, self._given_name, self._follow = policy, now_ns, frame_id, device.follow
-        self._use(predictor)
+        self._policy = policy
+        self._now_ns = now_ns
+        self._given_name = frame_id
+        self._follow_rule = device.follow
+        self._set_model(predictor)
 
-    def _use(self, predictor: Predictor) -> None:
-        self._follower = None if self._follow is None else FilmFollower(predictor, self._follow)
-        self.predictor, self._validity = predictor, predictor.validity
+    def _set_model(self, predictor: Predictor) -> None:
+        follower = None
+        if self._follow_rule is not None:
+            follower = FilmFollower(predictor, self._follow_rule, self._readings.warming_ratio)
+        self._follower = follower
+        self.predictor = predictor
+        self._validity = predictor.validity
         if self._tracker is not None:
-            self._tracker.branches = branches = branches_of(predictor)
+            # The file of charges describes the calibrated film, and would contradict a model that follows the film.
+            branches = branches_of(predictor) if follower is None else None
+            self._tracker.branches = branches
             if branches is not None:
-                self._validity_followed = replace(self._validity, corners_mm=branches.charges.corners_mm)
-        self._electrodes, self._label = predictor.metadata.electrodes, predictor.metadata.label
+                self._tracked_validity = replace(self._validity, corners_mm=branches.charges.corners_mm)
+        self._electrodes = predictor.metadata.electrodes
+        self._label = predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
-        self._of_doubt = Sensitivity(DOUBT)
+        self._charge_scale_sensitivity = Sensitivity(CHARGE_SCALE_STEP)
 
     def use(self, predictor: Predictor) -> None:
-        """Go on with another model of the same electrodes; tare and chain stay as they are.
+        """Continue with another model of the same electrodes; tare and signal chain keep their state.
 
         Raises:
-            ModelError: If its electrodes are others, or in another order, or its film cannot be followed as this one
-                is; nothing changes then.
+            ModelError: If its electrodes are others, or in another order, or its film cannot be followed as the
+                present film is. The stream then keeps its model.
         """
-        before, after = self.predictor.metadata, predictor.metadata
+        before = self.predictor.metadata
+        after = predictor.metadata
         if after.electrodes != before.electrodes:
             raise ModelError(
                 f"model {after.label}: expected the electrodes {before.electrodes} of {before.label}, got "
                 f"{after.electrodes}; start another stream for it"
             )
-        self._use(predictor)
+        self._set_model(predictor)
 
     @property
     def has_tracking(self) -> bool:
@@ -194,67 +208,76 @@ class TouchStream:
     @property
     def has_film(self) -> bool:
         """Whether the film is followed, so that records have the field `film`."""
-        return self._follow is not None
+        return self._follow_rule is not None
+
+    @property
+    def answering_predictor(self) -> Predictor:
+        """The model of the film as it is now: that of the follower where the film is followed."""
+        return self.predictor if self._follower is None else self._follower.predictor
 
     def tare(self) -> None:
-        """Forget the tare; the next quiet frames are the new one."""
+        """Discard the tare, and measure it again from the next quiet frames."""
         self._readings.tare()
-        self._forget_contact()
+        self._discard_contact()
 
-    def back(self) -> None:
+    def reset_film(self) -> None:
         """Go back to the film as it was calibrated, where it is followed."""
         if self._follower is not None:
-            self._follower.back()
+            self._follower.reset()
 
-    def _forget_contact(self) -> None:
-        self._of_doubt = Sensitivity(DOUBT)
+    def _discard_contact(self) -> None:
+        """Discard the contact that is under way."""
+        self._charge_scale_sensitivity = Sensitivity(CHARGE_SCALE_STEP)
         if self._follower is not None:
-            self._follower.forget()
+            self._follower.discard_touch()
         if self._tracker is not None:
             self._tracker.forget()
 
     def restart(self) -> None:
-        """Begin as a new stream does, so that what follows can be repeated from its bytes alone; `totals` go on."""
+        """Begin as a new stream does, so that its records can be repeated from its bytes alone; `totals` continue."""
         self._before_restart = self.totals()
         self._readings.restart()
-        self._forget_contact()
-        self.back()
-        self.parser, self.gaps, self.clock = self._readings.parser, self._readings.gaps, self._readings.clock
+        self._discard_contact()
+        self.reset_film()
+        self.parser = self._readings.parser
+        self.gaps = self._readings.gaps
+        self.clock = self._readings.clock
 
     def totals(self) -> StreamTotals:
-        """What was counted since the stream began."""
-        frames, gaps = self.parser.counts, self.gaps
-        counted = StreamTotals(
-            frames.frames,
-            gaps.lost,
-            gaps.repeated,
-            gaps.restarts,
-            frames.crc_errors,
-            frames.malformed,
-            frames.bytes_dropped,
-            frames.resyncs,
+        """Return the counts since the stream began."""
+        counts = self.parser.counts
+        since_restart = StreamTotals(
+            frames=counts.frames,
+            lost=self.gaps.lost,
+            repeated=self.gaps.repeated,
+            restarts=self.gaps.restarts,
+            crc_errors=counts.crc_errors,
+            malformed=counts.malformed,
+            bytes_dropped=counts.bytes_dropped,
+            resyncs=counts.resyncs,
         )
-        return StreamTotals(*map(sum, zip(self._before_restart, counted, strict=True)))
+        return StreamTotals(*map(sum, zip(self._before_restart, since_restart, strict=True)))
 
     def feed(self, chunk: Chunk) -> Iterator[PredictionRecord]:
-        """The records of the frames that end in this chunk.
+        """Yield the records of the frames that end in this chunk.
 
         Raises:
             As `stream`.
         """
         if chunk.outage_s > 0.0:
             self.counts.outages += 1
-            self._forget_contact()
+            self._discard_contact()
         frames = self._readings.frames(chunk)
-        last, skipped = len(frames) - 1, set[str]()
+        last = len(frames) - 1
+        skipped_flags = set[str]()
         for number, frame in enumerate(frames):
             timed = self._readings.advance(frame, chunk)
             if self._policy is Policy.latest and number < last:
                 self.counts.skipped += 1
-                skipped.update(timed.reading.flags)
+                skipped_flags.update(timed.reading.flags)
                 continue
-            if skipped:
-                timed = timed._replace(reading=_after(skipped, timed.reading))
+            if skipped_flags:
+                timed = timed._replace(reading=_with_lasting_flags(timed.reading, skipped_flags))
             self.counts.records += 1
             yield self._record(chunk, frame, timed)
         self._readings.arrived(frames, chunk)
@@ -263,38 +286,31 @@ class TouchStream:
         """End the stream, as at the end of a file.
 
         Raises:
-            PortError: If there was not one intact frame.
+            PortError: If there was no intact frame.
         """
         self._readings.finish()
 
     def _record(self, chunk: Chunk, frame: Frame, timed: TimedReading) -> PredictionRecord:
-        """The record of a frame; the clock is asked once everything is computed."""
+        """Return the record of a frame. Its latency is measured after everything else has been computed."""
         reading, when = timed
         contact, flags = self._contact(reading)
         film = None
         if self._follower is not None:
             film = self._follower.film
-            self._follower.see(reading.charge_pC, contact, flags, when.clock_s)
-            flags += (FILM,) * (contact is not None and self._follower.is_lost)
-        tracked, event, other, charge_pC = None, None, None, reading.charge_pC
+            flags = self._follow_film(self._follower, reading, contact, flags, when.clock_s)
+        tracked = None
+        event = None
+        other = None
         if self._tracker is not None:
-            tracked, event = self._tracker.update(contact, when.clock_s, flags, charge_pC)
+            tracked, event = self._tracker.update(contact, when.clock_s, flags, reading.charge_pC)
             other = self._tracker.other
-        if self._tracker is not None and (answer := self._tracker.answer) is not None:
-            contact, flags = answer, reading.flags + self._validity_followed.flags(answer)
-            shift = 0.0, 0.0, LARGEST_POWER * reading.doubt * answer.force_N
-            contact, tracked = contact.widened(shift), tracked and tracked.widened(shift)
-        elif contact is not None and reading.doubt > 0.0 and charge_pC is not None:
-            shift = self._of_doubt.shift(
-                contact, reading.doubt, lambda: self._answers.predict(charge_pC * (1.0 + DOUBT))
-            )
-            contact, tracked = contact.widened(shift), tracked and tracked.widened(shift)
-        if contact is not None:
-            contact_values = contact.fields()
-        elif INVALID in flags:
-            contact_values = UNKNOWN_CONTACT
-        else:
-            contact_values = NO_CONTACT
+            if self._tracker.answer is not None:
+                contact = self._tracker.answer
+                flags = reading.flags + self._tracked_validity.flags(contact)
+        shift = self._charge_scale_error(contact, reading)
+        if contact is not None and shift is not None:
+            contact = contact.widened(shift)
+            tracked = tracked and tracked.widened(shift)
         tracking = None
         if self._tracker is not None:
             found_nothing = tracked is None and event is None and other is None
@@ -303,7 +319,7 @@ class TouchStream:
             timestamp=when.host_s,
             t_device_us=when.device_us,
             seq=frame.seq,
-            **contact_values,
+            **_contact_fields(contact, flags),
             contact=reading.contact,
             charge_pC=self._by_electrode(reading.charge_pC),
             charge_raw_pC=self._by_electrode(reading.raw_pC),
@@ -316,33 +332,72 @@ class TouchStream:
             film=film,
         )
 
-    @property
-    def _answers(self) -> Predictor:
-        """The model of the film as it is by now."""
-        return self.predictor if self._follower is None else self._follower.predictor
+    def _follow_film(
+        self,
+        follower: FilmFollower,
+        reading: Reading,
+        contact: Contact | None,
+        flags: tuple[str, ...],
+        clock_s: float,
+    ) -> tuple[str, ...]:
+        """Follow the film by a frame, and return the flags of the frame with those of the film."""
+        before = follower.predictor
+        follower.observe_frame(reading.charge_pC, contact, flags, clock_s)
+        if follower.predictor is not before:
+            self._charge_scale_sensitivity = Sensitivity(CHARGE_SCALE_STEP)
+        if contact is not None and follower.is_lost:
+            return (*flags, FILM)
+        return flags
 
     def _contact(self, reading: Reading) -> tuple[Contact | None, tuple[str, ...]]:
-        """The contact, None without one, and the reading's flags with those of the contact."""
+        """Return the contact, None without one, and the reading's flags with those of the contact."""
         flags = reading.flags
         if INVALID in flags or not reading.contact or reading.charge_pC is None:
             return None, flags
-        contact = self._answers.predict(reading.charge_pC)
+        contact = self.answering_predictor.predict(reading.charge_pC)
         flags += self._validity.flags(contact)
-        return contact if self._follower is None else self._follower.widened(contact, reading.charge_pC), flags
+        if self._follower is not None:
+            contact = self._follower.add_pretension_error(contact, reading.charge_pC)
+        return contact, flags
+
+    def _charge_scale_error(self, contact: Contact | None, reading: Reading) -> tuple[float, float, float] | None:
+        """Return how far one standard deviation of the charges' common scale moves x and y, mm, and force, N.
+
+        The scale is uncertain where the film's memory is not known exactly. None if it moves nothing.
+        """
+        charge_pC = reading.charge_pC
+        if contact is None:
+            return None
+        if self._tracker is not None and self._tracker.answer is not None:
+            return 0.0, 0.0, LARGEST_FORCE_EXPONENT * reading.doubt * contact.force_N
+        if reading.doubt <= 0.0 or charge_pC is None:
+            return None
+        return self._charge_scale_sensitivity.shift(
+            contact,
+            reading.doubt,
+            lambda: self.answering_predictor.predict(charge_pC * (1.0 + CHARGE_SCALE_STEP)),
+        )
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
-        """Charges by electrode name; None for one that is not a number."""
+        """Return charges by electrode name; None for a charge that is not a number."""
         if charge_pC is None:
             return None
         values = charge_pC.tolist()
         return {name: q if math.isfinite(q) else None for name, q in zip(self._electrodes, values, strict=True)}
 
     def _misfit(self, charge_pC: Array) -> Reals:
-        """The model's misfit, shape (n,), for charges of shape (n, electrodes), pC."""
-        return self.predictor.predict_batch(charge_pC).misfit
+        """Return the misfit of the film as it is now, shape (n,), for charges of shape (n, electrodes), pC."""
+        return self.answering_predictor.predict_batch(charge_pC).misfit
 
 
-def _after(skipped: set[str], reading: Reading) -> Reading:
-    """A reading with the flags of the skipped frames before it that say what happened meanwhile."""
-    earlier = tuple(flag for flag in LASTING_FLAGS if flag in skipped and flag not in reading.flags)
+def _contact_fields(contact: Contact | None, flags: tuple[str, ...]) -> Mapping[str, Any]:
+    """Return the fields of a record that describe its contact."""
+    if contact is not None:
+        return contact.fields()
+    return UNKNOWN_CONTACT if INVALID in flags else NO_CONTACT
+
+
+def _with_lasting_flags(reading: Reading, skipped_flags: set[str]) -> Reading:
+    """Return a reading with those flags of the skipped frames before it that describe what happened meanwhile."""
+    earlier = tuple(flag for flag in LASTING_FLAGS if flag in skipped_flags and flag not in reading.flags)
     return reading._replace(flags=earlier + reading.flags)
