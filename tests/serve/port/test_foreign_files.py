@@ -7,8 +7,8 @@ from pyarrow.parquet import write_table
 
 from isocharge.common.errors import InputError
 from isocharge.serve import Frame, Port, Recorder, TouchStream, encode_text, open_source
-from isocharge.serve.live.outputs import csv_header
 from isocharge.serve.port.source import Chunk, FileSource
+from isocharge.serve.record.csv_rows import csv_header
 
 
 def recording(path):
