@@ -125,16 +125,17 @@ def doctor_command(
         request=_request(request, request_Hz),
         wait=wait,
     )
-    wiring = None
+    if not json:
+        show("\n".join(report_lines(examination)))
+    found_channels = None
     if check_wiring and examination.good and not examination.touch:
         wiring = _check_wiring(examination, electrodes)
+        found_channels = wiring.found
         examination = replace(examination, device=corrected_table(examination.device, wiring))
-    if json:
-        show_json(asdict(examination) | ({} if wiring is None else {"found_channels": wiring.found}))
-    else:
-        show("\n".join(report_lines(examination)))
-        if wiring is not None:
+        if not json:
             show("\n".join(wiring.sentences))
+    if json:
+        show_json(asdict(examination) | {"found_channels": found_channels})
     alive = len(examination.channels)
     if examination.good and len(electrodes) > alive:
         say(f"models of {alive} electrodes: {', '.join(_models_of(alive, models)) or 'none'}; choose one with --model")

@@ -1,4 +1,4 @@
-"""What is on a port and what is missing to get a touch: listening, health of the channels, a device file that fits.
+"""The port check: listening, health of the channels, order of the electrodes, and a device file that fits the board.
 
 May import: live, port, frames, recognition, signal_chain.
 """

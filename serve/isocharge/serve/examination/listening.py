@@ -1,7 +1,8 @@
-"""Bytes of a port for a while, at the speed at which they are frames; and their frames, as a device file says."""
+"""Listening to a port at the baud rate at which its bytes are frames, and reading these frames."""
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,10 +23,13 @@ TRY_S = 1.0
 """Time of listening at a baud rate before the next one is tried, s."""
 
 ECHO_S = 0.3
-"""Time of listening for an echo, s."""
+"""Time of listening for an echo of the requests, s."""
 
 ECHO_SHARE = 0.7
-"""Share of requests that come back from which a line has an echo, dimensionless."""
+"""Share of returned requests above which a line has an echo, dimensionless."""
+
+MIN_SPAN_S = 1e-3
+"""Smallest time in which bytes are assumed to come, s."""
 
 
 @dataclass
@@ -33,11 +37,12 @@ class Heard:
     """What came through a port.
 
     Attributes:
-        url, baud: The port and its speed, bit/s.
-        request: What the board was asked.
-        chunks: The bytes as they came.
+        url: The port.
+        baud: Its speed, bit/s.
+        request: Request that was sent to the board; None if the board sends frames by itself.
+        chunks: The bytes with the times of their arrival.
         seconds: Time of listening, s.
-        echo_share: Share of the requests that the line brought back, dimensionless.
+        echo_share: Share of the requests that the line returned, dimensionless.
     """
 
     url: str
@@ -59,11 +64,14 @@ class Heard:
 
     @property
     def span_s(self) -> float:
-        """Time in which the bytes came, s: from the first chunk to the last, and a chunk's share more."""
+        """Time in which the bytes came, s.
+
+        The time from the first chunk to the last is extended by the mean time between two chunks.
+        """
         if len(self.chunks) < 2:
-            return max(self.seconds, 1e-3)
-        span_s = self.chunks[-1].timestamp - self.chunks[0].timestamp
-        return max(1e-3, span_s * len(self.chunks) / (len(self.chunks) - 1))
+            return max(self.seconds, MIN_SPAN_S)
+        first_to_last_s = self.chunks[-1].timestamp - self.chunks[0].timestamp
+        return max(first_to_last_s * len(self.chunks) / (len(self.chunks) - 1), MIN_SPAN_S)
 
     @property
     def are_datagrams(self) -> bool:
@@ -79,45 +87,49 @@ def listen(
     is_clear: Callable[[Heard], bool],
     wait: float = 0.0,
 ) -> Heard:
-    """Listen to a port, at the first of some speeds at which the bytes make sense; silence is silence at any speed.
+    """Listen to a port at the first baud rate at which the bytes are frames, or at which nothing comes.
 
     Args:
         url: The port.
-        bauds: Speeds to try, each for a second, bit/s.
-        seconds: Time of listening at the right one, s.
-        request: What the board has to be asked; whether the line brings it back is found out.
-        is_clear: Whether bytes make sense.
-        wait: Time to wait until it can be opened, s.
+        bauds: Baud rates to try, each for a second, bit/s.
+        seconds: Time of listening at the right baud rate, s.
+        request: Request that the board needs. Whether the line returns it is measured.
+        is_clear: Function that returns whether bytes are frames.
+        wait: Time to wait until the port can be opened, s.
 
     Raises:
         PortError: If the port cannot be opened.
     """
     if request is not None and not request.echo:
-        request = replace(request, echo=_listen(url, bauds[0], ECHO_S, request, wait).echo_share >= ECHO_SHARE)
+        heard = _listen(url, bauds[0], ECHO_S, request, wait)
+        request = replace(request, echo=heard.echo_share >= ECHO_SHARE)
+    right_baud = bauds[0]
     if has_speed(url) and len(bauds) > 1:
-        tries = (_listen(url, baud, TRY_S, request, wait) for baud in bauds)
-        bauds = [next((heard.baud for heard in tries if not heard.chunks or is_clear(heard)), bauds[0])]
-    return _listen(url, bauds[0], seconds, request, wait)
+        for baud in bauds:
+            heard = _listen(url, baud, TRY_S, request, wait)
+            if not heard.chunks or is_clear(heard):
+                right_baud = baud
+                break
+    return _listen(url, right_baud, seconds, request, wait)
 
 
 def _listen(url: str, baud: int, seconds: float, request: Request | None, wait: float) -> Heard:
-    """Listen for a while; after the loss of a port, what came before counts."""
+    """Listen for some time, or until the port is lost."""
     heard = Heard(url, baud, request)
-    with Port(url, baud=baud, request=request, wait=wait) as port:
-        began = time.monotonic()
-        try:
-            while (left_s := began + seconds - time.monotonic()) > 0.0:
-                chunk = port.read(left_s)
-                heard.chunks += [chunk] if chunk else []
-        except PortLost:
-            pass
-    heard.seconds, heard.echo_share = time.monotonic() - began, port.echo_share
+    with Port(url, baud=baud, request=request, wait=wait) as port, suppress(PortLost):
+        start_s = time.monotonic()
+        while (remaining_s := start_s + seconds - time.monotonic()) > 0.0:
+            chunk = port.read(remaining_s)
+            if chunk is not None:
+                heard.chunks.append(chunk)
+    heard.seconds = time.monotonic() - start_s
+    heard.echo_share = port.echo_share
     return heard
 
 
 @dataclass
 class Capture:
-    """What came through a port in a while.
+    """Frames that came through a port.
 
     Attributes:
         parser: The parser, with its counters.
@@ -136,12 +148,16 @@ class Capture:
     @property
     def share(self) -> float:
         """Share of bytes that were part of a good frame, dimensionless."""
-        return 1.0 - self.parser.counts.bytes_dropped / self.bytes_seen if self.frames else 0.0
+        if not self.frames:
+            return 0.0
+        return 1.0 - self.parser.counts.bytes_dropped / self.bytes_seen
 
     @property
     def rate_Hz(self) -> float:
         """Frames per second, Hz; 0 for fewer than two frames."""
-        span_s = self.times_s[-1] - self.times_s[0] if self.times_s else 0.0
+        if len(self.frames) < 2:
+            return 0.0
+        span_s = self.times_s[-1] - self.times_s[0]
         return (len(self.frames) - 1) / span_s if span_s > 0.0 else 0.0
 
     @property
@@ -150,20 +166,29 @@ class Capture:
         return channel_names(self.frames[-1]) if self.frames else ()
 
     def values(self) -> tuple[Array, Array]:
-        """Values (n, channels) of the frames that have as many as the last one, and their times (n,), s."""
-        width = len(self.frames[-1].values)
-        alike = [k for k, frame in enumerate(self.frames) if len(frame.values) == width]
-        times_s = np.array([self.times_s[k] for k in alike])
-        return np.array([self.frames[k].values for k in alike], dtype=float), times_s - times_s[0]
+        """Return the values of all frames that have as many channels as the last frame, and their times.
+
+        Returns:
+            Values, shape (n, channels), and times since the first of these frames, shape (n,), s.
+        """
+        channel_count = len(self.frames[-1].values)
+        rows = []
+        times_s = []
+        for frame, time_s in zip(self.frames, self.times_s, strict=True):
+            if len(frame.values) == channel_count:
+                rows.append(frame.values)
+                times_s.append(time_s)
+        return np.array(rows, dtype=float), np.array(times_s) - times_s[0]
 
 
 def read_frames(heard: Heard, device: Device) -> Capture:
-    """The frames of what was heard."""
-    capture, clock = Capture(device.parser(), bytes_seen=heard.bytes_seen), DeviceClock()
+    """Read the frames of the bytes that came through a port."""
+    capture = Capture(device.parser(), bytes_seen=heard.bytes_seen)
+    clock = DeviceClock()
     for chunk in heard.chunks:
         for frame in capture.parser.feed(chunk.data):
-            when = clock.read(frame.t_us, capture.parser.t_us_modulus, chunk.timestamp)
+            frame_time = clock.read(frame.t_us, capture.parser.t_us_modulus, chunk.timestamp)
             capture.frames.append(frame)
-            capture.times_s.append(when.clock_s)
+            capture.times_s.append(frame_time.clock_s)
             capture.gaps.update(frame.seq, capture.parser.seq_modulus)
     return capture
