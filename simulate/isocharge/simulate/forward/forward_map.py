@@ -1,15 +1,18 @@
-"""The forward map: charges for many presses from a few solves.
+"""The forward map: the charges of many presses, computed from a few solves.
 
-Presses of one probe form a family in distance from the centre, force and, unless the probe is round, orientation; the
-angle of the position is a rotation. Seen from the probe, the stress at the template's nodes is a smooth function of all
-of them. It is solved on Chebyshev nodes in distance and the force's logarithm and on evenly spread orientations,
-interpolated as a field, and the charge is integrated from the interpolated field again for every press: exact for the
-position of the electrode, also with the probe on it. Building a map compares it with direct solves.
+The presses of one probe form a family with the coordinates distance from the centre, force and, unless the probe is
+axisymmetric, orientation. The direction of the position is a rotation of the whole film. In a frame that moves with the
+probe, the stress at the nodes of the template is a smooth function of these coordinates. The press is solved at
+Chebyshev nodes in the distance and in the logarithm of the force, and at evenly spaced orientations. For every other
+press, the stress field is interpolated, and the charges are integrated from the interpolated field. The position of the
+electrodes is therefore exact, also if the probe lies on an electrode. When a map is built, it is compared with direct
+solves.
 """
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,47 +28,67 @@ from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mechanics.theory import Theory, theory_for
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.mesh.template import template_for
+from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
 
-CHUNK = 256
-"""Presses evaluated at once: keeps the working arrays within some 100 MB."""
+CHUNK_SIZE = 256
+"""Number of presses that are evaluated at once. It limits the working arrays to about 100 MB."""
 
 INTERPOLATION_ERROR = 5e-4
-"""Largest relative error of any charge against direct solves that a forward map may have."""
+"""Largest relative error of a charge with respect to direct solves that a forward map may have."""
 
-SMALL = 0.1
-"""Floor for the charge that an error is relative to, as a share of the press's largest charge, dimensionless."""
+CHARGE_FLOOR = 0.1
+"""Smallest charge to which an error is relative, as a share of the largest charge of the press, dimensionless."""
 
-EVEN = np.zeros(1, dtype=bool)
-"""Parity of the stress under a press on an isotropic round film."""
+EVEN_FIELD = np.zeros(1, dtype=bool)
+"""Parity of the stress field under a press on an isotropic round film: one field, which is even."""
 
-CHECKS = 10
-"""Number of direct solves that a forward map is compared with."""
+CHECK_COUNT = 10
+"""Number of direct solves with which a forward map is compared."""
 
-NODES = (((5, 3), ROTATIONS), ((8, 5), 2 * ROTATIONS), ((13, 8), 3 * ROTATIONS), ((13, 12), 3 * ROTATIONS))
-"""Distances and forces, and least orientations, that are tried in turn: the last for taut films, on which the charges
-pass from a power of the force to another, and through zero."""
+
+class NodeCount(NamedTuple):
+    """Number of nodes of a family.
+
+    Attributes:
+        distances: Number of distances.
+        forces: Number of forces.
+        min_orientations: Smallest number of orientations.
+    """
+
+    distances: int
+    forces: int
+    min_orientations: int
+
+
+NODE_COUNTS = (
+    NodeCount(5, 3, ROTATIONS),
+    NodeCount(8, 5, 2 * ROTATIONS),
+    NodeCount(13, 8, 3 * ROTATIONS),
+    NodeCount(13, 12, 3 * ROTATIONS),
+)
+"""Numbers of nodes that are tried in turn. The last one is for taut films, whose charges change from one power of the
+force to another and pass through zero."""
 
 
 @dataclass(frozen=True)
 class ForwardMap:
-    """Touch charges of a sensor under one probe as a function of (x, y, F) and orientation.
+    """Touch charges of a sensor under one probe, as a function of position, force and orientation.
 
     Attributes:
         sensor: The sensor.
-        probe: The footprint.
+        probe: The probe.
         family: Distances, forces and orientations of the solves.
-        theory: Which terms are modelled.
-        resolution: Mesh of the solves.
-        layer: Width of its thin rings at the rim over the film's radius.
-        table: Scaled stress C : E' at the nodes of every element, in a frame that rotates with the probe; shape
-            (n_distance * n_force * n_rotation, n_element * n_local * 3).
-        error: Largest relative error of a charge against the direct solves that the build compared with.
+        theory: Terms of the film theory that are modelled.
+        resolution: Fineness of the mesh of the solves.
+        layer: Width of the thin rings at the rim, in film radii.
+        table: Scaled stress C : E' at the nodes of every element, in a frame that rotates with the probe, shape
+            (n_distance * n_force * n_rotation, n_element * n_local * 3), dimensionless.
+        error: Largest relative error of a charge with respect to the direct solves of `build`.
     """
 
     sensor: Sensor
@@ -88,37 +111,40 @@ class ForwardMap:
         *,
         executor: Executor | None = None,
     ) -> "ForwardMap":
-        """Solve a family and check it.
+        """Solve a family of presses, and compare the interpolation with direct solves.
 
         Args:
             sensor: The sensor.
-            probe: The footprint.
+            probe: The probe.
             radius: Largest distance of a press from the centre, mm.
             force_range: Smallest and largest force, N.
-            settings: Accuracy, theory and mesh. What is "auto" is chosen for all presses: the fewest terms that the
-                accuracy allows over the forces, the mesh of the outermost press, thin rings for the middle force.
-            executor: Runs the solves; None for this process. The result does not depend on it.
+            settings: Accuracy, theory and mesh. Settings that are "auto" are chosen for all presses together: the
+                fewest terms that the accuracy allows for all forces, the mesh that the outermost press needs, and the
+                width of the thin rings for the geometric mean of the forces.
+            executor: Executor that runs the solves; None for this process. The result does not depend on it.
 
         Raises:
-            SceneError: If some presses cannot exist.
-            SolveError: If an equilibrium or the interpolation error is not reached.
+            SceneError: If some presses of the domain cannot exist.
+            SolveError: If a press has no equilibrium, or the interpolation error exceeds `INTERPOLATION_ERROR`.
         """
-        film, domain = sensor.film, Domain(radius, force_range)
+        film = sensor.film
+        domain = Domain(radius, force_range)
         check_family(sensor.coated_film, probe, domain)
-        middle = float(np.sqrt(force_range[0] * force_range[1]))
-        theory = (
-            theory_for(sensor, probe, force_range, settings.accuracy) if settings.theory == "auto" else settings.theory
-        )
-        layer = layer_for(film, middle) if settings.layer == "auto" else settings.layer
+        middle_force = float(np.sqrt(force_range[0] * force_range[1]))
+        theory = settings.theory
+        if theory == "auto":
+            theory = theory_for(sensor, probe, force_range, settings.accuracy)
+        layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
         settings = replace(settings, theory=theory, layer=layer)
-        resolution = needed_resolution(film, probe, (radius, 0.0), middle, settings)
+        resolution = needed_resolution(film, probe, (radius, 0.0), middle_force, settings)
         settings = replace(settings, resolution=resolution)
+        template = template_for(probe, resolution)
         error = np.inf
-        for count, rotations in NODES:
-            family = Family.spread(domain, count, probe.period, rotations)
-            table = family.unfold(family.solve(sensor, probe, settings, executor), template_for(probe, resolution))
+        for count in NODE_COUNTS:
+            family = Family.spread(domain, (count.distances, count.forces), probe.period, count.min_orientations)
+            table = family.unfold(family.solve(sensor, probe, settings, executor), template)
             forward_map = cls(sensor, probe, family, theory, resolution, layer, table, error)
-            error = max(relative_error(forward_map, *press) for press in family.probes_between(CHECKS))
+            error = max(relative_error(forward_map, *press) for press in family.probes_between(CHECK_COUNT))
             if error <= INTERPOLATION_ERROR:
                 return replace(forward_map, error=error)
         raise SolveError(
@@ -128,12 +154,13 @@ class ForwardMap:
 
     @property
     def domain(self) -> Domain:
-        """The presses that are covered."""
+        """Presses that the map covers."""
         return self.family.domain
 
     @property
     def settings(self) -> SolveSettings:
-        """Theory and mesh of the solves, for single presses or another map; the thin rings suit each press."""
+        """Theory and mesh of the solves, for single presses or another map. The width of the thin rings remains
+        "auto"."""
         return SolveSettings(theory=self.theory, resolution=self.resolution)
 
     @property
@@ -147,160 +174,224 @@ class ForwardMap:
         return self.family.distance.size * self.family.force.size * self.family.solved_rotations.size
 
     def charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
-        """Touch charges.
+        """Compute touch charges.
 
         Args:
-            contact: (x, y, F), shape (n, 3), mm and N; where F is zero the film is untouched and the charges are zero.
-            orientation: Further rotation of the probe, shape (n,) or a number, rad, anticlockwise.
+            contact: Presses (x, y, F), shape (n, 3), mm and N. If F is zero, the charges are zero.
+            orientation: Further rotation of the probe, anticlockwise, shape (n,) or a number, rad.
 
         Returns:
-            Shape (n, n_electrode), pC.
+            Charges, shape (n, n_electrode), pC.
 
         Raises:
             SceneError: If a press lies outside the domain.
         """
         contact = as_contacts(contact, "forward map")
         untouched = contact[:, 2] == 0.0
-        self.domain.check(np.where(untouched[:, None], (0.0, 0.0, self.domain.force_range[0]), contact), "forward map")
+        valid_contact = (0.0, 0.0, self.domain.force_range[0])
+        self.domain.check(np.where(untouched[:, None], valid_contact, contact), "forward map")
         orientation = np.broadcast_to(orientation, len(contact))
-        charge, touched = np.zeros((len(contact), len(self.electrodes))), np.flatnonzero(~untouched)
-        charge[touched] = self._at(contact[touched], orientation[touched])
+        charge = np.zeros((len(contact), len(self.electrodes)))
+        touched = np.flatnonzero(~untouched)
+        charge[touched] = self._unchecked_charges(contact[touched], orientation[touched])
         return charge
 
     def derivatives(self, contact: Array) -> Array:
-        """d(Q)/d(x, y, ln F), shape (n, n_electrode, 3), pC/mm, pC/mm and pC, of contacts, shape (n, 3), mm and N.
+        """Compute the derivatives of the charges with respect to x, y and ln F by central differences.
 
-        By central differences, which reach beyond the edge of the domain.
+        The differences also use presses a little outside the domain.
+
+        Args:
+            contact: Presses (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
 
         Raises:
             SceneError: If a press lies outside the domain.
         """
         contact = self.domain.check(contact, "forward map")
-        return differences(lambda moved: self._at(moved, np.zeros(len(moved))), contact)
+        return differences(lambda moved: self._unchecked_charges(moved, np.zeros(len(moved))), contact)
 
-    def _at(self, contact: Array, orientation: Array) -> Array:
-        """Charges of presses of the domain or a little beyond."""
-        at, charge = contact[:, 0] + 1j * contact[:, 1], np.empty((len(contact), len(self.electrodes)))
-        with single_threaded_blas():
-            for start in range(0, len(contact), CHUNK):
-                chunk = slice(start, start + CHUNK)
-                charge[chunk] = self._charges(at[chunk], contact[chunk, 2], orientation[chunk])
-        return charge
+    def field_charges(self, contact: Array, is_odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
+        """Compute the charges of several stress fields that the table contains, under a circular probe.
 
-    def by_field(self, contact: Array, odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
-        """Charges of several fields of stress in one table, each at its nodes in turn, under a round probe.
-
-        These are corrections: the coarse rule is used everywhere, and neither pressure on electrodes nor crosstalk is
-        in them.
+        The fields are small corrections, so the coarse integration rule is used for all electrodes, and the pressure on
+        the electrodes and the crosstalk are omitted.
 
         Args:
-            contact: Presses of the domain, shape (n, 3), mm and N.
-            odd: Which fields are odd about the direction of the press, shape (n_field,).
-            readout: What collects; the electrodes if absent.
+            contact: Presses (x, y, F) in the domain, shape (n, 3), mm and N.
+            is_odd: Whether each field is odd about the direction of the press, shape (n_field,). The table holds the
+                values of all fields at one node, then those at the next node.
+            readout: Integration points of the charges; None for those of the electrodes.
 
         Returns:
             Shape (n, n_electrode, n_field), pC.
         """
-        at, readout = contact[:, 0] + 1j * contact[:, 1], readout or self._readouts[1]
-        every = np.ones((at.size, len(readout.count)), dtype=bool)
+        at = contact[:, 0] + 1j * contact[:, 1]
+        readout = readout or self._coarse_readout
+        every_electrode = np.ones((at.size, len(readout.count)), dtype=bool)
+        parts = []
         with single_threaded_blas():
-            parts = [
-                self._by_field(at[chunk], contact[chunk, 2], np.zeros(1), odd, ((readout, every[chunk]),))
-                for chunk in (slice(start, start + CHUNK) for start in range(0, at.size, CHUNK))
-            ]
+            for start in range(0, at.size, CHUNK_SIZE):
+                chunk = slice(start, start + CHUNK_SIZE)
+                rules = ((readout, every_electrode[chunk]),)
+                parts.append(self._integrate_fields(at[chunk], contact[chunk, 2], np.zeros(1), is_odd, rules))
         return np.concatenate(parts)
 
-    def _charges(self, at: Complexes, force: Array, orientation: Array) -> Array:
-        """Charges of one chunk of presses, shape (n, n_electrode)."""
-        near, (fine, coarse) = self._near(at), self._readouts
-        charge: Array = self._by_field(at, force, orientation, EVEN, ((fine, near), (coarse, ~near)))[..., 0]
+    def _unchecked_charges(self, contact: Array, orientation: Array) -> Array:
+        """Compute the charges of presses in the domain or a little outside, shape (n, n_electrode), pC."""
+        at = contact[:, 0] + 1j * contact[:, 1]
+        charge = np.empty((len(contact), len(self.electrodes)))
+        with single_threaded_blas():
+            for start in range(0, len(contact), CHUNK_SIZE):
+                chunk = slice(start, start + CHUNK_SIZE)
+                charge[chunk] = self._chunk_charges(at[chunk], contact[chunk, 2], orientation[chunk])
+        return charge
+
+    def _chunk_charges(self, at: Complexes, force: Array, orientation: Array) -> Array:
+        """Compute the charges of one chunk of presses.
+
+        Args:
+            at: Positions x + iy, shape (n,), mm.
+            force: Forces, shape (n,), N.
+            orientation: Further rotation of the probe, shape (n,), rad.
+
+        Returns:
+            Shape (n, n_electrode), pC.
+        """
+        near = self._is_near(at)
+        rules = ((self._fine_readout, near), (self._coarse_readout, ~near))
+        charge: Array = self._integrate_fields(at, force, orientation, EVEN_FIELD, rules)[..., 0]
         if self.sensor.piezo.d33 != 0.0:
             for i in np.flatnonzero(near.any(axis=1)):
                 probe = self.probe.rotated(float(orientation[i]))
                 charge[i] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])
         return self.sensor.calibration.read(charge)
 
-    def _by_field(
+    def _integrate_fields(
         self,
         at: Complexes,
         force: Array,
         orientation: Array,
-        odd: Booleans,
+        is_odd: Booleans,
         rules: tuple[tuple[ReadoutPoints, Booleans], ...],
     ) -> Array:
-        """Charges of the fields of one chunk of presses, (n, n_electrode, n_field); each rule where it is chosen."""
+        """Interpolate the stress fields of one chunk of presses, and integrate their charges.
+
+        Args:
+            at: Positions x + iy, shape (n,), mm.
+            force: Forces, shape (n,), N.
+            orientation: Further rotation of the probe, shape (n,) or (1,), rad.
+            is_odd: Whether each field of the table is odd about the direction of the press, shape (n_field,).
+            rules: Integration rules, each with the pairs of press and electrode that use it, shape (n, n_electrode).
+
+        Returns:
+            Shape (n, n_electrode, n_field), pC.
+        """
         rotation = orientation - np.angle(at)
         field = self.family.weights(np.abs(at), force, rotation) @ self.table
         mesh = template_for(self.probe, self.resolution)
         placement = Placement.of(mesh, self.probe, np.abs(at), self.sensor.film.radius, self.layer, rotation)
-        charge = np.empty((*rules[0][1].shape, odd.size))
-        for readout, chosen in rules:
+        presses = _PressChunk(mesh, placement, field, np.angle(at), rotation + self.probe.angle)
+        _, first_pairs = rules[0]
+        charge = np.empty((*first_pairs.shape, is_odd.size))
+        for readout, uses_rule in rules:
             for count in np.unique(readout.count):
-                press_index, electrode = np.nonzero(chosen & (readout.count == count))
-                charge[press_index, electrode] = self._read(
-                    readout, field, placement, at, rotation + self.probe.angle, press_index, electrode, count, odd
-                )
-        scale = self.sensor.film.young * amplitude_squared(self.sensor.film, force)
-        return np.asarray(charge * scale[:, None, None])
+                press_index, electrode = np.nonzero(uses_rule & (readout.count == count))
+                points = readout.points[electrode, :count] @ np.array([1.0, 1j]) / self.sensor.film.radius
+                weights = readout.weights[electrode, :count]
+                charge[press_index, electrode] = presses.scaled_charges(press_index, points, weights, is_odd)
+        stress_unit = self.sensor.film.young * amplitude_squared(self.sensor.film, force)
+        return np.asarray(charge * stress_unit[:, None, None])
 
     @cached_property
-    def _readouts(self) -> tuple[ReadoutPoints, ReadoutPoints]:
-        """The fine and the coarse rule for the charges."""
-        return ReadoutPoints.of(self.sensor, FINE), ReadoutPoints.of(self.sensor, COARSE)
+    def _fine_readout(self) -> ReadoutPoints:
+        """Integration rule for electrodes near the probe."""
+        return ReadoutPoints.of(self.sensor, FINE)
 
-    def _near(self, at: Complexes) -> Booleans:
-        """Which electrodes need the fine rule for which presses, shape (n, n_electrode)."""
-        away = [(np.abs(at[:, None] - centre) - reach).min(axis=1) for centre, reach in self.sensor.discs]
-        return np.asarray(np.stack(away, axis=1) < self.probe.reach + NEAR)
+    @cached_property
+    def _coarse_readout(self) -> ReadoutPoints:
+        """Integration rule for electrodes away from the probe."""
+        return ReadoutPoints.of(self.sensor, COARSE)
 
-    def _read(
-        self,
-        readout: ReadoutPoints,
-        field: Array,
-        placement: Placement,
-        at: Complexes,
-        frame: Array,
-        press_index: Integers,
-        electrode: Integers,
-        count: int,
-        odd: Booleans,
-    ) -> Array:
-        """Scaled charges of pairs of press and electrode, whose readout has `count` points, shape (n_pair, n_field).
+    def _is_near(self, at: Complexes) -> Booleans:
+        """Return whether each electrode is so near to each press that it needs the fine rule, shape (n,
+        n_electrode)."""
+        gap = [(np.abs(at[:, None] - centre) - radius).min(axis=1) for centre, radius in self.sensor.part_circles]
+        return np.asarray(np.stack(gap, axis=1) < self.probe.reach + NEAR)
 
-        `frame` is the angle of the probe, and of the field's stress, from the direction of the press, shape (n,).
+
+@dataclass(frozen=True)
+class _PressChunk:
+    """Interpolated stress fields of some presses, ready for the integration of charges.
+
+    Attributes:
+        mesh: Template of the mesh.
+        placement: Position of the template under each press, with the press rotated onto the x axis.
+        field: Scaled stress of all fields at the nodes of every element, shape (n, n_element * n_local * 3 * n_field).
+        direction: Direction of each press from the centre of the film, shape (n,), rad.
+        probe_angle: Angle of the probe relative to the direction of the press, shape (n,) rad. The stress fields of
+            probes that are not axisymmetric are in a frame with this angle.
+    """
+
+    mesh: Template
+    placement: Placement
+    field: Array
+    direction: Array
+    probe_angle: Array
+
+    def scaled_charges(self, press_index: Integers, points: Complexes, weights: Array, is_odd: Booleans) -> Array:
+        """Integrate the charges of pairs of a press and an electrode.
+
+        Args:
+            press_index: Index of the press of each pair, shape (n_pair,).
+            points: Integration points on the electrode of each pair, shape (n_pair, n_point), in film radii.
+            weights: Charge per stress (s11, s22, s12), shape (n_pair, n_point, 3), pC/MPa.
+            is_odd: Whether each field is odd about the direction of the press, shape (n_field,).
+
+        Returns:
+            Charges over the unit of stress, shape (n_pair, n_field), pC/MPa.
         """
-        mesh, angle = template_for(self.probe, self.resolution), np.angle(at[press_index])
-        points = readout.points[electrode, :count] @ np.array([1.0, 1j]) / self.sensor.film.radius
-        position, mirrored = mesh.into_meshed_half(points * np.exp(-1j * angle)[:, None])
-        element, xi, eta = placement[press_index].locate(mesh, position)
-        values = tensor_values(self.resolution.order, xi.ravel(), eta.ravel())
-        width, frames = 3 * odd.size, (angle if mesh.half else angle + frame[press_index])[:, None]
-        nodal = field.reshape(len(field), mesh.n_element, -1, width)[press_index[:, None], element]
-        local = np.matmul(values[:, None, :], nodal.reshape(*values.shape, width)).reshape(*position.shape, width)
-        charge, weights = np.empty((len(local), odd.size)), readout.weights[electrode, :count]
-        for number in range(odd.size):
-            one = local[..., 3 * number : 3 * number + 3]
-            one[mirrored, (slice(0, 2) if odd[number] else 2)] *= -1.0
-            charge[:, number] = np.einsum("kpc,kpc->k", rotate_stress(one, frames), weights)
+        mesh = self.mesh
+        direction = self.direction[press_index]
+        position, mirrored = mesh.into_meshed_half(points * np.exp(-1j * direction)[:, None])
+        element, xi, eta = self.placement[press_index].locate(mesh, position)
+        frame_angle = direction if mesh.half else direction + self.probe_angle[press_index]
+
+        values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel())
+        width = 3 * is_odd.size
+        nodal = self.field.reshape(len(self.field), mesh.n_element, -1, width)[press_index[:, None], element]
+        stress = np.matmul(values[:, None, :], nodal.reshape(*values.shape, width)).reshape(*position.shape, width)
+
+        charge = np.empty((len(stress), is_odd.size))
+        for number, odd in enumerate(is_odd):
+            field_stress = stress[..., 3 * number : 3 * number + 3]
+            sign_changes = slice(0, 2) if odd else slice(2, 3)
+            field_stress[mirrored, sign_changes] *= -1.0
+            rotated = rotate_stress(field_stress, frame_angle[:, None])
+            charge[:, number] = np.einsum("kpc,kpc->k", rotated, weights)
         return charge
 
 
 def relative_error(
     forward_map: ForwardMap, distance: float, angle: float, force: float, rotation: float = 0.0
 ) -> float:
-    """Largest error of a charge against a direct solve, relative to the charge or `SMALL` of the largest one.
+    """Compute the largest error of a charge of one press with respect to a direct solve.
+
+    The error is relative to the charge, or to `CHARGE_FLOOR` times the largest charge of the press if that is larger.
 
     Args:
         forward_map: The map.
-        distance: Of the press from the centre, mm.
-        angle: Its direction from the centre, rad.
-        force: N.
+        distance: Distance of the press from the centre, mm.
+        angle: Direction of the press from the centre, rad.
+        force: Force, N.
         rotation: Further rotation of the probe, rad.
     """
-    sensor, at = forward_map.sensor, (distance * float(np.cos(angle)), distance * float(np.sin(angle)))
-    direct = touch_charge(
-        sensor, press(sensor.film, forward_map.probe.rotated(rotation), at, force, forward_map.settings)
-    )
+    sensor = forward_map.sensor
+    at = (distance * float(np.cos(angle)), distance * float(np.sin(angle)))
+    probe = forward_map.probe.rotated(rotation)
+    direct = touch_charge(sensor, press(sensor.film, probe, at, force, forward_map.settings))
     mapped = forward_map.charges(np.array([[*at, force]]), rotation)[0]
-    scale = np.maximum(np.abs(direct), SMALL * np.abs(direct).max())
+    scale = np.maximum(np.abs(direct), CHARGE_FLOOR * np.abs(direct).max())
     return float((np.abs(mapped - direct) / scale).max())

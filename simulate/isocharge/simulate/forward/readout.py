@@ -134,7 +134,7 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     if sensor.piezo.d33 == 0.0:
         return np.zeros(len(sensor.electrodes))
     covered = []
-    for electrode, (centre, reach) in zip(sensor.electrodes, sensor.discs, strict=True):
+    for electrode, (centre, reach) in zip(sensor.electrodes, sensor.part_circles, strict=True):
         near = np.flatnonzero(np.abs(complex(*at) - centre) < reach + probe.reach)
         covered.append(
             sum(probe.covered_area(sensor.calibration.place(electrode.parts[i]), complex(*at)) for i in near)

@@ -298,22 +298,23 @@ class Placement:
         high = np.take_along_axis(self.start, (sector + 1)[:, None], axis=1)[:, 0]
         v = np.full(points.shape, 0.5)
         t = np.full(points.shape, 0.5)
+        inner_by_t = b - a
+        straight_outer_by_t = d - c
         for _ in range(NEWTON_STEPS):
             z = self.rho * np.exp(1j * (low + t * (high - low)))
             circle = (z + self.c) / (1.0 + self.c * z)
             circle_by_t = 1j * (high - low) * z * (1.0 - self.c**2) / (1.0 + self.c * z) ** 2
-            outer = np.where(in_outermost, circle, c + t * (d - c))
-            outer_by_t = np.where(in_outermost, circle_by_t, d - c)
-            inner = a + t * (b - a)
-            inner_by_t = b - a
+            outer = np.where(in_outermost, circle, c + t * straight_outer_by_t)
+            outer_by_t = np.where(in_outermost, circle_by_t, straight_outer_by_t)
+            inner = a + t * inner_by_t
+            by_t = (1.0 - v) * inner_by_t + v * outer_by_t
             if blocks.n_layer == 2:
                 boundary, boundary_by_t = self._boundary_in_sector(blocks, sector, t)
                 in_first_layer = in_sector & ~in_outermost
                 outer = np.where(in_first_layer, boundary, outer)
                 outer_by_t = np.where(in_first_layer, boundary_by_t, outer_by_t)
                 inner = np.where(in_outermost, boundary, inner)
-                inner_by_t = np.where(in_outermost, boundary_by_t, inner_by_t)
-            by_t = (1.0 - v) * inner_by_t + v * outer_by_t
+                by_t = (1.0 - v) * np.where(in_outermost, boundary_by_t, inner_by_t) + v * outer_by_t
             by_v = outer - inner
             residual = inner + v * by_v - points
             determinant = (np.conj(by_v) * by_t).imag

@@ -1,11 +1,12 @@
-"""The unknown parameters of a real film, and how they spread about what a sensor's file says.
+"""The unknown parameters of a real film, and their prior distribution about the description in a sensor file.
 
-Film, coefficients, gains and the place of the electrodes are known to some percent or tenths of a millimetre before
-anything is measured; the pretension is hardly known at all. A calibration starts from this spread, a virtual film is a
-draw from it, and a network for all films is trained over it.
+Before anything is measured, the properties of the film, its coefficients and the gains are uncertain by a few percent,
+and the positions of the electrodes by tenths of a millimetre. The pretension is almost unknown. A calibration starts
+from this prior distribution, a virtual film is drawn from it, and a network for all films is trained over it.
 
-`PARAMETERS` declares each parameter once; the gains of the electrodes follow it, one for each electrode. Parameters are
-deviations from the sensor's file, so that zero is the film as described. Only the pretension is the pretension itself.
+`PARAMETERS` declares each parameter once. One gain for each electrode follows these parameters. Each parameter is a
+deviation from the sensor file, so the described film has the value zero. The only exception is the pretension, which is
+the pretension itself.
 """
 
 from collections.abc import Mapping
@@ -20,30 +21,36 @@ from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
 
-REACH = 2.5
-"""Largest deviation that a film or a calibration may have, in standard deviations; the pretension ends at `TAUTEST`."""
+MAX_DEVIATION = 2.5
+"""Largest deviation of a parameter other than the pretension, in standard deviations."""
 
-TAUTEST = 4.0 / 3.0
-"""Largest pretension that a calibration may find, over the largest of the spread."""
+MAX_PRETENSION_FACTOR = 4.0 / 3.0
+"""Largest pretension that a calibration may find, over the largest pretension of the prior distribution."""
 
-PROBES = (0.5, 1.5)
-"""Smallest and largest radius of a probe that a calibration may find, over the described one."""
+MIN_PROBE_RADIUS_FACTOR = 0.5
+"""Smallest probe radius that a calibration may find, over the described radius."""
+
+MAX_PROBE_RADIUS_FACTOR = 1.5
+"""Largest probe radius that a calibration may find, over the described radius."""
+
+MAX_SHOWN_CENTRES = 8
+"""Number of electrodes whose centres an error message shows."""
 
 
 @dataclass(frozen=True)
 class FilmSpread:
-    """How far films spread: the largest pretension, and one standard deviation of everything else.
+    """Widths of the prior distribution: the largest pretension, and the standard deviations of all other parameters.
 
     Attributes:
-        pretension: Largest pretension, MPa; all from none to this are equally likely.
-        young: Of the logarithm of Young's modulus, dimensionless, as those of thickness, d31, d32 and gain.
-        thickness: As above.
-        d31: As above.
-        d32: As above.
-        shift: Displacement of the electrodes along x and along y, mm.
-        rotation: Rotation of the electrodes, rad.
-        probe_radius: mm.
-        gain: Of every electrode's gain, each by itself.
+        pretension: Largest pretension, MPa. All values from zero to this one are equally likely.
+        young: Standard deviation of the logarithm of Young's modulus, dimensionless.
+        thickness: Standard deviation of the logarithm of the thickness, dimensionless.
+        d31: Standard deviation of the logarithm of d31, dimensionless.
+        d32: Standard deviation of the logarithm of d32, dimensionless.
+        shift: Standard deviation of the displacement of the electrodes along x and along y, mm.
+        rotation: Standard deviation of the rotation of the electrodes, rad.
+        probe_radius: Standard deviation of the radius of the probe, mm.
+        gain: Standard deviation of the logarithm of each gain, dimensionless. The gains are independent.
     """
 
     pretension: float = 3.0
@@ -64,7 +71,7 @@ class FilmSpread:
 
 
 Components = Mapping[str, Any]
-"""What parameters change: the `film`, `piezo` and `calibration` of a sensor, and the `probe`."""
+"""Objects that the parameters change, by name: `film`, `piezo` and `calibration` of a sensor, and `probe`."""
 
 
 @dataclass(frozen=True)
@@ -74,15 +81,15 @@ class FilmParameter:
     Attributes:
         name: Name of the parameter.
         unit: Unit of the parameter.
-        component: Which of `Components` it changes.
-        attribute: The attribute of the component.
+        component: Name of the object in `Components` that the parameter changes.
+        attribute: Name of the attribute of this object.
         form: "logarithm" for ln(value / described value), "difference" for value - described value, "value" for the
             value itself.
-        spread: The field of `FilmSpread` with its standard deviation.
-        derivative: How the derivative of the charges is computed: by a "difference" of films, or by "scaling", from the
+        spread: Name of the field of `FilmSpread` that contains the standard deviation.
+        derivative: Method for the derivative of the charges: "difference" of two films, or "scaling" with the
             dimensionless groups.
-        item: Index or key of the value, where the attribute is a tuple or a table.
-        file_factor: Factor from its unit to the unit in files of calibrations, which is Pa or m.
+        item: Index or key of the value if the attribute is a tuple or a mapping.
+        file_factor: Factor that converts the unit of the parameter into the unit in files of calibrations (Pa or m).
     """
 
     name: str
@@ -96,28 +103,34 @@ class FilmParameter:
     file_factor: float = 1.0
 
     def mean(self, prior: "FilmPrior") -> float:
-        """Return the mean over films."""
+        """Return the mean of the prior distribution."""
         del prior
         return 0.0
 
     def std(self, prior: "FilmPrior") -> float:
-        """Return the standard deviation over films."""
+        """Return the standard deviation of the prior distribution."""
         return float(getattr(prior.spread, self.spread))
 
     def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
-        """Return the smallest and largest value that a film or a calibration may have."""
-        reach = REACH * self.std(prior)
-        return self.mean(prior) - reach, self.mean(prior) + reach
+        """Return the smallest and the largest value that a film or a calibration may have."""
+        max_deviation = MAX_DEVIATION * self.std(prior)
+        return self.mean(prior) - max_deviation, self.mean(prior) + max_deviation
 
     def described(self, components: Components) -> float:
-        """Return the value of the quantity that a sensor and a probe have; a gain that is not given is 1."""
+        """Return the physical value that a sensor or a probe has. A missing gain is 1."""
         value = getattr(components[self.component], self.attribute)
         if isinstance(value, Mapping):
             return float(value.get(self.item, 1.0))
         return float(value if self.item is None else value[self.item])
 
     def changed(self, described: float, parameter: float, factor: float) -> float:
-        """Return the value of the quantity for a parameter; `factor` is the exponential of the parameter."""
+        """Convert a parameter into the physical value.
+
+        Args:
+            described: Physical value of the described film.
+            parameter: Value of the parameter.
+            factor: Exponential of the parameter, which the caller computes for all parameters together.
+        """
         if self.form == "logarithm":
             return described * factor
         if self.form == "difference":
@@ -125,10 +138,10 @@ class FilmParameter:
         return parameter
 
     def from_values(self, value: float, described: float) -> float:
-        """Return the parameter of a value; the inverse of `changed`.
+        """Convert a physical value into the parameter. This is the inverse of `changed`.
 
         Raises:
-            ValueError: If the parameter is a logarithm, and the values have different signs.
+            ValueError: If the parameter is a logarithm and the values have different signs.
         """
         if self.form == "logarithm":
             ratio = _ratio(value, described)
@@ -141,7 +154,7 @@ class FilmParameter:
 
 
 class PretensionParameter(FilmParameter):
-    """The pretension, which is equally likely between none and the largest of the spread."""
+    """The pretension, which is uniformly distributed between zero and the largest pretension."""
 
     def mean(self, prior: "FilmPrior") -> float:
         """Return half of the largest pretension."""
@@ -152,23 +165,24 @@ class PretensionParameter(FilmParameter):
         return prior.spread.pretension / float(np.sqrt(12.0))
 
     def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
-        """Return no pretension, and somewhat more than the largest of the spread."""
-        return 0.0, TAUTEST * prior.spread.pretension
+        """Return zero and a value somewhat above the largest pretension of the prior distribution."""
+        return 0.0, MAX_PRETENSION_FACTOR * prior.spread.pretension
 
 
 class ProbeRadiusParameter(FilmParameter):
-    """The radius of the probe, which is neither negative nor far from the described one."""
+    """The radius of the probe, which is bounded relative to the described radius."""
 
     def std(self, prior: "FilmPrior") -> float:
-        """Return the spread, or less for a small probe."""
+        """Return the standard deviation of the radius, mm, which is reduced for small probes."""
         return min(prior.spread.probe_radius, 0.3 * prior.probe.radius)
 
     def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
-        """Return the usual bounds, within `PROBES`."""
+        """Return the usual bounds, limited by `MIN_PROBE_RADIUS_FACTOR` and `MAX_PROBE_RADIUS_FACTOR`."""
         low, high = super().bounds(prior)
-        smallest, largest = PROBES
         radius = prior.probe.radius
-        return max(low, (smallest - 1.0) * radius), min(high, (largest - 1.0) * radius)
+        smallest = (MIN_PROBE_RADIUS_FACTOR - 1.0) * radius
+        largest = (MAX_PROBE_RADIUS_FACTOR - 1.0) * radius
+        return max(low, smallest), min(high, largest)
 
 
 PARAMETERS = (
@@ -182,14 +196,14 @@ PARAMETERS = (
     FilmParameter("rotation", "rad", "calibration", "rotation", "difference", "rotation"),
     ProbeRadiusParameter("probe_radius", "mm", "probe", "radius", "difference", "probe_radius", file_factor=1e-3),
 )
-"""Parameters that every film has; gains follow, one for each electrode."""
+"""Parameters that every film has. One gain for each electrode follows them."""
 
 SHARED = tuple(parameter.name for parameter in PARAMETERS)
-"""Names of these parameters."""
+"""Names of the parameters that every film has."""
 
 
 def gain_parameter(electrode: str) -> FilmParameter:
-    """Return the declaration of the gain of an electrode."""
+    """Return the declaration of the gain of the electrode with this name."""
     return FilmParameter(
         f"gain {electrode}", "1", "calibration", "gain", "logarithm", "gain", "scaling", item=electrode
     )
@@ -197,12 +211,12 @@ def gain_parameter(electrode: str) -> FilmParameter:
 
 @dataclass(frozen=True)
 class FilmPrior:
-    """The films that a described sensor may be, under a probe whose radius is not exactly known either.
+    """Prior distribution of the films that a described sensor may have, and of the radius of its probe.
 
     Attributes:
         sensor: The sensor as described.
-        probe: The probe as described; round, since its radius is one of the parameters.
-        spread: How far the films spread.
+        probe: The probe as described. It is circular, because its radius is one of the parameters.
+        spread: Widths of the prior distribution.
     """
 
     sensor: Sensor
@@ -210,38 +224,41 @@ class FilmPrior:
     spread: FilmSpread = FilmSpread()
 
     def __post_init__(self) -> None:
-        sensor, most = self.sensor, float(np.hypot(REACH, REACH)) * self.spread.shift
+        sensor = self.sensor
+        max_shift = float(np.hypot(MAX_DEVIATION, MAX_DEVIATION)) * self.spread.shift
         for electrode in sensor.electrodes:
-            reach = np.linalg.norm(sensor.calibration.place(np.concatenate(electrode.parts)), axis=1).max()
-            if not reach + most < sensor.film.radius:
+            corners = sensor.calibration.place(np.concatenate(electrode.parts))
+            farthest = np.linalg.norm(corners, axis=1).max()
+            if not farthest + max_shift < sensor.film.radius:
                 raise SensorError(
-                    f"electrode {electrode.name!r} reaches {reach:.4g} mm from the centre, and electrodes may be "
-                    f"{most:.3g} mm off their place: expected {sensor.film.radius - most:.4g} mm at most, or it lies "
-                    "over the rim of some films; move it inwards"
+                    f"electrode {electrode.name!r} reaches {farthest:.4g} mm from the centre, and electrodes may be "
+                    f"{max_shift:.3g} mm off their place: expected {sensor.film.radius - max_shift:.4g} mm at most, "
+                    "or it lies over the rim of some films; move it inwards"
                 )
 
     @cached_property
     def parameters(self) -> tuple[FilmParameter, ...]:
-        """Declarations of the parameters, in their order."""
+        """Declarations of all parameters, in the order of the parameter vector."""
         return (*PARAMETERS, *(gain_parameter(name) for name in self.sensor.electrode_names))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters, in their order."""
+        """Names of all parameters, in the order of the parameter vector."""
         return tuple(parameter.name for parameter in self.parameters)
 
     def index(self, name: str) -> int:
-        """Return the place of a parameter in the vector of parameters."""
+        """Return the index of a parameter in the parameter vector."""
         return self.names.index(name)
 
     @cached_property
     def gains(self) -> slice:
-        """Places of the gains in the vector of parameters."""
+        """Indices of the gains in the parameter vector."""
         return slice(len(PARAMETERS), len(self.parameters))
 
     @cached_property
     def mean(self) -> Array:
-        """Means of the parameters, shape (n_parameter,): the film as described, half of the largest pretension."""
+        """Means of the parameters, shape (n_parameter,). They are those of the described film with half of the largest
+        pretension."""
         return np.array([parameter.mean(self) for parameter in self.parameters])
 
     @cached_property
@@ -251,56 +268,69 @@ class FilmPrior:
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Smallest and largest parameters that a film or a calibration may have, each of shape (n_parameter,)."""
+        """Smallest and largest values of the parameters of a film or a calibration, each of shape (n_parameter,)."""
         low, high = np.array([parameter.bounds(self) for parameter in self.parameters]).T
         return low, high
 
     @cached_property
     def file_factors(self) -> Array:
-        """Factors from the parameters' units to those in files of calibrations, shape (n_parameter,)."""
+        """Factors that convert the units of the parameters into those of files of calibrations, shape
+        (n_parameter,)."""
         return np.array([parameter.file_factor for parameter in self.parameters])
 
     @cached_property
     def _components(self) -> Components:
-        """Film, coefficients and calibration of the described sensor, and the described probe."""
+        """The objects of the described sensor and probe that the parameters change."""
         return _components_of(self.sensor, self.probe)
 
     @property
     def described(self) -> Array:
-        """The parameters of the film exactly as described, shape (n_parameter,)."""
+        """Parameters of the film exactly as described, including its pretension, shape (n_parameter,)."""
         return self.parameters_of(self.sensor, self.probe)
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Return films drawn from the spread, shape (count, n_parameter).
+        """Draw films from the prior distribution.
 
-        Deviations beyond the bounds are drawn again. All pretensions up to the largest are equally likely.
+        Values outside the bounds are drawn again.
+
+        Args:
+            rng: Random number generator.
+            count: Number of films.
+
+        Returns:
+            Parameters, shape (count, n_parameter).
         """
         drawn = self.mean + self.std * rng.standard_normal((count, len(self.names)))
         while (outside := (drawn < self.bounds[0]) | (drawn > self.bounds[1])).any():
-            again = self.mean + self.std * rng.standard_normal(drawn.shape)
-            drawn = np.where(outside, again, drawn)
+            replacement = self.mean + self.std * rng.standard_normal(drawn.shape)
+            drawn = np.where(outside, replacement, drawn)
         drawn[:, self.index("pretension")] = self.spread.pretension * rng.random(count)
         return drawn
 
     def film(self, parameters: Array) -> tuple[Sensor, Circle]:
-        """Return the sensor and the probe that parameters, shape (n_parameter,), describe.
+        """Return the sensor and the probe that a parameter vector describes.
+
+        Args:
+            parameters: Parameters, shape (n_parameter,).
 
         Raises:
-            SensorError: If there can be no such sensor: electrodes moved off the film, or a negative pretension.
+            SensorError: If no such sensor can exist, because electrodes lie off the film or the pretension is invalid.
         """
         changes: dict[str, dict[str, Any]] = {component: {} for component in self._components}
         factors = np.exp(parameters)
-        for declared, described, parameter, factor in zip(
+        for declaration, described, parameter, factor in zip(
             self.parameters, self._described_values, parameters.tolist(), factors.tolist(), strict=True
         ):
-            value = declared.changed(described, parameter, factor)
-            component = changes[declared.component]
-            if declared.item is None:
-                component[declared.attribute] = value
+            value = declaration.changed(described, parameter, factor)
+            attributes = changes[declaration.component]
+            if declaration.item is None:
+                attributes[declaration.attribute] = value
             else:
-                component.setdefault(declared.attribute, {})[declared.item] = value
+                attributes.setdefault(declaration.attribute, {})[declaration.item] = value
         calibration = changes["calibration"]
-        calibration["shift"] = (calibration["shift"][0], calibration["shift"][1])
+        shift_x = calibration["shift"][0]
+        shift_y = calibration["shift"][1]
+        calibration["shift"] = (shift_x, shift_y)
         sensor = replace(
             self.sensor,
             film=replace(self.sensor.film, **changes["film"]),
@@ -311,17 +341,24 @@ class FilmPrior:
 
     @cached_property
     def _described_values(self) -> tuple[float, ...]:
-        """Values of the parameters' quantities that the described sensor and probe have."""
+        """Physical values of the described sensor and probe, in the order of the parameter vector."""
         return tuple(parameter.described(self._components) for parameter in self.parameters)
 
     def parameters_of(self, sensor: Sensor, probe: Circle) -> Array:
-        """Return the parameters of a sensor that differs from the described one by them alone: the inverse of `film`.
+        """Return the parameter vector of a sensor and a probe. This is the inverse of `film`.
+
+        Args:
+            sensor: Sensor that differs from the described sensor in the values of the parameters only.
+            probe: Probe that differs from the described probe in its radius only.
+
+        Returns:
+            Parameters, shape (n_parameter,).
 
         Raises:
-            SensorError: If it differs otherwise: other electrodes, another radius, another readout.
+            SensorError: If the sensor differs in other properties, such as the electrodes, the radius or the readout.
         """
         described = self.sensor
-        if _shapes(sensor) != _shapes(described):
+        if _rounded_corners(sensor) != _rounded_corners(described):
             raise SensorError(
                 f"{sensor.name}: expected the electrodes of {described.name} ({_centres(described)}), got others "
                 f"({_centres(sensor)})"
@@ -351,18 +388,28 @@ class FilmPrior:
 
 
 def _components_of(sensor: Sensor, probe: Circle) -> Components:
-    """Return what parameters change of a sensor and a probe."""
+    """Return the objects of a sensor and a probe that the parameters change."""
     return {"film": sensor.film, "piezo": sensor.piezo, "calibration": sensor.calibration, "probe": probe}
 
 
-def _shapes(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
-    """Corners of what collects as described, mm, rounded to a nanometre."""
-    return {e.name: [(round(x, 6), round(y, 6)) for part in e.parts for x, y in part] for e in sensor.electrodes}
+def _rounded_corners(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
+    """Return the corners of the parts of each electrode, rounded to a nanometre, mm."""
+    return {
+        electrode.name: [(round(x, 6), round(y, 6)) for part in electrode.parts for x, y in part]
+        for electrode in sensor.electrodes
+    }
 
 
 def _centres(sensor: Sensor) -> str:
-    places = [(e.name, *e.centre) for e in sensor.electrodes]
-    return ", ".join(f"{name} at ({x:.4g}, {y:.4g})" for name, x, y in places[:8]) + " mm" + ", ..." * (len(places) > 8)
+    """Return the centres of the first electrodes as text for an error message."""
+    centres = []
+    for electrode in sensor.electrodes[:MAX_SHOWN_CENTRES]:
+        x, y = electrode.centre
+        centres.append(f"{electrode.name} at ({x:.4g}, {y:.4g})")
+    text = ", ".join(centres) + " mm"
+    if len(sensor.electrodes) > MAX_SHOWN_CENTRES:
+        text += ", ..."
+    return text
 
 
 def _ratio(value: float, described: float) -> float:
@@ -373,6 +420,15 @@ def _ratio(value: float, described: float) -> float:
 
 
 def virtual_film(sensor: Sensor, probe: Circle, seed: int) -> tuple[Sensor, Circle]:
-    """A film drawn from the spread about a sensor and a probe."""
+    """Draw a film from the prior distribution of a sensor and a probe.
+
+    Args:
+        sensor: The sensor as described.
+        probe: The probe as described.
+        seed: Seed of the random number generator.
+
+    Returns:
+        The drawn sensor, and the drawn probe.
+    """
     prior = FilmPrior(sensor, probe)
     return prior.film(prior.draw(np.random.default_rng(seed), 1)[0])

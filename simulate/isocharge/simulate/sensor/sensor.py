@@ -253,15 +253,19 @@ class Sensor:
         return replace(self.film, coat=Coat(self.coating, corners))
 
     @cached_property
-    def discs(self) -> tuple[tuple[Complexes, Array], ...]:
-        """Centres x + iy and radii of discs round the parts of each electrode, on the real film, (n_part,) each, mm."""
-        discs = []
+    def part_circles(self) -> tuple[tuple[Complexes, Array], ...]:
+        """Circles round the parts of each electrode, at their calibrated positions.
+
+        Returns:
+            For each electrode the centres x + iy and the radii, each of shape (n_part,), mm.
+        """
+        part_circles = []
         for electrode in self.electrodes:
             parts = [self.calibration.place(part) for part in electrode.parts]
             centre = np.array([part.mean(axis=0) for part in parts])
             reach = [np.linalg.norm(part - at, axis=1).max() for part, at in zip(parts, centre, strict=True)]
-            discs.append((to_complex(centre), np.array(reach)))
-        return tuple(discs)
+            part_circles.append((to_complex(centre), np.array(reach)))
+        return tuple(part_circles)
 
     @property
     def gains(self) -> Array:

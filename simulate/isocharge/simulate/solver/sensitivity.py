@@ -86,7 +86,7 @@ FIELDS = {
 }
 """Imperfections by name; of those with two axes the even field and the odd one."""
 
-ODD = np.array([field.odd for fields in FIELDS.values() for field in fields])
+IS_ODD = np.array([field.odd for fields in FIELDS.values() for field in fields])
 """Which fields are odd, in the order of `stress_changes`."""
 
 

@@ -16,7 +16,7 @@ from isocharge.simulate import Circle, Film, ForwardMap, Probe, Sensor
 from isocharge.simulate.forward.charge_map import Domain, FunctionMap, differences
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.forward.film_modes import MODES, ModeMap
-from isocharge.simulate.forward.forward_map import EVEN
+from isocharge.simulate.forward.forward_map import EVEN_FIELD
 from isocharge.simulate.forward.readout import ReadoutPoints
 from isocharge.simulate.numerics.disk import onto_disk
 from isocharge.simulate.numerics.polygon import area_of
@@ -158,7 +158,7 @@ class FilmCharges:
         n = len(contact)
         electrode_count = len(self.prior.sensor.electrodes)
         points = ReadoutPoints.along(forward_map.sensor, self._trace_lines)
-        charge_per_mm = forward_map.by_field(contact, EVEN, points).reshape(n, electrode_count, 1, -1)
+        charge_per_mm = forward_map.field_charges(contact, EVEN_FIELD, points).reshape(n, electrode_count, 1, -1)
         own_electrode = np.eye(electrode_count)[:, :, None]
         return np.asarray((TRACE_STD_MM * charge_per_mm * own_electrode).reshape(n, electrode_count, -1))
 
@@ -253,7 +253,7 @@ class FilmCharges:
         if modes is None:
             modes = family.mode_map(forward_map, self.modes)
         fields = replace(modes.fields, sensor=sensor) if modes.fields is not None else None
-        by_mode = replace(modes, film=forward_map, fields=fields).by_mode(contact)
+        by_mode = replace(modes, film=forward_map, fields=fields).mode_jacobian(contact)
         by_pretension = self._difference("pretension", parameters, contact, charge)
         fall = -self._pretension(parameters) * by_pretension / charge
         by_unevenness = fall * (1.0 - np.clip(1.0 - 0.5 * fall, 0.0, 1.0) ** SLACKENING)

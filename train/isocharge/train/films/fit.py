@@ -16,7 +16,7 @@ from isocharge.common.resumable_run import ResumableRun
 from isocharge.simulate import Domain, NoiseModel, noise_model
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.forward.film_modes import FilmModes
-from isocharge.simulate.sensor.film_prior import REACH, SHARED, FilmPrior
+from isocharge.simulate.sensor.film_prior import MAX_DEVIATION, SHARED, FilmPrior
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.films.conditional_network import ConditionalPerceptron, FilmInputs
@@ -241,7 +241,12 @@ def contact_stage(
 def _with_fresh_factors(prior: FilmPrior, parameters: Array, random: torch.Generator) -> Array:
     """The films with d31, d32 and gains drawn anew."""
     fresh, columns = parameters.copy(), [D31, D32, *range(len(SHARED), parameters.shape[1])]
-    drawn = torch.randn((len(parameters), len(columns)), generator=random).clamp(-REACH, REACH).double().numpy()
+    drawn = (
+        torch.randn((len(parameters), len(columns)), generator=random)
+        .clamp(-MAX_DEVIATION, MAX_DEVIATION)
+        .double()
+        .numpy()
+    )
     fresh[:, columns] = prior.mean[columns] + prior.std[columns] * drawn
     return fresh
 
