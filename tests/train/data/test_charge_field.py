@@ -145,7 +145,7 @@ def test_where_the_map_folds_for_certain_the_charges_of_all_contacts_go_beside_t
     assert np.allclose(charge, presses.charge, rtol=2e-3)
     assert fitted.domain.radius < 5.2 < known.radius_mm
     assert "'serve stream --track' follows contacts to 8 mm" in fitted.cautions[0]
-    assert trained.split.folded is None
+    assert trained.split.folded_charges is None
 
 
 NOISE = noise_model("reference")
@@ -165,7 +165,7 @@ def field(trained):
 
 @pytest.fixture(scope="module")
 def held(trained):
-    return trained.split.held
+    return trained.split.test
 
 
 def by_scipy(field, charge, start):

@@ -38,7 +38,7 @@ ODD = {
 
 @pytest.fixture(scope="module")
 def held(trained):
-    return trained.split.held
+    return trained.split.test
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_the_graph_answers_as_the_network_does_on_odd_charges(trained, held, ses
 
 
 def test_a_network_that_runs_off_the_numbers_is_not_released(trained, held, monkeypatch):
-    monkeypatch.setattr(correlation, "EXAMPLES", 1_000)  # errors that are nonsense have no correlations to find
+    monkeypatch.setattr(correlation, "N_EXAMPLES", 1_000)  # errors that are nonsense have no correlations to find
     network = copy.deepcopy(trained.network)
     with torch.no_grad():
         network.contact.skip.weight *= 1e3

@@ -17,7 +17,7 @@ from isocharge.train.data.channel_noise import ChannelNoise
 from isocharge.train.data.measured_sensor import PressedArea, outline
 from isocharge.train.data.presses import folds_by_place, held_out
 from isocharge.train.model_release.release import model_domain, release
-from isocharge.train.training.cross_fit import deviation_factors, usable_presses
+from isocharge.train.training.cross_fit import std_factors, usable_presses
 from isocharge.train.training.features import WhitenedFeatures
 from kept import ROOT, kept
 
@@ -215,7 +215,7 @@ def test_deviations_that_are_too_small_are_multiplied():
     rng = np.random.default_rng(0)
     truth = rng.standard_normal((20_000, 3))
     off = np.array([2.0, 2.0, 0.5]) * rng.standard_normal(truth.shape)
-    assert deviation_factors(truth + off, np.ones_like(truth), truth) == pytest.approx((2.0, 0.5), rel=0.03)
+    assert std_factors(truth + off, np.ones_like(truth), truth) == pytest.approx((2.0, 0.5), rel=0.03)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from isocharge.simulate import Dataset, Domain, NoiseModel, Samples
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config
 from isocharge.train.training import descent
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.fit import Split, fit_identity, start_loss, teaching_loss, train_network
+from isocharge.train.training.fit import Split, fit_identity, train_network
+from isocharge.train.training.losses import distillation_loss, warm_up_loss
 from isocharge.train.training.network import LARGEST_INT8, TrainablePerceptron
 
 REPORT_EVERY = 20
@@ -65,7 +66,7 @@ def test_it_ends_when_nothing_better_has_come_for_long():
     made, seen = stage([5.0, 2.0, *[3.0] * 18])
     calls = run(made, patience=3 * REPORT_EVERY)
     assert [step for step, *_ in calls] == [REPORT_EVERY * k for k in (1, 2, 3, 4, 5)]
-    assert same(made.part.state_dict(), seen[1])
+    assert same(made.network.state_dict(), seen[1])
     assert calls[0][1] == 20 * REPORT_EVERY
     assert calls[0][2].startswith("loss ")
     assert calls[0][2].endswith("text")
@@ -75,7 +76,7 @@ def test_it_ends_when_nothing_better_has_come_for_long():
 def test_nothing_counts_while_another_loss_is_trained():
     made, seen = stage([0.0, 0.0, 2.0, 3.0], steps=4 * REPORT_EVERY, warm_up_steps=2 * REPORT_EVERY)
     run(made, patience=REPORT_EVERY + 1)
-    assert same(made.part.state_dict(), seen[2])
+    assert same(made.network.state_dict(), seen[2])
 
 
 @pytest.mark.usefixtures("_short_reports")
@@ -157,7 +158,7 @@ def test_the_first_loss_is_least_squares_and_deviations_follow_without_pulling()
     mean, unit = torch.randn((2, 20, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     mean.requires_grad_()
     log_std = torch.log(torch.abs(mean - unit)).detach().requires_grad_()
-    start_loss(mean, log_std, unit).backward()
+    warm_up_loss(mean, log_std, unit).backward()
     np.testing.assert_allclose(mean.grad, 60.0 / 20 * (mean - unit).detach(), rtol=1e-9)
     np.testing.assert_allclose(log_std.grad, 0.0, atol=1e-12)
 
@@ -168,7 +169,7 @@ def test_the_loss_of_a_student_is_the_divergence_of_gaussians():
     teacher = torch.distributions.Normal(taught_mean, taught_log_std.exp())
     student = torch.distributions.Normal(mean, log_std.exp())
     expected = torch.distributions.kl_divergence(teacher, student).sum(dim=1).mean()
-    torch.testing.assert_close(teaching_loss(mean, log_std, taught_mean, taught_log_std), expected)
+    torch.testing.assert_close(distillation_loss(mean, log_std, taught_mean, taught_log_std), expected)
 
 
 @pytest.mark.usefixtures("split_once")

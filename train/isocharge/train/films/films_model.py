@@ -174,7 +174,7 @@ class FilmsModel:
             good=presses,
             sha256=self.sha256,
             provenance=provenance or Provenance(),
-            asked=self.domain,
+            requested_domain=self.domain,
         )
 
     def fold(self, parameters: Array) -> FoldedNetwork:

@@ -33,16 +33,15 @@ from isocharge.train.films.films_data import (
 )
 from isocharge.train.films.films_model import ConditionalWeights, FilmsModel
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.fit import (
-    WARM_UP,
-    contact_score,
+from isocharge.train.training.fit import WARM_UP_FRACTION, threads_and_seed
+from isocharge.train.training.folded_network import N_CONTACT_ANSWERS
+from isocharge.train.training.losses import (
     likelihood_loss,
-    mean_square,
-    start_loss,
-    threads_and_seed,
+    mean_squared_distance,
+    validation_score,
+    warm_up_loss,
     with_fresh_noise,
 )
-from isocharge.train.training.folded_network import N_CONTACT_ANSWERS
 from isocharge.train.training.network import as_tensor, compress_length
 
 BEYOND = 1.5
@@ -208,7 +207,7 @@ def contact_stage(
     part: ConditionalPerceptron, inputs: FilmInputs, presses: FilmPresses, noise: NoiseModel, config: FilmsConfig
 ) -> TrainingStage:
     """The contact network's losses; the last films of the presses are only watched."""
-    scaling, warm_up, trained = inputs.scaling, round(WARM_UP * config.steps), len(presses) - config.watched
+    scaling, warm_up, trained = inputs.scaling, round(WARM_UP_FRACTION * config.steps), len(presses) - config.watched
 
     def posterior(
         of: np.ndarray, rows: np.ndarray, parameters: Array, random: torch.Generator
@@ -227,13 +226,13 @@ def contact_stage(
         rows = torch.randint(presses.contact.shape[1], (config.batch_films, config.batch_presses), generator=random)
         parameters = _with_fresh_factors(scaling.prior, presses.parameters[of.numpy()], random)
         answers = posterior(of.numpy(), rows.numpy(), parameters, random)
-        return (start_loss if step < warm_up else likelihood_loss)(*answers)
+        return (warm_up_loss if step < warm_up else likelihood_loss)(*answers)
 
     def score() -> tuple[float, str]:
         of = np.arange(trained, len(presses))
         rows = np.tile(np.arange(presses.contact.shape[1]), (config.watched, 1))
         random = torch.Generator().manual_seed(config.seed)
-        return contact_score(*posterior(of, rows, presses.parameters[of], random), scaling.domain, "films")
+        return validation_score(*posterior(of, rows, presses.parameters[of], random), scaling.domain, "films")
 
     return TrainingStage("contact", part, loss, score, config.steps, warm_up, LARGEST_GRADIENT)
 
@@ -284,17 +283,17 @@ def misfit_stage(
         residual = (across[of[:, None], rows] @ deviation[..., None])[..., 0]
         parameters = near.parameters[of.numpy()]
         vector = part(inputs.values(noisy, parameters), inputs.context(parameters))
-        return mean_square(vector, compress_length(residual))
+        return mean_squared_distance(vector, compress_length(residual))
 
     def loss(_: int, random: torch.Generator) -> Tensor:
         films = config.batch_films // 2
         of = torch.randint(trained, (films,), generator=random)
         rows = torch.randint(values.shape[1], (films, config.batch_presses), generator=random)
-        all_kinds = mean_square(part(values[of[:, None], rows], context[of]), targets[of[:, None], rows])
+        all_kinds = mean_squared_distance(part(values[of[:, None], rows], context[of]), targets[of[:, None], rows])
         return NEAR_WEIGHT * near_squares(films, config.batch_presses, random) + all_kinds
 
     def score() -> tuple[float, str]:
-        all_kinds = mean_square(part(values[trained:], context[trained:]), targets[trained:]).item()
+        all_kinds = mean_squared_distance(part(values[trained:], context[trained:]), targets[trained:]).item()
         good = near_squares(len(near_charge), 8, torch.Generator().manual_seed(0)).item()
         return NEAR_WEIGHT * good + all_kinds, f"{all_kinds:.4f} on watched films, {good:.5f} on good presses"
 

@@ -13,7 +13,7 @@ from isocharge.train.data.presses import draw_contacts, position_error
 from isocharge.train.films.films_file import FILE, films_bytes, films_from_bytes
 from isocharge.train.films.films_model import FilmsModel
 from isocharge.train.model_release.evaluate import ONLY_SIMULATED, contact_errors, rounded
-from isocharge.train.model_release.release import Release, release, yield_words
+from isocharge.train.model_release.release import Release, release, yield_text
 from isocharge.train.training.fitted import Fitted, Provenance
 
 FILMS, PRESSES = 64, 256
@@ -147,7 +147,7 @@ It serves before anything is calibrated, and errs as the right column says.
 | input | `charge_pC`, float32 [n, {len(about.electrodes)}], touch charges of {electrodes} in pC |
 | outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlated}, `misfit` |
 | working area | within {fitted.domain.radius:g} mm of the centre |
-| forces | {low:g} to {high:g} N{yield_words(about)} |
+| forces | {low:g} to {high:g} N{yield_text(about)} |
 | probe | {about.probes[0]} as described |
 | trained for the noise | {films.noise.name}: {films.noise.white:g} pC and {100 * films.noise.gain:g} % |
 

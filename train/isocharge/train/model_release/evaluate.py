@@ -1,4 +1,4 @@
-"""Errors on presses that a network never saw: the figures in cards, reports and the demo."""
+"""Measured errors of a network on presses on which it was not trained: the figures of cards, reports and the demo."""
 
 from collections.abc import Callable, Mapping
 
@@ -12,124 +12,193 @@ from isocharge.train.data.presses import LabelledPresses, position_error
 from isocharge.train.training.fitted import Fitted
 
 Predict = Callable[[Array], tuple[Array, Array, Array]]
-"""Charges (n, n_electrode), pC, to contact (n, 3), mm and N, standard deviations (n, 3) and misfit (n, 1)."""
+"""Function from charges, shape (n, n_electrode), pC, to contacts, shape (n, 3), mm and N, their standard deviations,
+shape (n, 3), and misfits, shape (n, 1)."""
 
-FALSE_ALARMS = 0.01
-"""Share of good presses whose misfit is above the alarm's threshold, dimensionless."""
+FALSE_ALARM_RATE = 0.01
+"""Fraction of good presses whose misfit exceeds the threshold of the alarm, dimensionless."""
 
-ABOUT_1_N = (0.8, 1.25)
-"""Smallest and largest force that counts as 1 N where faults are looked for, N."""
+FORCES_NEAR_1_N = (0.8, 1.25)
+"""Smallest and largest force of the presses on which the detection of faults is measured, N."""
 
-DRAWS = 20
-"""Draws of the noise for the misfit's rare values."""
+N_NOISE_DRAWS = 20
+"""Number of draws of the noise from which percentiles of the misfit are computed."""
 
 HELD_PRESSES = "measured_presses"
 """Entry of a model's errors: number of measured presses that they were measured on. Simulated errors have none."""
 
 ONLY_SIMULATED = ("position_p99_mm", "force_p99_percent")
-"""Errors that take more presses than a rig makes."""
+"""Errors that need more presses than a rig usually makes."""
+
+WITHIN_95_PERCENT = 1.96
+"""Half width of the 95 % interval of a Gaussian, in standard deviations."""
 
 
 def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *, seed: int = 1) -> dict[str, float]:
-    """Errors of a fitted network.
+    """Measure the errors of a trained network.
 
     Args:
         fitted: The network.
-        presses: To measure on; those that the network was not shown if absent. Measured ones count as they are, what
-            the rig does not know of places and forces included; to clean ones the network's noise is added.
-        seed: Of the noise.
+        presses: Presses on which the errors are measured; None for those on which the network was not trained. To
+            simulated presses the network's noise is added. Measured presses are used as they are, so the errors include
+            those of the measured places and forces.
+        seed: Seed of the noise.
 
     Returns:
-        Position errors in mm, relative force errors in percent, coverage of the 68 and 95 % intervals (share of
-        coordinates, 0 to 1), and the misfits that 1 % and 0.1 % of good presses exceed. For clean presses also the
-        errors without noise, and the share of faults that the former misfit finds; for measured ones their number.
+        Errors by name: position errors in mm, relative force errors in percent, coverage of the 68 and 95 % intervals
+        (fraction of the coordinates, 0 to 1), and the misfits that 1 % and 0.1 % of the good presses exceed. Simulated
+        presses also give the errors without noise, and the fraction of faults whose misfit exceeds the first of these
+        misfits. Measured presses also give their number.
     """
     if isinstance(presses, Dataset):
         presses = LabelledPresses.of(presses)
     test = fitted.test if presses is None else presses
     if not test.measured and isinstance(fitted.noise, NoiseModel):
         return simulated_errors(fitted.predict, test, fitted.noise, seed)
-    judged = fitted.judged if presses is None else None
-    errors = contact_errors(*(judged or fitted.predict(test.charge))[:2], test.contact)
-    kept = {name: error for name, error in errors.items() if name not in ONLY_SIMULATED}
-    if fitted.good.measured or not isinstance(fitted.noise, NoiseModel):
-        misfit = fitted.judged[2] if fitted.judged else fitted.predict(fitted.good.charge)[2]
-        alarm = {"misfit_p99": rounded(alarm_threshold(misfit))}
-        if fitted.judged:
-            alarm["misfit_p999"] = rounded(np.percentile(misfit, 99.9))
+
+    if presses is None and fitted.cross_validated is not None:
+        contact, std, _ = fitted.cross_validated
     else:
-        alarm = misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)
-    return {**kept, HELD_PRESSES: float(len(test)), **alarm}
+        contact, std, _ = fitted.predict(test.charge)
+    all_errors = contact_errors(contact, std, test.contact)
+    errors = {name: error for name, error in all_errors.items() if name not in ONLY_SIMULATED}
+    errors[HELD_PRESSES] = float(len(test))
+    if not fitted.good.measured and isinstance(fitted.noise, NoiseModel):
+        return errors | misfit_errors(fitted.predict, fitted.good, fitted.noise, seed)
+    if fitted.cross_validated is None:
+        _, _, misfit = fitted.predict(fitted.good.charge)
+        return errors | {"misfit_p99": rounded(alarm_threshold(misfit))}
+    misfit = fitted.cross_validated.misfit
+    return errors | {
+        "misfit_p99": rounded(alarm_threshold(misfit)),
+        "misfit_p999": rounded(np.percentile(misfit, 99.9)),
+    }
 
 
 def simulated_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int = 1) -> dict[str, float]:
-    """Errors on clean presses, with noise and without; see `evaluate`."""
+    """Measure the errors on simulated presses, with and without noise.
+
+    Args:
+        predict: The network.
+        presses: Presses without noise.
+        noise: Noise to add.
+        seed: Seed of the noise.
+
+    Returns:
+        Errors by name, as `evaluate` returns them.
+    """
     contact, std, _ = predict(presses.noisy(noise, seed))
-    clean = position_error(predict(presses.charge)[0], presses.contact)
+    clean_contact, _, _ = predict(presses.charge)
+    clean_error = position_error(clean_contact, presses.contact)
     return {
         **contact_errors(contact, std, presses.contact),
-        "clean_position_median_mm": rounded(np.median(clean)),
-        "clean_position_p95_mm": rounded(np.percentile(clean, 95)),
+        "clean_position_median_mm": rounded(np.median(clean_error)),
+        "clean_position_p95_mm": rounded(np.percentile(clean_error, 95)),
         **misfit_errors(predict, presses, noise, seed),
     }
 
 
 def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]:
-    """Errors of contacts (x, y, F) and coverage of their standard deviations, all of shape (n, 3), mm and N."""
-    position, force = position_error(contact, truth), contact[:, 2] / truth[:, 2] - 1.0
+    """Compute the errors of contacts and the coverage of their intervals.
+
+    Args:
+        contact: Estimated contacts (x, y, F), shape (n, 3), mm and N.
+        std: Their standard deviations, shape (n, 3).
+        truth: True contacts, shape (n, 3).
+
+    Returns:
+        Errors by name, as `evaluate` returns them.
+    """
+    position = position_error(contact, truth)
+    relative_force = contact[:, 2] / truth[:, 2] - 1.0
     deviation = np.abs(contact - truth) / std
     errors = {
         "position_median_mm": np.median(position),
         "position_rms_mm": rms(position),
         "position_p95_mm": np.percentile(position, 95),
         "position_p99_mm": np.percentile(position, 99),
-        "force_median_percent": 100.0 * np.median(np.abs(force)),
-        "force_rms_percent": 100.0 * rms(force),
-        "force_p99_percent": 100.0 * np.percentile(np.abs(force), 99),
+        "force_median_percent": 100.0 * np.median(np.abs(relative_force)),
+        "force_rms_percent": 100.0 * rms(relative_force),
+        "force_p99_percent": 100.0 * np.percentile(np.abs(relative_force), 99),
         "coverage_68": np.mean(deviation < 1.0),
-        "coverage_95": np.mean(deviation < 1.96),
+        "coverage_95": np.mean(deviation < WITHIN_95_PERCENT),
     }
     return {name: rounded(value) for name, value in errors.items()}
 
 
 def misfit_errors(predict: Predict, presses: LabelledPresses, noise: NoiseModel, seed: int) -> dict[str, float]:
-    """Misfits that few good presses exceed, and the share of faults that they find, on clean presses."""
+    """Compute the misfits that few good presses exceed, and the fraction of faults that exceed the alarm's threshold.
+
+    Args:
+        predict: The network.
+        presses: Presses without noise.
+        noise: Noise of the training.
+        seed: Seed of the noise.
+
+    Returns:
+        Errors by name, as `evaluate` returns them.
+    """
     unit = misfit_noise(noise)
-    good = np.concatenate([predict(presses.noisy(unit, seed + draw))[2] for draw in range(DRAWS)])
-    alarm = alarm_threshold(good)
-    faults = _detected_faults(predict, presses[about_1_N(presses.contact[:, 2])], unit, alarm, seed + DRAWS)
-    return {"misfit_p99": rounded(alarm), "misfit_p999": rounded(np.percentile(good, 99.9)), **faults}
+    good_misfits = []
+    for draw in range(N_NOISE_DRAWS):
+        _, _, misfit = predict(presses.noisy(unit, seed + draw))
+        good_misfits.append(misfit)
+    all_misfits = np.concatenate(good_misfits)
+    threshold = alarm_threshold(all_misfits)
+    presses_near_1_N = presses[is_near_1_N(presses.contact[:, 2])]
+    return {
+        "misfit_p99": rounded(threshold),
+        "misfit_p999": rounded(np.percentile(all_misfits, 99.9)),
+        **_detected_faults(predict, presses_near_1_N, unit, threshold, seed + N_NOISE_DRAWS),
+    }
 
 
 def alarm_threshold(good_misfits: Array) -> float:
-    """The misfit that the share `FALSE_ALARMS` of good presses exceeds; `good_misfits` has shape (n,)."""
-    return float(np.percentile(good_misfits, 100.0 * (1.0 - FALSE_ALARMS)))
+    """Compute the misfit that the fraction `FALSE_ALARM_RATE` of good presses exceeds, from their misfits."""
+    return float(np.percentile(good_misfits, 100.0 * (1.0 - FALSE_ALARM_RATE)))
 
 
-def about_1_N(force: Array) -> Booleans:
-    """Which forces, N, count as 1 N; the same shape."""
-    low, high = ABOUT_1_N
+def is_near_1_N(force: Array) -> Booleans:
+    """Return which forces, N, are close enough to 1 N to measure the detection of faults; the same shape."""
+    low, high = FORCES_NEAR_1_N
     return np.asarray((force >= low) & (force <= high))
 
 
 def rounded(value: float | np.floating) -> float:
-    """A figure as metadata have it, to four digits."""
+    """Round a figure to four significant digits, as the metadata hold it."""
     return float(f"{value:.4g}")
 
 
 def _detected_faults(
-    predict: Predict, presses: LabelledPresses, noise: NoiseModel, limit: float, seed: int
+    predict: Predict, presses: LabelledPresses, noise: NoiseModel, threshold: float, seed: int
 ) -> Mapping[str, float]:
-    """Share of presses with a fault whose misfit is above the limit, every electrode in turn."""
+    """Compute the fraction of presses with a faulty electrode whose misfit exceeds a threshold.
+
+    Args:
+        predict: The network.
+        presses: Presses without noise.
+        noise: Noise to add.
+        threshold: Misfit of the alarm.
+        seed: Seed of the noise.
+
+    Returns:
+        Fractions for a gain that is wrong by 20 % and for a dead electrode; empty if there are no presses.
+    """
     if not len(presses):
         return {}
-    charge, count = presses.noisy(noise, seed), presses.charge.shape[1]
+    charge = presses.noisy(noise, seed)
+    n_electrode = charge.shape[1]
 
-    def share(gain: float) -> float:
-        faults = [charge * np.where(np.arange(count) == electrode, gain, 1.0) for electrode in range(count)]
-        return float(np.mean(predict(np.concatenate(faults))[2] > limit))
+    def detected_fraction(gain: float) -> float:
+        faulty_charges = []
+        for electrode in range(n_electrode):
+            gains = np.ones(n_electrode)
+            gains[electrode] = gain
+            faulty_charges.append(charge * gains)
+        _, _, misfit = predict(np.concatenate(faulty_charges))
+        return float(np.mean(misfit > threshold))
 
     return {
-        "found_gain_20_percent": rounded(0.5 * (share(0.8) + share(1.2))),
-        "found_dead_electrode": rounded(share(0.0)),
+        "found_gain_20_percent": rounded(0.5 * (detected_fraction(0.8) + detected_fraction(1.2))),
+        "found_dead_electrode": rounded(detected_fraction(0.0)),
     }

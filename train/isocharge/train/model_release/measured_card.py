@@ -9,12 +9,12 @@ from isocharge.train.model_release.evaluate import HELD_PRESSES
 
 
 def measured_errors(errors: Mapping[str, float], which: str, how: str) -> str:
-    """The section about errors.
+    """Return the section of a card with the errors on measured presses.
 
     Args:
-        errors: Of the model.
-        which: Words behind "measured presses" in the heading.
-        how: What the figures mean.
+        errors: Errors of the model by name.
+        which: Words after "measured presses" in the heading.
+        how: Paragraph about the meaning of the figures.
     """
     return f"""## Errors on {errors[HELD_PRESSES]:.0f} measured presses {which}
 
@@ -32,8 +32,10 @@ def measured_errors(errors: Mapping[str, float], which: str, how: str) -> str:
 
 
 def measured_card(metadata: ModelMetadata) -> str:
-    """The text of `card.md`."""
-    (low, high), noise, measured = metadata.force_range_N, metadata.noise, metadata.made_with["measured"]
+    """Return the text of `card.md` for a model that was trained on measured presses alone."""
+    low, high = metadata.force_range_N
+    noise = metadata.noise
+    measured = metadata.made_with["measured"]
     width, height = np.ptp(np.array(metadata.working_area_mm), axis=0)
     channels = ", ".join(metadata.electrodes)
     levels = "\n".join(

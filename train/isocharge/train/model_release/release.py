@@ -1,6 +1,6 @@
-"""From a fitted network to a model folder: ONNX graph, measured errors, golden vectors, and the card.
+"""Release of a trained network as a model folder: ONNX graph, measured errors, golden vectors and model card.
 
-The card says what a model is for, what it reaches, what it cannot do, and how to make it again.
+The card states what the model is for, how large its errors are, what its limits are, and how to make it again.
 """
 
 import json
@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,23 +31,24 @@ from isocharge.train.model_release.measured_card import measured_card, measured_
 from isocharge.train.model_release.onnx_graph import write_graph
 from isocharge.train.training.fitted import Fitted
 
-CORNERS = 64
-"""Corners of the polygon that stands for a round working area."""
+N_CORNERS = 64
+"""Number of corners of the polygon that represents a round working area."""
 
-DISK_TOLERANCE_mm = 2e-3
-"""Distance by which the corners of that polygon may differ from their places; they are written to 0.0001 mm."""
+CORNER_TOLERANCE_mm = 2e-3
+"""Largest distance of the corners of such a polygon from their ideal places, mm. The metadata round them to 0.0001 mm.
+"""
 
-Card = Callable[[ModelMetadata, Fitted], str]
-"""The text of a card, from what the model says about itself and the network."""
+CardWriter = Callable[[ModelMetadata, Fitted], str]
+"""Function from the metadata and the trained network to the text of the card."""
 
 
 @dataclass(frozen=True)
 class Release:
-    """A model that was written.
+    """A released model.
 
     Attributes:
-        folder: Its version folder.
-        metadata: What the file says about itself, measured errors included.
+        folder: Version folder of the model.
+        metadata: Metadata in the model file, with the measured errors.
     """
 
     folder: Path
@@ -83,34 +85,36 @@ HUB_METRICS = {
     "force_median_percent": "force error, median, %",
     "force_rms_percent": "force error, rms, %",
 }
-"""Measured errors that model hubs list, and what they are called there."""
+"""Measured errors that model hubs list, and their names on the hubs."""
 
 
 def hub_block(metadata: ModelMetadata) -> str:
-    """The block of YAML above a card that model hubs read: what kind of model it is, and its measured errors.
+    """Return the block of YAML above a card that model hubs read: the kind of the model and its measured errors.
 
-    Source: https://huggingface.co/docs/hub/model-cards. No licence is named: whoever publishes a model chooses it.
+    Source: https://huggingface.co/docs/hub/model-cards. The block names no licence, because the publisher of a model
+    chooses it.
     """
     metrics = "".join(
         f"""
     - type: {key}
-      name: {said}
+      name: {name}
       value: {metadata.errors[key]:g}"""
-        for key, said in HUB_METRICS.items()
+        for key, name in HUB_METRICS.items()
         if key in metadata.errors
     )
-    name, sensor = json.dumps(metadata.name), json.dumps(str(metadata.sensor["name"]))
+    model_name = json.dumps(metadata.name)
+    sensor_name = json.dumps(str(metadata.sensor["name"]))
     return f"""---
 library_name: onnx
 pipeline_tag: tabular-regression
 tags: [isocharge, tactile-sensing, piezoelectric]
 model-index:
-- name: {name}
+- name: {model_name}
   results:
   - task:
       type: tabular-regression
     dataset:
-      name: {sensor}
+      name: {sensor_name}
       type: presses
     metrics:{metrics}
 ---
@@ -119,20 +123,19 @@ model-index:
 
 
 def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
-    """The text of `card.md`."""
+    """Return the text of `card.md`."""
     if isinstance(fitted.sensor, MeasuredSensor):
         return measured_card(metadata)
     if fitted.test.measured:
-        errors, truth = (
-            fitted.provenance.card + measured_errors(metadata.errors, "that training never saw", NO_NOISE),
-            MEASURED_TRUTH,
-        )
+        errors = fitted.provenance.card + measured_errors(metadata.errors, "that training never saw", NO_NOISE)
+        truth = MEASURED_TRUTH
     else:
-        errors, truth = _errors(metadata.errors, len(fitted.test)), SIMULATED_TRUTH
+        errors = _errors_section(metadata.errors, len(fitted.test))
+        truth = SIMULATED_TRUTH
     cautions = "".join(f"- {caution}.\n" for caution in fitted.cautions)
-    return f"""{_interface(metadata, fitted)}
+    return f"""{_interface_section(metadata, fitted)}
 {errors}
-{_misfit(metadata, fitted)}
+{_misfit_section(metadata, fitted)}
 ## Limits
 
 {truth}{cautions}{LIMITS}
@@ -144,8 +147,8 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
 """
 
 
-def yield_words(metadata: ModelMetadata) -> str:
-    """From where on PVDF yields, for the row of the forces; empty where no press of the range makes it."""
+def yield_text(metadata: ModelMetadata) -> str:
+    """Return the text about yielding for the row of the forces; empty if the film does not yield within the range."""
     if metadata.yield_force_N is None:
         return ""
     return (
@@ -154,30 +157,37 @@ def yield_words(metadata: ModelMetadata) -> str:
     )
 
 
-def _interface(metadata: ModelMetadata, fitted: Fitted) -> str:
-    (low, high), noise, teacher = metadata.force_range_N, metadata.noise, metadata.made_with.get("teacher")
+def _interface_section(metadata: ModelMetadata, fitted: Fitted) -> str:
+    """Return the section of the card with inputs, outputs and ranges."""
+    low, high = metadata.force_range_N
+    noise = metadata.noise
+    teacher = metadata.made_with.get("teacher")
     electrodes = ", ".join(metadata.electrodes)
-    taught = f"\nA small network that learned the answers of `{teacher}`." if teacher else ""
-    folded = f" (of {fitted.asked.radius:g} mm asked for: beyond, two contacts give the same charges)"
-    correlated = ", `contact_correlation` (xy, xF, yF)" if fitted.network.n_angle else ""
-    unknown_probe = "; which of them presses is not known to the model" if len(metadata.probes) > 1 else ""
+    teacher_text = f"\nA small network that learned the answers of `{teacher}`." if teacher else ""
+    requested = fitted.requested_domain
+    domain_text = ""
+    if requested != fitted.domain:
+        domain_text = f" (of {requested.radius:g} mm asked for: beyond, two contacts give the same charges)"
+    correlation = ", `contact_correlation` (xy, xF, yF)" if fitted.network.n_angle else ""
+    probe_text = "; which of them presses is not known to the model" if len(metadata.probes) > 1 else ""
     return f"""# {metadata.name}, version {metadata.version}
 
-Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of one press out.{taught}
+Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of one press out.{teacher_text}
 
 | | |
 |---|---|
 | input | `charge_pC`, float32 [n, {len(metadata.electrodes)}], touch charges of {electrodes} in pC |
-| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlated}, `misfit` |
-| working area | within {fitted.domain.radius:g} mm of the centre{folded if fitted.asked != fitted.domain else ""} |
-| forces | {low:g} to {high:g} N{yield_words(metadata)} |
-| probes | {", ".join(metadata.probes)}{unknown_probe} |
+| outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlation}, `misfit` |
+| working area | within {fitted.domain.radius:g} mm of the centre{domain_text} |
+| forces | {low:g} to {high:g} N{yield_text(metadata)} |
+| probes | {", ".join(metadata.probes)}{probe_text} |
 | trained for the noise | {noise.name}: {noise.white_pC:g} pC and {100 * noise.gain:g} % |
 """
 
 
-def _errors(errors: Mapping[str, float], presses: int) -> str:
-    return f"""## Measured on {presses} presses that training never saw
+def _errors_section(errors: Mapping[str, float], n_press: int) -> str:
+    """Return the section of the card with the errors on simulated presses."""
+    return f"""## Measured on {n_press} presses that training never saw
 
 Forces log-uniform, positions uniform over the working area.
 
@@ -195,29 +205,38 @@ Forces log-uniform, positions uniform over the working area.
 """
 
 
-def _misfit(metadata: ModelMetadata, fitted: Fitted) -> str:
-    errors, unit, shares = metadata.errors, fitted.misfit_noise, ""
-    simulated = "simulated good presses" if fitted.test.measured else "good presses"
-    good = "measured presses" if fitted.good.measured else simulated
-    of_unit = f" `{unit.name}` (1 pC and 0.2 %)" if unit != fitted.noise else ""
-    rare = f",\n0.1 % exceed {errors['misfit_p999']:g}" if "misfit_p999" in errors else ""
+def _misfit_section(metadata: ModelMetadata, fitted: Fitted) -> str:
+    """Return the paragraph of the card about the misfit."""
+    errors = metadata.errors
+    unit = fitted.misfit_noise
+    unit_text = f" `{unit.name}` (1 pC and 0.2 %)" if unit != fitted.noise else ""
+    if fitted.good.measured:
+        presses_text = "measured presses"
+    elif fitted.test.measured:
+        presses_text = "simulated good presses"
+    else:
+        presses_text = "good presses"
+    rare_text = f",\n0.1 % exceed {errors['misfit_p999']:g}" if "misfit_p999" in errors else ""
+    faults_text = ""
     if "found_dead_electrode" in errors:
-        gain, dead = (100 * errors[share] for share in ("found_gain_20_percent", "found_dead_electrode"))
-        shares = (
-            f"Of presses of about 1 N the former finds {gain:.3g} % where one gain\n"
-            f"is off by 20 %, and {dead:.3g} % where one electrode is dead."
+        gain_percent = 100 * errors["found_gain_20_percent"]
+        dead_percent = 100 * errors["found_dead_electrode"]
+        faults_text = (
+            f"Of presses of about 1 N the former finds {gain_percent:.3g} % where one gain\n"
+            f"is off by 20 %, and {dead_percent:.3g} % where one electrode is dead."
         )
-    sees = "Charges that disagree with each other (a wrong gain, a dead electrode, two presses) raise it."
+    meaning_text = "Charges that disagree with each other (a wrong gain, a dead electrode, two presses) raise it."
     if len(metadata.electrodes) == 3:
-        sees = (
+        meaning_text = (
             "Three charges and three unknowns: nearly every triple fits some contact, so it sees only what leads out\n"
             "of the working area or the forces."
         )
     return f"""\
-The misfit is the distance, in units of the noise{of_unit}, of the charges from the nearest single contact that the
-model knows; a network gives it, learned from exact searches. 1 % of {good} exceed {errors["misfit_p99"]:g}{rare}.
-{sees}
-{shares}
+The misfit is the distance, in units of the noise{unit_text}, of the charges from the nearest single contact that the
+model knows; a network gives it, learned from exact searches. 1 % of {presses_text} exceed \
+{errors["misfit_p99"]:g}{rare_text}.
+{meaning_text}
+{faults_text}
 """
 
 
@@ -228,33 +247,35 @@ def release(
     version: int = 1,
     command: str = "",
     errors: Mapping[str, float] | None = None,
-    card: Card = model_card,
+    card: CardWriter = model_card,
 ) -> Release:
-    """Write a fitted network as a version of a model.
+    """Write a trained network as a version of a model.
 
     Args:
         fitted: The network.
-        folder: The model's folder, `models/NAME`; the name is the model's.
+        folder: Folder of the model, `models/NAME`. Its name is the name of the model.
         version: Number of the version folder.
-        command: How to make this model again, for the card.
-        errors: For the metadata; what `evaluate` measures if absent.
-        card: Writes the card.
+        command: Command that makes this model again, for the card.
+        errors: Errors for the metadata; None to measure them with `evaluate`.
+        card: Function that writes the card.
+
+    Returns:
+        The version folder and the metadata.
 
     Raises:
         OutputExists: If the version exists.
         ModelError: If the folder holds a model with other electrodes.
-        TrainingError: If the exported file and the network disagree.
+        TrainingError: If the exported graph and the network disagree.
     """
     names = fitted.sensor.electrode_names
     check_target(folder, version, names)
+    packages = {package: metadata.version(package) for package in ("isocharge", "numpy", "onnx", "onnxruntime")}
     about = ModelMetadata(
         name=folder.resolve().name,
         version=version,
-        sensor=fitted.sensor.to_dict() if isinstance(fitted.sensor, MeasuredSensor) else sensor_to_dict(fitted.sensor),
+        sensor=_sensor_table(fitted),
         electrodes=names,
-        working_area_mm=fitted.domain.corners
-        if isinstance(fitted.domain, PressedArea)
-        else _disk_polygon(fitted.domain.radius),
+        working_area_mm=_working_area(fitted.domain),
         probes=fitted.probes,
         force_range_N=fitted.domain.force_range,
         noise=convert(fitted.noise.to_dict(), ModelNoise, "noise of the training", ModelError),
@@ -262,53 +283,74 @@ def release(
         errors=evaluate(fitted) if errors is None else dict(errors),
         made_with={
             "command": command,
-            **{package: metadata.version(package) for package in ("isocharge", "numpy", "onnx", "onnxruntime")},
+            **packages,
             "python": platform.python_version(),
             **fitted.provenance.made_with,
         },
         yield_force_N=_yield_force(fitted),
     )
     graph = write_graph(fitted.network, about.to_props())
-    golden = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, contact_floors(about))
-    text = hub_block(about) + card(about, fitted)
-    return Release(write_model(folder, graph, about, golden, text, fitted.provenance.files), about)
+    golden_charges = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, contact_floors(about))
+    card_text = hub_block(about) + card(about, fitted)
+    version_folder = write_model(folder, graph, about, golden_charges, card_text, fitted.provenance.files)
+    return Release(version_folder, about)
+
+
+def _sensor_table(fitted: Fitted) -> dict[str, Any]:
+    """Return the sensor as the metadata hold it."""
+    if isinstance(fitted.sensor, MeasuredSensor):
+        return fitted.sensor.to_dict()
+    return sensor_to_dict(fitted.sensor)
+
+
+def _working_area(domain: Domain) -> tuple[tuple[float, float], ...]:
+    """Return the corners (x, y) of the working area, mm."""
+    if isinstance(domain, PressedArea):
+        return domain.corners
+    return _disk_polygon(domain.radius)
 
 
 def _yield_force(fitted: Fitted) -> float | None:
-    """Force beyond which the film yields under the sharpest probe, N; None if no press that the model knows does so."""
+    """Compute the smallest force at which the film yields under any of the probes.
+
+    Returns:
+        Force, N; None if the film does not yield within the range of forces, or its stress is not simulated.
+    """
     if isinstance(fitted.sensor, MeasuredSensor):
         return None
-    low, high = forces = fitted.domain.force_range
-    least = high
+    force_range = fitted.domain.force_range
+    smallest, largest = force_range
+    yield_force = largest
     for probe in map(parse_probe, fitted.probes):
         try:
-            least = min(least, force_within_stress(fitted.sensor.film, probe, DEFAULT_STRESS_LIMIT, forces))
-        except SceneError:  # the smallest force is beyond it already
-            least = low
-        except SolveError:  # nobody knows
+            limit = force_within_stress(fitted.sensor.film, probe, DEFAULT_STRESS_LIMIT, force_range)
+        except SceneError:  # the film yields already at the smallest force
+            limit = smallest
+        except SolveError:  # the stress of this film cannot be computed
             continue
-    return round(least, 3) if least < high else None
+        yield_force = min(yield_force, limit)
+    return round(yield_force, 3) if yield_force < largest else None
 
 
 def _disk_polygon(radius: float) -> tuple[tuple[float, float], ...]:
-    """The working area as a polygon that just contains the disk."""
-    angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
-    outer = radius / np.cos(np.pi / CORNERS)
-    corners: Array = np.round(outer * np.stack([np.cos(angle), np.sin(angle)], axis=1), 4)
+    """Return the smallest regular polygon that contains a disk about the origin: corners (x, y), mm."""
+    angle = 2.0 * np.pi * np.arange(N_CORNERS) / N_CORNERS
+    corner_radius = radius / np.cos(np.pi / N_CORNERS)
+    corners: Array = np.round(corner_radius * np.stack([np.cos(angle), np.sin(angle)], axis=1), 4)
     return tuple((x, y) for x, y in corners.tolist())
 
 
 def model_domain(about: ModelMetadata) -> Domain:
-    """Return the contacts that a model was trained for, from its metadata.
+    """Return the contacts for which a model was trained, from its metadata.
 
-    A working area that is the polygon of a disk about the origin, as models of simulated presses have it, gives the
-    largest disk in it, to 0.001 mm. Every other working area gives a `PressedArea` with its corners.
+    If the working area is the polygon of a disk about the origin, as in models of simulated presses, the domain is the
+    largest disk in it, rounded to 0.001 mm. Every other working area gives a `PressedArea` with its corners.
     """
     corners = np.array(about.working_area_mm)
-    along = np.roll(corners, -1, axis=0) - corners
-    distances = np.abs(along[:, 0] * corners[:, 1] - along[:, 1] * corners[:, 0]) / np.hypot(*along.T)
-    radius = round(float(distances.min()), 3)
-    disk = np.array(_disk_polygon(radius))
-    if corners.shape == disk.shape and np.abs(corners - disk).max() < DISK_TOLERANCE_mm:
+    edges = np.roll(corners, -1, axis=0) - corners
+    edge_distance = np.abs(edges[:, 0] * corners[:, 1] - edges[:, 1] * corners[:, 0]) / np.hypot(*edges.T)
+    radius = round(float(edge_distance.min()), 3)
+    disk_corners = np.array(_disk_polygon(radius))
+    if corners.shape == disk_corners.shape and np.abs(corners - disk_corners).max() < CORNER_TOLERANCE_mm:
         return Domain(radius, about.force_range_N)
     return PressedArea.of_corners(corners, about.force_range_N)

@@ -1,7 +1,8 @@
-"""A small student of a model, for microcontrollers: some 5,000 numbers, the same inputs and outputs.
+"""Training data and settings of a student: a small network that learns the answers of a model.
 
-The student has two hidden layers instead of three, narrow enough for 40 kB of flash. Its contacts and deviations are
-the model's; its misfit is learned from exact searches, as the model's was.
+A student has the inputs and outputs of the model and about 5,000 weights and biases, so it fits into the flash memory
+of a microcontroller. It learns the contacts and standard deviations of the model. It learns the misfit, like the model,
+from distances that were computed exactly.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +24,11 @@ from isocharge.train.training.source import Teacher, TrainingData
 
 
 def student_config(weights: Literal["float32", "int8"] = "float32") -> FitConfig:
-    """Settings of a student; `weights` is their form."""
+    """Return the settings of a student.
+
+    Args:
+        weights: Form of the weights between hidden layers.
+    """
     return FitConfig(
         network=NetworkConfig(hidden=(30, 30), misfit_hidden=(34, 34), weights=weights),
         training=TrainingConfig(steps=16_000, misfit_steps=24_000),
@@ -32,12 +37,12 @@ def student_config(weights: Literal["float32", "int8"] = "float32") -> FitConfig
 
 @dataclass(frozen=True)
 class StudentCase:
-    """What a model knows, so that presses like those it was trained on can be simulated.
+    """Sensor, probes and contacts of a model, from which presses like those of its training can be simulated.
 
     Attributes:
-        sensor: Its sensor.
-        probes: Its probes.
-        domain: Its working area and forces.
+        sensor: Sensor of the model.
+        probes: Probes of the model.
+        domain: Working area and forces of the model.
     """
 
     sensor: Sensor
@@ -46,10 +51,10 @@ class StudentCase:
 
     @classmethod
     def of(cls, about: ModelMetadata) -> "StudentCase":
-        """From the model's metadata.
+        """Return the case of a model from its metadata.
 
         Raises:
-            ModelError: If it was trained on measured presses, which no simulation repeats.
+            ModelError: If the model was trained on measured presses, which cannot be simulated.
         """
         if HELD_PRESSES in about.errors:
             raise ModelError(
@@ -61,14 +66,14 @@ class StudentCase:
 
 
 def student_data(model: Path, dataset: Dataset) -> TrainingData:
-    """What a student is fitted to: presses, and the answers of a model to them.
+    """Return the training data of a student: presses, and the answers of a model to their charges.
 
     Args:
-        model: The model's version folder.
-        dataset: Clean charges of the model's sensor, such as a sweep over its `StudentCase`.
+        model: Version folder of the model.
+        dataset: Simulated presses on the model's sensor without noise, such as a sweep over its `StudentCase`.
 
     Raises:
-        DatasetError: If the dataset is of another sensor, or cannot train an inverse.
+        DatasetError: If the dataset is of another sensor, or a network cannot be trained on it.
     """
     predictor = Predictor(model)
     about = predictor.metadata
@@ -79,8 +84,10 @@ def student_data(model: Path, dataset: Dataset) -> TrainingData:
         )
 
     def answer(charge: Array) -> tuple[Array, Array]:
-        columns = np.stack(predictor.predict_batch(charge), axis=1).astype(float)
-        return columns[:, :3], columns[:, 3:6]
+        contact = predictor.predict_batch(charge)
+        position_and_force = np.stack([contact.x_mm, contact.y_mm, contact.force_N], axis=1)
+        std = np.stack([contact.x_std_mm, contact.y_std_mm, contact.force_std_N], axis=1)
+        return position_and_force.astype(float), std.astype(float)
 
     checksum = sha256_of((model / "model.onnx").read_bytes())
     return replace(TrainingData.of(dataset), teacher=Teacher(about.label, checksum, answer))

@@ -6,7 +6,7 @@ The record is that of `report.json`, but for the methods, each a `MethodRecord`.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from isocharge.train.model_release.evaluate import FALSE_ALARMS
+from isocharge.train.model_release.evaluate import FALSE_ALARM_RATE
 from isocharge.train.report.measures import MethodRecord
 from isocharge.train.report.studies import FARTHEST, GAIN_OFF, PRETENSION_OFF
 
@@ -172,7 +172,7 @@ CAPTIONS = {
     "noise": "Position error (rms, mm) when the noise is not the one that the methods were fitted for.",
     "effects": "Left: position error (rms, mm) when the probe, the pretension or gains are not as the methods "
     f"assume; answers beyond {FARTHEST:g} mm or N are cut there. Right: share of presses whose misfit gives an alarm, "
-    f"at {100.0 * FALSE_ALARMS:g} % false alarms (dashed).",
+    f"at {100.0 * FALSE_ALARM_RATE:g} % false alarms (dashed).",
 }
 
 

@@ -15,7 +15,7 @@ from isocharge.simulate.plots.figure import FELT, INK, new_axes, new_figure
 from isocharge.simulate.plots.film import draw_layout
 from isocharge.train.baselines.networks import RELEASED
 from isocharge.train.data.presses import position_error
-from isocharge.train.model_release.evaluate import FALSE_ALARMS
+from isocharge.train.model_release.evaluate import FALSE_ALARM_RATE
 from isocharge.train.report.case import BAYES, CRAMER_RAO
 from isocharge.train.report.measures import MethodRecord, Plot
 from isocharge.train.report.studies import COORDINATES, Draws
@@ -144,7 +144,7 @@ def mismatch_effect(cases: Sequence[Mapping[str, Any]], nominal: float | None) -
     left.axvline(nominal or np.nan, color=FELT, lw=0.9, ls="--", label="as assumed")
     bars = right.barh([*some], [case["alarms_percent"] for case in some.values()], color=FELT, alpha=0.8, height=0.6)
     right.bar_label(bars, fmt="{:g}", padding=3, fontsize=8)
-    right.axvline(100.0 * FALSE_ALARMS, color=INK, lw=0.9, ls="--")
+    right.axvline(100.0 * FALSE_ALARM_RATE, color=INK, lw=0.9, ls="--")
     left.set(xlabel="position error, rms, mm", xscale="log")
     left.invert_yaxis()
     right.set(xlabel="presses with an alarm from the misfit, %", xlim=(0, 112))

@@ -1,20 +1,22 @@
-"""How the errors of x, y and ln F go together: a linear head on a trained network, whose answers it leaves alone.
+"""Correlations of the errors of x, y and ln F: additional answers of a trained network, whose other answers stay.
 
-A correlation matrix is the Gram matrix of three unit vectors. With
+A correlation matrix is the Gram matrix of three unit vectors. The vectors
 
     (1, 0, 0),  (cos a, sin a, 0),  (cos b, sin b cos c, sin b sin c)
 
-any three angles give one that is valid, and the rows are its Cholesky factor. Products of sines and cosines are sums of
-cosines, so the correlations are linear in eight of these:
+give a valid matrix for any angles a, b and c; they are the rows of its Cholesky factor. Products of sines and cosines
+are sums of cosines, so the correlations are linear in eight cosines:
 
     xy = cos a,  xF = cos b,
     yF = (cos(a - b) + cos(a + b)) / 2 + (cos(a - b - c) + cos(a - b + c) - cos(a + b - c) - cos(a + b + c)) / 4.
 
-In a graph that is one node for the cosines and one for the sums. The angles are linear in the last hidden layer of the
-contact network and in the logarithms of the charges, and learned by maximum likelihood from the network's errors.
+In the exported graph this takes one node for the cosines and one for the sums. The angles are linear in the last hidden
+layer of the contact perceptron and in the input features. They are fitted to the network's errors by maximum
+likelihood.
 """
 
 import logging
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import minimize
@@ -29,116 +31,153 @@ from isocharge.train.training.folded_network import N_CONTACT_ANSWERS, FoldedNet
 
 _log = logging.getLogger(__name__)
 
-EXAMPLES = 30_000
-"""Noisy presses that the head learns from."""
+N_EXAMPLES = 30_000
+"""Number of presses with noise to which the angles are fitted."""
 
 RIDGE = 1e-4
-"""Weight of the squared coefficients in the loss, for features of unit variance: few presses do not turn it."""
+"""Weight of the squared coefficients in the loss, for inputs of unit variance. It keeps a fit to few presses stable."""
 
-LEAST_SPREAD = 0.02
-"""Deviation of a combination of features, over the largest, below which it counts for less: its coefficient would be
-large and be lost in the digits of a float32."""
+MIN_RELATIVE_STD = 0.02
+"""Standard deviation of a principal component of the inputs, relative to the largest, below which the component is not
+scaled to unit variance. Its coefficients would otherwise be too large for float32."""
 
-SPARSE = 7
-"""One example in so many is enough for the mean and the axes of the features."""
+WHITENING_STRIDE = 7
+"""The whitening of the inputs is computed from every seventh example."""
 
-SMALL_GRADIENT = 2e-3
-"""Largest derivative of the loss at its minimum."""
+GRADIENT_TOLERANCE = 2e-3
+"""Largest derivative of the loss at which the minimisation stops."""
 
-STARTS, STEPS, REMEMBERED = 5, 90, 20
-"""How often the search may begin anew, as a line search may find no step where two unit vectors nearly meet; its steps
-(more change the coverage by less than 0.005), and those that its idea of the curvature is made of."""
+MAX_STARTS = 5
+"""Number of times that the minimisation may be started. A line search can fail where two unit vectors nearly meet."""
+
+MAX_ITERATIONS = 90
+"""Number of iterations of all starts. More iterations change the coverage by less than 0.005."""
+
+N_UPDATES = 20
+"""Number of past updates that L-BFGS keeps."""
 
 FIRST_STEP = 0.125
-"""Length of a search's first step: a longer one leads to where unit vectors meet."""
+"""Length of the first step of the minimisation. A longer step leads to angles at which unit vectors meet."""
 
-FARTHEST = 5.0
-"""Deviations up to which an error counts: beyond it is none of a Gaussian."""
+MAX_DEVIATION = 5.0
+"""Largest error, in standard deviations, that the loss distinguishes; larger errors are not Gaussian."""
 
-LEAST_SINE = 1e-4
-"""Sines of angles count as no smaller: the squares of what is divided by three of them are numbers of a float32."""
+MIN_SINE = 1e-4
+"""Smallest absolute value of the sine of an angle, so that quotients stay within the range of float32."""
 
 ANGLE_SUMS = np.array([[1, 0, 1, 1, 1, 1, 1, 1], [0, 1, -1, 1, -1, -1, 1, 1], [0, 0, 0, 0, -1, 1, -1, 1]], dtype=float)
-"""From the angles (a, b, c) to the arguments of the cosines."""
+"""Matrix from the angles (a, b, c) to the arguments of the eight cosines."""
 
 
 def with_correlation(network: FoldedNetwork, presses: LabelledPresses, noise: NoiseModel, seed: int) -> FoldedNetwork:
-    """The network with a head for the correlations; its other answers stay as they are.
+    """Add correlations to a network.
 
     Args:
-        network: Trained and folded.
-        presses: Those that it learned from.
-        noise: Added to their charges.
-        seed: Of the noise.
+        network: The trained network.
+        presses: Presses on which the network was trained.
+        noise: Noise that is added to their charges.
+        seed: Seed of the noise.
+
+    Returns:
+        The network with additional answers, the angles of the correlations.
     """
-    examples = presses[np.arange(max(EXAMPLES, len(presses))) % len(presses)]
-    charge, truth = examples.noisy(noise, seed), examples.contact
-    logs = network.features.evaluate(charge)
-    features = evaluate_hidden_layers(network.layers.hidden, network.layers.activation, logs)
-    contact, std, *_ = network.outputs_from_answers(evaluate_output_layer(network.layers, features, logs))
-    errors = np.column_stack([truth[:, :2] - contact[:, :2], np.log(truth[:, 2] / contact[:, 2])])
-    weight, _ = network.layers.last
-    of_contact = weight[:, :N_CONTACT_ANSWERS].any(axis=1)
-    features = np.hstack([features[:, of_contact], logs])
-    deviation = errors / np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]])
-    with threadpool_limits(1):  # many small steps: two threads take three times as long
-        slopes, angles = _fit_angles(features, deviation)
-    head = np.zeros((len(weight), 3))
-    head[of_contact] = slopes[: -logs.shape[1]]
-    last = Layer(head @ ANGLE_SUMS, angles @ ANGLE_SUMS)
-    return network.with_angles(last, slopes[-logs.shape[1] :] @ ANGLE_SUMS)
+    layers = network.layers
+    examples = presses[np.arange(max(N_EXAMPLES, len(presses))) % len(presses)]
+    features = network.features.evaluate(examples.noisy(noise, seed))
+    hidden_output = evaluate_hidden_layers(layers.hidden, layers.activation, features)
+    contact, std, *_ = network.outputs_from_answers(evaluate_output_layer(layers, hidden_output, features))
+    truth = examples.contact
+    error = np.column_stack([truth[:, :2] - contact[:, :2], np.log(truth[:, 2] / contact[:, 2])])
+    error_std = np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]])
+
+    is_contact_unit = np.any(layers.last.weight[:, :N_CONTACT_ANSWERS] != 0.0, axis=1)
+    inputs = np.hstack([hidden_output[:, is_contact_unit], features])
+    with threadpool_limits(1):  # the steps are small: two threads would take three times as long
+        angles = _fit_angles(inputs, error / error_std)
+
+    hidden_weight, skip_weight = np.split(angles.weight, [np.count_nonzero(is_contact_unit)])
+    last_weight = np.zeros((hidden_output.shape[1], 3))
+    last_weight[is_contact_unit] = hidden_weight
+    last = Layer(last_weight @ ANGLE_SUMS, angles.bias @ ANGLE_SUMS)
+    return network.with_angles(last, skip_weight @ ANGLE_SUMS)
 
 
-def _fit_angles(features: Array, deviation: Array) -> tuple[Array, Array]:
-    """Slopes (k, 3) and shift (3,) of the angles, from features (n, k) and errors over their deviations (n, 3)."""
-    mean, matrix = whitening(features[::SPARSE], LEAST_SPREAD)
-    inputs = np.ascontiguousarray((features - mean) @ matrix, dtype=np.float32)
-    targets = np.ascontiguousarray(np.clip(deviation, -FARTHEST, FARTHEST).T, dtype=np.float32)
+def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
+    """Fit the linear layer that gives the angles.
 
-    def loss(steps: Array) -> tuple[float, Array]:
-        head = FIRST_STEP * steps.reshape(-1, 3)
-        slopes = head[1:].astype(np.float32)
-        angles = slopes.T @ inputs.T + head[0].astype(np.float32)[:, None]
-        total, by_angle = correlation_loss(angles, targets)
-        gradient = np.vstack([by_angle.sum(axis=1, dtype=float), inputs.T @ by_angle.T + 2.0 * RIDGE * slopes])
-        return total + RIDGE * float((head[1:] ** 2).sum()), FIRST_STEP * gradient.ravel()
+    Args:
+        inputs: Inputs of the layer, shape (n, k).
+        deviation: Errors of (x, y, ln F) over their standard deviations, shape (n, 3).
 
-    start = np.zeros((1 + features.shape[1], 3))
-    start[0] = 0.5 * np.pi / FIRST_STEP  # no correlation
-    found, options = start.ravel(), {"ftol": 0.0, "gtol": FIRST_STEP * SMALL_GRADIENT, "maxcor": REMEMBERED}
-    left = STEPS
-    for _ in range(STARTS):
-        result = minimize(loss, found, jac=True, method="L-BFGS-B", options=options | {"maxiter": left})
-        found, left = result.x, left - result.nit
-        if left <= 0 or np.abs(result.jac).max() <= options["gtol"]:
-            break
-    else:
-        largest = np.abs(result.jac).max() / FIRST_STEP
-        _log.warning("the correlations are not learned to the end: the gradient is %.1g", largest)
-    found *= FIRST_STEP
-    found = found.reshape(start.shape)
-    slopes = matrix @ found[1:]
-    return slopes, found[0] - mean @ slopes
+    Returns:
+        Layer with weight of shape (k, 3) and bias of shape (3,).
+    """
+    mean, matrix = whitening(inputs[::WHITENING_STRIDE], MIN_RELATIVE_STD)
+    white_inputs = np.ascontiguousarray((inputs - mean) @ matrix, dtype=np.float32)
+    targets = np.ascontiguousarray(np.clip(deviation, -MAX_DEVIATION, MAX_DEVIATION).T, dtype=np.float32)
+    n_input = inputs.shape[1]
+
+    def loss(scaled: Array) -> tuple[float, Array]:
+        """Return the loss and its gradient with respect to the flat array of bias and weights over FIRST_STEP."""
+        bias, weight = np.split(FIRST_STEP * scaled.reshape(-1, 3), [1])
+        single_weight = weight.astype(np.float32)
+        angles = single_weight.T @ white_inputs.T + bias.astype(np.float32).T
+        total, angle_gradient = correlation_loss(angles, targets)
+        bias_gradient = angle_gradient.sum(axis=1, dtype=float)
+        weight_gradient = white_inputs.T @ angle_gradient.T + 2.0 * RIDGE * single_weight
+        gradient = np.vstack([bias_gradient, weight_gradient])
+        return total + RIDGE * float((weight**2).sum()), FIRST_STEP * gradient.ravel()
+
+    start = np.zeros((1 + n_input, 3))
+    start[0] = 0.5 * np.pi / FIRST_STEP  # all cosines are zero: no correlation
+    scaled = _minimise(loss, start.ravel())
+    bias, white_weight = np.split(FIRST_STEP * scaled.reshape(start.shape), [1])
+    weight = matrix @ white_weight
+    return Layer(weight, bias[0] - mean @ weight)
+
+
+def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Array:
+    """Minimise a loss, given with its gradient, by L-BFGS; start again if a line search fails."""
+    tolerance = FIRST_STEP * GRADIENT_TOLERANCE
+    options = {"ftol": 0.0, "gtol": tolerance, "maxcor": N_UPDATES}
+    position = start
+    remaining = MAX_ITERATIONS
+    for _ in range(MAX_STARTS):
+        result = minimize(loss, position, jac=True, method="L-BFGS-B", options=options | {"maxiter": remaining})
+        position = result.x
+        remaining -= result.nit
+        if remaining <= 0 or np.abs(result.jac).max() <= tolerance:
+            return np.asarray(position)
+    largest = np.abs(result.jac).max() / FIRST_STEP
+    _log.warning("the correlations are not learned to the end: the gradient is %.1g", largest)
+    return np.asarray(position)
 
 
 def correlation_loss(angles: Array | Singles, deviation: Array | Singles) -> tuple[float, Array | Singles]:
-    """Negative logarithm of a Gaussian likelihood with unit variances, but for a constant, mean over n errors.
+    """Compute the negative logarithm of a Gaussian likelihood with unit variances, without its constant.
 
     Args:
-        angles: Shape (3, n).
-        deviation: Errors over their deviations, shape (3, n).
+        angles: Angles a, b and c, shape (3, n), rad.
+        deviation: Errors of x, y and ln F over their standard deviations, shape (3, n).
 
     Returns:
-        The loss, and its derivatives by the angles, shape (3, n).
+        Mean over the n errors, and its derivatives with respect to the angles, shape (3, n).
     """
-    sine, (cos_a, cos_b, cos_c) = np.sin(angles), np.cos(angles)
-    sin_a, sin_b, sin_c = np.copysign(np.maximum(np.abs(sine), LEAST_SINE), sine)
+    sine = np.sin(angles)
+    cos_a, cos_b, cos_c = np.cos(angles)
+    sin_a, sin_b, sin_c = np.copysign(np.maximum(np.abs(sine), MIN_SINE), sine)
+
+    # The Cholesky factor is inverted row by row: first, second and third have unit covariance.
     first, second, third = deviation
     second = (second - cos_a * first) / sin_a
     third = (third - cos_b * first - sin_b * cos_c * second) / (sin_b * sin_c)
     loss = np.log(np.abs(sin_a * sin_b * sin_c)) + 0.5 * (second**2 + third**2)
-    cot_a, cot_b, cot_c = (cos / sin for cos, sin in ((cos_a, sin_a), (cos_b, sin_b), (cos_c, sin_c)))
-    by_a = cot_a + (second - third * cot_c) * (first - cot_a * second)
-    by_b = cot_b + third * ((first - cot_b * cos_c * second) / sin_c - cot_b * third)
-    by_c = cot_c + third * (second - cot_c * third)
-    return float(loss.mean(dtype=float)), np.stack([by_a, by_b, by_c]) / np.float32(angles.shape[1])
+
+    cot_a = cos_a / sin_a
+    cot_b = cos_b / sin_b
+    cot_c = cos_c / sin_c
+    a_derivative = cot_a + (second - third * cot_c) * (first - cot_a * second)
+    b_derivative = cot_b + third * ((first - cot_b * cos_c * second) / sin_c - cot_b * third)
+    c_derivative = cot_c + third * (second - cot_c * third)
+    gradient = np.stack([a_derivative, b_derivative, c_derivative]) / np.float32(angles.shape[1])
+    return float(loss.mean(dtype=float)), gradient

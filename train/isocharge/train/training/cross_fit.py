@@ -1,12 +1,13 @@
-"""Fit a network to measured presses alone, of a sensor that nobody simulates.
+"""Training of a network on measured presses alone, for a sensor that is not simulated.
 
-Five networks each leave out a fifth of the places. What they say of the presses there, which they never saw, gives the
-errors, and the factor by which the standard deviations have to grow so that intervals hold what they promise (split
-conformal prediction, Papadopoulos et al. 2002). Their mean errs less than any one of them, and has seen all places; one
-network learns its answers (Hinton et al. 2015) and is as small and fast as those of simulated sensors.
+Five networks are trained, each without a fifth of the places (cross-validation). Their answers at the places on which
+they were not trained give the errors and the factors of the standard deviations: with these factors, intervals contain
+the truth as often as they state (split conformal prediction, Papadopoulos et al. 2002). The mean of the five networks
+has smaller errors than a single one. One further network learns this mean (Hinton et al. 2015), so the released model
+is as small and fast as those of simulated sensors.
 
-The presses' own noise is learned (`data.channel_noise`). It is added again, at half its size, in every step, against
-learning presses by heart.
+The noise of the presses is estimated from the presses (`isocharge.train.data.channel_noise`). In every training step,
+half of this noise is added to the charges as a regularisation.
 """
 
 import logging
@@ -38,29 +39,39 @@ from isocharge.train.data.presses import (
 from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
-from isocharge.train.training.fit import contact_stage, misfit_stage, teaching_loss, threads_and_seed, train_part
-from isocharge.train.training.fitted import Fitted, Provenance
+from isocharge.train.training.fit import contact_stage, misfit_stage, threads_and_seed, train_perceptron
+from isocharge.train.training.fitted import Answers, Fitted, Provenance
+from isocharge.train.training.losses import distillation_loss
 from isocharge.train.training.network import InverseNetwork, as_tensor, fold_network
 
 _log = logging.getLogger(__name__)
 
-FOLDS = 5
-"""Networks, and parts of the places of which each leaves out one."""
+N_FOLDS = 5
+"""Number of folds of the cross-validation, and of networks."""
 
 CHANNELS = (3, 8)
-"""Fewest and most channels."""
+"""Smallest and largest number of channels."""
 
 FIRST_STEPS = 1_200
-"""Steps that are tried first, then twice as many as long as that helps: noisy presses are learned by heart soon."""
+"""Number of steps that is tried first; it is doubled as long as the validation score improves. Networks soon overfit
+presses with noise."""
 
-ADDED_NOISE = 0.5
-"""Added to charges in every step, over their own noise: more blurs the map, less is learned by heart."""
+TRAINING_NOISE_FACTOR = 0.5
+"""Noise that is added in every step, relative to the noise of the presses. With more noise the network blurs the map;
+with less noise it overfits."""
 
-TAUGHT_NOISE = (0.0, 0.5, 0.5, 1.0, 1.0, 2.0)
-"""Noise added to the copies of the presses that the last network is taught on, over their own."""
+DISTILLATION_NOISE_FACTORS = (0.0, 0.5, 0.5, 1.0, 1.0, 2.0)
+"""Noise that is added to the copies of the presses from which the last network learns, relative to the noise of the
+presses; one factor for each copy."""
 
-PRESSES = "presses.csv"
-"""File beside the model: what it was fitted to."""
+PRESSES_FILE = "presses.csv"
+"""Name of the file in the version folder with the presses on which the model was trained."""
+
+ONE_STD_COVERAGE = 0.6827
+"""Probability that a Gaussian variable is within one standard deviation of its mean."""
+
+TWO_STD_COVERAGE = 0.95
+"""Probability that a Gaussian variable is within 1.96 standard deviations of its mean."""
 
 
 def fit_presses(
@@ -71,69 +82,76 @@ def fit_presses(
     probes: tuple[str, ...] = ("unknown",),
     run: ResumableRun | None = None,
 ) -> Fitted:
-    """Fit a network to measured presses of any sensor with three to eight channels.
+    """Train a network on measured presses of any sensor with three to eight channels.
+
+    A warning is logged if presses are left out, and if all presses have the same force.
 
     Args:
-        presses: From 500 presses at 50 places on; those of which something is unknown are left out.
-        name: Of the sensor.
-        config: Settings; `steps` are the most that are tried, `noise` and `hold_out` are those of the presses.
-        probes: Notations of the probes that pressed.
-        run: Keeps the state, so that a killed fit goes on.
+        presses: At least 500 presses at 50 places. Presses with an unknown place, force or charge are left out.
+        name: Name of the sensor.
+        config: Settings. `steps` is the largest number of steps; `noise` and `hold_out` are not used.
+        probes: Notations of the probes.
+        run: Saves the state, so that an interrupted training can be continued.
 
     Raises:
         PressError: If there are too few presses or places, not three to eight channels, or a fault that
             `check_measured_presses` finds.
         ConfigError: If a setting is out of its range.
         TrainingError: If the loss is not finite.
-
-    A warning is logged if presses are left out, and if all presses have the same force.
     """
-    settings, usable = (config or FitConfig()).checked(), usable_presses(presses)
-    known = LabelledPresses(usable.contact, usable.charge_pC, measured=True)
-    domain = PressedArea.of(known.contact)
-    noise = ChannelNoise.of(known.charge, domain.to_unit(known.contact))
-    with threads_and_seed(settings.training.threads, settings.training.seed):
-        features = WhitenedFeatures.fit_signed(known.charge, noise.bend(known.charge))
-        network, *members = (InverseNetwork(domain, features, settings.network) for _ in range(1 + FOLDS))
-        fold = folds_by_place(known.contact, FOLDS)
-        steps = _train_members(members, known, fold, noise, settings.training, run)
-        judged = [_answers(member, known.charge) for member in members]
-        contact, std = (np.choose(fold[:, None], [answer[part] for answer in judged]) for part in range(2))
-        position, force = deviation_factors(contact, std, known.contact)
-        train_part(_taught_stage(network, members, known, noise, settings.training), network.contact, settings, run)
-        draw = partial(_misfit_examples, known, domain, noise, settings.training)
-        examples = run.keeping("misfit-charges").submit(draw).result() if run else draw()
-        train_part(misfit_stage(network, examples, settings.training), network.misfit_vector, settings, run)
+    settings = (config or FitConfig()).checked()
+    training = settings.training
+    usable = usable_presses(presses)
+    labelled = LabelledPresses(usable.contact, usable.charge_pC, measured=True)
+    domain = PressedArea.of(labelled.contact)
+    noise = ChannelNoise.of(labelled.charge, domain.to_unit(labelled.contact))
+    with threads_and_seed(training.threads, training.seed):
+        features = WhitenedFeatures.fit_signed(labelled.charge, noise.bend(labelled.charge))
+        network, *members = (InverseNetwork(domain, features, settings.network) for _ in range(1 + N_FOLDS))
+        fold = folds_by_place(labelled.contact, N_FOLDS)
+        steps = _train_members(members, labelled, fold, noise, training, run)
+        contact, std = _cross_validated_contact(members, labelled.charge, fold)
+        position_factor, force_factor = std_factors(contact, std, labelled.contact)
+
+        distillation = _distillation_stage(network, members, labelled, noise, training)
+        train_perceptron(distillation, network.contact, settings, run)
+        draw = partial(_misfit_examples, labelled, domain, noise, training)
+        examples = draw() if run is None else run.keeping("misfit-charges").submit(draw).result()
+        train_perceptron(misfit_stage(network, examples, training), network.misfit_vector, settings, run)
+
+    cross_validated = Answers(
+        contact=contact,
+        std=std * [position_factor, position_factor, force_factor],
+        misfit=_cross_validated_misfit(labelled, domain, noise, fold),
+    )
+    made_with = {
+        "config": settings.to_dict(),
+        "torch": torch.__version__,
+        "measured": {
+            "presses": len(usable),
+            "places": len(np.unique(labelled.contact[:, :2], axis=0)),
+            "folds": N_FOLDS,
+            "steps": steps,
+            "std_factors": [float(f"{factor:.4g}") for factor in (position_factor, force_factor)],
+        },
+    }
     return Fitted(
-        network=fold_network(network.eval()).with_scaled_std(position, force),
+        network=fold_network(network.eval()).with_scaled_std(position_factor, force_factor),
         sensor=MeasuredSensor(name, usable.electrodes),
         probes=probes,
         domain=domain,
         noise=noise,
-        test=known,
-        good=known,
+        test=labelled,
+        good=labelled,
         sha256=presses_sha256(usable),
-        provenance=Provenance(
-            made_with={
-                "config": settings.to_dict(),
-                "torch": torch.__version__,
-                "measured": {
-                    "presses": len(usable),
-                    "places": len(np.unique(known.contact[:, :2], axis=0)),
-                    "folds": FOLDS,
-                    "steps": steps,
-                    "std_factors": [float(f"{factor:.4g}") for factor in (position, force)],
-                },
-            },
-            files={PRESSES: presses_text(usable).encode()},
-        ),
-        asked=domain,
-        judged=(contact, std * [position, position, force], _left_out_misfit(known, domain, noise, fold)),
+        provenance=Provenance(made_with=made_with, files={PRESSES_FILE: presses_text(usable).encode()}),
+        requested_domain=domain,
+        cross_validated=cross_validated,
     )
 
 
 def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, object]:
-    """All that decides about the weights: the identity of a resumable run."""
+    """Return everything that determines the weights, as the identity of a resumable run."""
     return {
         "presses_sha256": presses_sha256(presses),
         "electrodes": list(presses.electrodes),
@@ -144,7 +162,14 @@ def presses_identity(presses: MeasuredPresses, config: FitConfig) -> dict[str, o
 
 
 def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
-    """Return the presses of which everything is known; errors and warnings as `fit_presses`."""
+    """Return the presses whose place, force and charges are all known.
+
+    A warning is logged if presses are left out, and if all presses have the same force.
+
+    Raises:
+        PressError: If there are too few presses or places, not three to eight channels, or a fault that
+            `check_measured_presses` finds.
+    """
     names = presses.electrodes
     fewest_channels, most_channels = CHANNELS
     if not fewest_channels <= len(names) <= most_channels:
@@ -171,23 +196,28 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     return usable
 
 
-def deviation_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]:
-    """Factors of the standard deviations of position and of force with which intervals hold what they promise.
+def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]:
+    """Compute factors of the standard deviations with which intervals contain the truth as often as they state.
 
-    Each is the geometric mean of two: that with which intervals of 68 % hold 68 % of the presses, and of 95 % 95 %.
+    Each factor is the geometric mean of two factors: the one with which the 68 % intervals contain 68 % of the true
+    values, and the one with which the 95 % intervals contain 95 %.
 
     Args:
-        contact: Of networks that did not see the presses, (x, y, F), shape (n, 3), mm and N.
+        contact: Contacts (x, y, F) by networks that were not trained on the presses, shape (n, 3), mm and N.
         std: Their standard deviations, shape (n, 3).
-        truth: The contacts, shape (n, 3).
+        truth: True contacts, shape (n, 3).
+
+    Returns:
+        Factors for the position and for the force.
     """
-    off = np.abs(contact - truth) / std
-    return _factor(off[:, :2]), _factor(off[:, 2])
+    deviation = np.abs(contact - truth) / std
+    return _std_factor(deviation[:, :2]), _std_factor(deviation[:, 2])
 
 
-def _factor(off: Array) -> float:
-    sixty_eight, ninety_five = np.quantile(off, [0.6827, 0.95])
-    return float(np.sqrt(sixty_eight * ninety_five / 1.96))
+def _std_factor(deviation: Array) -> float:
+    """Compute one factor from errors over standard deviations, of any shape."""
+    one_std, two_std = np.quantile(deviation, [ONE_STD_COVERAGE, TWO_STD_COVERAGE])
+    return float(np.sqrt(one_std * two_std / 1.96))
 
 
 def _train_members(
@@ -198,63 +228,112 @@ def _train_members(
     config: TrainingConfig,
     run: ResumableRun | None,
 ) -> int:
-    """Train each on all but its part; the steps that were best for the first are those of all, and are returned."""
-    steps = min(FIRST_STEPS, config.steps)
+    """Train each network on the presses of the other folds.
 
-    def descend(number: int, steps: int) -> Descent:
-        out, settings = fold == number, structs.replace(config, steps=steps)
-        stage = contact_stage(members[number], presses[~out], presses[out], noise.scaled(ADDED_NOISE), settings)
+    The number of steps is doubled until the validation score of the first network no longer improves. All networks are
+    then trained with the best number.
+
+    Args:
+        members: Networks, one for each fold.
+        presses: All presses.
+        fold: Fold of each press, shape (n,).
+        noise: Noise of the presses.
+        config: Largest number of steps, learning rate and seed.
+        run: Saves the state.
+
+    Returns:
+        Number of steps.
+    """
+
+    def train(number: int, steps: int) -> Descent:
+        is_validation = fold == number
+        stage = contact_stage(
+            members[number],
+            presses[~is_validation],
+            presses[is_validation],
+            noise.scaled(TRAINING_NOISE_FACTOR),
+            structs.replace(config, steps=steps),
+        )
         stage = replace(stage, name=f"contact-{number + 1}-{steps}")
-        descent = Descent(stage, config.learning_rate, max(steps // 2, 1), config.seed + number)
+        patience = max(steps // 2, 1)
+        descent = Descent(stage, config.learning_rate, patience, config.seed + number)
         descent.run(run)
         return descent
 
-    start = {name: weight.clone() for name, weight in members[0].contact.state_dict().items()}
-    best = descend(0, steps)
-    while (doubled := 2 * steps) <= config.steps:
-        members[0].contact.load_state_dict(start)
-        longer = descend(0, doubled)
+    steps = min(FIRST_STEPS, config.steps)
+    first = members[0].contact
+    initial_weights = {name: weight.clone() for name, weight in first.state_dict().items()}
+    best = train(0, steps)
+    while 2 * steps <= config.steps:
+        first.load_state_dict(initial_weights)
+        longer = train(0, 2 * steps)
         if longer.best >= best.best:
-            members[0].contact.load_state_dict(best.best_weights)
+            first.load_state_dict(best.best_weights)
             break
-        best, steps = longer, doubled
+        best = longer
+        steps = 2 * steps
     for number in range(1, len(members)):
-        descend(number, steps)
+        train(number, steps)
     return steps
 
 
-def _answers(network: InverseNetwork, charge: Array) -> tuple[Array, Array]:
-    """Contacts and standard deviations, mm and N, shapes (n, 3), of charges (n, n_electrode), pC."""
-    with torch.no_grad():
-        contact, std, _ = network(as_tensor(charge))
-    return contact.double().numpy(), std.double().numpy()
+def _cross_validated_contact(members: list[InverseNetwork], charge: Array, fold: Integers) -> tuple[Array, Array]:
+    """Estimate each contact with the network that was not trained on it.
+
+    Args:
+        members: Networks, one for each fold.
+        charge: Charges of all presses, shape (n, n_electrode), pC.
+        fold: Fold of each press, shape (n,).
+
+    Returns:
+        Contacts, shape (n, 3), mm and N, and their standard deviations, shape (n, 3).
+    """
+    contact = np.empty((len(charge), 3))
+    std = np.empty((len(charge), 3))
+    for number, member in enumerate(members):
+        rows = fold == number
+        with torch.no_grad():
+            member_contact, member_std, _ = member(as_tensor(charge))
+        contact[rows] = member_contact.double().numpy()[rows]
+        std[rows] = member_std.double().numpy()[rows]
+    return contact, std
 
 
-def _taught_stage(
+def _distillation_stage(
     network: InverseNetwork,
     members: list[InverseNetwork],
     presses: LabelledPresses,
     noise: ChannelNoise,
     config: TrainingConfig,
 ) -> TrainingStage:
-    """The mean answers of the members to noisy copies of the presses; the last of them are only watched."""
+    """Return the training of a network on the mean answers of other networks to copies of the presses with noise.
+
+    Args:
+        network: The network that learns.
+        members: Networks whose mean it learns.
+        presses: All presses. The last half as many copies are used for validation.
+        noise: Noise of the presses.
+        config: Number of steps, batch size and seed.
+    """
     rng = np.random.default_rng(config.seed)
-    copies = [noise.scaled(factor).add(presses.charge, rng) for factor in TAUGHT_NOISE]
-    charge = as_tensor(np.concatenate(copies)[rng.permutation(len(copies) * len(presses))])
+    copies = [noise.scaled(factor).add(presses.charge, rng) for factor in DISTILLATION_NOISE_FACTORS]
+    order = rng.permutation(len(copies) * len(presses))
+    charge = as_tensor(np.concatenate(copies)[order])
     with torch.no_grad():
         answers = [torch.stack(member.posterior(charge)) for member in members]
     mean, log_std = torch.stack(answers).mean(dim=0)
-    trained = len(charge) - len(presses) // 2
+    n_train = len(charge) - len(presses) // 2
 
     def divergence(rows: Tensor | slice) -> Tensor:
-        return teaching_loss(*network.posterior(charge[rows]), mean[rows], log_std[rows])
+        own_mean, own_log_std = network.posterior(charge[rows])
+        return distillation_loss(own_mean, own_log_std, mean[rows], log_std[rows])
 
     def loss(_: int, random: torch.Generator) -> Tensor:
-        return divergence(torch.randint(trained, (config.batch,), generator=random))
+        return divergence(torch.randint(n_train, (config.batch,), generator=random))
 
     def score() -> tuple[float, str]:
-        left = divergence(slice(trained, None)).item()
-        return left, f"{left:.4f} from the mean of {len(members)} networks"
+        validation_loss = divergence(slice(n_train, None)).item()
+        return validation_loss, f"{validation_loss:.4f} from the mean of {len(members)} networks"
 
     return TrainingStage("contact", network.contact, loss, score, max(config.steps // 2, 1))
 
@@ -262,23 +341,43 @@ def _taught_stage(
 def _misfit_examples(
     presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, config: TrainingConfig
 ) -> Array:
-    """Charges of all kinds, pC, and how far they are from those of any press, in standard deviations of the noise.
+    """Draw charges of many kinds and compute their distance from the charges of the nearest press.
+
+    Args:
+        presses: All presses.
+        domain: Area of the presses.
+        noise: Noise of the presses.
+        config: Number of charges and seed.
 
     Returns:
-        Charges and residuals, shape (2, misfit_charges, n_electrode).
+        Charges, pC, and residuals in standard deviations of the noise, shape (2, misfit_charges, n_electrode).
     """
-    rng, count = np.random.default_rng(config.seed), config.misfit_charges
+    rng = np.random.default_rng(config.seed)
     planes = LocalPlanes.through(domain.to_unit(presses.contact), noise.level(presses.charge))
-    chosen = presses.charge[rng.integers(len(presses), size=count)]
-    charge = draw_charges(rng, chosen, presses.charge, noise)[1]
+    chosen = presses.charge[rng.integers(len(presses), size=config.misfit_charges)]
+    _, charge = draw_charges(rng, chosen, presses.charge, noise)
     return np.stack([charge, planes.residuals(noise.level(charge))])
 
 
-def _left_out_misfit(presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, fold: Integers) -> Array:
-    """Misfit of each press from the presses of the other folds, shape (n, 1)."""
-    unit, level, misfit = domain.to_unit(presses.contact), noise.level(presses.charge), np.empty((len(presses), 1))
-    for number in range(FOLDS):
-        out = fold == number
-        residual = LocalPlanes.through(unit[~out], level[~out]).residuals(level[out])
-        misfit[out] = np.linalg.norm(residual, axis=1, keepdims=True)
+def _cross_validated_misfit(
+    presses: LabelledPresses, domain: PressedArea, noise: ChannelNoise, fold: Integers
+) -> Array:
+    """Compute the distance of each press from the presses of the other folds.
+
+    Args:
+        presses: All presses.
+        domain: Area of the presses.
+        noise: Noise of the presses.
+        fold: Fold of each press, shape (n,).
+
+    Returns:
+        Misfits, shape (n, 1), in standard deviations of the noise.
+    """
+    unit = domain.to_unit(presses.contact)
+    level = noise.level(presses.charge)
+    misfit = np.empty((len(presses), 1))
+    for number in range(N_FOLDS):
+        rows = fold == number
+        planes = LocalPlanes.through(unit[~rows], level[~rows])
+        misfit[rows] = np.linalg.norm(planes.residuals(level[rows]), axis=1, keepdims=True)
     return misfit

@@ -1,8 +1,8 @@
-"""First-order training of one perceptron: optimisers, schedule, early stop, checkpoint.
+"""Training of one network by gradient descent: optimisers, learning rate, early stopping, checkpoints.
 
-Hidden layers are trained by Muon (Jordan et al. 2024), all other parameters by Adam with a short memory; at equal
-steps the pair halves the error that plain Adam reaches on clean charges. The rate rises over a tenth of the steps and
-falls to nothing along a cosine.
+Weights between hidden layers are trained by Muon (Jordan et al. 2024), all other weights by Adam with a short memory.
+With the same number of steps, this combination halves the error of plain Adam on charges without noise. The learning
+rate rises during the first tenth of the steps and then falls to zero along a cosine.
 """
 
 import copy
@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,35 +21,41 @@ from isocharge.common.progress import report
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.train.training.network import TrainableNetwork
 
-MUON_RATE = 6.0
-"""Ratio of Muon's rate to Adam's: a step of Muon has a given size whatever the gradient."""
+MUON_RATE_FACTOR = 6.0
+"""Learning rate of Muon, relative to that of Adam. The size of a step of Muon does not depend on the gradient."""
 
-RISE = 0.1
-"""Length of the rate's rise over all steps, dimensionless."""
+WARM_UP_FRACTION = 0.1
+"""Fraction of the steps during which the learning rate rises, dimensionless."""
+
+INITIAL_RATE = 0.04
+"""Learning rate of the first step, relative to the largest rate."""
+
+ADAM_BETAS = (0.9, 0.98)
+"""Decay rates of Adam's moving averages of the gradient and of its square."""
 
 REPORT_EVERY = 200
-"""Steps between two evaluations on presses that training does not see."""
+"""Number of steps between two evaluations on the validation data."""
 
 SAVE_EVERY_S = 3.0
-"""Seconds between two checkpoints."""
+"""Time between two checkpoints, s."""
 
 
 @dataclass(frozen=True)
 class TrainingStage:
-    """What to train and how well it does.
+    """A training of one network.
 
     Attributes:
-        name: Of the stage, for checkpoints and messages.
-        part: The network.
-        loss: From (step, generator) to the loss of a fresh batch.
-        score: The loss on presses that training does not see, and a text about it.
+        name: Name of the stage, for checkpoints and messages.
+        network: The network to train.
+        loss: Function from the number of the step and a random generator to the loss of a new batch.
+        score: Function that returns the loss on validation data and a text for the progress report.
         steps: Number of steps.
-        warm_up_steps: Steps before which no network counts as the best: they train another loss.
-        largest_gradient: Norm to which gradients are cut after them.
+        warm_up_steps: Number of first steps with another loss. Weights of these steps are never the best ones.
+        largest_gradient: Norm to which larger gradients are clipped after these steps.
     """
 
     name: str
-    part: TrainableNetwork
+    network: TrainableNetwork
     loss: Callable[[int, torch.Generator], Tensor]
     score: Callable[[], tuple[float, str]]
     steps: int
@@ -57,54 +63,82 @@ class TrainingStage:
     largest_gradient: float = math.inf
 
 
+class _OptimiserRate(NamedTuple):
+    """An optimiser and its largest learning rate."""
+
+    optimiser: torch.optim.Optimizer
+    largest_rate: float
+
+
 class Descent:
-    """One run of a stage; `run` goes on where a checkpoint says."""
+    """One run of a training stage. It can be continued from a checkpoint.
+
+    Args:
+        stage: What to train.
+        rate: Largest learning rate of Adam.
+        patience: Number of steps without a better validation score after which the training stops.
+        seed: Seed of the batches and the noise.
+
+    Attributes:
+        best: Lowest validation score so far.
+        best_weights: State of the network at this score.
+    """
 
     def __init__(self, stage: TrainingStage, rate: float, patience: int, seed: int) -> None:
-        self.stage, self.patience = stage, patience
-        self.optimisers = _optimisers(stage.part, rate)
+        self.stage = stage
+        self.patience = patience
+        self.optimisers = _optimisers(stage.network, rate)
         self.random = torch.Generator().manual_seed(seed)
-        self.step, self.best, self.best_step = 0, math.inf, 0
-        self.best_weights = copy.deepcopy(stage.part.state_dict())
+        self.step = 0
+        self.best = math.inf
+        self.best_step = 0
+        self.best_weights = copy.deepcopy(stage.network.state_dict())
 
     def run(self, run: ResumableRun | None = None) -> None:
-        """Train; the part then holds the best weights that were seen.
+        """Train the network, and give it the weights with the best validation score.
 
         Args:
-            run: Keeps the state every few seconds, so that a killed training goes on and ends with the same weights.
+            run: Saves the state every few seconds, so that an interrupted training can be continued and ends with the
+                same weights.
 
         Raises:
             TrainingError: If the loss is not finite.
         """
         saved_at = time.monotonic()
-        if run and (state := run.load(self.stage.name, tensors)) is not None:
-            self._restore(state)
-        while self.step < self.stage.steps and not self._stalled():
-            loss = self._advance()
+        if run is not None:
+            state = run.load(self.stage.name, tensors)
+            if state is not None:
+                self._restore(state)
+        while self.step < self.stage.steps and not self._is_stalled():
+            loss = self._take_step()
             if self.step % REPORT_EVERY == 0 or self.step == self.stage.steps:
                 self._evaluate(loss.item())
-            if run and time.monotonic() - saved_at >= SAVE_EVERY_S:
+            if run is not None and time.monotonic() - saved_at >= SAVE_EVERY_S:
                 run.save(self.stage.name, tensor_bytes(self._state()))
                 saved_at = time.monotonic()
-        if run:
+        if run is not None:
             run.save(self.stage.name, tensor_bytes(self._state()))
-        self.stage.part.load_state_dict(self.best_weights)
+        self.stage.network.load_state_dict(self.best_weights)
 
-    def _advance(self) -> Tensor:
-        share = _rate_share(self.step / self.stage.steps)
-        for optimiser, rate in self.optimisers:
-            optimiser.param_groups[0]["lr"] = share * rate
+    def _take_step(self) -> Tensor:
+        """Change the weights by one step of the optimisers and return the loss before it."""
+        network = self.stage.network
+        relative_rate = _relative_rate(self.step / self.stage.steps)
+        for optimiser, largest_rate in self.optimisers:
+            (group,) = optimiser.param_groups
+            group["lr"] = relative_rate * largest_rate
         loss = self.stage.loss(self.step, self.random)
-        self.stage.part.zero_grad()
+        network.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         if self.step >= self.stage.warm_up_steps and math.isfinite(self.stage.largest_gradient):
-            torch.nn.utils.clip_grad_norm_(self.stage.part.parameters(), self.stage.largest_gradient)
+            torch.nn.utils.clip_grad_norm_(network.parameters(), self.stage.largest_gradient)
         for optimiser, _ in self.optimisers:
             optimiser.step()
         self.step += 1
         return loss
 
     def _evaluate(self, loss: float) -> None:
+        """Compute the validation score, keep the weights if they are the best so far, and report the progress."""
         with torch.no_grad():
             score, text = self.stage.score()
         if not (math.isfinite(loss) and math.isfinite(score)):
@@ -113,16 +147,19 @@ class Descent:
                 "training.learning_rate"
             )
         if self.step > self.stage.warm_up_steps and score < self.best:
-            self.best, self.best_step = score, self.step
-            self.best_weights = copy.deepcopy(self.stage.part.state_dict())
+            self.best = score
+            self.best_step = self.step
+            self.best_weights = copy.deepcopy(self.stage.network.state_dict())
         report(f"training the {self.stage.name} network", self.step, self.stage.steps, f"loss {loss:.3f}, {text}")
 
-    def _stalled(self) -> bool:
+    def _is_stalled(self) -> bool:
+        """Return whether the score has not improved for `patience` steps after the warm-up."""
         return self.step - max(self.best_step, self.stage.warm_up_steps) >= self.patience
 
     def _state(self) -> dict[str, Any]:
+        """Return everything that a checkpoint holds."""
         return {
-            "part": self.stage.part.state_dict(),
+            "part": self.stage.network.state_dict(),
             "optimisers": [optimiser.state_dict() for optimiser, _ in self.optimisers],
             "random": self.random.get_state(),
             "step": self.step,
@@ -131,37 +168,55 @@ class Descent:
         }
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self.stage.part.load_state_dict(state["part"])
+        """Continue from the state of a checkpoint."""
+        self.stage.network.load_state_dict(state["part"])
         for (optimiser, _), saved in zip(self.optimisers, state["optimisers"], strict=True):
             optimiser.load_state_dict(saved)
         self.random.set_state(state["random"])
-        self.step, (self.best, self.best_step) = state["step"], state["best"]
+        self.step = state["step"]
+        self.best, self.best_step = state["best"]
         self.best_weights = state["best_weights"]
 
 
 def tensor_bytes(state: object) -> bytes:
-    """Tensors, numbers and texts as a part of a `ResumableRun`."""
+    """Return tensors, numbers and texts as bytes for a `ResumableRun`."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
     return buffer.getvalue()
 
 
 def tensors(data: bytes) -> Any:
-    """The inverse of `tensor_bytes`; nothing in the bytes is executed."""
+    """Return what `tensor_bytes` was given. No code in the bytes is executed."""
     return torch.load(io.BytesIO(data), weights_only=True)
 
 
-def _rate_share(done: float) -> float:
-    """Rate over its largest value when a share `done` of the steps is done."""
-    if done < RISE:
-        return 0.04 + 0.96 * 0.5 * (1.0 - math.cos(math.pi * done / RISE))
-    return 0.5 * (1.0 + math.cos(math.pi * (done - RISE) / (1.0 - RISE)))
+def _relative_rate(progress: float) -> float:
+    """Return the learning rate relative to its largest value.
+
+    Args:
+        progress: Number of completed steps relative to the number of all steps.
+    """
+    if progress < WARM_UP_FRACTION:
+        rise = 0.5 * (1.0 - math.cos(math.pi * progress / WARM_UP_FRACTION))
+        return INITIAL_RATE + (1.0 - INITIAL_RATE) * rise
+    return 0.5 * (1.0 + math.cos(math.pi * (progress - WARM_UP_FRACTION) / (1.0 - WARM_UP_FRACTION)))
 
 
-def _optimisers(part: TrainableNetwork, rate: float) -> list[tuple[torch.optim.Optimizer, float]]:
-    """Optimisers of a network, each with its largest rate; rounded matrices have none."""
-    hidden = {id(matrix) for matrix in part.hidden_matrices()}
-    adam = torch.optim.Adam([each for each in part.parameters() if id(each) not in hidden], betas=(0.9, 0.98))
-    trained = [matrix for matrix in part.hidden_matrices() if matrix.requires_grad]
-    muon = [(torch.optim.Muon(trained, weight_decay=0.0), MUON_RATE * rate)] if trained else []
-    return [*muon, (adam, rate)]
+def _optimisers(network: TrainableNetwork, rate: float) -> list[_OptimiserRate]:
+    """Return the optimisers of a network. Weights that were rounded are not trained.
+
+    Args:
+        network: The network.
+        rate: Largest learning rate of Adam.
+    """
+    hidden_matrices = network.hidden_matrices()
+    hidden_ids = {id(matrix) for matrix in hidden_matrices}
+    other_parameters = [parameter for parameter in network.parameters() if id(parameter) not in hidden_ids]
+    trained_matrices = [matrix for matrix in hidden_matrices if matrix.requires_grad]
+    optimisers = []
+    if trained_matrices:
+        muon = torch.optim.Muon(trained_matrices, weight_decay=0.0)
+        optimisers.append(_OptimiserRate(muon, MUON_RATE_FACTOR * rate))
+    adam = torch.optim.Adam(other_parameters, betas=ADAM_BETAS)
+    optimisers.append(_OptimiserRate(adam, rate))
+    return optimisers

@@ -1,7 +1,8 @@
-"""A fitted network: what it answers, what it is for, where it comes from."""
+"""A trained network with everything that a release needs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Domain, NoiseModel, Sensor
@@ -14,12 +15,12 @@ from isocharge.train.training.folded_network import FoldedNetwork
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a released model says about its origin, beside what every model says.
+    """Additional information about the origin of a model, which a release writes beside the usual information.
 
     Attributes:
-        card: A section for the card, in Markdown.
+        card: Section for the model card, in Markdown.
         made_with: Entries for the metadata.
-        files: More files for the version folder, by name.
+        files: Additional files for the version folder, by name.
     """
 
     card: str = ""
@@ -27,24 +28,39 @@ class Provenance:
     files: Mapping[str, bytes] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Fitted:
-    """A fitted network, and what it is for.
+class Answers(NamedTuple):
+    """What networks estimate from the charges of n presses.
 
     Attributes:
-        network: The network as plain layers in NumPy.
-        sensor: The sensor whose charges it takes.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        std: Standard deviations of the contacts, shape (n, 3), mm and N.
+        misfit: Misfits, shape (n, 1), in standard deviations of the noise.
+    """
+
+    contact: Array
+    std: Array
+    misfit: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted:
+    """A trained network, and the presses and conditions for which it was trained.
+
+    Attributes:
+        network: The network in NumPy.
+        sensor: The sensor whose charges are the inputs.
         probes: Notations of the probes.
-        domain: The contacts that it knows.
-        noise: Noise that it was trained for.
-        test: Presses that it is judged by; it did not learn from them, or see `judged`.
-        good: Presses of which 1 % may have a misfit above the alarm's.
-        sha256: Checksum of what it was fitted to.
-        provenance: For the release.
-        asked: The domain that was asked for; larger than the network's where the map folds.
-        cautions: What users of the network should know, a sentence each.
-        judged: Contacts and standard deviations, mm and N, shapes (n, 3), and misfits, shape (n, 1), of `test` without
-            what was learned from a press's own place; None where this network did not see `test`.
+        domain: Contacts for which the network was trained.
+        noise: Noise for which the network was trained.
+        test: Presses for measuring errors. The network was not trained on them, unless `cross_validated` is given.
+        good: Presses without faults, whose misfits determine the threshold of the alarm.
+        sha256: Checksum of the training data.
+        provenance: Additional information for the release.
+        requested_domain: Contacts for which a network was requested. This domain is larger than `domain` if the map
+            folds, that is, if different contacts have the same charges.
+        cautions: Sentences that users of the network should read.
+        cross_validated: Answers to the charges of `test` by networks that were not trained on them. They are given if
+            this network was trained on all presses of `test`.
     """
 
     network: FoldedNetwork
@@ -56,15 +72,22 @@ class Fitted:
     good: LabelledPresses
     sha256: str
     provenance: Provenance
-    asked: Domain
+    requested_domain: Domain
     cautions: tuple[str, ...] = ()
-    judged: tuple[Array, Array, Array] | None = None
+    cross_validated: Answers | None = None
 
     @property
     def misfit_noise(self) -> Noise:
-        """The unit of the misfit."""
+        """Noise whose standard deviation is the unit of the misfit."""
         return misfit_noise(self.noise) if isinstance(self.noise, NoiseModel) else self.noise
 
     def predict(self, charge: Array) -> tuple[Array, Array, Array]:
-        """Charges (n, n_electrode), pC, to contact (n, 3), mm and N, standard deviations (n, 3), and misfit (n, 1)."""
+        """Estimate contacts.
+
+        Args:
+            charge: Shape (n, n_electrode), pC.
+
+        Returns:
+            Contact (x, y, F), shape (n, 3), mm and N; its standard deviations, shape (n, 3); misfit, shape (n, 1).
+        """
         return self.network.predict(charge)

@@ -1,4 +1,4 @@
-"""What a network is fitted to: simulated presses, measured ones, or the answers of another model."""
+"""Training data: simulated or measured presses, or the answers of another model."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,15 +16,16 @@ from isocharge.train.training.network import as_tensor
 
 @dataclass(frozen=True)
 class Teacher:
-    """A model whose answers a smaller one learns.
+    """A model whose answers a smaller network learns (knowledge distillation, Hinton et al. 2015).
 
-    A press says where it was, but not what its noisy charges tell; the answer of a good model is that, without the
-    scatter of single presses. So a small network learns faster from answers than from presses (Hinton et al. 2015).
+    The contact of a press is one sample of the posterior of its noisy charges. A good model gives this posterior
+    without the scatter of single samples, so a small network learns faster from its answers than from the contacts.
 
     Attributes:
-        label: Its name and version.
-        sha256: Of its file.
-        answer: Charges (n, n_electrode), pC, to contact (n, 3), mm and N, and standard deviations (n, 3).
+        label: Name and version of the model.
+        sha256: Checksum of the model file.
+        answer: Function from charges, shape (n, n_electrode), pC, to contacts, shape (n, 3), mm and N, and their
+            standard deviations, shape (n, 3).
     """
 
     label: str
@@ -32,26 +33,34 @@ class Teacher:
     answer: Callable[[Array], tuple[Array, Array]]
 
     def posterior(self, charge: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
-        """Mean and log standard deviation of the domain's unit coordinates, each (n, 3)."""
+        """Compute the teacher's posterior in unit coordinates.
+
+        Args:
+            charge: Shape (n, n_electrode), pC.
+            domain: Centre and scale of the unit coordinates.
+
+        Returns:
+            Mean and logarithm of the standard deviation, shape (n, 3) each.
+        """
         contact, std = self.answer(charge.double().numpy())
-        relative = np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]]) / domain.scale
-        return as_tensor(domain.to_unit(contact)), as_tensor(np.log(relative))
+        unit_std = np.column_stack([std[:, :2], std[:, 2] / contact[:, 2]]) / domain.scale
+        return as_tensor(domain.to_unit(contact)), as_tensor(np.log(unit_std))
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingData:
-    """What one network is fitted to, and what it is judged by.
+    """Presses on which one network is trained, and presses for measuring its errors.
 
     Attributes:
-        sensor: What was pressed.
-        probes: Notations of the probes that pressed.
-        domain: The contacts that the network shall know; it knows fewer where the map folds.
-        presses: Simulated ones are clean, and noise is added while training. To measured ones it is added as well,
-            against learning them by heart.
+        sensor: The pressed sensor.
+        probes: Notations of the probes.
+        domain: Contacts for which a network is requested. The network gets a smaller domain if the map folds.
+        presses: Presses for training. Noise is added to their charges during training, also to those of measured
+            presses, as a regularisation.
         sha256: Checksum of the presses.
-        test: Measured presses to judge by; by default a part of `presses` is held out.
-        teacher: A model whose answers are learned; by default the contacts of the presses are.
-        provenance: For the release.
+        test: Measured presses for measuring errors; None to hold out a part of `presses`.
+        teacher: Model whose answers are learned; None to learn the contacts of the presses.
+        provenance: Additional information for the release.
     """
 
     sensor: Sensor

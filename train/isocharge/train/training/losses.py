@@ -1,0 +1,90 @@
+"""Loss functions of the contact and misfit perceptrons, and the noise that is added to the charges in every step."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from isocharge.simulate import Domain
+from isocharge.simulate.numerics.statistics import rms
+from isocharge.train.data.channel_noise import Noise
+
+WARM_UP_MEAN_WEIGHT = 30.0
+"""Weight of the squared errors of the mean in the warm-up loss."""
+
+WARM_UP_STD_WEIGHT = 0.1
+"""Weight of the standard deviations in the warm-up loss."""
+
+
+def with_fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor:
+    """Add noise to charges of any shape, pC."""
+    white = torch.as_tensor(noise.white, dtype=torch.float32)
+    gain = torch.as_tensor(noise.gain, dtype=torch.float32)
+    sigma = torch.hypot(white, gain * charge)
+    return charge + sigma * torch.randn(charge.shape, generator=random)
+
+
+def warm_up_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
+    """Compute the loss of the first steps: least squares for the mean.
+
+    The standard deviations are fitted to the errors of the mean, but their gradient does not reach the mean. A Gaussian
+    likelihood with free standard deviations would find the mean slowly.
+
+    Args:
+        mean: Estimated unit coordinates, shape (n, 3).
+        log_std: Logarithms of their standard deviations, shape (n, 3).
+        target: True unit coordinates, shape (n, 3).
+    """
+    squares = (mean - target) ** 2
+    std_loss = log_std + 0.5 * squares.detach() * torch.exp(-2.0 * log_std)
+    return (WARM_UP_MEAN_WEIGHT * squares + WARM_UP_STD_WEIGHT * std_loss).sum(dim=1).mean()
+
+
+def likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
+    """Compute the negative logarithm of a Gaussian likelihood without its constant.
+
+    Args:
+        mean: Estimated unit coordinates, shape (n, 3).
+        log_std: Logarithms of their standard deviations, shape (n, 3).
+        target: True unit coordinates, shape (n, 3).
+    """
+    deviation = (mean - target) * torch.exp(-log_std)
+    return (log_std + 0.5 * deviation**2).sum(dim=1).mean()
+
+
+def distillation_loss(mean: Tensor, log_std: Tensor, teacher_mean: Tensor, teacher_log_std: Tensor) -> Tensor:
+    """Compute the Kullback-Leibler divergence of the network's Gaussians from those of the teacher.
+
+    Args:
+        mean: Unit coordinates that the network estimates, shape (n, 3).
+        log_std: Logarithms of their standard deviations, shape (n, 3).
+        teacher_mean: Unit coordinates that the teacher estimates, shape (n, 3).
+        teacher_log_std: Logarithms of the teacher's standard deviations, shape (n, 3).
+
+    Returns:
+        Mean over the n presses of the sum over (x, y, ln F).
+    """
+    squares = torch.exp(2.0 * teacher_log_std) + (mean - teacher_mean) ** 2
+    divergence = log_std - teacher_log_std + 0.5 * (squares * torch.exp(-2.0 * log_std) - 1.0)
+    return divergence.sum(dim=1).mean()
+
+
+def mean_squared_distance(vector: Tensor, target: Tensor) -> Tensor:
+    """Compute the mean of the squared distances between vectors of shape (..., n_electrode)."""
+    return torch.sum((vector - target) ** 2, dim=-1).mean()
+
+
+def validation_score(mean: Tensor, log_std: Tensor, target: Tensor, domain: Domain, samples: str) -> tuple[float, str]:
+    """Compute the likelihood loss on validation data, and a text with the errors for the progress report.
+
+    Args:
+        mean: Estimated unit coordinates, shape (n, 3).
+        log_std: Logarithms of their standard deviations, shape (n, 3).
+        target: True unit coordinates, shape (n, 3).
+        domain: Scale of the unit coordinates.
+        samples: What the validation data are, for the text.
+    """
+    loss = likelihood_loss(mean, log_std, target).item()
+    x_mm, y_mm, log_force = ((mean - target).double().numpy() * domain.scale).T
+    position_mm = rms(np.hypot(x_mm, y_mm))
+    force_percent = 100.0 * rms(log_force)
+    return loss, f"{loss:.3f} on watched {samples}: {position_mm:.4f} mm and {force_percent:.3f} % of force rms"
