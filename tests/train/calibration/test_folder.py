@@ -11,7 +11,7 @@ from isocharge.common.errors import ModelError, PressError
 from isocharge.serve import Predictor, load_model, read_presses, write_presses
 from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, read_earlier, write_calibration
-from isocharge.train.calibration.folder import calibration_folder, save_session, session_presses
+from isocharge.train.calibration.folder import calibration_folder
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
 
@@ -139,20 +139,6 @@ def test_a_folder_is_checked_before_anything_is_read(film, tmp_path, refused):
         ("copy", "names the model 'mine', its folder is 'copy'"),
     ):
         refused(*CALIBRATE, tmp_path / "none.csv", "-o", tmp_path / name, said=message)
-
-
-def test_presses_of_a_session_are_of_one_sensor_and_probe(film, problem, tmp_path):
-    folder, presses = tmp_path / "film", film[1].presses
-    with calibration_folder(folder, problem):
-        assert session_presses(folder, problem, fresh=False) is None
-        save_session(folder, presses[:3])
-    assert session_presses(folder, problem, fresh=False) == presses[:3]
-    other = CalibrationProblem.of(problem.sensor, Circle(1.2))
-    with pytest.raises(PressError, match="with another probe"), calibration_folder(folder, other):
-        session_presses(folder, other, fresh=False)
-    with calibration_folder(folder, other):
-        assert session_presses(folder, other, fresh=True) is None
-    assert not folder.exists()
 
 
 def test_presses_are_proposed_before_the_first(command):

@@ -83,7 +83,7 @@ class MeasuredPresses:
         ignored: Columns of the file that were not read.
         temperature_C: Temperature of the ring of the film, shape (n,), degrees Celsius; NaN if unknown, None if it is
             unknown for all presses.
-        row_noun: What `lines` counts, for messages: "line" or "row".
+        row_noun: What `lines` counts, for messages: "line", "row" or "press".
 
     Raises:
         PressError: If shapes disagree or a value is impossible; the line and the column are named.
@@ -328,10 +328,11 @@ def row_words(rows: Sequence[int], row_noun: str, most: int = 10) -> str:
 
     Args:
         rows: Numbers of the presses in their file.
-        row_noun: What the numbers count: "line" or "row".
+        row_noun: What the numbers count, such as "line", "row" or "press".
         most: Largest number of presses that are listed.
     """
-    noun = row_noun if len(rows) == 1 else f"{row_noun}s"
+    ending = "es" if row_noun.endswith("s") else "s"
+    noun = row_noun if len(rows) == 1 else f"{row_noun}{ending}"
     listed = ", ".join(map(str, rows[:most]))
     if len(rows) <= most:
         return f"{noun} {listed}"

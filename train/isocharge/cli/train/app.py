@@ -8,6 +8,11 @@ train_app = lazy_group(
         "fit": LazyCommand(
             "isocharge.cli.train.fit:fit_command", "Train a network and write its model folder.", extra="train"
         ),
+        "press": LazyCommand(
+            "isocharge.cli.train.press:press_command",
+            "Guide presses at a port, and write them to a file.",
+            extra="train",
+        ),
         "calibrate": LazyCommand(
             "isocharge.cli.train.calibrate:calibrate_command",
             "Fit a real film to some presses, and write its model folder.",

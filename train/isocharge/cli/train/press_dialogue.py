@@ -1,238 +1,183 @@
-"""The dialogue about presses at a port: says what to press, takes it when it is steady, asks whether it was there.
+"""Dialogue of a press session: propose a press, take it when it is steady, and ask whether it was made there.
 
-A machine that makes the presses of a list is asked nothing: its presses are taken in their order.
+A machine that makes the presses of a list is asked nothing: its presses are taken in the order of the list.
 """
 
-import threading
-from collections.abc import Callable, Iterable
-from io import FileIO
-from queue import Queue
-from typing import Self
+from collections.abc import Callable
 
 import numpy as np
 
 from isocharge.cli.shared.terminal import say
+from isocharge.cli.train.press_events import PressEvents, SessionEnd
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, PortLost, PressError
-from isocharge.serve import Chunk, ReadingStream
-from isocharge.serve.live.steady_press import AWAY, Phase, PressWatch, SteadyPress, Watched
-from isocharge.train.calibration.session import PressSession, describe_press, read_answer
+from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, Watched
+from isocharge.train.calibration.session import Answer, PressSession, describe_press, read_answer
 
-LINE_S = 1.0
-"""Time between two lines about a press that settles, s."""
+LINE_INTERVAL_s = 1.0
+"""Time between two lines about a press that has not settled yet, s."""
 
-PHASES = {
-    Phase.taring: "taring: leave the film alone",
+SAME_CONTACT_TOLERANCE = 1e-9
+"""Difference up to which a press of the session is a row of a machine's list, mm and N."""
+
+PHASE_TEXTS = {
+    Phase.taring: "measuring the tare: leave the film alone",
     Phase.lift: "lift the probe",
     Phase.waiting: "waiting for the press",
     Phase.settling: "hold it",
 }
-"""Phase of the press watch in words."""
+"""Instruction for the person in each phase of the press watch."""
 
-QUESTION = '   There, and as hard? Enter: yes; or type "x y force" (? is unknown), s: skip, u: undo, q: end'
+QUESTION = '   Was it there, and as hard? Enter: yes; or type "x y force" (? is unknown), s: skip, u: undo, q: quit'
 
-KEYS = "   (type s to skip this place, u to undo the last press, q to end)"
+KEYS = "   (type s to skip this place, u to undo the last press, q to quit)"
 
-Taken = Callable[[PressSession, SteadyPress], None]
-"""Called after each press that is in the session."""
-
-
-class Stopped(Exception):
-    """The person ends the session, or the input or the port is over."""
-
-
-class PressEvents:
-    """Readings of a port and lines of the keyboard, in their order, from entering the context to leaving it.
-
-    The port is read also while a person answers and while a fit runs: nothing is lost, and a lift in between is seen.
-    `arm` forgets what has come so far: only presses that begin afterwards are passed on.
-    """
-
-    def __init__(
-        self, chunks: Iterable[Chunk], stream: ReadingStream, watch: PressWatch, keyboard: int | None = None
-    ) -> None:
-        """Set up; nothing is read yet.
-
-        Args:
-            chunks: An open port.
-            stream: From chunks to readings.
-            watch: From readings to steady presses.
-            keyboard: Descriptor of the keyboard; None for no keyboard.
-        """
-        self._chunks, self._stream, self._watch, self._keyboard = chunks, stream, watch, keyboard
-        self._queue: Queue[tuple[int, Watched | str | Exception]] = Queue()
-        self._stop, self._armed = threading.Event(), 0
-        self._reader = threading.Thread(target=self._read_port, name="press port", daemon=True)
-
-    def __enter__(self) -> Self:
-        """Start to read."""
-        self._reader.start()
-        if self._keyboard is not None:
-            threading.Thread(target=self._read_keyboard, args=[self._keyboard], daemon=True).start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Stop reading; a port or a keyboard that is silent is left to its thread."""
-        self._stop.set()
-        self._reader.join(timeout=1.0)
-
-    def arm(self) -> None:
-        """From now on, take only a press that has not begun yet."""
-        self._armed += 1
-
-    def next(self) -> Watched | str:
-        """The next reading or line that was typed; readings from before the last `arm` are left out.
-
-        Raises:
-            Stopped: At the end of the port or of the input.
-            IsochargeError: Of the port.
-        """
-        while True:
-            armed, event = self._queue.get()
-            if isinstance(event, Exception):
-                raise event
-            if isinstance(event, str) or armed == self._armed:
-                return event
-
-    def _read_port(self) -> None:
-        armed = self._armed
-        try:
-            for chunk in self._chunks:
-                if self._stop.is_set():
-                    return
-                if armed != self._armed:
-                    armed = self._armed
-                    self._watch.arm()
-                for reading in self._stream.feed(chunk):
-                    self._queue.put((armed, self._watch.feed(reading)))
-            self._stream.finish()
-            self._queue.put((0, Stopped()))
-        except Exception as error:  # passed on to the thread that asks
-            self._queue.put((0, error))
-
-    def _read_keyboard(self, keyboard: int) -> None:
-        for line in FileIO(keyboard, closefd=False):  # unbuffered: no lock that is held when the program ends
-            self._queue.put((0, line.decode(errors="replace")))
-        self._queue.put((0, Stopped()))
+OnTaken = Callable[[PressSession, SteadyPress], None]
+"""Function that is called after each press that the session has taken."""
 
 
 class Screen:
-    """What a person sees on stderr: sentences, and now and then the charges as they settle."""
+    """Messages for a person on stderr: sentences, and about once a second the charges of a press that settles."""
 
     def __init__(self, electrodes: tuple[str, ...]) -> None:
-        """Set up; `electrodes` are names, in the order of the charges."""
+        """Set up the screen.
+
+        Args:
+            electrodes: Names of the electrodes, in the order of the charges.
+        """
         self._electrodes = electrodes
-        self._last: tuple[str, float] = ("", 0.0)
+        self._last_phase: Phase | None = None
+        self._last_line_s = 0.0
 
     def say(self, sentence: str) -> None:
-        """A sentence."""
-        self._last = ("", 0.0)
+        """Print a sentence."""
+        self._last_phase = None
         say(sentence)
 
-    def show(self, watched: Watched) -> None:
-        """The charges of a reading, and what the watch waits for."""
-        if watched.phase not in PHASES:
+    def show_phase(self, watched: Watched) -> None:
+        """Print the instruction of the present phase, and the charges while a press settles."""
+        if watched.phase not in PHASE_TEXTS:
             return
-        line = f"   {PHASES[watched.phase]}"
+        is_new_phase = watched.phase != self._last_phase
+        if not is_new_phase and watched.held_s - self._last_line_s < LINE_INTERVAL_s:
+            return
+        self._last_phase = watched.phase
+        self._last_line_s = watched.held_s
+
+        line = f"   {PHASE_TEXTS[watched.phase]}"
         if watched.charge_pC is not None and watched.phase == Phase.settling:
-            line += f", {watched.held_s:.1f} s: {self._charges(watched.charge_pC)}"
-        line += f" ({watched.reason})" if watched.reason else ""
-        phase, shown_s = self._last
-        if watched.phase != phase or watched.held_s - shown_s >= LINE_S:
-            self._last = watched.phase, watched.held_s
-            say(line)
+            line += f", {watched.held_s:.1f} s: {self._charge_text(watched.charge_pC)}"
+        if watched.reason:
+            line += f" ({watched.reason})"
+        say(line)
 
-    def taken(self, press: SteadyPress) -> None:
-        """A press that was steady."""
+    def show_steady(self, press: SteadyPress) -> None:
+        """Print the charges of a steady press."""
         flags = f" [{', '.join(press.flags)}]" if press.flags else ""
-        self.say(f"   steady after {press.held_s:.1f} s: {self._charges(press.charge_pC)}{flags}")
+        self.say(f"   steady after {press.held_s:.1f} s: {self._charge_text(press.charge_pC)}{flags}")
 
-    def _charges(self, charge_pC: Array) -> str:
-        """Charges as "A 812.3, B 401.0 pC"."""
-        return ", ".join(f"{name} {q:.1f}" for name, q in zip(self._electrodes, charge_pC, strict=True)) + " pC"
+    def _charge_text(self, charge_pC: Array) -> str:
+        """Return charges as "A 812.3, B 401.0 pC"."""
+        charges = [f"{name} {charge:.1f}" for name, charge in zip(self._electrodes, charge_pC, strict=True)]
+        return f"{', '.join(charges)} pC"
 
 
 class Dialogue:
-    """One session, from the first press to the last."""
+    """Dialogue of one session, from the first press to the last."""
 
-    def __init__(self, session: PressSession, events: PressEvents, screen: Screen, taken: Taken) -> None:
-        """Put the parts together.
+    def __init__(self, session: PressSession, events: PressEvents, screen: Screen, on_taken: OnTaken) -> None:
+        """Set up the dialogue.
 
         Args:
-            session: What is proposed and known.
-            events: Of port and keyboard.
-            screen: For people.
-            taken: Called after each press.
+            session: Session that proposes presses and takes them.
+            events: Events of port and keyboard.
+            screen: Messages for the person.
+            on_taken: Function that is called after each press.
         """
-        self._session, self._events, self._screen, self._taken = session, events, screen, taken
+        self._session = session
+        self._events = events
+        self._screen = screen
+        self._on_taken = on_taken
 
-    def with_person(self, *, asks: bool = True) -> None:
-        """Propose presses and take them until the film is known well enough, or the person ends.
+    def guide_person(self, *, asks: bool = True) -> None:
+        """Propose presses and take them until the film is known well enough, or the person quits.
 
         Args:
-            asks: Whether to ask of each press whether it was where it should be; otherwise it was.
+            asks: Whether to ask after each press where it was made. Otherwise each press counts as made where it was
+                proposed.
         """
         if asks:
             self._screen.say(KEYS)
         try:
             while not self._session.enough:
-                self._one_press(asks=asks)
-        except Stopped:
+                self._guide_press(asks=asks)
+        except SessionEnd:
             return
-        self._screen.say("The film is known well enough; --until 0 goes on.")
+        self._screen.say("The film is known well enough. With --until 0 the same command takes more presses.")
 
-    def with_machine(self, contacts: Array) -> None:
-        """Take the presses that a machine makes, as they come.
+    def follow_machine(self, contacts: Array) -> None:
+        """Take the presses that a machine makes.
 
         Args:
-            contacts: (x, y, F), shape (n, 3), NaN where unknown; those in the session were made before.
+            contacts: Presses (x, y, F) in their order, shape (n, 3), mm and N, NaN where unknown. The rows up to the
+                last press of the session were made before, and are not expected again.
 
         Raises:
-            PortLost: If the port goes away: nobody knows then which press is next.
+            PortLost: If the port is lost, because it is then unknown which press comes next.
             InputError: If the port ends before the last press.
         """
-        first = _done(self._session, contacts)
+        first_row = _count_rows_made(self._session, contacts)
         try:
-            self._until(Phase.waiting)  # a press before the tare would be lost, and all after it be taken for others
-            self._screen.say("the film is tared: let the machine begin")
-            for number, contact in enumerate(contacts[first:], start=first + 1):
-                self._screen.say(f"{number}. {describe_press(contact)}")
-                event = self._until(Phase.taken, Phase.refused)
-                if event.press is not None:
-                    self._screen.taken(event.press)
-                    self._take(event.press, contact)
-                elif event.reason == AWAY:
-                    raise PortLost(
-                        f"{AWAY}; let the machine go on with row {number} of its list, with the same command"
-                    )
-                else:
-                    self._screen.say(f"   row {number} is left out: {event.reason}")
-        except Stopped as end:
-            raise InputError("the port ended before the last press of the list") from end
+            # A press before the tare would be lost, and each later press would be taken for the one before it.
+            self._wait_for(Phase.waiting)
+            self._screen.say("The tare is measured. Let the machine begin.")
+            for number, contact in enumerate(contacts[first_row:], start=first_row + 1):
+                self._follow_press(number, contact)
+        except SessionEnd as end:
+            raise InputError(
+                "the port ended before the last press of the list; run the same command again for the remaining presses"
+            ) from end
 
-    def _until(self, *phases: Phase) -> Watched:
-        """The next reading in one of these phases; those before it are shown."""
+    def _follow_press(self, number: int, contact: Array) -> None:
+        """Take the press of one row of a machine's list."""
+        self._screen.say(f"{number}. {describe_press(contact)}")
+        event = self._wait_for(Phase.taken, Phase.refused)
+        if event.press is not None:
+            self._screen.show_steady(event.press)
+            self._take(event.press, contact)
+        elif event.reason == AWAY:
+            raise PortLost(
+                f"{AWAY}; run the same command again, and let the machine continue with row {number} of its list"
+            )
+        else:
+            self._screen.say(f"   row {number} is left out: {event.reason}")
+
+    def _wait_for(self, *phases: Phase) -> Watched:
+        """Return the next reading in one of these phases, and show the phases of the readings before it."""
         while True:
             event = self._events.next()
-            if isinstance(event, Watched):
-                if event.phase in phases:
-                    return event
-                self._screen.show(event)
+            if isinstance(event, str):
+                continue
+            if event.phase in phases:
+                return event
+            self._screen.show_phase(event)
 
-    def _one_press(self, *, asks: bool) -> None:
-        """Propose a press until one is taken, or something else is to be proposed."""
-        proposed, press = self._session.proposed, None
+    def _guide_press(self, *, asks: bool) -> None:
+        """Propose a press, and return when it is taken or when another press is to be proposed."""
+        proposed = self._session.proposed
+        press: SteadyPress | None = None
         self._screen.say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")
         self._events.arm()
-        while press is not None or self._session.proposed is proposed:  # until another press is undone
+        # Undoing an earlier press changes the proposal, except that the answer about a steady press comes first.
+        while press is not None or self._session.proposed is proposed:
             event = self._events.next()
             if isinstance(event, str):
-                if self._is_over(event, press, proposed.contact):
+                if self._handle_line(event, press, proposed.contact):
                     return
             elif press is not None:
-                continue  # readings while the question stands
+                continue  # readings do not matter while the question is open
             elif event.press is not None:
-                self._screen.taken(event.press)
+                self._screen.show_steady(event.press)
                 if not asks:
                     self._take(event.press, proposed.contact)
                     return
@@ -242,39 +187,53 @@ class Dialogue:
                 self._screen.say(f"   not taken: {event.reason}; press again")
                 self._events.arm()
             else:
-                self._screen.show(event)
+                self._screen.show_phase(event)
 
-    def _is_over(self, typed: str, press: SteadyPress | None, proposed: Array) -> bool:
-        """Do what was typed, while a press is waited for or asked about: whether something else is to be proposed."""
+    def _handle_line(self, line: str, press: SteadyPress | None, proposed: Array) -> bool:
+        """Do what a person typed.
+
+        Args:
+            line: The typed line.
+            press: Steady press that the question is about; None while the press is still expected.
+            proposed: The proposed press (x, y, F), shape (3,), mm and N.
+
+        Returns:
+            Whether the proposal is settled, so that the next press is to be proposed.
+        """
         try:
-            answer = read_answer(typed)
-            if answer.reply == "quit":
-                raise Stopped
-            if answer.reply == "take" and press is None:
-                self._screen.say("   press first: the question comes when the press is steady")
-            elif answer.reply == "take" and press is not None:
-                return self._take(press, proposed if isinstance(answer.contact, str) else answer.contact)
-            elif answer.reply == "skip":
-                self._session.skip()
-            elif answer.number == "last" and press is not None:
-                self._screen.say("   this press is not taken")
-            else:
-                self._screen.say(f"   press {self._session.undo(answer.number)} is taken back")
-                self._say_summary()
-                return False
+            return self._act_on(read_answer(line), press, proposed)
         except PressError as error:
             self._screen.say(f"   {error}")
             return False
-        return answer.reply != "take"
+
+    def _act_on(self, answer: Answer, press: SteadyPress | None, proposed: Array) -> bool:
+        """Act on an answer; arguments and result as `_handle_line`."""
+        if answer.reply == "quit":
+            raise SessionEnd
+        if answer.reply == "skip":
+            self._session.skip()
+            return True
+        if answer.reply == "take":
+            if press is None:
+                self._screen.say("   press first: the question comes when the press is steady")
+                return False
+            return self._take(press, proposed if isinstance(answer.contact, str) else answer.contact)
+        if answer.number == "last" and press is not None:
+            self._screen.say("   this press is not taken")
+            return True
+        removed_number = self._session.undo(answer.number)
+        self._screen.say(f"   press {removed_number} is removed")
+        self._say_summary()
+        return False
 
     def _take(self, press: SteadyPress, contact: Array) -> bool:
-        """Whether the session takes a press."""
+        """Add a press to the session, and return whether the session accepts it."""
         try:
             self._session.take(press.charge_pC, contact)
         except PressError as error:
             self._screen.say(f"   {error}")
             return False
-        self._taken(self._session, press)
+        self._on_taken(self._session, press)
         self._say_summary()
         return True
 
@@ -283,9 +242,11 @@ class Dialogue:
             self._screen.say(f"   {sentence}")
 
 
-def _done(session: PressSession, contacts: Array) -> int:
-    """Number of rows of a list that were made before: up to the last press of the session."""
+def _count_rows_made(session: PressSession, contacts: Array) -> int:
+    """Return the number of rows of a list up to the last press of the session."""
     if not len(session):
         return 0
-    same = (np.isclose(contacts, session.presses.contact[-1], rtol=0.0, atol=1e-9, equal_nan=True)).all(axis=1)
-    return max(np.flatnonzero(same).tolist(), default=-1) + 1
+    last_contact = session.presses.contact[-1]
+    is_last = np.isclose(contacts, last_contact, rtol=0.0, atol=SAME_CONTACT_TOLERANCE, equal_nan=True).all(axis=1)
+    rows = np.flatnonzero(is_last)
+    return int(rows[-1]) + 1 if rows.size else 0

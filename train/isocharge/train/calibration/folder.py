@@ -8,7 +8,6 @@
     FOLDER/<version>/pretensions.npz     weights for `serve stream --follow`, with four electrodes or more
     FOLDER/<version>/calibration.png
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the last version's
-    FOLDER/presses.part.csv        presses of a session that is not over; .presses.part.json says on what
 
 A further calibration in the same folder is its next version: a server that watches it takes it with a reload, and
 nothing is lost. Only the version folders count: what lies above them is written anew from the last one, whatever was
@@ -30,13 +29,12 @@ from isocharge.common.errors import ModelError, PressError
 from isocharge.common.files import refusals_explained, remove_empty, write_whole
 from isocharge.common.json_values import plain_values
 from isocharge.common.resumable_run import locked
-from isocharge.common.structs import read_json
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, version_folders
 from isocharge.serve.model.pretensions import FILE as PRETENSIONS
-from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text, read_presses, write_presses
+from isocharge.serve.prediction.measured_presses import presses_text
 from isocharge.simulate.plots.figure import picture_bytes
-from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
+from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.calibrate import CalibrationResult, film_without_presses
 from isocharge.train.calibration.calibration_file import film_table, read_film
 from isocharge.train.calibration.contact_error import ContactError
@@ -49,12 +47,6 @@ from isocharge.train.training.fitted import Provenance
 RESULT, SENSOR, PRESSES, PICTURE, CARD = "calibration.json", "sensor.toml", "presses.csv", "calibration.png", "card.md"
 """Names of the files."""
 
-SESSION = "presses.part.csv"
-"""Name of the file with the presses of a session that is not over."""
-
-IDENTITY = ".presses.part.json"
-"""Name of the file that says on what these were made."""
-
 
 def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
     """Raise ModelError if a calibration cannot go into this folder: for its name, or for what it holds."""
@@ -62,13 +54,13 @@ def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
     check_target(folder, max(versions, default=0) + 1, electrodes)
     if not folder.exists() or any((version / RESULT).is_file() for version in versions.values()):
         return
-    if {path.name for path in folder.iterdir() if not path.name.startswith(".")} - {SESSION}:
+    if any(not path.name.startswith(".") for path in folder.iterdir()):
         raise ModelError(f"{folder}: expected a new folder or one of an earlier calibration; choose another --output")
 
 
 @contextmanager
 def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[None]:
-    """Hold a folder for a calibration, from the first press on, and repair what a kill has left in it.
+    """Lock a folder for a calibration, and remove or complete what a killed process left in it.
 
     Raises:
         ModelError: As `check_calibration_folder`.
@@ -87,8 +79,6 @@ def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[No
                 _publish(folder)
                 yield
         finally:
-            if not (folder / SESSION).exists():
-                (folder / IDENTITY).unlink(missing_ok=True)
             remove_empty(missing)
 
 
@@ -99,42 +89,6 @@ def _publish(folder: Path) -> None:
         data = (version / name).read_bytes()
         if not (folder / name).is_file() or (folder / name).read_bytes() != data:
             write_whole(folder / name, data)
-
-
-def session_presses(folder: Path, problem: CalibrationProblem, *, fresh: bool, **std: float) -> MeasuredPresses | None:
-    """Presses of a session that was stopped, if there was one; the next are of this sensor and probe.
-
-    Args:
-        folder: Of the calibration.
-        problem: What is calibrated.
-        fresh: Whether to delete them.
-        std: As `read_presses` takes it.
-
-    Raises:
-        PressError: If they were made on another sensor or with another probe.
-    """
-    path, about = folder / SESSION, {"sensor": sensor_to_dict(problem.sensor), "probe": problem.probe.notation}
-    if fresh:
-        path.unlink(missing_ok=True)
-    presses = read_presses(path, problem.electrodes, **std) if path.is_file() else None
-    if presses and (folder / IDENTITY).is_file():  # older versions wrote none
-        of = read_json(folder / IDENTITY, "what the presses of a session were made on", PressError, dict[str, Any])
-        if differing := [key for key, value in about.items() if of.get(key) != json.loads(json.dumps(value))]:
-            raise PressError(
-                f"{path}: the presses of a session with another {' and another '.join(differing)}; go on with the "
-                "same, choose another --output, or begin anew with --fresh, which deletes them"
-            )
-    write_whole(folder / IDENTITY, json.dumps(about).encode())
-    return presses
-
-
-def save_session(folder: Path, presses: MeasuredPresses) -> None:
-    """Write the presses of a session into its folder, all of them anew; without presses the file goes."""
-    if len(presses):
-        folder.mkdir(parents=True, exist_ok=True)
-        write_presses(folder / SESSION, presses)
-    else:
-        (folder / SESSION).unlink(missing_ok=True)
 
 
 def write_calibration(result: CalibrationResult, folder: Path, command: str = "") -> Path:

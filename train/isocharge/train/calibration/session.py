@@ -1,7 +1,7 @@
-"""Session of presses taken one after the other: the next press, the film so far, undo, and when to stop.
+"""Session of presses that are taken one after the other, with the next press that a person or a machine should make.
 
-No port, no screen and no clock: whoever drives a session shows what it proposes, brings the charges of the press, and
-passes on what a person answers.
+A session has no port, no screen and no clock. Its caller shows the proposed press, measures the charges, and passes on
+the answer of the person. After each press the film is fitted again, and the next proposal follows from the fit.
 """
 
 import math
@@ -14,39 +14,44 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.serve.prediction.measured_presses import FORCE_STD, POSITION_STD_MM, MeasuredPresses
+from isocharge.serve.prediction.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.train.calibration.calibrate import FEW, CalibrationResult, calibrate, no_presses
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.diagnosis import outside
-from isocharge.train.calibration.problem import CalibrationProblem
+from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 
-FEWEST_TO_SAY = 2
-"""Presses from which the error left is said: one press alone says little."""
+MIN_PRESSES = 2
+"""Number of presses from which on the remaining error is reported; a single press says too little."""
 
 ENOUGH = 0.5
-"""Error left by the film, as a share of the position error that noise alone leaves, at which a session is over."""
+"""Position error left by the film at which a session is complete, as a share of the error by noise alone."""
 
 EXPECTED_ANSWER = (
     'Enter for "as proposed", the real "x y force" in mm and N (? for a value that is unknown), s to skip the place, '
-    "u to undo the last press (u 3: press 3), or q to end"
+    "u to undo the last press (u 3: press 3), or q to quit"
 )
 
-
 Reply = Literal["take", "skip", "undo", "quit"]
-"""What a person wants."""
+"""Action that a person asks for."""
 
-WORDS: dict[str, Reply] = {"": "take", "take": "take", "s": "skip", "skip": "skip", "q": "quit", "quit": "quit"}
-"""What stands for it."""
+REPLIES: dict[str, Reply] = {"": "take", "take": "take", "s": "skip", "skip": "skip", "q": "quit", "quit": "quit"}
+"""Actions by the word that is typed for them."""
+
+UNDO = re.compile(r"(?:u|undo)\s*(\d*)")
+"""Word that undoes a press, with the number of the press or without."""
+
+UNKNOWN_CELLS = ("", "?")
+"""Words for a value that is unknown."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a person says of a press.
+    """Answer of a person about a press.
 
     Attributes:
-        reply: What to do.
-        contact: Where the press to take was: (x_mm, y_mm, force_N), NaN where unknown, shape (3,).
-        number: The press to undo, from 1.
+        reply: Action to take.
+        contact: Contact (x_mm, y_mm, force_N) of the press to take, shape (3,), NaN where unknown.
+        number: Number of the press to undo, from 1.
     """
 
     reply: Reply
@@ -55,41 +60,56 @@ class Answer:
 
 
 def read_answer(text: str) -> Answer:
-    """Return the meaning of a line that a person typed.
+    """Return the answer that a person typed.
 
     Args:
         text: Empty, three values with blanks or commas between them, `u`, `u 3`, `s` or `q`.
 
     Raises:
-        PressError: If it is something else.
+        PressError: If the text is something else.
     """
     word = text.strip().lower()
-    if word in WORDS:
-        return Answer(WORDS[word])
-    if undo := re.fullmatch(r"(?:u|undo)\s*(\d*)", word):
+    if word in REPLIES:
+        return Answer(REPLIES[word])
+    undo = UNDO.fullmatch(word)
+    if undo is not None:
         return Answer("undo", number=int(undo[1]) if undo[1] else "last")
-    cells = [cell.strip() for cell in (word.split(",") if "," in word else word.split())] * (3 if word == "?" else 1)
-    is_given = [cell not in ("", "?") for cell in cells]
+    if word == "?":
+        return Answer("take", np.full(len(CONTACT), np.nan))
+
+    cells = word.split(",") if "," in word else word.split()
     try:
-        contact = np.array([float(cell) if given else np.nan for cell, given in zip(cells, is_given, strict=True)])
+        contact = np.array([_cell_value(cell.strip()) for cell in cells])
     except ValueError:
         contact = np.empty(0)
-    if contact.shape != (3,) or not np.array_equal(np.isfinite(contact), is_given):
+    if contact.shape != (len(CONTACT),):
         raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")
     return Answer("take", contact)
 
 
+def _cell_value(cell: str) -> float:
+    """Return the number in a cell, NaN if it is unknown; ValueError if the cell is not a finite number."""
+    if cell in UNKNOWN_CELLS:
+        return math.nan
+    value = float(cell)
+    if not math.isfinite(value):
+        raise ValueError(f"expected a finite number, got {cell}")
+    return value
+
+
 class PressSession:
-    """The presses of one film as they are taken, and what they say of it.
+    """Presses of one film in the order in which they are made, and the film that they determine so far.
 
     Attributes:
-        problem: The films that it may be, and the estimate before the presses.
-        presses: Taken so far, numbered from 1 by their lines.
-        result: The film by now; None without presses, or where no film explains them.
-        refusal: Why no film explains the presses; empty where one does.
+        problem: Films that the sensor may be, and the estimate before the presses.
+        presses: Presses so far; their lines are numbered from 1.
+        result: Calibration by these presses; None without presses, or if no film explains them.
+        refusal: Reason why no film explains the presses; empty if a film explains them.
     """
 
+    presses: MeasuredPresses
     result: CalibrationResult | None
+    refusal: str
     _proposed: ProposedPress | None
 
     def __init__(
@@ -102,19 +122,23 @@ class PressSession:
         force_std: float = FORCE_STD,
         until: float = ENOUGH,
     ) -> None:
-        """Begin a session, or go on with one.
+        """Begin a session, or continue an earlier one.
 
         Args:
-            problem: The films.
-            save: Called with all presses whenever they change, before anything is computed.
-            presses: Those of a session that was stopped.
-            position_std_mm: How well the rig knows a place, mm.
-            force_std: How well it knows a force, share.
-            until: Error left by the film as a share of that of noise, at which it is enough; 0 for never.
+            problem: Films that the sensor may be.
+            save: Function that stores the presses. It is called with all presses after each change, before the film is
+                fitted.
+            presses: Presses of an earlier session to continue.
+            position_std_mm: Standard deviation of the places of further presses, mm.
+            force_std: Standard deviation of the forces of further presses, as a share of the force.
+            until: Position error left by the film, as a share of the error by noise, at which the session is complete;
+                0 for never.
         """
-        self.problem, self._save, self._until = problem, save, until
-        self._std = {"position_std_mm": position_std_mm, "force_std": force_std}
-        self._skipped: list[tuple[float, float]] = []
+        self.problem = problem
+        self._save = save
+        self._until = until
+        self._stds = {"position_std_mm": position_std_mm, "force_std": force_std}
+        self._skipped_places: list[tuple[float, float]] = []
         self._fit(presses or no_presses(problem.electrodes))
 
     def __len__(self) -> int:
@@ -122,54 +146,68 @@ class PressSession:
 
     @property
     def proposed(self) -> ProposedPress:
-        """The press that would tell most now.
+        """The press that would reduce the remaining error most.
 
         Raises:
             PressError: If every place was skipped.
         """
         if self._proposed is None:
-            film, avoid = self.problem.expected, np.reshape(self._skipped, (-1, 2))
-            count = len(self) + 1  # of a plan for presses that no film explains
-            if self.result:
-                film, count = self.result.posterior, 1
-            self._proposed = next_presses(self.problem, count, film, avoid_mm=avoid, **self._std)[-1]
+            skipped_mm = np.reshape(self._skipped_places, (-1, 2))
+            film: FilmEstimate
+            if self.result is not None:
+                film = self.result.posterior
+                count = 1
+            else:  # no film explains the presses: continue the plan of the described film
+                film = self.problem.expected
+                count = len(self) + 1
+            self._proposed = next_presses(self.problem, count, film, avoid_mm=skipped_mm, **self._stds)[-1]
         return self._proposed
 
     @property
     def enough(self) -> bool:
-        """Whether the error left by the film is below the share of the noise that was asked for."""
+        """Whether the position error left by the film is small enough in comparison with that by noise."""
         if self.result is None or len(self) < FEW:
             return False
-        return self.result.error_left.position_mm <= self._until * self.result.sensitivity.noise_error.position_mm
+        noise_mm = self.result.sensitivity.noise_error.position_mm
+        return self.result.error_left.position_mm <= self._until * noise_mm
 
     def take(self, charge: Array, contact: Array) -> None:
-        """Take a press, save all, and fit the film.
+        """Add a press, save all presses, and fit the film.
 
         Args:
             charge: Touch charges, shape (n_electrode,), pC.
-            contact: (x, y, F), NaN where unknown, shape (3,), mm and N.
+            contact: Contact (x, y, F), shape (3,), mm and N, NaN where unknown.
 
         Raises:
-            PressError: If there can be no such press; nothing is taken.
+            PressError: If the press is not one that a calibration accepts. The session is then unchanged.
         """
         self.check(contact)
-        taken = self.presses
+        presses = self.presses
+        temperature_C = presses.temperature_C
+        if temperature_C is not None:
+            temperature_C = np.append(temperature_C, np.nan)
         self._change(
             replace(
-                taken,
-                contact=np.vstack([taken.contact, contact]),
-                charge_pC=np.vstack([taken.charge_pC, charge]),
-                position_std_mm=np.append(taken.position_std_mm, self._std["position_std_mm"]),
-                force_std=np.append(taken.force_std, self._std["force_std"]),
-                lines=(*taken.lines, len(taken) + 1),
+                presses,
+                contact=np.vstack([presses.contact, contact]),
+                charge_pC=np.vstack([presses.charge_pC, charge]),
+                position_std_mm=np.append(presses.position_std_mm, self._stds["position_std_mm"]),
+                force_std=np.append(presses.force_std, self._stds["force_std"]),
+                temperature_C=temperature_C,
+                lines=(*presses.lines, len(presses) + 1),
             )
         )
 
     def check(self, contact: Array) -> None:
-        """Raise PressError if no calibration takes a press (x, y, F), NaN where unknown, shape (3,), mm and N."""
-        domain = self.problem.charges.domain
-        if math.isnan(contact[0]) != math.isnan(contact[1]):
+        """Raise PressError if no calibration accepts a press.
+
+        Args:
+            contact: Contact (x, y, F), shape (3,), mm and N, NaN where unknown.
+        """
+        x, y, _ = contact.tolist()
+        if math.isnan(x) != math.isnan(y):
             raise PressError("expected both x and y, or ? for both, got one of them")
+        domain = self.problem.charges.domain
         if outside(contact[None], domain).any():
             low, high = domain.force_range
             raise PressError(
@@ -178,22 +216,25 @@ class PressSession:
             )
 
     def undo(self, number: int | Literal["last"] = "last") -> int:
-        """Take a press back; the number of the press that is gone.
+        """Remove a press, and return its number.
 
         Raises:
             PressError: If there is no such press.
         """
-        if not len(self):
+        count = len(self)
+        if not count:
             raise PressError("there is no press to undo yet")
-        gone = len(self) if number == "last" else number
-        if not 1 <= gone <= len(self):
-            raise PressError(f"there is no press {gone} to undo: {len(self)} {'is' if len(self) == 1 else 'are'} taken")
-        self._change(self.presses[np.arange(len(self)) != gone - 1])
-        return gone
+        removed_number = count if number == "last" else number
+        if not 1 <= removed_number <= count:
+            taken = "1 is taken" if count == 1 else f"{count} are taken"
+            raise PressError(f"there is no press {removed_number} to undo: {taken}")
+        is_kept = np.arange(count) != removed_number - 1
+        self._change(self.presses[is_kept])
+        return removed_number
 
     def skip(self) -> None:
-        """Propose another place than this one, from now on."""
-        self._skipped.append((self.proposed.x_mm, self.proposed.y_mm))
+        """Propose another place, and never this one again."""
+        self._skipped_places.append((self.proposed.x_mm, self.proposed.y_mm))
         self._proposed = None
 
     def _change(self, presses: MeasuredPresses) -> None:
@@ -201,34 +242,41 @@ class PressSession:
         self._fit(presses)
 
     def _fit(self, presses: MeasuredPresses) -> None:
-        self.presses = replace(presses, lines=tuple(range(1, len(presses) + 1)))
-        self.result, self.refusal, self._proposed = None, "", None
+        self.presses = replace(presses, lines=tuple(range(1, len(presses) + 1)), row_noun="press")
+        self.result = None
+        self.refusal = ""
+        self._proposed = None
+        if not len(presses):
+            return
         try:
-            self.result = calibrate(self.presses, self.problem) if len(presses) else None
+            self.result = calibrate(self.presses, self.problem)
         except PressError as error:
             self.refusal = str(error)
 
     @property
     def summary(self) -> tuple[str, ...]:
-        """The error that the film leaves so far, and the presses that fit badly, a sentence each."""
+        """Sentences about the error that the film leaves so far, and about presses that do not fit."""
         if self.refusal:
             return (f"No film explains these presses: {self.refusal}",)
-        if self.result is None or len(self) < FEWEST_TO_SAY:
+        if self.result is None or len(self) < MIN_PRESSES:
             return ()
-        left, noise = self.result.error_left, self.result.sensitivity.noise_error
-        return (
+        left = self.result.error_left
+        noise = self.result.sensitivity.noise_error
+        error_sentence = (
             f"{left.position_mm:.2g} mm and {left.force_percent:.2g} % are left by not knowing the film; "
-            f"noise alone is {noise.position_mm:.2g} mm and {noise.force_percent:.2g} %.",
-            *(
-                f"Press {number}, {describe_press(self.presses.contact[number - 1])}, fits no film that the others "
-                f"fit, and is left out: was it there, and as hard? u {number} takes it back."
-                for number in self.result.bad_lines
-            ),
+            f"noise alone is {noise.position_mm:.2g} mm and {noise.force_percent:.2g} %."
         )
+        bad_sentences = [
+            f"Press {number}, {describe_press(self.presses.contact[number - 1])}, fits no film that the others fit, "
+            f"and is left out. Was it made there, and as hard? Type u {number} to remove it."
+            for number in self.result.bad_lines
+        ]
+        return (error_sentence, *bad_sentences)
 
 
 def describe_press(contact: Array) -> str:
-    """A press (x, y, F), shape (3,), mm and N, as "1.65 N at (3.0, 2.5) mm"; NaN is unknown."""
+    """Describe a contact (x, y, F), shape (3,), mm and N, NaN where unknown, as in "1.65 N at (3.0, 2.5) mm"."""
     x, y, force = contact.tolist()
-    how = "an unknown force" if math.isnan(force) else f"{force:.2f} N"
-    return f"{how} at an unknown place" if math.isnan(x) else f"{how} at ({x:.1f}, {y:.1f}) mm"
+    force_text = "an unknown force" if math.isnan(force) else f"{force:.2f} N"
+    place_text = "an unknown place" if math.isnan(x) else f"({x:.1f}, {y:.1f}) mm"
+    return f"{force_text} at {place_text}"

@@ -1,5 +1,6 @@
-"""Calibrating at a port: the dialogue against a list of events, and the command against a board that presses."""
+"""`train press`: the dialogue with a list of events, and the command with a simulated board."""
 
+import itertools
 import json
 import os
 import re
@@ -9,15 +10,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import coarse  # noqa: F401  (a fixture of this module, too)
+from tests.train.calibration.conftest import (
+    coarse,  # noqa: F401  (a fixture of this module, too)
+    presses_of,
+)
 
-from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, Screen, Stopped
-from isocharge.common.errors import PortLost
+from boards import TcpBoard, until
+from isocharge.cli.train.press_dialogue import Dialogue, Screen
+from isocharge.cli.train.press_events import PressEvents, SessionEnd
+from isocharge.common.errors import OutputExists, PortLost, PressError
 from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_frame, read_presses
 from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, Watched
 from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
-from isocharge.train.calibration.folder import SESSION
+from isocharge.train.calibration.press_file import open_press_file
 
 NAMES = ("A", "B", "C", "D")
 RATE_HZ = 200.0
@@ -86,9 +92,9 @@ def dialogue(*events, asks=True, contacts=None):
     session, script, taken = FakeSession(), Script(*events), []
     talk = Dialogue(session, script, Screen(NAMES), lambda *_: taken.append(len(session)))
     if contacts is None:
-        talk.with_person(asks=asks)
+        talk.guide_person(asks=asks)
     else:
-        talk.with_machine(contacts)
+        talk.follow_machine(contacts)
     assert not script.events
     return session, script, taken
 
@@ -104,7 +110,7 @@ def test_enter_takes_a_press_as_proposed(capsys):
     assert ("0.8 s" in said, "hold it, 1.4 s" in said) == (False, True)  # one line a second
     assert re.findall(r": A (\S+),", said) == ["400.0"] * 2 + ["500.0"] * 3
     assert said.count("so much is known") == 3
-    assert said.endswith("The film is known well enough; --until 0 goes on.\n")
+    assert said.endswith("With --until 0 the same command takes more presses.\n")
 
 
 FIRST, SECOND, THIRD = ((float(x), 0.0, 1.0) for x in range(3))
@@ -115,10 +121,10 @@ FIRST, SECOND, THIRD = ((float(x), 0.0, 1.0) for x in range(3))
     [
         ([STEADY, "", "q"], [FIRST], "so much is known"),
         ([STEADY, "q"], [], ""),
-        ([STEADY, Stopped()], [], ""),
-        ([Stopped()], [], ""),
-        ([STEADY, "u", STEADY, "", "u", "q"], [], "press 1 is taken back"),
-        ([STEADY, "", STEADY, "u 1", "", "q"], [SECOND], "press 1 is taken back"),
+        ([STEADY, SessionEnd()], [], ""),
+        ([SessionEnd()], [], ""),
+        ([STEADY, "u", STEADY, "", "u", "q"], [], "press 1 is removed"),
+        ([STEADY, "", STEADY, "u 1", "", "q"], [SECOND], "press 1 is removed"),
         (["s", STEADY, "s", STEADY, "", "q"], [(0.2, 0.0, 1.0)], "(0.2, 0.0) mm"),
         (["what?", STEADY, "1 2", "1 2 3", "q"], [(1.0, 2.0, 3.0)], "got '1 2'"),
         (["", STEADY, "q"], [], "press first"),
@@ -147,12 +153,12 @@ def test_presses_of_a_machine_are_those_of_its_list(capsys):
     np.testing.assert_array_equal(session.taken, LIST[[0, 2]])
     said = capsys.readouterr().err
     assert script.armed == 0
-    assert said.index("let the machine begin") < said.index("1. 0.50 N")
+    assert said.index("Let the machine begin") < said.index("1. 0.50 N")
     assert "row 2 is left out: it moves" in said
 
 
 def test_a_port_that_goes_away_under_a_machine_ends_the_session():
-    with pytest.raises(PortLost, match="go on with row 2 of its list"):
+    with pytest.raises(PortLost, match="continue with row 2 of its list"):
         dialogue(TARED, STEADY, refused(AWAY), contacts=LIST)
 
 
@@ -172,8 +178,8 @@ def places(problem):
     return np.array([press.contact for press in next_presses(problem, 3)])
 
 
-def board(film, places, seed=0) -> Iterator[bytes]:
-    """Frames of a machine that presses at places for 1.2 s each, through an amplifier."""
+def board_rows(film, places, seed=0) -> Iterator[tuple[float, ...]]:
+    """Charges, pC, of a machine that presses at places for 1.2 s each, as an amplifier measures them."""
     t = np.arange(round(1.2 * RATE_HZ)) / RATE_HZ
     rise = np.clip(np.minimum(t, 1.2 - t) / 0.1, 0.0, 1.0)[:, None] ** (2 / 3)
     pause = np.zeros((round(0.8 * RATE_HZ), 4))
@@ -181,8 +187,14 @@ def board(film, places, seed=0) -> Iterator[bytes]:
     for charge in film.charges(places):
         pieces += [rise * charge, pause]
     measure = load_amplifier("reference").start(4, RATE_HZ, np.random.default_rng(seed))
-    for k, row in enumerate(measure(np.concatenate(pieces))):
-        yield encode_frame(Frame(k, round(1e6 * k / RATE_HZ), tuple(row + 12.0)))
+    for row in measure(np.concatenate(pieces)):
+        yield tuple(row + 12.0)
+
+
+def board(film, places, seed=0) -> Iterator[bytes]:
+    """Frames of the same machine."""
+    for number, row in enumerate(board_rows(film, places, seed)):
+        yield encode_frame(Frame(number, round(1e6 * number / RATE_HZ), row))
 
 
 @pytest.fixture
@@ -213,33 +225,112 @@ def test_a_press_that_had_begun_is_left_out_and_a_line_is_not(film, places):
         events.arm()
         armed.set()
         press = next(event.press for event in coming if event.press)
-        with pytest.raises(Stopped):
+        with pytest.raises(SessionEnd):
             list(coming)
     np.testing.assert_allclose(press.charge_pC, film.charges(places[1:2])[0], rtol=0.01, atol=2.0)
     os.close(keyboard)
 
 
-CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial", "-o", "film")
+PRESS = ("train", "press", "--sensor", "four-25um-biaxial", "-o", "presses.csv")
 
 
-def test_presses_of_a_machine_calibrate_a_film(command, desk, film, places):
-    """The port ends after two presses; the same command goes on with the third row."""
-    _, _, err = command(*CALIBRATE, "--port", "some.bin", "--press-list", "list.csv")
-    assert "2 presses are in film/presses.part.csv; the same command goes on with them" in err
-    assert len(read_presses(desk / "film" / SESSION)) == 2
-    code, out, err = command(*CALIBRATE, "--port", "rest.bin", "--press-list", "list.csv", "--json")
-    assert (code, "going on with 2 presses" in err) == (0, True)
-    *lines, end = map(json.loads, out.splitlines())
-    assert [(line["press"], line["problem"], line["next"]) for line in lines] == [
-        (3, None, None)
-    ]  # a machine asks for none
+def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk, film, places):
+    """The port ends after two presses. The same command continues with the third row of the list."""
+    _, _, err = command(*PRESS, "--port", "some.bin", "--press-list", "list.csv")
+    assert "presses.csv has 2 presses; the same command continues the session" in err
+    assert len(read_presses(desk / "presses.csv")) == 2
+
+    code, out, err = command(*PRESS, "--port", "rest.bin", "--press-list", "list.csv", "--json")
+    assert code == 0, err
+    assert "presses.csv has 2 presses; the session continues with them" in err
+    assert "isocharge train calibrate presses.csv --sensor four-25um-biaxial" in err
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert [(line["press"], line["problem"], line["next"]) for line in lines] == [(3, None, None)]
+
+    presses = read_presses(desk / "presses.csv", NAMES)
     clean = film.charges(places)
-    taken = read_presses(desk / "film/1/presses.csv", NAMES)
-    assert [[line["charge_pC"][name] for name in NAMES] for line in lines] == taken.charge_pC[2:].tolist()
-    assert (np.abs(taken.charge_pC - clean) < 5 * np.hypot(1.0, 0.002 * clean) * np.sqrt(1 / 90 + 1 / 50)).all()
-    assert lines[-1]["error_left"] == end["error_left"]
-    assert not (desk / "film" / SESSION).exists()
-    np.testing.assert_array_equal(taken.contact, places)
+    std = np.hypot(1.0, 0.002 * clean) * np.sqrt(1 / 90 + 1 / 50)
+    assert (np.abs(presses.charge_pC - clean) < 5 * std).all()
+    assert [lines[0]["charge_pC"][name] for name in NAMES] == presses.charge_pC[2].tolist()
+    np.testing.assert_array_equal(presses.contact, places)
+
+    table = json.loads(command("train", "calibrate", "presses.csv", *PRESS[2:4], "--json")[1])
+    assert table["error_left"] == lines[0]["error_left"]
+
+
+def test_a_killed_session_leaves_whole_lines_and_continues(start_command, command, desk, film, places):
+    """The process is killed by SIGKILL after two presses."""
+    path = desk / "presses.csv"
+
+    def rows():
+        yield from board_rows(film, places[:2])
+        rest = itertools.repeat((12.0,) * 4)
+        yield from until(rest, lambda: path.exists() and len(read_presses(path)) == 2)
+        process.kill()
+        yield from itertools.islice(rest, 1000)
+
+    with TcpBoard(rows(), RATE_HZ) as port:
+        process = start_command(*PRESS, "--port", port.url, "--press-list", "list.csv")
+        process.wait(timeout=120)
+    assert path.read_text("utf-8").endswith("\n")
+    code, _, err = command(*PRESS, "--port", "rest.bin", "--press-list", "list.csv")
+    assert code == 0, err
+    np.testing.assert_array_equal(read_presses(path, NAMES).contact, places)
+
+
+def test_presses_of_another_probe_or_sensor_are_not_continued(problem, film, places, tmp_path):
+    path = tmp_path / "presses.csv"
+    presses = presses_of(problem, places, film.charges(places))
+    stds = {"position_std_mm": 0.1, "force_std": 0.01}
+    with open_press_file(path, problem.sensor, Circle(1.0)) as file:
+        assert file.read(**stds) is None
+        file.write(presses)
+    with open_press_file(path, problem.sensor, Circle(1.0)) as file:
+        assert file.read(**stds) == presses
+        with pytest.raises(OutputExists, match="another process"), open_press_file(path, problem.sensor, Circle(1.0)):
+            pass
+    other_probe = open_press_file(path, problem.sensor, Circle(1.2))
+    with pytest.raises(PressError, match="got presses of another probe;"), other_probe:
+        pass
+    other_sensor = open_press_file(path, load_sensor("four-25um-uniaxial"), Circle(1.0))
+    with pytest.raises(PressError, match="got presses of another sensor;"), other_sensor:
+        pass
+    assert read_presses(path) == presses
+    with open_press_file(path, problem.sensor, Circle(1.2), fresh=True) as file:
+        assert file.read(**stds) is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_with_further_columns_is_not_overwritten(refused, desk):
+    text = "x_mm,y_mm,force_N,A,B,C,D,comment\n1,1,1,500,500,500,500,mine\n"
+    (desk / "presses.csv").write_text(text)
+    refused(*PRESS, "--port", "some.bin", "--yes", said="got further columns: comment")
+    assert (desk / "presses.csv").read_text() == text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--port", "some.bin", "--press-list", "far.csv"], "far.csv, press 2: expected a press within 9"),
+        (["--port", "some.bin", "--press-list", "half.csv"], "half.csv, line 2: expected both x_mm and y_mm"),
+        (["--port", "some.bin", "--press-list", "nothing.csv"], "cannot be read"),
+        (["--port", "some.bin", "--yes", "--probe", "triangle:4.0"], "expected a round one"),
+        (["--port", "some.bin", "--yes", "-o", "."], "expected a file for the presses, got a folder"),
+        (["--port", "some.bin", "--yes", "-o", "nowhere/presses.csv"], "nowhere"),
+        (["--port", "noise.bin", "--press-list", "list.csv"], "no intact frame"),
+    ],
+)
+def test_bad_input_is_refused_before_the_first_press(refused, desk, words, message):
+    (desk / "far.csv").write_text("x_mm,y_mm,force_N\n1,1,1\n30,1,1\n")
+    (desk / "half.csv").write_text("x_mm,y_mm,force_N\n1,,1\n")
+    (desk / "noise.bin").write_bytes(bytes(range(256)) * 100)
+    before = sorted(desk.iterdir())
+    is_port_or_output = bool({"noise.bin", "-o"} & {*words})
+    refused(*PRESS, *words, said=message, code=1 if is_port_or_output else 2)
+    assert sorted(desk.iterdir()) == before
+
+
+CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial", "-o", "film")
 
 
 @pytest.mark.parametrize(
@@ -247,22 +338,13 @@ def test_presses_of_a_machine_calibrate_a_film(command, desk, film, places):
     [
         ([], "or --from FOLDER with --temperature C, got none of them"),
         (["list.csv", "--temperature", "nan"], "--temperature: expected -100 to 200 degrees Celsius, got nan"),
-        (["--from", "film", "--temperature", "23", "--port", "some.bin"], "--temperature: presses from --port"),
         (["--next", "2"], "nothing is calibrated without PRESSES.csv"),
         (["list.csv", "--probe", "triangle:4.0"], "expected a round one"),
         (["metres.csv"], "were they written in metres"),
-        (["--port", "some.bin", "list.csv"], "leave out PRESSES.csv, --next"),
-        (["--press-list", "list.csv"], "belong to --port"),
-        (["--port", "some.bin", "--press-list", "far.csv"], "far.csv, press 2: expected a press within 9"),
-        (["--port", "some.bin", "--press-list", "half.csv"], "half.csv, line 2: expected both x_mm and y_mm"),
-        (["--port", "some.bin", "--press-list", "nothing.csv"], "cannot be read"),
-        (["--port", "noise.bin", "--press-list", "list.csv"], "no intact frame"),
+        (["list.csv", "--port", "some.bin"], "No such option: --port"),
     ],
 )
-def test_what_cannot_be_is_said_before_the_first_press(refused, desk, words, message):
-    (desk / "far.csv").write_text("x_mm,y_mm,force_N\n1,1,1\n30,1,1\n")
+def test_calibrate_refuses_bad_input_before_it_writes(refused, desk, words, message):
     (desk / "metres.csv").write_text("x_mm,y_mm,force_N,A,B,C,D\n0.001,0,1,9,8,7,6\n0,0.002,1,9,8,7,6\n")
-    (desk / "half.csv").write_text("x_mm,y_mm,force_N\n1,,1\n")
-    (desk / "noise.bin").write_bytes(bytes(range(256)) * 100)
-    refused(*CALIBRATE, *words, said=message, code=1 if "noise.bin" in words else 2)
+    refused(*CALIBRATE, *words, said=message)
     assert not (desk / "film").exists()

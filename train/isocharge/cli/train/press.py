@@ -1,0 +1,253 @@
+"""`isocharge train press`: guide presses at a port, and write the file of measured presses."""
+
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption
+from isocharge.cli.shared.options import DeviceOption, ModelsOption, StressLimitOption
+from isocharge.cli.shared.port_hints import doctor_is_named
+from isocharge.cli.shared.probe_option import ProbeOption
+from isocharge.cli.shared.terminal import say, show_json
+from isocharge.cli.train.press_dialogue import Dialogue, OnTaken, Screen
+from isocharge.cli.train.press_events import PressEvents
+from isocharge.common.arrays import Array
+from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
+from isocharge.common.errors import InputError, PressError, told_where
+from isocharge.serve import ReadingStream, load_device, open_source
+from isocharge.serve.live.steady_press import PressWatch, SteadyPress
+from isocharge.serve.prediction.measured_presses import CONTACT, read_press_list
+from isocharge.simulate import load_sensor, parse_probe
+from isocharge.train import CalibrationProblem, read_earlier
+from isocharge.train.calibration.folder import error_table
+from isocharge.train.calibration.press_file import PressFile, open_press_file
+from isocharge.train.calibration.session import PressSession
+
+
+@dataclass(frozen=True)
+class SensorPort:
+    """Port of a sensor, as the options describe it.
+
+    Attributes:
+        url: Device path or pyserial URL of the port, or a file of bytes.
+        device: Device file of the board; None for the default board.
+        baud: Speed of the port, bits per second.
+        reconnects: Whether to wait for a port that is lost.
+        keyboard: File descriptor of the keyboard; None if nobody is asked.
+    """
+
+    url: str
+    device: Path | None
+    baud: int
+    reconnects: bool
+    keyboard: int | None
+
+
+def press_command(
+    port: Annotated[
+        str, typer.Option("--port", metavar="URL", help="Port of the sensor: device path or pyserial URL.")
+    ],
+    sensor: Annotated[
+        str,
+        typer.Option("--sensor", metavar="SENSOR", help="Name of a built-in sensor, or a TOML file that describes it."),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="PRESSES.csv",
+            help="File to write. If it already has presses of this sensor, the session continues with them.",
+        ),
+    ],
+    probe: ProbeOption = "circle:1.0",
+    position_std_mm: PositionStdOption = 0.1,
+    force_std: ForceStdOption = 0.01,
+    device: DeviceOption = None,
+    baud: Annotated[
+        int, typer.Option("--baud", min=1, help="Speed of the port, bits per second; USB ports ignore it.")
+    ] = 115200,
+    yes: Annotated[
+        bool,
+        typer.Option("--yes", help="Take each press as made where it was proposed, without asking. (default: ask)"),
+    ] = False,
+    press_list: Annotated[
+        Path | None,
+        typer.Option(
+            "--press-list",
+            metavar="FILE",
+            help="Presses that a machine makes, in their order: CSV with x_mm, y_mm, force_N. Nothing is asked. "
+            "(default: proposed presses)",
+        ),
+    ] = None,
+    until: Annotated[
+        float,
+        typer.Option(
+            "--until",
+            metavar="SHARE",
+            min=0.0,
+            help="Position error left by the film at which the session ends, as a share of the error by noise alone; "
+            "0 for never.",
+        ),
+    ] = 0.5,
+    stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
+    earlier: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="FOLDER",
+            help="Propose presses for the film of this earlier calibration, which may have drifted since. "
+            "(default: the film of the sensor file)",
+        ),
+    ] = None,
+    models: ModelsOption = None,
+    fresh: Annotated[
+        bool,
+        typer.Option("--fresh", help="Delete the presses in the output file, and begin again. (default: continue)"),
+    ] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object for each press on stdout. (default: none)")
+    ] = False,
+) -> None:
+    """Guide presses on a film at a port, and write them to a file of measured presses.
+
+    The command proposes a press, takes it when it is steady, and asks whether it was made there. After each press it
+    reports how well the film is known. The session ends when the film is known well enough, or when q is typed.
+
+    The file is complete after each press. If the session is interrupted, the same command continues it.
+
+    Check the wiring first: `isocharge serve doctor --check-electrodes` asks for a press near each electrode in turn,
+    and finds electrodes that are swapped.
+
+    Example: isocharge train press --port /dev/ttyACM0 --sensor four-25um-biaxial -o presses.csv
+    """
+    problem = replace(CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models), stress_limit=stress_limit)
+    if earlier is not None:
+        problem = replace(problem, earlier=read_earlier(earlier, problem))
+    contacts = None if press_list is None else read_press_list(press_list)
+    is_asked = contacts is None and not yes
+    sensor_port = SensorPort(
+        url=port,
+        device=device,
+        baud=baud,
+        reconnects=contacts is None,
+        keyboard=_keyboard() if is_asked else None,
+    )
+    stds = {"position_std_mm": position_std_mm, "force_std": force_std}
+    with open_press_file(output, problem.sensor, problem.probe, fresh=fresh) as press_file:
+        session = _open_session(press_file, problem, until, stds)
+        if contacts is not None:
+            _check_list(contacts, session, str(press_list))
+        on_taken: OnTaken = _ignore_press
+        if json:
+            on_taken = _print_proposing if contacts is None else _print_press
+        try:
+            with _open_events(sensor_port, problem) as events:
+                dialogue = Dialogue(session, events, Screen(problem.electrodes), on_taken)
+                if contacts is None:
+                    dialogue.guide_person(asks=is_asked)
+                else:
+                    dialogue.follow_machine(contacts)
+        finally:
+            _say_what_is_written(session, output)
+    if not len(session):
+        raise PressError(f"no press was taken, so {output} is not written")
+    if session.refusal:
+        raise PressError(f"{output}: {session.refusal}")
+    say(f"To make a model: isocharge train calibrate {shlex.quote(str(output))} --sensor {sensor} -o my-film")
+
+
+def _open_session(
+    press_file: PressFile, problem: CalibrationProblem, until: float, stds: dict[str, float]
+) -> PressSession:
+    """Return a session that continues with the presses of the file, if it has any."""
+    presses = press_file.read(position_std_mm=stds["position_std_mm"], force_std=stds["force_std"])
+    if presses is not None:
+        say(f"{press_file.path} has {len(presses)} presses; the session continues with them (--fresh deletes them)")
+    return PressSession(problem, save=press_file.write, presses=presses, until=until, **stds)
+
+
+def _check_list(contacts: Array, session: PressSession, name: str) -> None:
+    """Raise PressError, with the number of the row, if no calibration accepts a press of a machine's list."""
+    for number, contact in enumerate(contacts, start=1):
+        with told_where(f"{name}, press {number}: ", PressError):
+            session.check(contact)
+
+
+@contextmanager
+def _open_events(port: SensorPort, problem: CalibrationProblem) -> Iterator[PressEvents]:
+    """Open the port, and yield its readings and the lines of the keyboard."""
+    board = load_device(port.device)
+    if board.common_mode is not None:
+        say(
+            f"{port.device}: [common_mode] is not used for these presses, because it needs a model that is calibrated "
+            "for the film"
+        )
+        board = msgspec.structs.replace(board, common_mode=None)
+    stream = ReadingStream(problem.electrodes, board, reader=f"sensor {problem.sensor.name}")
+    watch = PressWatch(problem.electrodes)
+    with (
+        doctor_is_named(port.url, port.device),
+        open_source(port.url, baud=port.baud, reconnect=port.reconnects, request=board.request) as source,
+        PressEvents(source, stream, watch, port.keyboard) as events,
+    ):
+        yield events
+
+
+def _keyboard() -> int:
+    """Return the file descriptor of the standard input."""
+    try:
+        return sys.stdin.fileno()
+    except (OSError, ValueError, AttributeError) as error:
+        raise InputError(
+            "expected a standard input for the answers about presses, got none; give --yes for presses that are made "
+            "where they are proposed, or --press-list FILE for the presses of a machine"
+        ) from error
+
+
+def _say_what_is_written(session: PressSession, output: Path) -> None:
+    count = len(session)
+    if count:
+        noun = "press" if count == 1 else "presses"
+        say(f"{output} has {count} {noun}; the same command continues the session")
+
+
+def _ignore_press(session: PressSession, press: SteadyPress) -> None:
+    pass
+
+
+def _print_press(session: PressSession, press: SteadyPress) -> None:
+    """Print the last press, and how well the film is known since, as a line of JSON."""
+    show_json(_press_table(session, press) | {"next": None})
+
+
+def _print_proposing(session: PressSession, press: SteadyPress) -> None:
+    """Print the last press as a line of JSON, with the press that is proposed next."""
+    proposed = None if session.enough else vars(session.proposed)
+    show_json(_press_table(session, press) | {"next": proposed})
+
+
+def _press_table(session: PressSession, press: SteadyPress) -> dict[str, object]:
+    """Return the last press of a session, and how well the film is known since, for JSON."""
+    electrodes = session.presses.electrodes
+    result = session.result
+    return {
+        "press": len(session),
+        **dict(zip(CONTACT, session.presses.contact[-1].tolist(), strict=True)),
+        "charge_pC": dict(zip(electrodes, press.charge_pC.tolist(), strict=True)),
+        "scatter_pC": dict(zip(electrodes, press.scatter_pC.tolist(), strict=True)),
+        "held_s": press.held_s,
+        "frames": press.frames,
+        "flags": list(press.flags),
+        "error_left": None if result is None else error_table(result.error_left),
+        "left_out": [] if result is None else list(result.bad_lines),
+        "problem": session.refusal or None,
+        "enough": session.enough,
+    }

@@ -1,0 +1,97 @@
+"""Readings of a port and lines of the keyboard, merged into one sequence of events."""
+
+import threading
+from collections.abc import Iterable
+from io import FileIO
+from queue import Queue
+from typing import Self
+
+from isocharge.serve import Chunk, ReadingStream
+from isocharge.serve.live.steady_press import PressWatch, Watched
+
+JOIN_TIMEOUT_s = 1.0
+"""Time to wait for the thread that reads the port, s. A silent port keeps its thread busy for longer."""
+
+
+class SessionEnd(Exception):
+    """The person ends the session, or the input or the port has ended."""
+
+
+class PressEvents:
+    """Events of a port and a keyboard in the order in which they happen; a context manager that starts and stops it.
+
+    The port is also read while a person answers and while a fit runs. No reading is lost, and the watch detects that
+    the probe was lifted in the meantime.
+    """
+
+    def __init__(
+        self, chunks: Iterable[Chunk], stream: ReadingStream, watch: PressWatch, keyboard: int | None = None
+    ) -> None:
+        """Set up the events; nothing is read before the context is entered.
+
+        Args:
+            chunks: Bytes of an open port.
+            stream: Decoder of the bytes.
+            watch: Detector of steady presses.
+            keyboard: File descriptor of the keyboard; None for no keyboard.
+        """
+        self._chunks = chunks
+        self._stream = stream
+        self._watch = watch
+        self._keyboard = keyboard
+        self._queue: Queue[tuple[int, Watched | str | Exception]] = Queue()
+        self._stop = threading.Event()
+        self._arm_count = 0
+        self._port_thread = threading.Thread(target=self._read_port, name="press port", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Start the threads that read the port and the keyboard."""
+        self._port_thread.start()
+        if self._keyboard is not None:
+            threading.Thread(target=self._read_keyboard, args=[self._keyboard], daemon=True).start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Stop reading. A thread that waits for a silent port or keyboard ends with the process."""
+        self._stop.set()
+        self._port_thread.join(timeout=JOIN_TIMEOUT_s)
+
+    def arm(self) -> None:
+        """Discard the readings so far, and detect only presses that begin from now on."""
+        self._arm_count += 1
+
+    def next(self) -> Watched | str:
+        """Wait for the next reading or typed line. Readings from before the last call of `arm` are discarded.
+
+        Raises:
+            SessionEnd: If the port or the input has ended.
+            IsochargeError: If the port fails.
+        """
+        while True:
+            arm_count, event = self._queue.get()
+            if isinstance(event, Exception):
+                raise event
+            if isinstance(event, str) or arm_count == self._arm_count:
+                return event
+
+    def _read_port(self) -> None:
+        arm_count = self._arm_count
+        try:
+            for chunk in self._chunks:
+                if self._stop.is_set():
+                    return
+                if arm_count != self._arm_count:
+                    arm_count = self._arm_count
+                    self._watch.arm()
+                for reading in self._stream.feed(chunk):
+                    self._queue.put((arm_count, self._watch.feed(reading)))
+            self._stream.finish()
+            self._queue.put((arm_count, SessionEnd()))
+        except Exception as error:  # raised again by `next`, in the thread that waits for events
+            self._queue.put((arm_count, error))
+
+    def _read_keyboard(self, keyboard: int) -> None:
+        # The file is not buffered, because a buffer would hold a lock when the program ends.
+        for line in FileIO(keyboard, closefd=False):
+            self._queue.put((self._arm_count, line.decode(errors="replace")))
+        self._queue.put((self._arm_count, SessionEnd()))
