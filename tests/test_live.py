@@ -14,7 +14,7 @@ from isocharge.serve import (
     device_from_table,
     encode_frame,
 )
-from isocharge.serve.signal_chain.chain import ChainState, advance
+from isocharge.serve.signal_chain.chain import SignalChain
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.simulate import load_amplifier
 
@@ -34,10 +34,10 @@ def undo(measurement, charge_pC, seed, *, hum=True):
     output = measurement(charge_pC)
     gain = measurement.gain * (1 + 0.002 * rng.uniform(-1, 1, 3))
     tau = measurement.tau * (1 + 0.005 * rng.uniform(-1, 1, 3))
-    chain = Chain(gain_pC=1 / gain, limit_pC=1499.9, hum=HumRule() if hum else None, tau_s=tau)
-    state, charges, contact = ChainState.start(3), [], []
+    chain = SignalChain(Chain(gain_pC=1 / gain, limit_pC=1499.9, hum=HumRule() if hum else None, tau_s=tau), 3)
+    charges, contact = [], []
     for k, row in enumerate(output):
-        state, reading = advance(chain, state, row, k / RATE_HZ, 1 / RATE_HZ)
+        reading = chain.advance(row, k / RATE_HZ, 1 / RATE_HZ)
         charges.append(np.full(3, np.nan) if reading.charge_pC is None else reading.charge_pC)
         contact.append(reading.contact)
     return np.array(charges), np.array(contact)

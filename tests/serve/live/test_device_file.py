@@ -18,7 +18,8 @@ from isocharge.serve.frames.frame_layout import SyncParser
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import ANY_BOARD, with_settings
 from isocharge.serve.live.reading_stream import ChannelPicker
-from isocharge.serve.signal_chain.chain import ChainState, advance
+from isocharge.serve.signal_chain.chain import SignalChain
+from isocharge.serve.signal_chain.stages import Gain
 
 ELECTRODES = ("A", "B", "C")
 FULL = """
@@ -96,17 +97,21 @@ def test_format_decides_the_parser(device):
     assert isinstance(device(described).parser(), SyncParser)
 
 
+def gain_of(chain):
+    return Gain(chain.gain_pC, chain.zero)
+
+
 def test_offset_is_subtracted_before_the_gain(device):
     """Offset binary: half scale is no charge; one number, or one for each electrode."""
     for offset, zero in (("8388608", [8388608] * 3), ("{A = 1, B = 2, C = 3}", [1, 2, 3])):
         chain = device(f"[gain]\noffset = {offset}\npC_per_unit = {{A = 0.5, B = -0.5, C = 1}}\n").chain(ELECTRODES)
-        np.testing.assert_array_equal(chain.raw(np.array(zero) + 10.0), [5.0, -5.0, 10.0])
+        np.testing.assert_array_equal(gain_of(chain).convert(np.array(zero) + 10.0), [5.0, -5.0, 10.0])
 
 
 def test_volts_on_a_feedback_capacitance(device):
     """1 V on 1 nF is 1 nC."""
     text = "[gain]\nV_per_unit = -0.001\noffset = 1650\nfeedback_pF = {A = 1000, B = 1000, C = 500}\n"
-    np.testing.assert_allclose(device(text).chain(ELECTRODES).raw(np.full(3, 1651.0)), [-1.0, -1.0, -0.5])
+    np.testing.assert_allclose(gain_of(device(text).chain(ELECTRODES)).convert(np.full(3, 1651.0)), [-1.0, -1.0, -0.5])
     assert device(text).gain.charge_pC("C", np.array([1651.0])) == pytest.approx(-0.5)
 
 
@@ -242,11 +247,11 @@ def test_a_board_that_rests_elsewhere_is_told_its_offset():
 
 
 def test_saturation_is_flagged_until_the_press_is_over(device):
-    chain = device("[saturation]\nlimit_pC = 1500.0\n[tare]\nframes = 5\n").chain(ELECTRODES)
+    chain = SignalChain(device("[saturation]\nlimit_pC = 1500.0\n[tare]\nframes = 5\n").chain(ELECTRODES), 3)
     totals = [0.0] * 6 + [800.0, 1500.0, 800.0, 800.0, 0.0, 0.0, 800.0]
-    state, flags = ChainState.start(3), []
+    flags = []
     for k, total in enumerate(totals):
-        state, reading = advance(chain, state, np.full(3, total), 0.005 * k, 0.005)
+        reading = chain.advance(np.full(3, total), 0.005 * k, 0.005)
         flags.append("saturated" in reading.flags)
     assert flags == [False] * 7 + [True] * 3 + [False] * 3
 

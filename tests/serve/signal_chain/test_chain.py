@@ -5,7 +5,7 @@ import pytest
 
 from isocharge.common.errors import TareError
 from isocharge.serve import Chain
-from isocharge.serve.signal_chain.chain import ChainState, advance
+from isocharge.serve.signal_chain.chain import SignalChain
 from isocharge.serve.signal_chain.contact import Touch, TouchRule, update_contact
 from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.tare import TareRule, measure_tare
@@ -21,11 +21,8 @@ def rest(n, seed=0, sigma=1.0):
 
 def run(frames, chain=None):
     """All readings of raw frames, shape (n, 3)."""
-    state, readings = ChainState.start(3), []
-    for k, raw in enumerate(frames):
-        state, reading = advance(chain or Chain(), state, raw, k / RATE_HZ, 1 / RATE_HZ)
-        readings.append(reading)
-    return readings
+    running = SignalChain(chain or Chain(), 3)
+    return [running.advance(raw, k / RATE_HZ, 1 / RATE_HZ) for k, raw in enumerate(frames)]
 
 
 def test_tare_is_mean_and_noise():
@@ -63,12 +60,13 @@ def test_tare_gives_up_with_the_reason():
 
 def test_second_tare_never_gives_up():
     """In the middle of a live run, a finger that rests on the film is no reason to stop."""
-    chain, state = Chain(tare=TareRule(frames=20, patience=50)), ChainState.start(3)
+    chain = SignalChain(Chain(tare=TareRule(frames=20, patience=50)), 3)
     for k, raw in enumerate(rest(60)):
-        state, _ = advance(chain, state, raw, k / RATE_HZ, 1 / RATE_HZ)
-    state, tared = state.without_tare(), []
+        chain.advance(raw, k / RATE_HZ, 1 / RATE_HZ)
+    chain.reset_tare()
+    tared = []
     for k, raw in enumerate(np.concatenate([rest(200, sigma=100.0), rest(30)])):
-        state, reading = advance(chain, state, raw, k / RATE_HZ, 1 / RATE_HZ)
+        reading = chain.advance(raw, k / RATE_HZ, 1 / RATE_HZ)
         tared.append(reading.tare is not None)
     assert tared.index(True) == 220
 
@@ -122,29 +120,32 @@ def test_noise_of_a_minute_gives_no_touch():
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.01e9, 1.7e308])
 @pytest.mark.parametrize("gain", [None, 0.5, 2.0])
 def test_invalid_frame_passes_no_stage(value, gain):
-    """The state after it is that before, but for the time that it took."""
-    chain, state = Chain(gain_pC=None if gain is None else np.full(3, gain)), ChainState.start(3)
+    """The frames after it give the same readings as without it."""
+    settings = Chain(gain_pC=None if gain is None else np.full(3, gain))
+    chain, undisturbed = SignalChain(settings, 3), SignalChain(settings, 3)
     for k, raw in enumerate(rest(150)):
-        state, _ = advance(chain, state, raw, k / RATE_HZ, 1 / RATE_HZ)
+        chain.advance(raw, k / RATE_HZ, 1 / RATE_HZ)
+        undisturbed.advance(raw, k / RATE_HZ, 1 / RATE_HZ)
     bad = np.array([1.0, value / (gain or 1.0), 2.0])
-    after, reading = advance(chain, state, bad, 150 / RATE_HZ, 0.25, flags=("gap",))
-    assert after == state._replace(invalid_s=0.25)
+    reading = chain.advance(bad, 150 / RATE_HZ, 0.25, flags=("gap",))
+    for k, raw in enumerate(rest(20, seed=1)):
+        after = chain.advance(raw, 151 / RATE_HZ, 1 / RATE_HZ)
+        expected = undisturbed.advance(raw, 151 / RATE_HZ, 1 / RATE_HZ + (0.25 if k == 0 else 0.0))
+        np.testing.assert_array_equal(after.charge_pC, expected.charge_pC)
     assert (reading.charge_pC, reading.tare, reading.contact, reading.flags) == (None, None, False, ("gap", "invalid"))
 
 
 def test_time_of_invalid_frames_counts_for_the_next():
     """A leak is undone over all the time since the last valid frame: exp(-0.5 s / 1 s) of the output is left."""
-    chain = Chain(tare=None, touch=None, tau_s=np.ones(3), leak=LeakRule(learn=False))
-    state = ChainState.start(3)
+    chain = SignalChain(Chain(tare=None, touch=None, tau_s=np.ones(3), leak=LeakRule(learn=False)), 3)
     for charge_pC, dt_s in ((0.0, 0.1), (0.0, 0.1), (100.0, 0.1), (np.nan, 0.05), (np.inf, 0.15)):
-        state, _ = advance(chain, state, np.full(3, charge_pC), 0.0, dt_s)
-    state, reading = advance(chain, state, 100.0 * np.exp(np.full(3, -0.5)), 0.0, 0.3)
+        chain.advance(np.full(3, charge_pC), 0.0, dt_s)
+    reading = chain.advance(100.0 * np.exp(np.full(3, -0.5)), 0.0, 0.3)
     np.testing.assert_allclose(reading.charge_pC, 100.0)
-    assert state.invalid_s == 0.0
 
 
 def test_flags_of_the_frame_come_before_those_of_the_chain():
-    _, reading = advance(Chain(), ChainState.start(3), OFFSET, 0.0, 0.0, limited=True, flags=("gap",))
+    reading = SignalChain(Chain(), 3).advance(OFFSET, 0.0, 0.0, limited=True, flags=("gap",))
     assert reading.flags == ("gap", "tare", "saturated")
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Chain
-from isocharge.serve.signal_chain.chain import ChainState, advance
+from isocharge.serve.signal_chain.chain import SignalChain
 from isocharge.serve.signal_chain.leak import Leak, LeakRule, undo_leak
 from isocharge.serve.signal_chain.tare import TareRule
 
@@ -27,12 +27,13 @@ def pressed(*presses, seconds=20.0):
 
 def undo(output_pC, rule=None, every=1, tau_s=TAU_S):
     """Touch charges (n, 3) and contact (n,) of one output (n,) on three electrodes; only every so many frames come."""
-    chain = Chain(tare=TareRule(frames=20), tau_s=np.full(3, tau_s), leak=rule or LeakRule())
-    state, charges, contact, last = ChainState.start(3), [], [], 0.0
+    settings = Chain(tare=TareRule(frames=20), tau_s=np.full(3, tau_s), leak=rule or LeakRule())
+    chain = SignalChain(settings, 3)
+    charges, contact, last = [], [], 0.0
     for k, v in enumerate(output_pC):
         if k % every:
             continue
-        state, reading = advance(chain, state, np.full(3, v), k / RATE_HZ, k / RATE_HZ - last)
+        reading = chain.advance(np.full(3, v), k / RATE_HZ, k / RATE_HZ - last)
         last = k / RATE_HZ
         charges.append(np.full(3, np.nan) if reading.charge_pC is None else reading.charge_pC)
         contact.append(reading.contact)

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Contact, Frame, TouchStream, device_from_table, encode_frame
 from isocharge.serve.prediction.contact import Sensitivity
-from isocharge.serve.signal_chain.chain import ChainState, advance
+from isocharge.serve.signal_chain.chain import SignalChain
 from isocharge.serve.signal_chain.memory import DECADES_S, LEARN_S, UNLIKE, WANDER_PC
 from isocharge.train.export_c.folder import device_header
 
@@ -37,11 +37,10 @@ def shown(t, *presses):
 def undo(charge_pC, table=MEMORY, noise_pC=0.3, misfit=None):
     """Touch charges (n, m), contact (n,) and doubt (n,) of charges (n, m), pC."""
     count, rng = charge_pC.shape[1], np.random.default_rng(0)
-    chain, state = device_from_table(table, "b").chain(tuple("ABCD"[:count])), ChainState.start(count)
+    chain = SignalChain(device_from_table(table, "b").chain(tuple("ABCD"[:count])), count, misfit)
     readings = []
     for k, row in enumerate(charge_pC + noise_pC * rng.standard_normal(charge_pC.shape)):
-        state, reading = advance(chain, state, row, k / RATE_HZ, 1.0 / RATE_HZ, misfit=misfit)
-        readings.append(reading)
+        readings.append(chain.advance(row, k / RATE_HZ, 1.0 / RATE_HZ))
     charges = [np.zeros(count) if reading.charge_pC is None else reading.charge_pC for reading in readings]
     return np.array(charges), *np.array([(reading.contact, reading.doubt) for reading in readings]).T
 
@@ -188,7 +187,7 @@ def test_records_say_it(film, predictor):
     expected = np.hypot(plain.force_std_N, moved[0] - moved[1])
     assert records[30].force_std_N == pytest.approx(expected, rel=0.1)
     assert expected > 2.0 * plain.force_std_N
-    assert records[30].tracked["force_std_N"] > 0.8 * expected
+    assert records[30].tracked.force_std_N > 0.8 * expected
     stds = plain.x_std_mm, plain.y_std_mm  # of this film no place moves
     assert (records[30].x_std_mm, records[30].y_std_mm) == pytest.approx(stds)
 

@@ -10,7 +10,7 @@ from isocharge.serve import BinaryParser, Predictor, device_from_table, encode_f
 from isocharge.serve.flags import BLIND, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
 from isocharge.serve.frames.frame import T_US_MODULUS, Frame
 from isocharge.serve.port.device_clock import DeviceClock
-from isocharge.serve.signal_chain.chain import ChainState, advance
+from isocharge.serve.signal_chain.chain import SignalChain
 from isocharge.train.export_c.folder import device_header
 
 BITS = {TARE: 1, SATURATED: 2, NEGATIVE: 4, THERMAL: 8, BLIND: 16, INVALID: 32}
@@ -71,10 +71,12 @@ def recording(board, seed, electrodes=4, seconds=20.0):
 
 def ours(chain, values, t_s, dt_s, limited, tare, misfit):
     """Readings of the chain in Python as arrays, as `Exported.chain` gives them."""
-    state, rows = ChainState.start(values.shape[1]), []
+    running = SignalChain(chain, values.shape[1], misfit)
+    rows = []
     for value, t, dt, at_limit, again in zip(values, t_s, dt_s, limited, tare, strict=True):
-        state = state.without_tare() if again else state
-        state, reading = advance(chain, state, value, float(t), float(dt), limited=bool(at_limit), misfit=misfit)
+        if again:
+            running.reset_tare()
+        reading = running.advance(value, float(t), float(dt), limited=bool(at_limit))
         zero = np.zeros_like(value)
         rows.append(
             (

@@ -17,7 +17,7 @@ from isocharge.serve.frames.frame import SATURATED_BIT, Frame, Parser, SequenceG
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.port.device_clock import DeviceClock, ReadingTime
 from isocharge.serve.port.source import Chunk
-from isocharge.serve.signal_chain.chain import Chain, ChainState, Reading, advance
+from isocharge.serve.signal_chain.chain import Chain, Reading, SignalChain
 from isocharge.serve.signal_chain.thermal import Misfit
 
 
@@ -148,25 +148,28 @@ class ReadingStream:
         self.gaps = gaps or SequenceGaps()
         self.clock = DeviceClock()
         self._device, self._electrodes = device, electrodes
-        self._chain = chain or device.chain(electrodes)
+        self._settings = chain or device.chain(electrodes)
         self._picker = ChannelPicker(electrodes, device.channels, reader, device.where)
-        self._state = ChainState.start(len(electrodes))
         self._misfit = misfit
+        self._chain = self._new_chain()
         self._pending_flags: tuple[str, ...] = ()
 
     @property
     def warming_ratio(self) -> Array | float:
         """Charge of each electrode over the mean magnitude of all when the film warms, shape (electrodes,)."""
-        return self._chain.pyro
+        return self._settings.pyro
+
+    def _new_chain(self) -> SignalChain:
+        return SignalChain(self._settings, len(self._electrodes), self._misfit)
 
     def tare(self) -> None:
-        """Forget the tare; the next quiet frames are the new one."""
-        self._state = self._state.without_tare()
+        """Measure the tare again from the next quiet frames."""
+        self._chain.reset_tare()
 
     def restart(self) -> None:
         """Begin as a new stream does: format, frame numbers, clock, tare and all counters are forgotten."""
         self.parser, self.gaps, self.clock = self._device.parser(), SequenceGaps(), DeviceClock()
-        self._state = ChainState.start(len(self._electrodes))
+        self._chain = self._new_chain()
         self._pending_flags = ()
 
     def feed(self, chunk: Chunk) -> Iterator[TimedReading]:
@@ -195,14 +198,11 @@ class ReadingStream:
         self._pending_flags = ()
         values = self._picker.pick(frame)
         try:
-            self._state, reading = advance(
-                self._chain,
-                self._state,
+            reading = self._chain.advance(
                 values,
                 time_of_reading.clock_s,
                 time_of_reading.step_s,
                 limited=bool(frame.flags & SATURATED_BIT),
-                misfit=self._misfit,
                 flags=flags,
             )
         except TareError as error:

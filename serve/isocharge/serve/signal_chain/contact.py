@@ -48,6 +48,9 @@ class Touch(NamedTuple):
     below: bool = False
 
 
+NO_TOUCH = Touch()
+"""The state before the first touch."""
+
 UNKNOWN_SIGMAS = 2.0
 """Deviations of what is not known of the film's memory by which a press is released earlier."""
 

@@ -1,0 +1,96 @@
+"""The interface of a stage of the signal chain, and the frame that passes the stages."""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from isocharge.common.arrays import Array
+from isocharge.serve.signal_chain.contact import NO_TOUCH, Touch
+from isocharge.serve.signal_chain.tare import Tare
+
+
+@dataclass(slots=True)
+class ChainFrame:
+    """A frame on its way through the stages, which change it in place.
+
+    Attributes:
+        values: Values as they came, in the unit of the device, shape (electrodes,).
+        t_s: Time on the clock of the device, s.
+        dt_s: Time since the frame before, s.
+        is_at_limit: Whether an amplifier is at its limit.
+        was_contact: Whether something touched in the frame before.
+        flags: Words of `isocharge.serve.flags`, in their order.
+        raw_pC: Charges as the device sent them, shape (electrodes,), pC.
+        charge_pC: The same charges after the stages so far, shape (electrodes,), pC.
+        tare: The tare that was subtracted; None while there is none.
+        is_finished: Whether the later stages are left out, because there is no tare yet.
+        charge_scale_std: Relative standard deviation that all charges have in common, because the film's memory is not
+            known exactly.
+        touch: Whether something touches, after the touch stage.
+        base_relax_s: Time constant with which the charge out of contact decays to zero, s.
+        is_base_held: Whether a finger that is leaving the film keeps the charge out of contact from decaying.
+        is_saturated: Whether an amplifier was at its limit at any time in this press.
+    """
+
+    values: Array
+    t_s: float
+    dt_s: float
+    is_at_limit: bool
+    was_contact: bool
+    flags: list[str]
+    raw_pC: Array = field(init=False)
+    charge_pC: Array = field(init=False)
+    tare: Tare | None = None
+    is_finished: bool = False
+    charge_scale_std: float = 0.0
+    touch: Touch = NO_TOUCH
+    base_relax_s: float = math.inf
+    is_base_held: bool = False
+    is_saturated: bool = False
+
+    def __post_init__(self) -> None:
+        self.raw_pC = self.values
+        self.charge_pC = self.values
+
+    @property
+    def noise_pC(self) -> Array:
+        """Standard deviation of each electrode at rest, shape (electrodes,), pC; known once there is a tare."""
+        assert self.tare is not None
+        return self.tare.noise_pC
+
+
+class Stage(ABC):
+    """One stage of the signal chain. Its settings and its state are inside it."""
+
+    @abstractmethod
+    def step(self, frame: ChainFrame) -> None:
+        """Process the next frame in place."""
+
+    def reset(self) -> None:  # noqa: B027  # most stages have no state
+        """Forget everything that depends on the tare, because the film is tared again."""
+
+    def begin_touch(self, frame: ChainFrame) -> None:  # noqa: B027  # most stages do nothing
+        """Adapt to a touch that begins with this frame; the touch stage calls it on the stages before it."""
+
+
+class OffsetStage(Stage):
+    """A stage that holds the charge at rest, from which the touch charge is measured."""
+
+    @abstractmethod
+    def add_warming(self, change: "WarmingChange") -> None:
+        """Count a part of the touch charge as warming of the film."""
+
+
+class WarmingChange(NamedTuple):
+    """A change of the estimated warming.
+
+    Attributes:
+        charge_pC: Part of the touch charge that is warming, shape (electrodes,), pC.
+        rate_pC_per_s: Change of the slope of the warming, shape (electrodes,), pC/s.
+        is_learned: Whether the properties of the film may be learned after this touch.
+    """
+
+    charge_pC: Array | float
+    rate_pC_per_s: Array | float
+    is_learned: bool

@@ -1,0 +1,344 @@
+"""The stages of the signal chain, each with its settings and its state.
+
+The computations are pure functions in a module for each stage (`hum`, `tare`, `leak`, `memory`, `contact`, `thermal`).
+The classes here hold the state between frames and pass on what other stages need.
+"""
+
+import math
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.serve.flags import BLIND, NEGATIVE, SATURATED, TARE, THERMAL
+from isocharge.serve.signal_chain.contact import NO_TOUCH, Touch, TouchRule, update_contact
+from isocharge.serve.signal_chain.hum import Hum, HumRule, remove_hum
+from isocharge.serve.signal_chain.leak import Leak, LeakRule, undo_leak
+from isocharge.serve.signal_chain.memory import Memory, MemoryRule, begin_touch, doubt, undo_memory, warmer
+from isocharge.serve.signal_chain.stage import ChainFrame, OffsetStage, Stage, WarmingChange
+from isocharge.serve.signal_chain.tare import Tare, TareRule, look_for_tare
+from isocharge.serve.signal_chain.thermal import NO_DRIFT, Misfit, ThermalRule, track_thermal_drift
+
+
+class Gain(Stage):
+    """Converts the unit of the device to pC, with offset, sign and gain of each channel."""
+
+    def __init__(self, gain_pC: Array | None, zero: Array | None) -> None:
+        """Set the conversion.
+
+        Args:
+            gain_pC: Charge per unit of the device, with sign, shape (electrodes,), pC; None if the unit is pC.
+            zero: What the device shows without charge, shape (electrodes,), in its unit; None for zeros.
+        """
+        self._gain_pC = gain_pC
+        self._zero = zero
+
+    def convert(self, values: Array) -> Array:
+        """Return values of the device, shape (electrodes,), as charges, pC."""
+        charges = values if self._zero is None else values - self._zero
+        return charges if self._gain_pC is None else charges * self._gain_pC
+
+    def step(self, frame: ChainFrame) -> None:
+        """Set the raw charges of a frame."""
+        frame.raw_pC = self.convert(frame.values)
+        frame.charge_pC = frame.raw_pC
+
+
+class Limit(Stage):
+    """Notices charges at the limit of the converter."""
+
+    def __init__(self, limit_pC: float) -> None:
+        """Set the largest charge that the converter can show, pC."""
+        self._limit_pC = limit_pC
+
+    def step(self, frame: ChainFrame) -> None:
+        """Mark a frame with a charge at the limit."""
+        if bool((np.abs(frame.raw_pC) >= self._limit_pC).any()):
+            frame.is_at_limit = True
+
+
+class HumStage(Stage):
+    """Subtracts mains hum."""
+
+    def __init__(self, rule: HumRule, n_electrode: int) -> None:
+        """Begin without any hum."""
+        self._rule = rule
+        self._hum = Hum.start(n_electrode)
+
+    def step(self, frame: ChainFrame) -> None:
+        """Subtract the hum from a frame, and learn it."""
+        self._hum, frame.charge_pC = remove_hum(self._rule, self._hum, frame.charge_pC, frame.t_s, frame.dt_s)
+
+    def reset(self) -> None:
+        """Keep the hum, but compare the next frame with no earlier one."""
+        self._hum = self._hum._replace(raw_pC=None)
+
+
+class TareStage(OffsetStage):
+    """Measures the charge at rest on quiet frames, and subtracts it from all later frames."""
+
+    def __init__(self, rule: TareRule | None, n_electrode: int) -> None:
+        """Begin without a tare; None as the rule takes zero charges as the tare."""
+        self._rule = rule
+        self._tare: Tare | None = None
+        self._waiting_pC = np.empty((0, n_electrode))
+        self._searched_frames = 0
+        self._gives_up = True
+
+    @property
+    def tare(self) -> Tare | None:
+        """The tare that is subtracted; None while there is none."""
+        return self._tare
+
+    def step(self, frame: ChainFrame) -> None:
+        """Subtract the tare, or use the frame to find one.
+
+        Raises:
+            TareError: If the film is not left alone for long enough.
+        """
+        if self._tare is not None:
+            frame.tare = self._tare
+            frame.charge_pC = frame.charge_pC - self._tare.charge_pC
+            return
+        self._search(frame.charge_pC)
+        frame.is_finished = True
+        frame.flags.append(TARE)
+        if frame.is_at_limit:
+            frame.flags.append(SATURATED)
+
+    def reset(self) -> None:
+        """Measure the tare again from the next quiet frames, however long that takes."""
+        self._tare = None
+        self._waiting_pC = self._waiting_pC[:0]
+        self._searched_frames = 0
+        self._gives_up = False
+
+    def add_warming(self, change: WarmingChange) -> None:
+        """Add the warming to the tare."""
+        assert self._tare is not None
+        self._tare = self._tare._replace(charge_pC=self._tare.charge_pC + change.charge_pC)
+
+    def _search(self, charge_pC: Array) -> None:
+        """Measure the tare on the latest frames if they are enough and quiet; it counts from the next frame on."""
+        if self._rule is None:
+            nothing_pC = np.zeros_like(charge_pC)
+            self._tare = Tare(nothing_pC, nothing_pC, 0)
+            return
+        self._waiting_pC = np.vstack([self._waiting_pC, charge_pC])[-self._rule.frames :]
+        if self._gives_up:
+            self._searched_frames += 1
+        self._tare = look_for_tare(self._rule, self._waiting_pC, self._searched_frames)
+        if self._tare is not None:
+            self._waiting_pC = self._waiting_pC[:0]
+
+
+class LeakStage(OffsetStage):
+    """Undoes the decay of the charge amplifiers, and learns their offset current."""
+
+    def __init__(self, rule: LeakRule, tau_s: Array) -> None:
+        """Set the time constant of each amplifier, shape (electrodes,), s."""
+        self._rule = rule
+        self._tau_s = tau_s
+        self._leak: Leak | None = None
+
+    def step(self, frame: ChainFrame) -> None:
+        """Replace the output of the amplifiers by the touch charge."""
+        output_pC = frame.charge_pC
+        if self._leak is None:
+            self._leak = Leak.start(output_pC)
+        else:
+            self._leak = undo_leak(
+                self._rule,
+                self._tau_s,
+                self._leak,
+                output_pC,
+                frame.noise_pC,
+                frame.dt_s,
+                contact=frame.was_contact,
+            )
+        frame.charge_pC = self._leak.charge_pC
+        frame.base_relax_s = self._rule.relax_s
+
+    def reset(self) -> None:
+        """Begin again at the first frame after the tare."""
+        self._leak = None
+
+    def add_warming(self, change: WarmingChange) -> None:
+        """Take the warming off the touch charge that the stage integrates."""
+        assert self._leak is not None
+        self._leak = self._leak._replace(charge_pC=self._leak.charge_pC - change.charge_pC)
+
+
+class MemoryStage(OffsetStage):
+    """Undoes creep, the thermoelastic step and the decay of the amplifiers together."""
+
+    def __init__(self, rule: MemoryRule, leak_rule: LeakRule, tau_s: Array | None) -> None:
+        """Set the properties of the film and of the amplifiers.
+
+        Args:
+            rule: Memory of the film.
+            leak_rule: How the offset of the amplifiers is learned.
+            tau_s: Time constant of each amplifier, shape (electrodes,), s; None if charges do not leak.
+        """
+        self._rule = rule
+        self._leak_rule = leak_rule
+        self._tau_s = tau_s
+        self._memory: Memory | None = None
+
+    def step(self, frame: ChainFrame) -> None:
+        """Replace the output of the amplifiers by the touch charge."""
+        output_pC = frame.charge_pC
+        before = self._memory
+        if before is None:
+            self._memory = Memory.start(self._rule, output_pC)
+        else:
+            frame.is_base_held = before.lingers
+            self._memory = undo_memory(
+                self._rule,
+                self._leak_rule,
+                self._tau_s,
+                before,
+                output_pC,
+                frame.noise_pC,
+                frame.dt_s,
+                contact=frame.was_contact,
+            )
+        frame.base_relax_s = 0.5 * self._rule.settle_s
+        self._report(frame)
+
+    def begin_touch(self, frame: ChainFrame) -> None:
+        """Predict the warmth of the touch from before it."""
+        assert self._memory is not None
+        self._memory = begin_touch(self._rule, self._memory)
+        self._report(frame)
+
+    def reset(self) -> None:
+        """Begin again at the first frame after the tare."""
+        self._memory = None
+
+    def add_warming(self, change: WarmingChange) -> None:
+        """Add the warming to the predicted warmth."""
+        assert self._memory is not None
+        self._memory = warmer(self._memory, change.charge_pC, change.rate_pC_per_s, learns=change.is_learned)
+
+    def _report(self, frame: ChainFrame) -> None:
+        """Write the touch charge and its common standard deviation into a frame."""
+        assert self._memory is not None
+        frame.charge_pC = self._memory.leak.charge_pC
+        frame.charge_scale_std = doubt(self._memory)
+
+
+class TouchStage(Stage):
+    """Determines whether something touches."""
+
+    def __init__(self, rule: TouchRule | None, earlier_stages: list[Stage]) -> None:
+        """Begin without a touch.
+
+        Args:
+            rule: The thresholds; None if every frame with a tare is in contact.
+            earlier_stages: Stages that are notified when a touch begins.
+        """
+        self._rule = rule
+        self._earlier_stages = earlier_stages
+        self._touch = NO_TOUCH
+
+    @property
+    def is_contact(self) -> bool:
+        """Whether something touched in the latest frame."""
+        return self._touch.contact
+
+    def step(self, frame: ChainFrame) -> None:
+        """Write the touch into a frame, and notify the earlier stages if it begins."""
+        before = self._touch
+        self._touch = self._next(before, frame)
+        frame.touch = self._touch
+        if self._touch.contact and not before.contact:
+            for stage in self._earlier_stages:
+                stage.begin_touch(frame)
+
+    def reset(self) -> None:
+        """Forget the touch."""
+        self._touch = NO_TOUCH
+
+    def _next(self, before: Touch, frame: ChainFrame) -> Touch:
+        if self._rule is None:
+            return Touch(contact=True)
+        relax_s = math.inf if frame.is_base_held and before.base_pC > 0.0 else frame.base_relax_s
+        decay = math.exp(-frame.dt_s / relax_s)
+        total_pC = float(frame.charge_pC.sum())
+        return update_contact(self._rule, before, total_pC, frame.noise_pC, decay, frame.charge_scale_std)
+
+
+class PressFlags(Stage):
+    """Flags a press in which an amplifier was at its limit, and charges that are well below zero."""
+
+    def __init__(self) -> None:
+        """Begin without a press."""
+        self._is_saturated = False
+
+    def step(self, frame: ChainFrame) -> None:
+        """Add the flags to a frame."""
+        self._is_saturated = frame.is_at_limit or (self._is_saturated and frame.touch.contact)
+        frame.is_saturated = self._is_saturated
+        if frame.is_saturated:
+            frame.flags.append(SATURATED)
+        if frame.touch.below:
+            frame.flags.append(NEGATIVE)
+
+    def reset(self) -> None:
+        """Forget the press."""
+        self._is_saturated = False
+
+
+class Warming(Stage):
+    """Estimates the common charge of a warming film with the model, and subtracts it."""
+
+    def __init__(
+        self,
+        rule: ThermalRule,
+        misfit: Misfit,
+        offset_stage: OffsetStage,
+        *,
+        ratios: Array | float = 1.0,
+        warmth_s: float | None = None,
+    ) -> None:
+        """Begin without any warming.
+
+        Args:
+            rule: How warming is estimated.
+            misfit: Misfit of the model that currently answers.
+            offset_stage: Stage that holds the charge at rest, to which the warming is added.
+            ratios: Charge of each electrode over the mean magnitude of all, shape (electrodes,), dimensionless.
+            warmth_s: Time constant with which the film follows the air, s; None if it is not known.
+        """
+        self._rule = rule
+        self._misfit = misfit
+        self._offset_stage = offset_stage
+        self._ratios = ratios
+        self._warmth_s = warmth_s
+        self._drift = NO_DRIFT
+
+    def step(self, frame: ChainFrame) -> None:
+        """Subtract the warming from a frame in contact, and flag it."""
+        if not frame.touch.contact:
+            self._drift = NO_DRIFT
+            return
+        if frame.is_saturated:  # a clipped charge fits no contact, whatever the temperature
+            return
+        before = self._drift
+        self._drift = track_thermal_drift(
+            self._rule, before, frame.charge_pC, self._misfit, frame.dt_s, self._ratios, self._warmth_s
+        )
+        is_large = abs(self._drift.charge_pC) >= self._rule.tell_pC
+        if self._drift.charge_pC != before.charge_pC:
+            change_pC = (self._drift.charge_pC - before.charge_pC) * self._ratios
+            frame.charge_pC = frame.charge_pC - change_pC
+            rate_pC_per_s = self._drift.rate_pC_per_s * self._ratios
+            self._offset_stage.add_warming(WarmingChange(change_pC, rate_pC_per_s, is_learned=not is_large))
+        if is_large:
+            frame.flags.append(THERMAL)
+        if self._drift.blind:
+            frame.flags.append(BLIND)
+
+    def reset(self) -> None:
+        """Forget the warming."""
+        self._drift = NO_DRIFT
