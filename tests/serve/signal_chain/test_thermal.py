@@ -112,7 +112,7 @@ def test_reading_is_corrected_in_the_frame_of_the_estimate():
 def test_correction_goes_into_the_leak_if_there_is_one():
     chain = in_contact(tau_s=np.full(4, 1e9))
     reading = step(chain, 15.0)
-    np.testing.assert_allclose(reading.charge_pC, PRESS + 15.0 - warming_of(chain), atol=1e-3)
+    np.testing.assert_allclose(reading.charge_pC, PRESS + 15.0 - warming_of(chain), atol=0.01)
     np.testing.assert_allclose(reading.tare.charge_pC, TARE_PC)
     assert warming_of(chain) == pytest.approx(15.0, abs=3.0)
 
