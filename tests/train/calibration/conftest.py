@@ -17,7 +17,7 @@ def coarse():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contact_error, "CONTACTS", 50)
         patch.setattr(contact_error, "PLACES", 30)
-        patch.setattr(correlation, "EXAMPLES", 3_000)
+        patch.setattr(correlation, "N_EXAMPLES", 3_000)
         yield
 
 

@@ -131,7 +131,7 @@ def solved(films, monkeypatch):
     monkeypatch.setattr(films_fit.FilmModes, "build", lambda *_: films.family.imperfections)
     monkeypatch.setattr(films_release, "FILMS", 4)
     monkeypatch.setattr(films_data, "CANDIDATES", 64)
-    monkeypatch.setattr(correlation, "EXAMPLES", 1_000)
+    monkeypatch.setattr(correlation, "N_EXAMPLES", 1_000)
 
 
 @pytest.mark.usefixtures("solved")
