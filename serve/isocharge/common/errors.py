@@ -166,7 +166,7 @@ class MissingExtra(IsochargeError, ImportError):
 
 
 @contextmanager
-def told_where(where: str, kind: type[IsochargeError]) -> Iterator[None]:
+def error_prefix(where: str, kind: type[IsochargeError]) -> Iterator[None]:
     """Put `where` before the messages of the errors of a kind that the block raises."""
     try:
         yield

@@ -9,7 +9,7 @@ from msgspec import structs
 from tests.train.random_networks import random_network
 
 from isocharge.serve import find_model, load_model, write_model
-from isocharge.serve.model.session import outputs_of
+from isocharge.serve.model.session import output_widths
 from isocharge.simulate import load_sensor, noise_model
 from isocharge.train.data.presses import draw_contacts
 from isocharge.train.model_release.onnx_graph import write_graph
@@ -24,7 +24,7 @@ MODELS = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial-films",
 def answers(model, charge_pC):
     """What onnxruntime answers, one press at a time as a host program asks, shape (n, 10 or 7)."""
     session = load_model(find_model(model)).session
-    names = sorted(outputs_of(session), key="contact_correlation".__eq__)
+    names = sorted(output_widths(session), key="contact_correlation".__eq__)
     return np.array([np.concatenate(session.run(names, {"charge_pC": row[None]}), axis=1)[0] for row in charge_pC])
 
 

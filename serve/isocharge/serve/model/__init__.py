@@ -1,4 +1,4 @@
-"""The model folder: metadata, ONNX session, golden vectors, Triton's configuration, look-up by name.
+"""Model folders: metadata, ONNX session, golden vectors, companion files, Triton configuration, and search by name.
 
 May import: nothing else of isocharge.serve.
 """

@@ -1,15 +1,16 @@
-"""The charges of every contact as a short series, and the file `charges.npz` that holds it beside a model.
+"""Charges of a film as a Chebyshev series in position and force, and the file `charges.npz` that stores the series.
 
-A model answers where charges say which contact it is. Where the map from contacts to charges folds they do not, and the
-contact is followed through the charges themselves:
+A network maps charges to a contact. Where several contacts give the same charges (a fold of the forward map), that
+mapping is not unique, and the tracker compares the measured charges with this series instead:
 
     ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
 
-with r the radius up to which contacts are known, and l the logarithm of the force, scaled to [-1, 1].
+where T_i are Chebyshev polynomials, r is the largest distance of a contact from the centre, and l is the logarithm of
+the force, scaled to [-1, 1]. The file lies beside `model.onnx` and holds three arrays:
 
     series      c, shape (degree + 1, degree + 1, force_degree + 1, n_electrode)
     radius_mm   r
-    force_N     the smallest and the largest force
+    force_N     smallest and largest force
 """
 
 import io
@@ -30,74 +31,113 @@ FILE = "charges.npz"
 """Name of the file in a version folder."""
 
 ADVICE = "copy the model's folder again, or train again"
+"""What the user can do about a damaged file, for error messages."""
 
 MAX_DEGREE = 100
-"""Largest degree of the series; the series of this project have at most 30."""
+"""Largest degree of a series in a file; `isocharge train` writes degrees up to 30."""
 
 MAX_RADIUS_mm = 1e4
-"""Largest radius, mm."""
+"""Largest radius in a file, mm."""
 
 MIN_FORCE_RATIO = 1.01
-"""Smallest ratio of the largest to the smallest force: with equal forces the scaled logarithm is not defined."""
+"""Smallest ratio of the largest force to the smallest force. If both are equal, the scaled logarithm is undefined."""
 
-CHUNK = 4096
-"""Contacts whose terms are held at once."""
+CHUNK_SIZE = 4096
+"""Number of contacts that are evaluated at a time, which limits the memory."""
+
+N_CORNERS = 64
+"""Number of corners of the polygon that encloses the area of a series."""
+
+N_CHECKED_DIRECTIONS = 8
+"""Number of directions in which the charges of a file are checked."""
+
+N_CHECKED_FORCES = 5
+"""Number of forces at which the charges of a file are checked."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """Products of Chebyshev polynomials in three coordinates from -1 to 1.
+    """A sum of products of Chebyshev polynomials in three coordinates, each from -1 to 1.
 
     Attributes:
-        coefficients: Shape (degree + 1, degree + 1, force_degree + 1, n_electrode).
+        coefficients: Shape (degree + 1, degree + 1, force_degree + 1, n_electrode). The first three axes are the
+            degrees of the polynomials in x, in y and in the logarithm of the force.
     """
 
     coefficients: Array
 
     def values(self, unit: Array) -> Array:
-        """The sums and their derivatives by the coordinates: places (n, 3) to (n, 4, n_electrode)."""
-        degree, _, orders, n_electrode = (size - 1 for size in self.coefficients.shape)
-        parts = []
-        for some in np.array_split(unit, len(unit) // CHUNK + 1):
-            plane, in_force = terms(some, degree, orders)
-            by_force = (plane @ self._rows).reshape(len(some), in_force.shape[1], -1)
-            parts.append((in_force[:, None, :] @ by_force)[:, 0])
-        return np.concatenate(parts).reshape(len(unit), 4, n_electrode + 1)
+        """Evaluate the series and its derivatives with respect to the three coordinates.
+
+        Args:
+            unit: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.
+
+        Returns:
+            Shape (n, 4, n_electrode): the value, then the three derivatives.
+        """
+        _, n_y, n_force, n_electrode = self.coefficients.shape
+        chunks = []
+        for points in np.array_split(unit, len(unit) // CHUNK_SIZE + 1):
+            position_terms, force_terms = chebyshev_terms(points, degree=n_y - 1, force_degree=n_force - 1)
+            force_coefficients = (position_terms @ self._rows).reshape(len(points), n_force, -1)
+            chunks.append((force_terms[:, None, :] @ force_coefficients)[:, 0])
+        return np.concatenate(chunks).reshape(len(unit), 4, n_electrode)
 
     @cached_property
     def _rows(self) -> Array:
-        """The series and its derivatives by term of the plane, shape (n_term, (force_degree + 1) 4 n_electrode)."""
-        all_four = np.stack([self.coefficients, *(_derivative(self.coefficients, axis) for axis in range(3))])
-        of_terms = all_four[:, *plane_terms(self.coefficients.shape[0] - 1)]
-        return np.asarray(of_terms.transpose(1, 2, 0, 3).reshape(of_terms.shape[1], -1))
+        """The coefficients of the series and of its derivatives, one row for each product of polynomials in x and y.
+
+        The shape is (n_term, (force_degree + 1) * 4 * n_electrode).
+        """
+        derivatives = [_derivative(self.coefficients, axis) for axis in range(3)]
+        stacked = np.stack([self.coefficients, *derivatives])
+        x_degree, y_degree = position_degrees(self.coefficients.shape[0] - 1)
+        rows = stacked[:, x_degree, y_degree].transpose(1, 2, 0, 3)
+        return np.asarray(rows.reshape(len(x_degree), -1))
 
 
-def plane_terms(degree: int) -> tuple[Integers, Integers]:
-    """Degrees in x and y of the terms."""
-    of_x, of_y = np.nonzero(np.add.outer(np.arange(degree + 1), np.arange(degree + 1)) <= degree)
-    return of_x, of_y
+def position_degrees(degree: int) -> tuple[Integers, Integers]:
+    """Return the degrees in x and in y of all terms whose total degree is at most `degree`, each of shape (n_term,)."""
+    single = np.arange(degree + 1)
+    total = np.add.outer(single, single)
+    x_degree, y_degree = np.nonzero(total <= degree)
+    return x_degree, y_degree
 
 
-def terms(unit: Array, degree: int, force_degree: int) -> tuple[Array, Array]:
-    """Products of the polynomials in x and y, (n, n_term), and the polynomials in the force, (n, force_degree + 1)."""
+def chebyshev_terms(unit: Array, degree: int, force_degree: int) -> tuple[Array, Array]:
+    """Evaluate the polynomials of which a series consists.
+
+    Args:
+        unit: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.
+        degree: Largest total degree in x and y.
+        force_degree: Largest degree in the logarithm of the force.
+
+    Returns:
+        The products of the polynomials in x and y, shape (n, n_term), in the order of `position_degrees`, and the
+        polynomials in the logarithm of the force, shape (n, force_degree + 1).
+    """
     inside = np.clip(unit, -1.0, 1.0)
-    in_x, in_y = (chebyshev.chebvander(inside[:, axis], degree).astype(float) for axis in range(2))
-    of_x, of_y = plane_terms(degree)
-    return in_x[:, of_x] * in_y[:, of_y], chebyshev.chebvander(inside[:, 2], force_degree).astype(float)
+    x_polynomials = chebyshev.chebvander(inside[:, 0], degree).astype(float)
+    y_polynomials = chebyshev.chebvander(inside[:, 1], degree).astype(float)
+    force_polynomials = chebyshev.chebvander(inside[:, 2], force_degree).astype(float)
+    x_degree, y_degree = position_degrees(degree)
+    return x_polynomials[:, x_degree] * y_polynomials[:, y_degree], force_polynomials
 
 
-def _derivative(series: Array, axis: int) -> Array:
-    """Series of the derivative by one unit coordinate, padded to the same shape."""
-    return np.pad(chebyshev.chebder(series, axis=axis), [(0, int(k == axis)) for k in range(4)])
+def _derivative(coefficients: Array, axis: int) -> Array:
+    """Return the coefficients of the derivative with respect to one coordinate, padded with zeros to the same shape."""
+    padding = [(0, 0)] * coefficients.ndim
+    padding[axis] = (0, 1)
+    return np.pad(chebyshev.chebder(coefficients, axis=axis), padding)
 
 
 @dataclass(frozen=True)
 class ChargeSeries:
-    """The charges of contacts (x, y, ln F) up to a radius.
+    """The charges of all contacts up to a distance from the centre.
 
     Attributes:
-        series: Of ln Q, Q in pC.
-        radius_mm: Largest distance from the centre, mm.
+        series: Series of ln Q, where Q is the charge in pC.
+        radius_mm: Largest distance of a contact from the centre, mm.
         force_N: Smallest and largest force, N.
     """
 
@@ -107,26 +147,40 @@ class ChargeSeries:
 
     @property
     def corners_mm(self) -> Array:
-        """Corners of a polygon about the area, shape (64, 2), mm."""
-        angle = 2.0 * np.pi * np.arange(64) / 64
-        reach_mm = self.radius_mm / np.cos(np.pi / 64)
-        return np.asarray(reach_mm * np.column_stack([np.cos(angle), np.sin(angle)]))
+        """Corners of a regular polygon that encloses the circle of `radius_mm`, shape (64, 2), mm."""
+        angle = 2.0 * np.pi * np.arange(N_CORNERS) / N_CORNERS
+        corner_distance_mm = self.radius_mm / np.cos(np.pi / N_CORNERS)
+        return np.asarray(corner_distance_mm * np.column_stack([np.cos(angle), np.sin(angle)]))
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Charges, pC, and their derivatives by x and y, mm, and ln F: (n, 3) to (n, e) and (n, e, 3).
+        """Compute the charges of contacts and their derivatives.
 
-        Beyond the forces, ln Q goes on as a straight line.
+        Outside the range of forces, ln Q is extrapolated linearly in ln F.
+
+        Args:
+            contact: Contacts (x, y, ln F), shape (n, 3), with x and y in mm and F in N.
+
+        Returns:
+            The charges, shape (n, n_electrode), pC, and their derivatives with respect to x, y (pC/mm) and ln F (pC),
+            shape (n, n_electrode, 3).
         """
-        low, high = np.log(self.force_N)
-        scale = np.array([self.radius_mm, self.radius_mm, 0.5 * (high - low)])
-        unit = (contact - [0.0, 0.0, 0.5 * (low + high)]) / scale
+        log_low, log_high = np.log(self.force_N)
+        centre = np.array([0.0, 0.0, 0.5 * (log_low + log_high)])
+        scale = np.array([self.radius_mm, self.radius_mm, 0.5 * (log_high - log_low)])
+        unit = (contact - centre) / scale
         values = self.series.values(unit)
-        beyond = unit[:, 2:] - np.clip(unit[:, 2:], -1.0, 1.0)
-        charge = np.exp(values[:, 0] + beyond * values[:, 3])
-        return charge, charge[:, :, None] * values[:, 1:].swapaxes(1, 2) / scale
+        log_charge = values[:, 0]
+        log_slopes = values[:, 1:]
+        log_force_slope = values[:, 3]
+
+        unit_force = unit[:, 2:]
+        excess = unit_force - np.clip(unit_force, -1.0, 1.0)
+        charge = np.exp(log_charge + excess * log_force_slope)
+        slopes = charge[:, :, None] * log_slopes.swapaxes(1, 2) / scale
+        return charge, slopes
 
     def to_bytes(self) -> bytes:
-        """The file."""
+        """Return the content of the file `charges.npz`."""
         file = io.BytesIO()
         np.savez_compressed(
             file, series=self.series.coefficients, radius_mm=np.array(self.radius_mm), force_N=np.array(self.force_N)
@@ -155,7 +209,7 @@ def read_charges(version_folder: Path, n_electrode: int) -> ChargeSeries | None:
 
 
 def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> ChargeSeries:
-    """Return the series that the arrays of a file describe; raise ValueError if they describe none."""
+    """Return the series that the arrays of a file describe; raise ValueError if the arrays describe no valid series."""
     coefficients = finite_array(arrays, "series", (None, None, None, n_electrode))
     degree, y_degree, force_degree, _ = (length - 1 for length in coefficients.shape)
     if degree != y_degree or not (1 <= degree <= MAX_DEGREE and 1 <= force_degree <= MAX_DEGREE):
@@ -178,9 +232,9 @@ def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Charge
 
 
 def _check_charges(charges: ChargeSeries) -> None:
-    """Refuse a series whose charges overflow, or do not change with the position or with the force."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
-    log_forces = np.log(np.geomspace(*charges.force_N, 5))
+    """Raise ValueError if the charges of a series overflow, or do not depend on the position or on the force."""
+    angle = np.linspace(0.0, 2.0 * np.pi, N_CHECKED_DIRECTIONS, endpoint=False)
+    log_forces = np.log(np.geomspace(*charges.force_N, N_CHECKED_FORCES))
     circle = 0.5 * charges.radius_mm * np.column_stack([np.cos(angle), np.sin(angle)])
     contacts = np.array([[x_mm, y_mm, log_force] for x_mm, y_mm in circle for log_force in log_forces])
     with np.errstate(over="ignore", invalid="ignore"):

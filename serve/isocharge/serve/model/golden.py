@@ -1,7 +1,7 @@
-"""Golden vectors: charges, and a model's answers to them at the time of export.
+"""Golden vectors of a model: input charges and the outputs that the model computed at the time of export.
 
-They show whether a file is still the one that was released (checksum), and whether another machine or runtime computes
-the same answers: |a - b| <= 1e-5 max(|b|, floor).
+The checksum shows whether `model.onnx` is still the released file. The outputs show whether another machine or another
+version of onnxruntime computes the same results: |a - b| <= 1e-5 max(|b|, floor).
 """
 
 import json
@@ -22,28 +22,39 @@ from isocharge.common.structs import Finite, NotNegative, Text, WrongKey, read_j
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS, run
 
-RELATIVE = 1e-5
-"""Largest difference of two answers, relative to max(|answer|, floor), dimensionless."""
+RELATIVE_TOLERANCE = 1e-5
+"""Largest difference of two outputs, relative to max(|output|, floor), dimensionless."""
 
 FLOORS = {
     "contact": (1.0, 1.0, 0.1),  # mm, mm, N
     "contact_std": (1.0, 1.0, 0.1),
-    CORRELATION: (10.0, 10.0, 10.0),  # the cosine of a sum whose terms nearly cancel: 1e-4 between runtimes
-    # The sinh of a norm whose terms cancel near zero: float32 agrees between runtimes to 1e-4.
+    # A correlation is the cosine of a sum whose terms nearly cancel: runtimes differ by 1e-4.
+    CORRELATION: (10.0, 10.0, 10.0),
+    # The misfit is the sinh of a norm whose terms cancel near zero: runtimes differ by 1e-4 in float32.
     "misfit": (20.0,),
 }
-"""Floor for each column of an output, in the unit of the column."""
+"""Floor for each column of an output, in the unit of the column. Below it, differences are compared absolutely."""
 
-USUAL_REACH_MM, USUAL_FORCE_N = 20.0, 2.0
-"""Reach of a working area and largest force up to which these floors hold; beyond, they grow in proportion."""
+REFERENCE_RADIUS_MM = 20.0
+"""Radius of the working area up to which the floors of x and y hold, mm. For a larger area they grow in proportion."""
+
+REFERENCE_FORCE_N = 2.0
+"""Largest force up to which the floor of the force holds, N. For larger forces it grows in proportion."""
 
 
 def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
-    """Floors of x and y, mm, and force, N: larger for a wide area, large forces, and where millimetres are noise."""
-    x_mm, y_mm, force_N = FLOORS["contact"]
-    reach_mm = max(math.hypot(x, y) for x, y in metadata.working_area_mm)
-    length = max(1.0, reach_mm / USUAL_REACH_MM, metadata.errors.get("position_rms_mm", 0.0) / x_mm)
-    return x_mm * length, y_mm * length, force_N * max(1.0, metadata.force_range_N[1] / USUAL_FORCE_N)
+    """Return the floors of x and y, mm, and of the force, N, for the outputs `contact` and `contact_std` of a model.
+
+    The floors of the position grow with the working area and with the position error of the model, the floor of the
+    force grows with the largest force.
+    """
+    x_floor_mm, y_floor_mm, force_floor_N = FLOORS["contact"]
+    radius_mm = max(math.hypot(x_mm, y_mm) for x_mm, y_mm in metadata.working_area_mm)
+    position_rms_mm = metadata.errors.get("position_rms_mm", 0.0)
+    _, max_force_N = metadata.force_range_N
+    position_factor = max(1.0, radius_mm / REFERENCE_RADIUS_MM, position_rms_mm / x_floor_mm)
+    force_factor = max(1.0, max_force_N / REFERENCE_FORCE_N)
+    return x_floor_mm * position_factor, y_floor_mm * position_factor, force_floor_N * force_factor
 
 
 @dataclass(frozen=True)
@@ -52,10 +63,10 @@ class Golden:
 
     Attributes:
         sha256: Checksum of the model file.
-        charge_pC: Inputs, shape (n, electrodes), pC.
-        outputs: Answers by output name, shape (n, width).
-        relative: Tolerance relative to max(|answer|, floor).
-        floors: The floor for each column, by output name.
+        charge_pC: Input charges, shape (n, electrodes), pC.
+        outputs: Outputs of the model by name, each of shape (n, width).
+        relative: Tolerance relative to max(|output|, floor).
+        floors: Floor for each column of an output, by output name.
         companion_sha256: Checksums of the files that lie beside the model, by file name. None for a model that was
             written before these files had checksums.
     """
@@ -68,7 +79,7 @@ class Golden:
     companion_sha256: Mapping[str, str] | None = None
 
     def to_json(self) -> str:
-        """The text of `golden.json`."""
+        """Return the text of `golden.json`."""
         content: dict[str, Any] = {
             "sha256": self.sha256,
             "tolerance": {
@@ -85,77 +96,102 @@ class Golden:
 
 
 def make_golden(
-    session: ort.InferenceSession, onnx_model: bytes, charge_pC: Singles, contact: tuple[float, float, float]
+    session: ort.InferenceSession, onnx_model: bytes, charge_pC: Singles, contact_floor: tuple[float, float, float]
 ) -> Golden:
-    """Run charges of shape (n, electrodes), pC, through a model and keep its answers; `contact` are `contact_floors`.
+    """Compute the golden vectors of a new model.
+
+    Args:
+        session: Session of the model.
+        onnx_model: Content of `model.onnx`, of which the checksum is computed.
+        charge_pC: Input charges, shape (n, electrodes), pC.
+        contact_floor: Floors of x and y, mm, and of the force, N, as `contact_floors` returns them.
 
     Raises:
-        ModelError: If an answer is not finite.
+        ModelError: If an output is not finite.
     """
     outputs = run(session, charge_pC)
     for name, rows in outputs.items():
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-        if bad.size:
-            raise ModelError(f"the new model answers {name} = {rows[bad[0]]} to the charges {charge_pC[bad[0]]} pC")
-    floors = FLOORS | {"contact": contact, "contact_std": contact}
-    return Golden(sha256_of(onnx_model), charge_pC, outputs, RELATIVE, {name: floors[name] for name in outputs})
+        bad_rows = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        if bad_rows.size:
+            row = bad_rows[0]
+            raise ModelError(
+                f"the new model: {name}: expected finite outputs, got {rows[row]} for the charges {charge_pC[row]} pC"
+            )
+    floors = FLOORS | {"contact": contact_floor, "contact_std": contact_floor}
+    return Golden(
+        sha256=sha256_of(onnx_model),
+        charge_pC=charge_pC,
+        outputs=outputs,
+        relative=RELATIVE_TOLERANCE,
+        floors={name: floors[name] for name in outputs},
+    )
 
 
 def read_golden(path: Path) -> Golden:
-    """Read `golden.json`.
+    """Read the golden vectors of a model from its file `golden.json`.
 
     Raises:
-        ModelError: If it is missing or damaged.
+        ModelError: If the file is missing or damaged.
     """
     if not path.exists():
-        raise ModelError(f"{path}: missing; a model comes with its golden.json: copy the whole folder")
+        raise ModelError(f"{path}: missing; every model has this file: copy the whole folder of the model again")
     try:
         file = read_json(path, "golden vectors", ModelError, _File)
     except ModelError as error:
         raise ModelError(f"{error}; the file is damaged: copy or export the model again") from error
-    given = [name for name in OUTPUTS if getattr(file.outputs, name) is not None]
+    names = [name for name in OUTPUTS if getattr(file.outputs, name) is not None]
     return Golden(
         sha256=file.sha256,
-        charge_pC=_singles(file.inputs.charge_pC),
-        outputs={name: _singles(getattr(file.outputs, name)) for name in given},
+        charge_pC=_float32_array(file.inputs.charge_pC),
+        outputs={name: _float32_array(getattr(file.outputs, name)) for name in names},
         relative=file.tolerance.relative,
-        floors={name: getattr(file.tolerance.floor, name) for name in given},
+        floors={name: getattr(file.tolerance.floor, name) for name in names},
         companion_sha256=file.files,
     )
 
 
-Three = tuple[Finite, Finite, Finite]
+Triple = tuple[Finite, Finite, Finite]
+"""Three finite numbers, one for each column of an output."""
 
 
 class _Inputs(Struct):
+    """The object `inputs` of `golden.json`."""
+
     charge_pC: Annotated[list[list[Finite]], Meta(min_length=1)]
 
     def __post_init__(self) -> None:
-        if len(set(map(len, self.charge_pC))) > 1:
+        lengths = {len(row) for row in self.charge_pC}
+        if len(lengths) > 1:
             raise WrongKey(INPUT, "rows of one length", self.charge_pC)
 
 
 class _Outputs(Struct):
-    contact: list[Three]
-    contact_std: list[Three]
+    """The object `outputs` of `golden.json`."""
+
+    contact: list[Triple]
+    contact_std: list[Triple]
     misfit: list[tuple[Finite]]
-    contact_correlation: list[Three] | None = None
+    contact_correlation: list[Triple] | None = None
 
 
 class _Floors(Struct):
-    contact: Three
-    contact_std: Three
+    """The object `tolerance.floor` of `golden.json`."""
+
+    contact: Triple
+    contact_std: Triple
     misfit: tuple[Finite]
-    contact_correlation: Three = (10.0, 10.0, 10.0)
+    contact_correlation: Triple = (10.0, 10.0, 10.0)
 
 
 class _Tolerance(Struct):
+    """The object `tolerance` of `golden.json`."""
+
     relative: NotNegative
     floor: _Floors
 
 
 class _File(Struct):
-    """The content of `golden.json`; that there is an answer to each press is checked with the model."""
+    """The content of `golden.json`. Whether it has one output row for each press is checked when the model is read."""
 
     sha256: Text
     inputs: _Inputs
@@ -164,32 +200,39 @@ class _File(Struct):
     files: dict[Text, Text] | None = None
 
 
-def _singles(rows: Sequence[Sequence[float]]) -> Singles:
-    """An array of shape (n, width); what float32 cannot hold is infinite, and equals no answer."""
+def _float32_array(rows: Sequence[Sequence[float]]) -> Singles:
+    """Return rows of numbers as a float32 array of shape (n, width).
+
+    Numbers that are too large for float32 become infinite, so that they differ from every output of a model.
+    """
+    if not rows:
+        return np.zeros((0, 0), dtype=np.float32)
     with np.errstate(over="ignore"):
-        return np.array(rows, dtype=np.float64).reshape(len(rows), -1 if rows else 0).astype(np.float32)
+        return np.array(rows, dtype=np.float64).astype(np.float32)
 
 
-def check_answers(golden: Golden, answers: dict[str, Singles], where: str) -> None:
-    """Compare a model's answers to the golden charges with the golden ones.
+def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> None:
+    """Compare outputs that a model computed from the golden charges with the stored outputs.
 
     Args:
         golden: Golden vectors.
-        answers: By output name, shape (n, width).
-        where: The model, for messages.
+        outputs: Computed outputs by name, each of shape (n, width).
+        where: Name or file of the model, for error messages.
 
     Raises:
-        ModelError: If an answer differs by more than the tolerance; the worst one is named.
+        ModelError: If an output differs by more than the tolerance. The message names the largest difference.
     """
     for name, expected in golden.outputs.items():
-        got = answers[name].astype(np.float64)
-        allowed = golden.relative * np.maximum(np.abs(expected), golden.floors[name])
-        with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 where nothing is allowed: no agreement
-            excess = np.abs(got - expected) / allowed
-        if not (excess <= 1.0).all():
-            worst = np.argmax(np.where(np.isnan(excess), np.inf, excess))
-            row, column = np.unravel_index(worst, excess.shape)
-            raise ModelError(
-                f"{where}: {name}[{row}, {column}] is {got[row, column]:.9g}, golden.json says "
-                f"{expected[row, column]:.9g} +- {allowed[row, column]:.1g}; copy or export the model again"
-            )
+        actual = outputs[name].astype(np.float64)
+        tolerance = golden.relative * np.maximum(np.abs(expected), golden.floors[name])
+        with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 with a tolerance of 0 is reported as a difference
+            excess = np.abs(actual - expected) / tolerance
+        if (excess <= 1.0).all():
+            continue
+
+        comparable_excess = np.where(np.isnan(excess), np.inf, excess)
+        row, column = np.unravel_index(np.argmax(comparable_excess), excess.shape)
+        raise ModelError(
+            f"{where}: {name}[{row}, {column}]: expected {expected[row, column]:.9g} +- {tolerance[row, column]:.1g} "
+            f"(golden.json), got {actual[row, column]:.9g}; copy or export the model again"
+        )

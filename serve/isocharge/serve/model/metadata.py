@@ -1,8 +1,8 @@
-"""The metadata of a model: the `metadata_props` of its ONNX graph, one JSON value per key.
+"""Metadata of a model, stored in the `metadata_props` of its ONNX graph as one JSON value per key.
 
-From `model.onnx` alone one can read for which sensor the model was trained, in which order it takes the charges, where
-it may be trusted and how large its errors are. The sensor is stored whole but only its name is read here: the frame
-that x and y refer to.
+The metadata describe the sensor for which the model was trained, the order of its charges, the domain in which it is
+valid, and its measured errors. The complete description of the sensor is stored, but this module reads only its name,
+which is the frame to which x and y refer.
 """
 
 import json
@@ -19,8 +19,7 @@ from isocharge.common.printable_text import is_printable
 from isocharge.common.structs import Finite, NotNegative, Positive, Settings, Text, WrongKey, convert, parse_json
 
 FORMAT_VERSION = 1
-"""Version of the metadata."""
-
+"""Version of the format of the metadata."""
 
 Names = Annotated[tuple[Text, ...], Meta(min_length=1)]
 
@@ -28,7 +27,7 @@ NoiseLevel = Annotated[
     NotNegative | tuple[NotNegative, ...],
     Meta(extra_json_schema={"description": "a number from 0, or a list with one for each electrode"}),
 ]
-"""Standard deviation of the noise of all electrodes, or of each."""
+"""Noise level as one number for all electrodes, or as one number for each electrode."""
 
 
 class ModelNoise(Struct, frozen=True, kw_only=True):
@@ -58,23 +57,23 @@ class ModelNoise(Struct, frozen=True, kw_only=True):
 
 
 class ModelMetadata(Settings, frozen=True, kw_only=True):
-    """Everything a user of a model file needs to know.
+    """Metadata of a model.
 
     Attributes:
-        name: Model name, equal to its folder's.
-        version: Number from 1; the name of the version folder.
-        sensor: The whole sensor as JSON; only its `name` is read here.
-        electrodes: Electrode names in the order of the charges.
-        working_area_mm: Polygon (x, y), mm, inside which the model was trained.
+        name: Name of the model, which is also the name of its folder.
+        version: Version number, 1 or more, which is also the name of the version folder.
+        sensor: Complete description of the sensor as JSON. Only its `name` is read here.
+        electrodes: Names of the electrodes in the order of the charges.
+        working_area_mm: Corners (x, y) of the polygon inside which the model was trained, mm.
         probes: Notations of the probes in the training.
         force_range_N: Smallest and largest force in the training, N.
-        noise: The noise of the training.
+        noise: Noise of the charges in the training.
         dataset_sha256: Checksum of the dataset.
-        errors: Measured errors, by names that carry the unit.
-        made_with: The command and the package versions.
-        format_version: Version of the metadata.
-        yield_force_N: Force beyond which the film yields under the sharpest of the probes, N; None if that is beyond
-            the range, or not known.
+        errors: Measured errors by name. Each name contains the unit.
+        made_with: Command and package versions with which the model was made.
+        format_version: Version of the format of the metadata.
+        yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if that force is above
+            the range of forces, or unknown.
     """
 
     name: ModelName
@@ -94,53 +93,56 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if "name" not in self.sensor:
             raise WrongKey("sensor.name")
-        if not isinstance(name := self.sensor["name"], str) or not name:
-            raise WrongKey("sensor.name", "a text", name)
+        sensor_name = self.sensor["name"]
+        if not isinstance(sensor_name, str) or not sensor_name:
+            raise WrongKey("sensor.name", "a text", sensor_name)
         if len(set(self.electrodes)) < len(self.electrodes):
             raise WrongKey("electrodes", "names that differ", self.electrodes)
-        for key, texts in (("electrodes", self.electrodes), ("probes", self.probes), ("sensor.name", (name,))):
+        displayed = {"electrodes": self.electrodes, "probes": self.probes, "sensor.name": (sensor_name,)}
+        for key, texts in displayed.items():
             if not all(is_printable(text) for text in texts):
                 raise WrongKey(key, "printable characters", texts)
-        if self.force_range_N[0] > self.force_range_N[1]:
-            raise WrongKey("force_range_N", "a smaller and a larger number", list(self.force_range_N))
+        low_N, high_N = self.force_range_N
+        if low_N > high_N:
+            raise WrongKey("force_range_N", "a smaller and a larger number", [low_N, high_N])
         for key, level in (("white_pC", self.noise.white_pC), ("gain", self.noise.gain)):
             if isinstance(level, tuple) and len(level) != len(self.electrodes):
                 raise WrongKey(f"noise.{key}", f"one number for each of {len(self.electrodes)} electrodes", level)
 
     @property
     def label(self) -> str:
-        """`name/version`, as prediction records carry it."""
+        """Label of the model, `name/version`, which prediction records contain."""
         return f"{self.name}/{self.version}"
 
     @property
     def frame_id(self) -> str:
-        """The sensor's name: the frame of x and y."""
+        """Name of the sensor, which is the name of the frame of x and y."""
         return str(self.sensor["name"])
 
     def to_props(self) -> dict[str, str]:
-        """The metadata as ONNX `metadata_props`: field name to JSON.
+        """Return the ONNX `metadata_props`: the value of each field as JSON, without the fields that are None.
 
         Raises:
-            ModelError: If a value is not JSON, NaN included.
+            ModelError: If a value, such as NaN, cannot be expressed in JSON.
         """
-        known = [name for name in self.__struct_fields__ if getattr(self, name) is not None]
-        return {name: _to_json(name, getattr(self, name)) for name in known}
+        values = {name: getattr(self, name) for name in self.__struct_fields__}
+        return {name: _to_json(name, value) for name, value in values.items() if value is not None}
 
     @classmethod
     def from_props(cls, props: Mapping[str, str], where: str) -> "ModelMetadata":
         """Read ONNX `metadata_props`.
 
         Args:
-            props: Field name to JSON; other keys are left alone.
-            where: The file, for messages.
+            props: Value of each field as JSON. Other keys are ignored.
+            where: Name or file of the model, for error messages.
 
         Raises:
-            ModelError: If the format version is another, or a key is missing or wrong.
+            ModelError: If the format version is not supported, or a key is missing or wrong.
         """
         where = f"{where}: metadata"
         try:
-            known = [name for name in cls.__struct_fields__ if name in props]
-            values = {name: parse_json(props[name], f"{where}: {name}", ModelError, object) for name in known}
+            names = [name for name in cls.__struct_fields__ if name in props]
+            values = {name: parse_json(props[name], f"{where}: {name}", ModelError, object) for name in names}
             version = convert(values, _Version, where, ModelError).format_version
             if version == FORMAT_VERSION:
                 return convert(values, cls, where, ModelError)
@@ -153,7 +155,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
 
 
 class _Version(Struct):
-    """What is read first of any version."""
+    """The key that metadata of every format version contain."""
 
     format_version: Annotated[int, Meta(ge=1)]
 

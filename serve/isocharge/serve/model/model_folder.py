@@ -1,15 +1,16 @@
-"""The model folder: its one writer, its one reader, and the search by name, version or path.
+"""The folder of a model: writing a version, reading a version, and finding a model by its name or path.
 
-    <name>/config.pbtxt            for Triton
-    <name>/<version>/model.onnx    charge_pC -> contact, its deviations and correlations, misfit; metadata inside
-    <name>/<version>/golden.json   charges, answers, tolerances, and the checksums of model.onnx and of further files
-    <name>/<version>/card.md       for people
+    <name>/config.pbtxt            configuration for Triton
+    <name>/<version>/model.onnx    graph from charge_pC to contact, contact_std, contact_correlation and misfit,
+                                   with the metadata of the model
+    <name>/<version>/golden.json   golden vectors, tolerances, and the checksums of model.onnx and of companion files
+    <name>/<version>/card.md       model card
 
-A version appears whole or not at all: it is written under a temporary name, read back as a user reads it, and only then
-renamed.
+A version is written under a temporary name, read back with all checks of a reader, and then renamed. Other processes
+therefore never see an incomplete version.
 
-A model repository is a folder of such folders; other files in it are ignored. Names are looked up in the folder that
-was given, in `$ISOCHARGE_MODELS`, in `./models`, and in the models that ship with isocharge.
+A model repository is a folder of such folders; other files in it are ignored. Names are looked up in the repository
+that the caller gives, in `$ISOCHARGE_MODELS`, in `./models`, and in the models that ship with isocharge, in this order.
 """
 
 import os
@@ -23,10 +24,10 @@ import onnxruntime as ort
 from numpy.typing import ArrayLike
 
 from isocharge.common.defaults import MAX_BATCH
-from isocharge.common.errors import ModelError, OutputExists, shown, told_where
+from isocharge.common.errors import ModelError, OutputExists, error_prefix, shown
 from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
 from isocharge.common.model_labels import NAME, VERSION
-from isocharge.serve.model.golden import Golden, check_answers, contact_floors, make_golden, read_golden
+from isocharge.serve.model.golden import Golden, check_outputs, contact_floors, make_golden, read_golden
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import (
     CORRELATION,
@@ -34,43 +35,46 @@ from isocharge.serve.model.session import (
     OUTPUTS,
     as_batch,
     check_interface,
-    check_rows,
+    check_output_shapes,
     open_session,
-    outputs_of,
+    output_widths,
     run,
 )
 
 
 def find_model(model: str | Path, models: Path | None = None) -> Path:
-    """The version folder of a model.
+    """Find the version folder of a model by its name or path.
 
     Args:
-        model: A name (`three-25um-biaxial`, the highest version, or `three-25um-biaxial/1`), or the path of a model
-            folder, of a version folder, or of a `model.onnx`. A Path, and a text that begins with `.` or `/` or ends
-            in `.onnx`, is only ever a path; another text is a path if no model has that name.
+        model: A name (`three-25um-biaxial` for the highest version, or `three-25um-biaxial/1`), or the path of a model
+            folder, of a version folder, or of a `model.onnx`. A Path object, and a text that begins with `.` or `/` or
+            ends in `.onnx`, is always taken as a path. Any other text is taken as a path only if no model has this
+            name.
         models: Repository in which names are looked up first.
 
     Raises:
-        ModelError: If there is no such model; the message names the folders that were searched and their models.
+        ModelError: If there is no such model. The message names the folders that were searched and their models.
     """
     roots = repositories(models)
     is_path = isinstance(model, Path) or model.startswith((".", "/")) or model.endswith(".onnx")
-    candidates = [Path(model)] if is_path else [*(root / model for root in roots), Path(model)]
+    candidates = [Path(model)]
+    if not is_path:
+        candidates = [root / model for root in roots] + candidates
     for candidate in candidates:
-        version = _version_folder(candidate)
-        if version is not None:
-            return version
-    raise ModelError(_not_found(model, roots, is_path))
+        folder = _version_folder(candidate)
+        if folder is not None:
+            return folder
+    raise ModelError(_not_found_message(model, roots, is_path))
 
 
 def find_labelled_model(label: str, models: Path | None = None) -> Path:
-    """Return the version folder of the model with a label, `NAME/VERSION`, that a file names.
+    """Find the version folder of a model by a label, `NAME/VERSION`, that was read from a file.
 
     Unlike `find_model`, this function searches only the repositories and never takes the label as a path, because the
-    file may come from somebody else.
+    file may come from an untrusted source.
 
     Args:
-        label: The label, as a recording holds it.
+        label: The label, for example the one in a recording.
         models: Repository that is searched first.
 
     Raises:
@@ -84,35 +88,43 @@ def find_labelled_model(label: str, models: Path | None = None) -> Path:
         folder = root / name / version
         if (folder / "model.onnx").is_file():
             return folder
-    raise ModelError(_not_found(label, roots, is_path=False))
+    raise ModelError(_not_found_message(label, roots, is_path=False))
 
 
 def repositories(models: Path | None = None) -> list[Path]:
-    """The folders in which names are looked up, in this order.
+    """Return the folders in which the names of models are looked up, in the order of the search.
+
+    Args:
+        models: Repository that is searched first. The other folders need not exist.
 
     Raises:
-        ModelError: If `models` is given and no folder; the other folders need not exist.
+        ModelError: If `models` is given and is not a folder.
     """
-    if models is not None and not models.is_dir():
-        raise ModelError(f"{models}: expected a folder of models, got no folder; correct --models or leave it out")
-    variable = os.environ.get("ISOCHARGE_MODELS")
-    given = [models] if models is not None else []
-    return [*given, *([Path(variable)] if variable else []), Path("models"), _shipped()]
+    roots: list[Path] = []
+    if models is not None:
+        if not models.is_dir():
+            raise ModelError(f"{models}: expected a folder of models, got no folder; correct --models or leave it out")
+        roots.append(models)
+    environment_folder = os.environ.get("ISOCHARGE_MODELS")
+    if environment_folder:
+        roots.append(Path(environment_folder))
+    return [*roots, Path("models"), _released_models()]
 
 
 def model_names(root: Path) -> list[str]:
-    """Names of the models in a repository."""
-    return sorted(folder.name for folder in _folders_in(root) if _versions(folder))
+    """Return the names of the models in a repository in alphabetical order."""
+    return sorted(folder.name for folder in _subfolders(root) if _versions(folder))
 
 
-def _shipped() -> Path:
-    """Released models: inside the installed package, or at the top of a source checkout."""
+def _released_models() -> Path:
+    """Return the folder of the released models: in the installed package, or at the top of a source checkout."""
     module = Path(__file__).resolve()
     packaged = module.parents[1] / "released"
     return packaged if packaged.is_dir() else module.parents[4] / "models"
 
 
 def _version_folder(path: Path) -> Path | None:
+    """Return the version folder that a path stands for: its highest version if the path is a model folder."""
     if path.name == "model.onnx" and path.is_file():
         return path.parent
     if (path / "model.onnx").is_file():
@@ -122,39 +134,52 @@ def _version_folder(path: Path) -> Path | None:
 
 
 def version_folders(folder: Path) -> dict[int, Path]:
-    """Version folders of a model folder, ascending: the sub-folders whose name is a whole number."""
+    """Return the version folders of a model folder by version, in ascending order.
+
+    A version folder is a sub-folder whose name is a whole number.
+    """
     return {version: folder / str(version) for version in sorted(_versions(folder))}
 
 
 def _versions(folder: Path) -> list[int]:
-    return [int(entry.name) for entry in _folders_in(folder) if VERSION.fullmatch(entry.name)]
+    return [int(entry.name) for entry in _subfolders(folder) if VERSION.fullmatch(entry.name)]
 
 
-def _folders_in(folder: Path) -> list[Path]:
-    """The folders in a folder; none if it is none.
+def _subfolders(folder: Path) -> list[Path]:
+    """Return the folders in a folder; an empty list if the path is not a folder.
 
     Raises:
-        ModelError: If it cannot be listed.
+        ModelError: If the folder cannot be listed.
     """
     try:
-        return [entry for entry in folder.iterdir() if entry.is_dir()] if folder.is_dir() else []
+        if not folder.is_dir():
+            return []
+        return [entry for entry in folder.iterdir() if entry.is_dir()]
     except OSError as error:
         raise ModelError(f"{folder}: cannot be listed ({error.strerror}); try again, or correct its rights") from error
 
 
-def _not_found(model: str | Path, roots: list[Path], is_path: bool) -> str:
+def _not_found_message(model: str | Path, roots: list[Path], is_path: bool) -> str:
     if is_path:
         return (
             f"{model}: no model; expected a model folder with numbered versions, a version folder with "
             "model.onnx, or a model.onnx"
         )
-    looked = "; ".join(f"{root} ({', '.join(model_names(root)) or 'no models'})" for root in roots)
-    return f"no model {str(model)!r}; looked in: {looked}; give one of these names, a path, or --models DIR"
+    searched = "; ".join(f"{root} ({', '.join(model_names(root)) or 'no models'})" for root in roots)
+    return f"no model {str(model)!r}; looked in: {searched}; give one of these names, a path, or --models DIR"
 
 
 @dataclass(frozen=True)
 class Model:
-    """A model that was read and checked: version folder, metadata, golden vectors, its session, and its bytes."""
+    """A model that was read and checked.
+
+    Attributes:
+        folder: Version folder.
+        metadata: Metadata of the model.
+        golden: Golden vectors.
+        session: Session of onnxruntime.
+        graph: Content of `model.onnx`.
+    """
 
     folder: Path
     metadata: ModelMetadata
@@ -167,51 +192,56 @@ def load_model(folder: Path) -> Model:
     """Read and check a model.
 
     Args:
-        folder: The version folder, as `find_model` gives it.
+        folder: The version folder, as `find_model` returns it.
 
     Raises:
-        ModelError: If a file is missing or damaged, or the model is of another format.
+        ModelError: If a file is missing or damaged, or has an unsupported format.
     """
     path = folder / "model.onnx"
     data = read_needed(path, ModelError, "copy or export the model again")
     golden = read_golden(folder / "golden.json")
-    _check_intact(data, golden, path)
+    _check_checksum(data, golden, path)
     session = open_session(data, str(path))
     metadata = ModelMetadata.from_props(session.get_modelmeta().custom_metadata_map, str(path))
     check_interface(session, len(metadata.electrodes), str(path))
-    _check_fits(golden, metadata, folder)
+    _check_golden_shapes(golden, metadata, folder / "golden.json")
     return Model(folder, metadata, golden, session, data)
 
 
-def _check_intact(data: bytes, golden: Golden, path: Path) -> None:
-    if sha256_of(data) != golden.sha256:
+def _check_checksum(data: bytes, golden: Golden, path: Path) -> None:
+    """Raise ModelError if the checksum of `model.onnx` is not the one in `golden.json`."""
+    actual = sha256_of(data)
+    if actual != golden.sha256:
         raise ModelError(
-            f"{path}: expected sha256 {golden.sha256} (golden.json), got {sha256_of(data)} over {len(data)} bytes; "
+            f"{path}: expected sha256 {golden.sha256} (golden.json), got {actual} over {len(data)} bytes; "
             "the file is damaged or changed: copy or export it again"
         )
 
 
-def _check_fits(golden: Golden, metadata: ModelMetadata, folder: Path) -> None:
+def _check_golden_shapes(golden: Golden, metadata: ModelMetadata, path: Path) -> None:
+    """Raise ModelError if the golden vectors do not fit the number of electrodes or the number of presses."""
     shape = golden.charge_pC.shape
-    if len(shape) != 2 or shape[0] == 0 or shape[1] != len(metadata.electrodes):
+    n_electrode = len(metadata.electrodes)
+    if len(shape) != 2 or shape[0] == 0 or shape[1] != n_electrode:
         raise ModelError(
-            f"{folder / 'golden.json'}: expected charges of shape (n, {len(metadata.electrodes)}) with n > 0, "
-            f"got {shape}; copy or export the model again"
+            f"{path}: expected charges of shape (n, {n_electrode}) with n > 0, got {shape}; "
+            "copy or export the model again"
         )
-    check_rows(golden.outputs, len(golden.charge_pC), str(folder / "golden.json"))
+    check_output_shapes(golden.outputs, len(golden.charge_pC), str(path))
 
 
 def check_golden(model: Model) -> None:
-    """Compare the answers of this machine with a model's golden vectors.
+    """Compare the outputs that this machine computes with a model's golden vectors.
 
     Raises:
-        ModelError: If an answer differs from that in golden.json.
+        ModelError: If an output differs from the output in `golden.json` by more than the tolerance.
     """
-    where, charge_pC = str(model.folder / "model.onnx"), model.golden.charge_pC
-    with told_where(f"{where}: ", ModelError):
-        answers = run(model.session, charge_pC)
-    check_rows(answers, len(charge_pC), where)
-    check_answers(model.golden, answers, where)
+    where = str(model.folder / "model.onnx")
+    charge_pC = model.golden.charge_pC
+    with error_prefix(f"{where}: ", ModelError):
+        outputs = run(model.session, charge_pC)
+    check_output_shapes(outputs, len(charge_pC), where)
+    check_outputs(model.golden, outputs, where)
 
 
 def write_model(
@@ -220,18 +250,18 @@ def write_model(
     metadata: ModelMetadata,
     golden_charge_pC: ArrayLike,
     card: str,
-    further: Mapping[str, bytes] = MappingProxyType({}),
+    companion_files: Mapping[str, bytes] = MappingProxyType({}),
 ) -> Path:
     """Write a new version of a model.
 
     Args:
-        folder: The model's folder; it has the model's name and may already hold other versions.
-        onnx_model: The graph, with `metadata.to_props()` in its metadata_props.
+        folder: The model's folder. It has the model's name and may already contain other versions.
+        onnx_model: Content of `model.onnx`, with `metadata.to_props()` in its metadata_props.
         metadata: The same metadata.
-        golden_charge_pC: Inputs of the golden vectors, shape (n, electrodes), pC.
+        golden_charge_pC: Input charges of the golden vectors, shape (n, electrodes), pC.
         card: Text of the model card.
-        further: More files for the version folder, by name. A server ignores them. Their checksums go into
-            `golden.json`.
+        companion_files: Contents of companion files for the version folder, by file name. Their checksums are stored in
+            `golden.json`. Servers ignore these files.
 
     Returns:
         The version folder.
@@ -239,8 +269,8 @@ def write_model(
     Raises:
         OutputExists: If this version exists already, or a file has the folder's name.
         ChargeError: If the golden charges do not fit the electrodes.
-        ModelError: If the graph cannot be loaded as a reader loads it, or disagrees with `metadata`. After any error
-            no file of the version is left.
+        ModelError: If a reader would refuse the model, or its metadata differ from `metadata`. After any error no file
+            of the version remains.
     """
     target = check_target(folder, metadata.version, metadata.electrodes)
     if folder.resolve().name != metadata.name:
@@ -249,33 +279,46 @@ def write_model(
     session = open_session(onnx_model, where)
     check_interface(session, len(metadata.electrodes), where)
     charges = as_batch(golden_charge_pC, metadata.electrodes)
-    answers = make_golden(session, onnx_model, charges, contact_floors(metadata))
-    golden = replace(answers, companion_sha256={name: sha256_of(content) for name, content in further.items()})
+    golden = make_golden(session, onnx_model, charges, contact_floors(metadata))
+    golden = replace(golden, companion_sha256={name: sha256_of(content) for name, content in companion_files.items()})
     with new_folder(target) as draft:
         write_whole(draft / "model.onnx", onnx_model)
         write_whole(draft / "golden.json", golden.to_json().encode())
         write_whole(draft / "card.md", card.encode())
-        for name, content in further.items():
+        for name, content in companion_files.items():
             write_whole(draft / name, content)
         _check_draft(draft, metadata)
-    config, electrodes = folder / "config.pbtxt", len(metadata.electrodes)
-    plain = triton_config(metadata.name, electrodes, correlation=False)
-    every = CORRELATION in outputs_of(session) and not (config.exists() and config.read_text(encoding="utf-8") == plain)
-    write_whole(config, triton_config(metadata.name, electrodes, correlation=every).encode())
+    _write_triton_config(folder / "config.pbtxt", metadata, has_correlation=CORRELATION in output_widths(session))
     return target
 
 
-def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Path:
-    """The version folder; refused where a model version cannot be written. Training checks it before it starts.
+def _write_triton_config(path: Path, metadata: ModelMetadata, *, has_correlation: bool) -> None:
+    """Write `config.pbtxt` so that Triton can serve all versions of the model.
 
     Args:
-        folder: The model's folder, named as the model.
+        path: The file, which may exist already.
+        metadata: Metadata of the new version.
+        has_correlation: Whether the new version computes correlations. They are left out if an existing file does not
+            list them, because an older version then does not compute them.
+    """
+    n_electrode = len(metadata.electrodes)
+    config_without_correlation = triton_config(metadata.name, n_electrode, correlation=False)
+    older_has_correlation = not path.exists() or path.read_text(encoding="utf-8") != config_without_correlation
+    correlation = has_correlation and older_has_correlation
+    write_whole(path, triton_config(metadata.name, n_electrode, correlation=correlation).encode())
+
+
+def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Path:
+    """Check that a model version can be written, and return its folder. Training does this before it starts.
+
+    Args:
+        folder: The model's folder, which has the name of the model.
         version: Number of the version to write.
         electrodes: Names of the model's electrodes.
 
     Raises:
         OutputExists: If the version exists already, or a file has the folder's name.
-        ModelError: If the folder's name is no model name, or the folder holds a model with other electrodes.
+        ModelError: If the folder's name is no valid model name, or the folder contains a model with other electrodes.
     """
     target = folder / str(version)
     refuse_existing(target)
@@ -284,42 +327,54 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
     name = folder.resolve().name
     if not NAME.fullmatch(name):
         raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; rename the folder")
-    config = folder / "config.pbtxt"
-    expected = [triton_config(name, len(electrodes), correlation=correlation) for correlation in (False, True)]
-    if config.exists() and (text := config.read_text(encoding="utf-8")) not in expected:
-        named = re.match('name: "(.*)"', text)
-        if named and named[1] != name:
-            raise ModelError(
-                f"{config}: names the model {named[1]!r}, its folder is {name!r}: was it copied or renamed? Give it "
-                "its old name, or choose another output"
-            )
-        raise ModelError(
-            f"{config}: describes a model other than one with the electrodes {electrodes}; use another model name"
-        )
+    _check_triton_config(folder / "config.pbtxt", name, electrodes)
     return target
 
 
+def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> None:
+    """Raise ModelError if `config.pbtxt` exists and describes another model."""
+    if not path.exists():
+        return
+    text = path.read_text(encoding="utf-8")
+    if text in [triton_config(name, len(electrodes), correlation=correlation) for correlation in (False, True)]:
+        return
+    match = re.match('name: "(.*)"', text)
+    if match and match[1] != name:
+        raise ModelError(
+            f"{path}: names the model {match[1]!r}, its folder is {name!r}: was it copied or renamed? Give it "
+            "its old name, or choose another output"
+        )
+    raise ModelError(
+        f"{path}: describes a model other than one with the electrodes {electrodes}; use another model name"
+    )
+
+
 def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
-    """Read a new version back as a user reads it."""
+    """Read a new version as a user reads it, and compare its metadata with the expected metadata."""
     model = load_model(draft)
-    inside, given = model.metadata.to_props(), metadata.to_props()
-    differing = [key for key in given if inside[key] != given[key]]
-    if differing:
-        key = differing[0]
-        raise ModelError(f"the graph's metadata disagree on {key!r}: expected {given[key]}, got {inside[key]}")
+    actual = model.metadata.to_props()
+    expected = metadata.to_props()
+    for key, value in expected.items():
+        if actual[key] != value:
+            raise ModelError(f"the graph's metadata disagree on {key!r}: expected {value}, got {actual[key]}")
     check_golden(model)
 
 
 def triton_config(name: str, electrodes: int, *, correlation: bool = True) -> str:
-    """The text of `config.pbtxt` for a model with this number of electrodes; Triton adds the batch dimension.
+    """Return the text of `config.pbtxt` for a model.
 
-    Without `correlation`, which older models do not give, it serves all versions of a model.
+    Args:
+        name: Name of the model.
+        electrodes: Number of electrodes.
+        correlation: Whether the output with the correlations is listed. Without it, Triton also serves older versions,
+            which do not have this output.
     """
     outputs = {tensor: width for tensor, width in OUTPUTS.items() if correlation or tensor != CORRELATION}
     head = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
-    return head + _tensors("input", {INPUT: electrodes}) + _tensors("output", outputs)
+    return head + _tensor_list("input", {INPUT: electrodes}) + _tensor_list("output", outputs)
 
 
-def _tensors(kind: str, widths: dict[str, int]) -> str:
+def _tensor_list(kind: str, widths: dict[str, int]) -> str:
+    """Return the part of `config.pbtxt` that lists tensors; Triton adds the batch dimension to their shapes."""
     lines = [f'  {{ name: "{name}" data_type: TYPE_FP32 dims: [ {width} ] }}' for name, width in widths.items()]
     return f"{kind} [\n" + ",\n".join(lines) + "\n]\n"

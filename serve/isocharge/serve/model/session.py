@@ -1,10 +1,12 @@
-"""What charges a model takes, and how it is run: ONNX sessions of one thread, no spinning, a checked interface.
+"""ONNX sessions: opening them, checking their interface, running them, and converting charges for them.
 
-A network of this size takes microseconds. A second thread costs more than it saves, and onnxruntime's default, to spin
-between runs, burns most of a core at 100 Hz. `BoundPress` is the fast way for one press: memory bound once.
+A network of this size takes microseconds. A session therefore uses one thread, because a second thread costs more time
+than it saves, and does not spin between runs, because onnxruntime's default would keep most of a core busy at 100 Hz.
+`BoundPress` is the fastest way to compute one press: its input and output memory is bound to the session once.
 
-Charges are finite numbers, in the order of the electrodes. The hot paths ask `write_finite` for plain numbers and
-`as_singles` for arrays; what these do not take is examined number by number, so that the error names the electrode.
+Charges must be finite numbers in the order of the electrodes. The fast checks are `write_finite` for plain numbers and
+`as_float32` for arrays. If a fast check fails, the numbers are checked one by one, so that the error names the
+electrode.
 """
 
 import math
@@ -25,10 +27,10 @@ INPUT = "charge_pC"
 """Name of the input."""
 
 CORRELATION = "contact_correlation"
-"""Name of the output that older models have not."""
+"""Name of the output that older models do not have."""
 
 OUTPUTS = {"contact": 3, "contact_std": 3, CORRELATION: 3, "misfit": 1}
-"""Names and widths of the outputs; see `OUTPUT_MEANINGS`."""
+"""Names of the outputs and their numbers of columns. `OUTPUT_MEANINGS` describes the columns."""
 
 OUTPUT_MEANINGS = {
     "contact": "x_mm, y_mm, force_N: position (mm) and force (N, positive when the probe pushes)",
@@ -36,11 +38,11 @@ OUTPUT_MEANINGS = {
     CORRELATION: "correlations of the errors, from -1 to 1: x with y, x with the force, y with the force",
     "misfit": "distance of the charges from the nearest single contact, in standard deviations of the noise",
 }
-"""Numbers of each output in their order, with their units. The first dimension of each output is the press."""
+"""Columns of each output with their units. The rows of each output are the presses."""
 
 
-def outputs_of(session: ort.InferenceSession) -> dict[str, int]:
-    """Names and widths of the outputs that a model has, in the order of `OUTPUTS`."""
+def output_widths(session: ort.InferenceSession) -> dict[str, int]:
+    """Return the names of the outputs of a model and their numbers of columns, in the order of `OUTPUTS`."""
     names = {tensor.name for tensor in session.get_outputs()}
     return {name: width for name, width in OUTPUTS.items() if name in names}
 
@@ -48,33 +50,39 @@ def outputs_of(session: ort.InferenceSession) -> dict[str, int]:
 def open_session(
     onnx_model: bytes, where: str, constants: Mapping[str, Singles] = MappingProxyType({})
 ) -> ort.InferenceSession:
-    """A session for one thread, whose interface is not checked yet.
+    """Open a session with one thread. Its inputs and outputs are not checked; `check_interface` does that.
 
     Args:
-        onnx_model: The graph.
-        where: The model, for messages.
-        constants: In the place of the graph's constants of these names.
+        onnx_model: Content of `model.onnx`.
+        where: Name or file of the model, for error messages.
+        constants: Arrays that replace constants of the graph, by the names of the constants. The session uses the
+            memory of the arrays, so they must not be changed afterwards.
 
     Raises:
         ModelError: If the bytes are not an ONNX graph that onnxruntime can run.
     """
-    options = _options()
+    options = _single_thread_options()
     try:
-        held = {name: ort.OrtValue.ortvalue_from_numpy(values) for name, values in constants.items()}
-        for name, value in held.items():
-            options.add_initializer(name, value)
+        initializers = {name: ort.OrtValue.ortvalue_from_numpy(values) for name, values in constants.items()}
+        for name, initializer in initializers.items():
+            options.add_initializer(name, initializer)
         session = ort.InferenceSession(onnx_model, options, providers=["CPUExecutionProvider"])
-        _ = session.get_modelmeta().custom_metadata_map  # raises here, not later, if it is no text
-        _ = [tensor.name for tensor in (*session.get_inputs(), *session.get_outputs())]
+        _decode_texts(session)
         return session
-    except Exception as error:  # onnxruntime's exceptions have no common base of their own
+    except Exception as error:  # onnxruntime's exceptions have no common base class of their own
         raise ModelError(
             f"{where}: onnxruntime {ort.__version__} cannot read these {len(onnx_model)} bytes as a model "
             f"({cut(str(error))}); copy or export it again"
         ) from error
 
 
-def _options() -> ort.SessionOptions:
+def _decode_texts(session: ort.InferenceSession) -> None:
+    """Read the metadata and the names of a session, which raises an exception if they are not valid UTF-8."""
+    _ = session.get_modelmeta().custom_metadata_map
+    _ = [tensor.name for tensor in (*session.get_inputs(), *session.get_outputs())]
+
+
+def _single_thread_options() -> ort.SessionOptions:
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
@@ -85,212 +93,259 @@ def _options() -> ort.SessionOptions:
 
 
 def run(session: ort.InferenceSession, charge_pC: Singles, names: Sequence[str] | None = None) -> dict[str, Singles]:
-    """Outputs by name, all of them by default, shape (n, width), from charges of shape (n, electrodes), pC.
+    """Run a model on a batch of presses.
+
+    Args:
+        session: Session of the model.
+        charge_pC: Charges, shape (n, electrodes), pC.
+        names: Names of the requested outputs; all outputs by default.
+
+    Returns:
+        The requested outputs by name, each of shape (n, width).
 
     Raises:
-        ModelError: If the graph cannot be run on them: it is not the model of these charges.
+        ModelError: If onnxruntime cannot run the graph on these charges.
     """
-    names = tuple(outputs_of(session)) if names is None else names
+    names = tuple(output_widths(session)) if names is None else names
     try:
         return dict(zip(names, session.run(names, {INPUT: charge_pC}), strict=True))
-    except Exception as error:  # onnxruntime's exceptions have no common base of their own
+    except Exception as error:  # onnxruntime's exceptions have no common base class of their own
         raise run_error(error) from error
 
 
 def run_error(error: Exception) -> ModelError:
-    """The error of a graph that was read, and fails when it is run."""
+    """Return the error to raise if onnxruntime could read a graph but fails to run it."""
     return ModelError(f"the model's graph fails when it is run ({cut(str(error))}); copy or export it again")
 
 
-def check_rows(outputs: Mapping[str, Singles], count: int, where: str) -> None:
-    """Check what a graph really answered: its file may declare other shapes.
+def check_output_shapes(outputs: Mapping[str, Singles], count: int, where: str) -> None:
+    """Check the shapes of computed outputs, because a graph may declare shapes that differ from the computed ones.
+
+    Args:
+        outputs: Outputs by name.
+        count: Number of presses.
+        where: Name or file of the model, for error messages.
 
     Raises:
-        ModelError: If an output has not a row for each of `count` presses.
+        ModelError: If an output does not have one row of the right width for each press.
     """
     for name, rows in outputs.items():
-        if rows.shape != (count, OUTPUTS[name]):
+        expected_shape = (count, OUTPUTS[name])
+        if rows.shape != expected_shape:
             raise ModelError(
-                f"{where}: {name}: expected answers of shape {(count, OUTPUTS[name])}, got {rows.shape}; "
+                f"{where}: {name}: expected an output of shape {expected_shape}, got {rows.shape}; "
                 "copy or export the model again"
             )
 
 
 def check_interface(session: ort.InferenceSession, electrodes: int, where: str) -> None:
-    """Check names, number type and shapes of a model's input and outputs; the batch must be free.
+    """Check the names, number types and shapes of a model's input and outputs. The batch size must be variable.
+
+    Args:
+        session: Session of the model.
+        electrodes: Number of electrodes of the model.
+        where: Name or file of the model, for error messages.
 
     Raises:
-        ModelError: If they are not those of a model with this number of electrodes.
+        ModelError: If the input or the outputs are not those of a model with this number of electrodes.
     """
+    required_outputs = {name: width for name, width in OUTPUTS.items() if name != CORRELATION}
     _check_tensors("input", session.get_inputs(), {INPUT: electrodes}, where)
-    known = {name: width for name, width in OUTPUTS.items() if name != CORRELATION}
-    _check_tensors("outputs", session.get_outputs(), known | outputs_of(session), where)
+    _check_tensors("outputs", session.get_outputs(), required_outputs | output_widths(session), where)
 
 
 def _check_tensors(kind: str, tensors: list[ort.NodeArg], widths: dict[str, int], where: str) -> None:
     expected = {name: ("tensor(float)", width) for name, width in widths.items()}
-    got = {tensor.name: (tensor.type, _row_width(tensor.shape)) for tensor in tensors}
-    if got != expected:
+    actual = {tensor.name: (tensor.type, _row_width(tensor.shape)) for tensor in tensors}
+    if actual != expected:
         raise ModelError(
-            f"{where}: expected the {kind} {_show(expected)}, got {_show(got)}; "
+            f"{where}: expected the {kind} {_describe(expected)}, got {_describe(actual)}; "
             "this is not a model of isocharge, or one of another version"
         )
 
 
 def _row_width(shape: list[int | str | None]) -> object:
-    """The width of a tensor of shape [any, width], or the shape itself if it is another one."""
-    return shape[1] if len(shape) == 2 and not isinstance(shape[0], int) else shape
+    """Return the width of a tensor of shape [variable, width]; return the whole shape of any other tensor."""
+    is_batch = len(shape) == 2 and not isinstance(shape[0], int)
+    return shape[1] if is_batch else shape
 
 
-def _show(tensors: Mapping[str, tuple[str, object]]) -> str:
+def _describe(tensors: Mapping[str, tuple[str, object]]) -> str:
     return ", ".join(f"{name} {kind} [n, {width}]" for name, (kind, width) in tensors.items())
 
 
-class BoundPress:
-    """Input and output memory of one press, bound to a session.
+N_WITHOUT_CORRELATION = 7
+"""Number of the values of a `Contact` without its correlations, which are the last values."""
 
-    `write(q1, q2, ...)` puts the charges in, `run()` computes, `read()` gives the numbers of a Contact: ten, or
-    seven from a model without correlations.
+
+class BoundPress:
+    """Input and output memory of one press that is bound to a session.
 
     Attributes:
-        size: How many it gives.
-        columns: Where each output lies in the row of these numbers.
+        write: Function that stores the charges, pC, which are passed as separate arguments.
+        run: Function that computes the outputs from the stored charges.
+        read: Function that returns the computed values in the order of a `Contact`.
+        size: Number of values that `read` returns: ten, or seven if the model computes no correlations.
+        columns: Positions of each output among these values.
     """
 
     def __init__(self, session: ort.InferenceSession, electrodes: int) -> None:
         charges = np.zeros((1, electrodes), dtype=np.float32)
-        self.columns = _columns(outputs_of(session))
+        self.columns = _columns(output_widths(session))
         self.size = max(part.stop for part in self.columns.values())
-        answers = np.zeros(self.size, dtype=np.float32)
-        # The session sees only addresses: the views in `write` and `read` keep the arrays alive.
-        binding = _bind(session, charges, answers, self.columns)
+        outputs = np.zeros(self.size, dtype=np.float32)
+        # The session holds only the addresses of the arrays. The views in `write` and `read` keep the arrays alive.
+        binding = _bind(session, charges, outputs, self.columns)
         self.run: Callable[[], None] = partial(session.run_with_iobinding, binding)
         self.write = partial(struct.Struct(f"={electrodes}f").pack_into, charges.data.cast("B"), 0)
-        self.read = partial(struct.Struct(f"={answers.size}f").unpack, answers.data.cast("B"))
-        self._charges: Any = charges[0].data  # Any: typing knows a memoryview as bytes only
-        self._answers: Any = answers.data
-        self._first_seven: Any = answers[:SEVEN].data
+        self.read = partial(struct.Struct(f"={outputs.size}f").unpack, outputs.data.cast("B"))
+        # The type is Any because the type hints of memoryview cover only bytes.
+        self._charge_view: Any = charges[0].data
+        self._output_view: Any = outputs.data
+        self._output_view_without_correlation: Any = outputs[:N_WITHOUT_CORRELATION].data
 
     def run_into(self, charge_pC: Singles, out: Singles) -> None:
-        """Compute from an array into an array; the copies through memoryviews check number type and shape at no cost.
+        """Compute one press from an array into another array.
+
+        The arrays are copied through memoryviews, which check the number type and the shape without extra time.
+
+        Args:
+            charge_pC: Charges, shape (electrodes,), float32, pC.
+            out: Receives the values, shape (size,) or (7,), float32.
 
         Raises:
-            AttributeError, NotImplementedError, TypeError, ValueError: If an array has not the number type and shape of
-                the bound memory; nothing is written into `out` then.
+            AttributeError, NotImplementedError, TypeError, ValueError: If an array does not have the number type and
+                shape of the bound memory. Nothing is written into `out` in this case.
         """
-        self._charges[:] = charge_pC
+        self._charge_view[:] = charge_pC
         self.run()
         target: Any = out.data
-        target[:] = self._first_seven if len(target) == SEVEN else self._answers
+        if len(target) == N_WITHOUT_CORRELATION:
+            target[:] = self._output_view_without_correlation
+        else:
+            target[:] = self._output_view
 
 
-SEVEN = 7
-"""Numbers of a Contact without its correlations, which come after them."""
+def _columns(widths: Mapping[str, int]) -> dict[str, slice]:
+    """Return the positions of the outputs among the values of a `Contact`, where the correlations are the last."""
+    names = [name for name in widths if name != CORRELATION]
+    if CORRELATION in widths:
+        names.append(CORRELATION)
 
-
-def _columns(outputs: Mapping[str, int]) -> dict[str, slice]:
-    """Where outputs lie in the numbers of a Contact: the correlations, if there are any, last."""
-    names, end = sorted(outputs, key=CORRELATION.__eq__), 0
-    return {name: slice(end, end := end + outputs[name]) for name in names}
+    columns: dict[str, slice] = {}
+    start = 0
+    for name in names:
+        stop = start + widths[name]
+        columns[name] = slice(start, stop)
+        start = stop
+    return columns
 
 
 def _bind(
-    session: ort.InferenceSession, charges: Singles, answers: Singles, columns: Mapping[str, slice]
+    session: ort.InferenceSession, charges: Singles, outputs: Singles, columns: Mapping[str, slice]
 ) -> ort.IOBinding:
-    """Bind the input (1, electrodes) and the outputs, in their columns of `answers`, by address."""
+    """Bind the input, shape (1, electrodes), and the columns of `outputs`, shape (size,), to a session."""
     binding = session.io_binding()
     binding.bind_input(INPUT, "cpu", 0, np.float32, charges.shape, charges.ctypes.data)
     for name, part in columns.items():
         width = part.stop - part.start
-        binding.bind_output(name, "cpu", 0, np.float32, (1, width), answers[part].ctypes.data)
+        binding.bind_output(name, "cpu", 0, np.float32, (1, width), outputs[part].ctypes.data)
     return binding
 
 
-LARGEST_SQUARE_SUM = 1e38
-"""Sum of squared charges, pC^2, up to which each charge is certainly finite and fits into float32."""
+MAX_FAST_SQUARE_SUM_pC2 = 1e38
+"""Sum of squared charges, pC^2, up to which every charge is certainly finite and within the range of float32."""
 
 
 def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
-    """Write numbers as float32 if they are finite and fit; the fast way for the few numbers of one press.
+    """Write the charges of one press as float32 numbers if they are finite and within the range of float32.
 
     Args:
-        write: Takes the numbers one by one, as `struct.Struct("=3f").pack_into` does, and raises what that raises.
+        write: Function that takes the numbers as separate arguments and raises the exceptions of `struct.pack_into`.
         values: The numbers, as many as `write` takes.
 
     Returns:
-        Whether they were written and are finite; if not, what was written is not to be used.
+        Whether the numbers were written and are finite. If not, the written memory must not be used.
     """
     try:
         numbers = tuple(values)
         write(*numbers)
-        return math.isfinite(sum(numbers))  # float32 numbers cannot overflow a sum of float64
+        return math.isfinite(sum(numbers))  # a float64 sum of float32 numbers cannot overflow
     except (struct.error, TypeError, ValueError, OverflowError):
         return False
 
 
 def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
-    """The charges of one press as an array of shape (electrodes,), float32, pC.
+    """Convert the charges of one press to an array of shape (electrodes,), float32, pC.
 
     Raises:
-        ChargeError: If the number of charges is another, or one is not finite; the electrode is named.
+        ChargeError: If the number of charges is wrong, or a charge is not finite. The message names the electrode.
     """
     charges = _as_numbers(charge_pC, electrodes)
     if charges.shape != (len(electrodes),):
-        raise ChargeError(f"expected {_charges(electrodes)}, got an array of shape {charges.shape}")
-    return np.asarray(as_singles(charges[np.newaxis], electrodes, one_press=True)[0])
+        raise ChargeError(f"expected {_expected_charges(electrodes)}, got an array of shape {charges.shape}")
+    batch = as_float32(charges[np.newaxis], electrodes, is_single_press=True)
+    return np.asarray(batch[0])
 
 
 def as_batch(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
-    """The charges of n presses as a contiguous array of shape (n, electrodes), float32, pC.
+    """Convert the charges of n presses to a contiguous array of shape (n, electrodes), float32, pC.
 
     Raises:
-        ChargeError: If the shape is another, or a charge is not finite; the electrode and the row are named.
+        ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
     """
     charges = _as_numbers(charge_pC, electrodes)
     if charges.ndim != 2 or charges.shape[1] != len(electrodes):
         raise ChargeError(
-            f"expected rows of {_charges(electrodes)}, shape (n, {len(electrodes)}), "
+            f"expected rows of {_expected_charges(electrodes)}, shape (n, {len(electrodes)}), "
             f"got an array of shape {charges.shape}"
         )
-    return as_singles(charges, electrodes)
+    return as_float32(charges, electrodes)
 
 
-def _charges(electrodes: tuple[str, ...]) -> str:
+def _expected_charges(electrodes: tuple[str, ...]) -> str:
     return f"{len(electrodes)} charges {electrodes}"
 
 
 def _as_numbers(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> NDArray[np.number]:
+    """Convert charges to an array of numbers; raise ChargeError if they are not numbers."""
+    expected = _expected_charges(electrodes)
     try:
         charges = np.asarray(charge_pC)
     except ValueError as error:  # rows of different lengths
-        raise ChargeError(f"expected {_charges(electrodes)} in each row, got {charge_pC!r:.200} ({error})") from error
+        raise ChargeError(f"expected {expected} in each row, got {charge_pC!r:.200} ({error})") from error
     if charges.dtype.kind not in "fiu":
-        raise ChargeError(f"expected {_charges(electrodes)} as numbers (pC), got {charge_pC!r:.200}")
+        raise ChargeError(f"expected {expected} as numbers (pC), got {charge_pC!r:.200}")
     return charges
 
 
-def as_singles(charges: NDArray[Any], electrodes: tuple[str, ...], *, one_press: bool = False) -> Singles:
-    """Charges of shape (n, electrodes), pC, of any number type as a contiguous float32 array.
+def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...], *, is_single_press: bool = False) -> Singles:
+    """Convert charges of any number type to a contiguous float32 array.
+
+    Args:
+        charges: Charges, shape (n, electrodes), pC.
+        electrodes: Names of the electrodes, for the error message.
+        is_single_press: Whether the error message omits the number of the row.
 
     Raises:
-        ChargeError: If a charge is not finite; its electrode is named, and its row unless there is only `one_press`.
+        ChargeError: If a charge is not finite or beyond the range of float32. The message names the electrode.
     """
-    flat = charges.ravel()
-    if (
-        charges.dtype.kind == "f" and np.vdot(flat, flat) <= LARGEST_SQUARE_SUM
-    ):  # one call instead of three and an errstate
-        return np.ascontiguousarray(charges, dtype=np.float32)
-    return _examined(charges, electrodes, one_press)
+    if charges.dtype.kind == "f":
+        flat = charges.ravel()
+        # A scalar product is faster than a check of each number, and is not finite if one of the charges is not.
+        if np.vdot(flat, flat) <= MAX_FAST_SQUARE_SUM_pC2:
+            return np.ascontiguousarray(charges, dtype=np.float32)
+    return _checked_float32(charges, electrodes, is_single_press)
 
 
-def _examined(charges: NDArray[np.number], electrodes: tuple[str, ...], one_press: bool) -> Singles:
-    """Charges one by one; the first row with a bad one is named."""
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused below
-        singles = np.ascontiguousarray(charges, dtype=np.float32)
-    rows, columns = np.nonzero(~np.isfinite(singles))
-    if rows.size:
-        row = rows[0]
-        bad = [f"{electrodes[column]!r} ({charges[row, column]})" for column in columns[rows == row]]
-        where = "" if one_press else f" in row {row} (rows count from 0)"
-        raise ChargeError(f"expected finite charges (pC), got{where} for electrode {', '.join(bad)}")
-    return singles
+def _checked_float32(charges: NDArray[np.number], electrodes: tuple[str, ...], is_single_press: bool) -> Singles:
+    """Convert charges to float32 and check each of them; raise ChargeError for the first row with a bad charge."""
+    with np.errstate(over="ignore"):  # charges beyond the range of float32 become infinite and are refused below
+        converted = np.ascontiguousarray(charges, dtype=np.float32)
+    rows, columns = np.nonzero(~np.isfinite(converted))
+    if not rows.size:
+        return converted
+    row = rows[0]
+    refused = [f"{electrodes[column]!r} ({charges[row, column]})" for column in columns[rows == row]]
+    where = "" if is_single_press else f" in row {row} (rows count from 0)"
+    raise ChargeError(f"expected finite charges (pC), got{where} for electrode {', '.join(refused)}")

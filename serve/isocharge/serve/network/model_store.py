@@ -24,7 +24,7 @@ from isocharge.serve.model.model_folder import (
     repositories,
     version_folders,
 )
-from isocharge.serve.model.session import BoundPress, outputs_of
+from isocharge.serve.model.session import BoundPress, output_widths
 from isocharge.serve.network.traffic import Statistics
 from isocharge.serve.prediction.contact import Validity
 
@@ -52,7 +52,7 @@ class LoadedVersion:
     @cached_property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs that the model has."""
-        return tuple(outputs_of(self.model.session))
+        return tuple(output_widths(self.model.session))
 
     def press(self) -> BoundPress:
         """Bound memory for one press; each thread has its own."""

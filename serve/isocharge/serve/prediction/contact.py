@@ -16,7 +16,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Reals, Singles
 from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.session import SEVEN
+from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 
 MOST_DECIMALS = 6
 """Decimals that are shown at most: 1 nm and 1 uN."""
@@ -112,7 +112,7 @@ class Sensitivity:
         return units * by_x, units * by_y, units * by_F
 
 
-NO_CORRELATION = dict.fromkeys(Contact._fields[SEVEN:])
+NO_CORRELATION = dict.fromkeys(Contact._fields[N_WITHOUT_CORRELATION:])
 """The fields that a model may not give."""
 
 

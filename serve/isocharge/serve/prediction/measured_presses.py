@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.common.errors import PressError, shown, told_where
+from isocharge.common.errors import PressError, error_prefix, shown
 from isocharge.serve.prediction.tables.csv_table import csv_text
 from isocharge.serve.prediction.tables.header_advice import ColumnMeaning
 from isocharge.serve.prediction.tables.number_table import (
@@ -244,7 +244,7 @@ def read_presses(
             electrodes = [name for name in table.header if name and name not in PRESS_RULES]
             table.refuse_similar_names([name for name in electrodes if len(name) > 1], PRESS_RULES)
         names = tuple(electrodes)
-        with told_where(f"{path}: ", PressError):
+        with error_prefix(f"{path}: ", PressError):
             _check_electrodes(names)
         chosen = table.choose_columns(dict.fromkeys(names, CHARGE_RULE), PRESS_RULES)
         columns = table.read(chosen, MOST_ROWS)
@@ -257,7 +257,7 @@ def read_presses(
     for name, std in default_stds.items():
         values[name] = np.where(np.isnan(values[name]), std, values[name])
     temperature_C = values[TEMPERATURE]
-    with told_where(f"{path}, ", PressError):
+    with error_prefix(f"{path}, ", PressError):
         return MeasuredPresses(
             contact=np.column_stack([values[name] for name in CONTACT]),
             charge_pC=np.column_stack([values[name] for name in names]),
@@ -288,7 +288,7 @@ def read_press_list(path: Path) -> Array:
     count = len(columns.row_numbers)
     if not count:
         raise PressError(f"{path}: expected one press or more below the header, got none")
-    with told_where(f"{path}, ", PressError):
+    with error_prefix(f"{path}, ", PressError):
         presses = MeasuredPresses(
             contact=np.column_stack([columns.values[name] for name in CONTACT]),
             charge_pC=np.zeros((count, 1)),

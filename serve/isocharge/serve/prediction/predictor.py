@@ -18,7 +18,15 @@ from numpy.typing import ArrayLike
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError, ModelError, shown
 from isocharge.serve.model.model_folder import Model, find_model, load_model
-from isocharge.serve.model.session import SEVEN, BoundPress, as_batch, as_press, open_session, run, write_finite
+from isocharge.serve.model.session import (
+    N_WITHOUT_CORRELATION,
+    BoundPress,
+    as_batch,
+    as_press,
+    open_session,
+    run,
+    write_finite,
+)
 from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 
 log = logging.getLogger(__name__)
@@ -128,7 +136,7 @@ class Predictor:
         except (AttributeError, NotImplementedError, TypeError, ValueError) as error:
             raise ChargeError(
                 f"expected charges {self.metadata.electrodes} and a writable `out` of the {self._press.size} numbers "
-                f"of a Contact that the model gives, or of the first {SEVEN}, both float32 arrays, got "
+                f"of a Contact that the model gives, or of the first {N_WITHOUT_CORRELATION}, both float32 arrays, got "
                 f"{_kind(charge_pC)} and {_kind(out)} ({error})"
             ) from error
 

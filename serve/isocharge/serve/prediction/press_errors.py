@@ -12,7 +12,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.flags import MISFIT, OUTSIDE
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.session import SEVEN
+from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.serve.prediction.contact import MISFIT_LIMIT, Contacts, Validity, inside_polygon
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.serve.prediction.predictor import Predictor
@@ -65,7 +65,7 @@ class PressErrors:
         error, noise, rig = self.error[press], self.noise_std[press], self.rig_std[press]
         return {
             "line": self.lines[press],
-            **dict(zip(Contacts._fields[:SEVEN], self.answer[press].tolist(), strict=False)),
+            **dict(zip(Contacts._fields[:N_WITHOUT_CORRELATION], self.answer[press].tolist(), strict=False)),
             "x_error_mm": error[0],
             "y_error_mm": error[1],
             "position_error_mm": self.position_error_mm[press],
@@ -117,7 +117,7 @@ def _answers(predictor: Predictor, charge_pC: Array) -> Array:
 
 def _flags(metadata: ModelMetadata, answer: Array) -> tuple[tuple[str, ...], ...]:
     outside = [OUTSIDE in flags for flags in Validity.of(metadata).batch_flags(Contacts(*answer.astype(np.float32).T))]
-    misfit, whole = answer[:, SEVEN - 1] > misfit_limit(metadata), ~np.isnan(answer[:, 0])
+    misfit, whole = answer[:, N_WITHOUT_CORRELATION - 1] > misfit_limit(metadata), ~np.isnan(answer[:, 0])
     return tuple(
         (OUTSIDE,) * (is_outside and is_whole) + (MISFIT,) * is_misfit
         for is_outside, is_misfit, is_whole in zip(outside, misfit.tolist(), whole.tolist(), strict=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError
-from isocharge.serve.model.session import SEVEN
+from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.tables.csv_table import CsvTable
@@ -103,7 +103,7 @@ def write_contacts(
     touches = np.ones(len(contacts.x_mm), dtype=bool)
     if validity is not None and charge_pC is not None:
         touches = validity.is_touch(charge_pC)
-    names = Contacts._fields[:SEVEN]
+    names = Contacts._fields[:N_WITHOUT_CORRELATION]
     no_contact = tuple("0.000000" if name == "force_N" else "" for name in names)
 
     writer = csv.writer(out, lineterminator="\n")
@@ -112,8 +112,9 @@ def write_contacts(
     for start in range(0, len(rows), BLOCK):
         block = rows[start : start + BLOCK]
         is_touch = touches[start : start + BLOCK]
+        values = block[:, :N_WITHOUT_CORRELATION].tolist()
         flags = [()] * len(block) if validity is None else validity.batch_flags(Contacts(*block.T))
-        for numbers, row_touches, words in zip(block[:, :SEVEN].tolist(), is_touch.tolist(), flags, strict=True):
+        for numbers, row_touches, words in zip(values, is_touch.tolist(), flags, strict=True):
             cells = tuple(map("{:.6f}".format, numbers)) if row_touches else no_contact
             if validity is None:
                 writer.writerow(cells)

@@ -20,7 +20,7 @@ import numpy as np
 from msgspec import Struct
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import DatasetError, SensorError, cut, shown, told_where
+from isocharge.common.errors import DatasetError, SensorError, cut, error_prefix, shown
 from isocharge.common.files import new_folder, read_needed, sha256_of, write_whole
 from isocharge.common.npz import npz_arrays
 from isocharge.common.structs import MOST_JSON_BYTES, Text, convert, parse_json
@@ -282,7 +282,7 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
             f"{folder} is not a dataset: it has no manifest.json; make one with 'isocharge simulate sweep'"
         )
     data = read_needed(path, DatasetError, "make the dataset again", MOST_JSON_BYTES)
-    with told_where(f"{path}: not a manifest of a dataset: ", DatasetError):
+    with error_prefix(f"{path}: not a manifest of a dataset: ", DatasetError):
         manifest = parse_json(data, "", DatasetError, dict[str, Any])
         if "format_version" not in manifest:
             raise DatasetError("key 'format_version' is missing")

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_type_hints
 
 from msgspec import defstruct, structs
 
-from isocharge.common.errors import InputError, told_where
+from isocharge.common.errors import InputError, error_prefix
 from isocharge.common.structs import NotNegative, Settings, read_toml
 from isocharge.simulate.measuring_chain.amplifier import Amplifier
 from isocharge.simulate.measuring_chain.noise import NoiseModel
@@ -96,7 +96,7 @@ def load_amplifier(level: str) -> Amplifier:
     given: dict[str, Any] = {name: value for name, value in structs.asdict(file).items() if value is not None}
     like = AMPLIFIER_LEVELS[given.pop("like")]
     white, gain = given.pop("white_pC", like.noise.white), given.pop("proportional", like.noise.gain)
-    with told_where(f"{level}: ", InputError):
+    with error_prefix(f"{level}: ", InputError):
         return replace(like, noise=NoiseModel(Path(level).stem, white, gain), **given)
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, field
 
-from isocharge.common.errors import SensorError, told_where
+from isocharge.common.errors import SensorError, error_prefix
 from isocharge.common.files import refuse_existing, write_whole
 from isocharge.common.structs import (
     Finite,
@@ -146,7 +146,7 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
     """Build a sensor from the tables of its file (units in the keys); `where` opens the error messages."""
     file = convert(table, SensorTable, where, SensorError)
     piezo, calibration, coating = file.piezo, file.calibration, file.electrodes.get(COATING)
-    with told_where(f"{where}: ", SensorError):
+    with error_prefix(f"{where}: ", SensorError):
         return Sensor(
             name=file.name,
             film=_film(file.film),

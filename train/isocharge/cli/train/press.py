@@ -20,7 +20,7 @@ from isocharge.cli.train.press_dialogue import Dialogue, OnTaken, Screen
 from isocharge.cli.train.press_events import PressEvents
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
-from isocharge.common.errors import InputError, PressError, told_where
+from isocharge.common.errors import InputError, PressError, error_prefix
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress
 from isocharge.serve.prediction.measured_presses import CONTACT, read_press_list
@@ -177,7 +177,7 @@ def _open_session(
 def _check_list(contacts: Array, session: PressSession, name: str) -> None:
     """Raise PressError, with the number of the row, if no calibration accepts a press of a machine's list."""
     for number, contact in enumerate(contacts, start=1):
-        with told_where(f"{name}, press {number}: ", PressError):
+        with error_prefix(f"{name}, press {number}: ", PressError):
             session.check(contact)
 
 

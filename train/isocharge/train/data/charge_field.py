@@ -20,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, TrainingError
-from isocharge.serve.model.charge_series import CHUNK, ChargeSeries, Series, plane_terms, terms
+from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, Series, chebyshev_terms, position_degrees
 from isocharge.simulate import NoiseModel, working_area
 from isocharge.simulate.forward.charge_map import Domain, within
 from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
@@ -159,14 +159,14 @@ def _least_squares(unit: Array, target: Array, degree: int, force_degree: int) -
     """Series for targets of shape (n, k), by the normal equations: double precision is plenty for these polynomials."""
     count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
     normal, moment = RIDGE * len(unit) * np.eye(count), np.zeros((count, target.shape[1]))
-    for some in np.array_split(np.arange(len(unit)), len(unit) // CHUNK + 1):
-        plane, in_force = terms(unit[some], degree, force_degree)
+    for some in np.array_split(np.arange(len(unit)), len(unit) // CHUNK_SIZE + 1):
+        plane, in_force = chebyshev_terms(unit[some], degree, force_degree)
         columns = (plane[:, :, None] * in_force[:, None, :]).reshape(len(some), -1)
         normal += columns.T @ columns
         moment += columns.T @ target[some]
     series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
     solution = cho_solve(cho_factor(normal), moment)
-    series[plane_terms(degree)] = solution.reshape(-1, force_degree + 1, target.shape[1])
+    series[position_degrees(degree)] = solution.reshape(-1, force_degree + 1, target.shape[1])
     return series
 
 

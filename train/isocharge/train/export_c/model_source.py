@@ -20,7 +20,7 @@ from isocharge.common.arrays import Array, Singles
 from isocharge.common.charge_features import ChargeFeatures
 from isocharge.serve import Contact, ModelMetadata
 from isocharge.serve.model.golden import Golden
-from isocharge.serve.model.session import CORRELATION, SEVEN
+from isocharge.serve.model.session import CORRELATION, N_WITHOUT_CORRELATION
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
 from isocharge.train.export_c.layer_source import LayerSource, find_blocks
 from isocharge.train.training.folded_network import (
@@ -102,7 +102,7 @@ def _layer_sources(network: FoldedNetwork) -> tuple[list[LayerSource], LayerSour
 
 def _contact_size(network: FoldedNetwork) -> int:
     """Return how many numbers of a `Contact` a network gives."""
-    return len(Contact._fields) if network.n_angle else SEVEN
+    return len(Contact._fields) if network.n_angle else N_WITHOUT_CORRELATION
 
 
 def _correlations_source(network: FoldedNetwork) -> str:

@@ -20,8 +20,8 @@ from isocharge.common.structs import convert
 from isocharge.serve.model.session import (
     CORRELATION,
     INPUT,
-    as_singles,
-    check_rows,
+    as_float32,
+    check_output_shapes,
     run,
     run_error,
     write_finite,
@@ -197,7 +197,7 @@ def _charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[
             f"input and Inference-Header-Content-Length, got binary_data_size {size!r:.50} and {len(binary)} bytes"
         )
     # A copy: what follows a JSON text may lie at any address, and a runtime expects numbers at even ones.
-    return as_singles(np.frombuffer(binary, dtype).reshape(shape).copy(), electrodes)
+    return as_float32(np.frombuffer(binary, dtype).reshape(shape).copy(), electrodes)
 
 
 def _from_values(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
@@ -226,7 +226,7 @@ def _examined(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Sin
             f"input {INPUT!r}: expected `data`, numbers for the shape {shape}, flat or in rows, "
             f"got {numbers.dtype} of shape {list(numbers.shape)}"
         )
-    return as_singles(numbers.reshape(shape), electrodes)
+    return as_float32(numbers.reshape(shape), electrodes)
 
 
 def _as_array(values: Any) -> np.ndarray[Any, Any]:
@@ -294,7 +294,7 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
             int(not misfit.item() <= loaded.validity.misfit_limit),
         )
     outputs = dict[str, Rows](run(loaded.model.session, charge_pC, names))
-    check_rows(outputs, len(charge_pC), loaded.metadata.label)
+    check_output_shapes(outputs, len(charge_pC), loaded.metadata.label)
     if "misfit" not in outputs:
         return outputs, len(charge_pC), 0
     return outputs, 0, len(charge_pC) - int(np.count_nonzero(outputs["misfit"] <= loaded.validity.misfit_limit))
