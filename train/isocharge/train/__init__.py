@@ -1,4 +1,6 @@
-"""Training: a dataset in, a small network that gives contacts from charges out, as an ONNX model with its card.
+"""Training of small networks that compute contacts from charges, and calibration of films by measured presses.
+
+A network is trained on a dataset, and released as a folder with an ONNX model and its card:
 
     from isocharge.simulate import read_dataset
     from isocharge.train import evaluate, fit, release
@@ -7,7 +9,8 @@
     print(evaluate(fitted))
     release(fitted, Path("models/mine"))
 
-Each of the three works alone.
+Each of these functions can be used without the others. The names in `needs_torch` are imported when they are first
+used, because torch takes a second to import.
 """
 
 from importlib import import_module
@@ -74,35 +77,21 @@ __all__ = [
 __version__: str
 
 if TYPE_CHECKING:
-    from isocharge.train.films.fit import FilmsConfig, fit_films
-    from isocharge.train.films.release import release_films
-    from isocharge.train.model_release.student import StudentCase, student_config, student_data
-    from isocharge.train.rig.rig_data import Rig, rig_data
-    from isocharge.train.training.cross_fit import fit_presses
-    from isocharge.train.training.fit import fit
-    from isocharge.train.training.source import Teacher, TrainingData
-else:  # a type checker would take every misspelt name for a text
-    _LATE = {  # with torch, which takes a second
-        "FilmsConfig": "films.fit",
-        "fit_films": "films.fit",
-        "release_films": "films.release",
-        "StudentCase": "model_release.student",
-        "student_config": "model_release.student",
-        "student_data": "model_release.student",
-        "Rig": "rig.rig_data",
-        "rig_data": "rig.rig_data",
-        "fit_presses": "training.cross_fit",
-        "fit": "training.fit",
-        "Teacher": "training.source",
-        "TrainingData": "training.source",
-    }
-    _other = version_attribute(__name__)
+    from isocharge.train.needs_torch import *
+else:  # hidden from type checkers, which would otherwise accept every misspelt name
+    _version_attribute = version_attribute(__name__)
 
     def __getattr__(name):
-        if name not in _LATE:
-            return _other(name)
+        """Import a public name from `needs_torch` when it is first used."""
+        if name not in __all__:
+            return _version_attribute(name)
         with require("train"):
-            globals()[name] = getattr(import_module(f"{__name__}.{_LATE[name]}"), name)
-        return globals()[name]
+            value = getattr(import_module("isocharge.train.needs_torch"), name)
+        globals()[name] = value
+        return value
+
+    def __dir__():
+        """List the public names that are not imported yet as well, for tab completion."""
+        return sorted({*globals(), *__all__})
 
     del TYPE_CHECKING

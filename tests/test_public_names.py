@@ -1,0 +1,41 @@
+"""Public names of the three packages: tab completion lists them, and each can be imported."""
+
+import subprocess
+import sys
+from importlib import import_module
+
+import pytest
+
+PACKAGES = ["isocharge.simulate", "isocharge.train", "isocharge.serve"]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_dir_lists_all_public_names_before_their_first_use(package):
+    """In a new process, because a name that was used once is an ordinary attribute from then on."""
+    code = (
+        f"import sys, {package} as package\n"
+        "print(*sorted(set(package.__all__) - set(dir(package))), 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_public_name_can_be_imported(package):
+    module = import_module(package)
+    assert all(getattr(module, name) is not None for name in module.__all__)
+    assert sorted(module.__all__) == module.__all__
+
+
+def test_every_name_of_the_module_with_torch_is_public():
+    """A name is lazy if it is listed there, and public if it is in `__all__`."""
+    lazy_names = [name for name in vars(import_module("isocharge.train.needs_torch")) if not name.startswith("_")]
+    assert lazy_names
+    assert set(lazy_names) <= set(import_module("isocharge.train").__all__)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_misspelt_name_is_an_attribute_error(package):
+    module = import_module(package)
+    with pytest.raises(AttributeError, match="has no attribute 'calibrat'"):
+        module.calibrat  # noqa: B018
