@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import Domain, noise_model
-from isocharge.train.baselines.rivals import FittingTask
+from isocharge.train.baselines.compared_methods import FittingTask
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 
 DOMAIN = Domain(8.0, (0.05, 2.0))

@@ -9,7 +9,7 @@ from sklearn.metrics import root_mean_squared_error
 
 from isocharge.serve.benchmark import Timing
 from isocharge.simulate import Domain, parse_probe
-from isocharge.train.baselines.rivals import GivenMethod, Rival
+from isocharge.train.baselines.compared_methods import ComparedMethod, GivenMethod
 from isocharge.train.data.presses import draw_contacts
 from isocharge.train.report.case import EvaluationCase
 from isocharge.train.report.measures import Errors, MethodRecord, coverage, pareto, verdict
@@ -74,9 +74,9 @@ def test_true_deviations_cover_their_level():
 
 
 def method(name, kind, error, p50, *, per_second=1e5, given=False, answered=1.0):
-    rival = Rival(name, kind, "NumPy", GivenMethod(), given_force=given)
+    compared = ComparedMethod(name, kind, "NumPy", GivenMethod(), given_force=given)
     timings = Timing(name, 1, 1, p50, p50, 1e6 / p50), Timing(name, 64, 1, 1.0, 1.0, per_second)
-    return MethodRecord(rival, Errors(error, error, error, 1.0, 1.0, answered), None, *timings, 1, 0.0)
+    return MethodRecord(compared, Errors(error, error, error, 1.0, 1.0, answered), None, *timings, 1, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ def test_better_is_to_the_left_and_below(plot):
     """The best two are on the front; the released model is marked; a limit above all errors is left out."""
     records = [
         SimpleNamespace(
-            rival=SimpleNamespace(name=name, kind="network", given_force=False),
+            compared=SimpleNamespace(name=name, kind="network", given_force=False),
             errors=SimpleNamespace(position_rms_mm=error),
             error_mm=error,
             competes=True,

@@ -1,7 +1,9 @@
-"""Every other way from charges to contacts, as regressors of scikit-learn's form, for the report on speed and error.
+"""Other methods to estimate a contact from charges, as regressors of scikit-learn, for the comparison in a report.
 
-from isocharge.train.baselines.rivals import rivals
+    from isocharge.train.baselines.compared_methods import compared_methods
 
-fitted = [rival.fit(task) for rival in rivals(task)]
-contact = fitted[0].regressor.predict(charge)  # (n, n_electrode), pC, to (n, 3): x, y, mm, and force, N
+    fitted = [method.fit(task) for method in compared_methods(task)]
+    contact = fitted[0].regressor.predict(charge)
+
+The charges have the shape (n, n_electrode), pC, and the contacts (x, y, F) the shape (n, 3), mm and N.
 """

@@ -1,7 +1,8 @@
-"""Gauss-Newton on a charge map: the contact whose charges fit best, maximum a posteriori.
+"""Maximum a posteriori estimate of a contact by the Gauss-Newton method on a charge map.
 
-The residuals are (Q - Q(c)) / sigma(Q); the prior, uniform over the disk and the range of log force, is a constraint.
-The start is the nearest of a few presses, and the next nearest where that led to charges that do not fit.
+The residuals are (Q - Q(c)) / sigma(Q). The prior is uniform over the disk and over the logarithm of the force, so it
+only constrains the contact. The search starts at the press with the nearest charges. If the residuals of the solution
+are too large, it starts again at the press with the next nearest charges.
 """
 
 import numpy as np
@@ -15,60 +16,80 @@ from isocharge.train.baselines.learned import whitening
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.presses import LabelledPresses, split_by_position
 
-STARTS = 600
-"""Presses that a start is chosen from."""
+N_STARTS = 600
+"""Number of presses among which the start of a search is chosen."""
 
-ATTEMPTS = 3
-"""Starts at most."""
+MAX_ATTEMPTS = 3
+"""Largest number of searches for one press."""
 
-DOUBTFUL = 12.0
-"""Sum of squared residuals from which another start is tried: noise alone, with a charge or none to spare, hardly
-reaches it."""
+RESTART_THRESHOLD = 12.0
+"""Sum of squared residuals above which another start is tried. Noise alone rarely exceeds it, with three or four
+charges."""
 
 BATCH = 512
-"""Presses at once: their polynomials stay in the cache."""
+"""Number of presses that are searched at once. The polynomials of a batch fit into the processor's cache."""
 
-HELD = 0.1
-"""Share of the positions by which the degree of the series is chosen."""
+VALIDATION_FRACTION = 0.1
+"""Fraction of the positions by which the degree of the charge series is chosen."""
 
 
 class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """The search.
+    """Regressor that searches the contact whose charges fit best.
 
-    Attributes:
-        domain: The contacts that can occur.
-        noise: The unit of the residuals.
-        charge_map: What is searched; the series of `ChargeField`, fitted to the presses, if absent.
-        seed: Of the starts.
+    Args:
+        domain: Contacts that can occur.
+        noise: Noise whose standard deviation is the unit of the residuals.
+        charge_map: Map from contacts to charges; None to fit a `ChargeField` to the presses.
+        seed: Seed of the starts.
     """
 
     def __init__(self, domain: Domain, noise: NoiseModel, charge_map: ChargeMap | None = None, seed: int = 0) -> None:
-        self.domain, self.noise, self.charge_map, self.seed = domain, noise, charge_map, seed
+        self.domain = domain
+        self.noise = noise
+        self.charge_map = charge_map
+        self.seed = seed
 
     def fit(self, charge: Array, contact: Array) -> "GaussNewton":
-        """Map and starts from clean presses."""
+        """Fit the charge map, unless it is given, and choose the starts.
+
+        Args:
+            charge: Charges without noise, shape (n, n_electrode), pC.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        """
         presses = LabelledPresses(contact, charge)
-        names = tuple(map(str, range(charge.shape[1])))
-        self.map_ = self.charge_map or ChargeField.fit(self.domain, names, *split_by_position(presses, HELD, self.seed))
-        rows = np.random.default_rng(self.seed).permutation(len(presses))[:STARTS]
-        self.features_, self.starts_ = whitening().fit(charge), contact[rows]
+        if self.charge_map is not None:
+            self.map_ = self.charge_map
+        else:
+            names = tuple(str(number) for number in range(charge.shape[1]))
+            train, validation = split_by_position(presses, VALIDATION_FRACTION, self.seed)
+            self.map_ = ChargeField.fit(self.domain, names, train, validation)
+        rows = np.random.default_rng(self.seed).permutation(len(presses))[:N_STARTS]
+        self.features_ = whitening().fit(charge)
+        self.starts_ = contact[rows]
         self.tree_ = cKDTree(self.features_.transform(charge[rows]))
         return self
 
     def predict(self, charge: Array) -> Array:
-        """Contacts, shape (n, 3)."""
-        return np.concatenate([self._search(charge[k : k + BATCH]) for k in range(0, len(charge), BATCH)])
+        """Estimate contacts, shape (n, 3), mm and N, from charges of shape (n, n_electrode), pC."""
+        batches = [self._search(charge[first : first + BATCH]) for first in range(0, len(charge), BATCH)]
+        return np.concatenate(batches)
 
     def _search(self, charge: Array) -> Array:
-        sigma, features = self.noise.sigma(charge), self.features_.transform(charge)
-        contact, square = np.empty((len(charge), 3)), np.full(len(charge), np.inf)
-        for attempt in range(1, ATTEMPTS + 1):
-            again = np.flatnonzero(square > DOUBTFUL)
-            if not again.size:
+        """Estimate the contacts of one batch."""
+        sigma = self.noise.sigma(charge)
+        features = self.features_.transform(charge)
+        contact = np.empty((len(charge), 3))
+        square_sum = np.full(len(charge), np.inf)
+        for attempt in range(1, MAX_ATTEMPTS + 1):
+            remaining = np.flatnonzero(square_sum > RESTART_THRESHOLD)
+            if not remaining.size:
                 break
-            start = self.starts_[self.tree_.query(features[again], [attempt])[1][:, 0]]
-            found, residual = explain(self.map_, charge[again], sigma[again], start)
-            found_square = (residual**2).sum(axis=1)
-            better = found_square < square[again]
-            contact[again[better]], square[again[better]] = found[better], found_square[better]
+            _, nearest = self.tree_.query(features[remaining], [attempt])
+            start = self.starts_[nearest[:, 0]]
+            solution, residual = explain(self.map_, charge[remaining], sigma[remaining], start)
+            solution_square_sum = (residual**2).sum(axis=1)
+            is_better = solution_square_sum < square_sum[remaining]
+            improved = remaining[is_better]
+            contact[improved] = solution[is_better]
+            square_sum[improved] = solution_square_sum[is_better]
         return contact

@@ -1,8 +1,8 @@
-"""What scikit-learn knows: regressors behind one transformer of the charges and one of the contacts.
+"""Regressors of scikit-learn with common transformers of the charges and of the contacts.
 
-They see whitened logarithms of the charges, a linear map of the log-ratios, which carry the position, and of the mean
-logarithm, which carries the force: the first principal axis is the force's, the next two are the position's, and what
-is left in a fourth charge is mostly noise. They learn x, y and ln F, scaled to [-1, 1].
+The inputs are whitened logarithms of the charges. The first principal axis is mostly the mean logarithm, which carries
+the force; the next two are mostly logarithms of ratios, which carry the position. A fourth charge adds an axis that is
+mostly noise. The targets are x, y and ln F, scaled to [-1, 1].
 """
 
 from typing import Any
@@ -24,19 +24,22 @@ from isocharge.train.data.channel_noise import BOTH_SIGNS, LEAST_BEND, usual_siz
 from isocharge.train.data.presses import LOWEST_CHARGE
 
 BATCH = 256
-"""Presses whose kernel rows a Gaussian process computes at once."""
+"""Number of presses for which a Gaussian process computes the kernel at once."""
 
-RULERS = ({"force": 1.0, "rest": 1.0}, {"force": 0.1, "rest": 0.03}, {"force": 0.03, "rest": 0.03})
-"""Candidates for the rulers of near neighbours, `stretched`: along the force the map hardly changes, so neighbours may
-be far apart there."""
+AXIS_SCALES = ({"force": 1.0, "rest": 1.0}, {"force": 0.1, "rest": 0.03}, {"force": 0.03, "rest": 0.03})
+"""Candidates for the factors of `scale_axes`. The map is nearly linear along the axis of the force, so neighbours may
+be far apart along this axis."""
+
+N_POSITION_AND_FORCE_AXES = 3
+"""Number of principal axes that carry force and position."""
 
 
 def on_logarithms(domain: Domain, **steps: Any) -> TransformedTargetRegressor:
-    """A regressor from charges (n, n_electrode), pC, to contacts (n, 3), mm and N.
+    """Return a regressor from charges, shape (n, n_electrode), pC, to contacts, shape (n, 3), mm and N.
 
     Args:
-        domain: The contacts that can occur.
-        steps: Transformers of the whitened logarithms, and the regressor last, by their names in the pipeline.
+        domain: Contacts that can occur.
+        steps: Steps of the pipeline by name: transformers of the whitened logarithms, then the regressor.
     """
     pipeline = Pipeline([*whitening().steps, *steps.items()])
     return TransformedTargetRegressor(
@@ -45,76 +48,102 @@ def on_logarithms(domain: Domain, **steps: Any) -> TransformedTargetRegressor:
 
 
 def whitening() -> Pipeline:
-    """From charges (n, n_electrode), pC, to logarithms along their principal axes, each of variance 1."""
+    """Return a transformer from charges, shape (n, n_electrode), pC, to whitened logarithms of the same shape."""
     return Pipeline([("logarithms", Logarithms()), ("whitening", PCA(whiten=True))])
 
 
 class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """ln(max(Q, 1 pC)) of charges, shape (n, n_electrode); asinh(2 Q / usual size) if they have both signs."""
+    """Transformer that computes ln(max(Q, 1 pC)), or asinh(2 Q / usual size) if the charges have both signs."""
 
     def fit(self, charge: Array, target: object = None) -> "Logarithms":
-        """Noise alone does not make a sign."""
+        """Determine whether charges, shape (n, n_electrode), pC, have both signs; noise alone does not count."""
         del target
-        signed = (np.mean(charge <= 0.0, axis=0) > BOTH_SIGNS).any()
-        self.bend_ = LEAST_BEND * usual_size(charge) if signed else None
+        is_negative = charge <= 0.0
+        has_both_signs = (is_negative.mean(axis=0) > BOTH_SIGNS).any()
+        self.scale_ = LEAST_BEND * usual_size(charge) if has_both_signs else None
         return self
 
     def transform(self, charge: Array) -> Array:
-        """The same shape."""
-        if self.bend_ is None:
+        """Transform charges, shape (n, n_electrode), pC; the result has the same shape."""
+        if self.scale_ is None:
             return np.asarray(np.log(np.maximum(charge, LOWEST_CHARGE)))
-        return np.asarray(np.arcsinh(charge / self.bend_))
+        return np.asarray(np.arcsinh(charge / self.scale_))
 
 
-def stretched(values: Array, force: float, rest: float) -> Array:
-    """Whitened logarithms with the force's axis, and those after the third, times a factor."""
+def scale_axes(values: Array, force: float, rest: float) -> Array:
+    """Multiply the principal axes of whitened logarithms by factors.
+
+    Args:
+        values: Whitened logarithms, shape (n, n_electrode).
+        force: Factor of the first axis, which carries the force.
+        rest: Factor of the axes after the third, which carry mostly noise.
+    """
     factors = np.full(values.shape[1], rest)
-    factors[:3] = force, 1.0, 1.0
+    factors[:N_POSITION_AND_FORCE_AXES] = 1.0
+    factors[0] = force
     return np.asarray(values * factors)
 
 
-class AfterLinear(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """A regressor on what a linear fit leaves: near the force's axis, all that is not linear is small."""
+class ResidualRegressor(BaseEstimator, RegressorMixin):  # type: ignore[misc]
+    """Sum of a linear regression and a regressor that is fitted to its residuals.
+
+    Args:
+        regressor: Regressor for the residuals, which are small because the map is nearly linear along the force.
+    """
 
     def __init__(self, regressor: Any) -> None:
         self.regressor = regressor
 
-    def fit(self, values: Array, target: Array) -> "AfterLinear":
-        """Both, one after the other."""
-        self.linear_, self.regressor_ = LinearRegression().fit(values, target), clone(self.regressor)
+    def fit(self, values: Array, target: Array) -> "ResidualRegressor":
+        """Fit the linear regression and then the regressor.
+
+        Args:
+            values: Inputs, shape (n, n_input).
+            target: Targets, shape (n, n_target).
+        """
+        self.linear_ = LinearRegression().fit(values, target)
+        self.regressor_ = clone(self.regressor)
         self.regressor_.fit(values, target - self.linear_.predict(values))
         return self
 
     def predict(self, values: Array) -> Array:
-        """Their sum."""
+        """Estimate the targets, shape (n, n_target), of inputs of shape (n, n_input)."""
         return np.asarray(self.linear_.predict(values) + self.regressor_.predict(values))
 
 
 class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """A Gaussian process on some of its presses, since its cost grows with them; lengths learned from fewer still.
+    """Gaussian process on a random subset of the presses, because its cost grows with the cube of their number.
 
-    Attributes:
-        points: Presses that it keeps.
-        learned_from: Presses that choose the kernel's lengths, by marginal likelihood.
-        seed: Of the choice.
+    Args:
+        points: Number of presses of the process.
+        kernel_points: Number of presses to which the kernel is fitted, by marginal likelihood.
+        seed: Seed of the subset.
     """
 
-    def __init__(self, points: int = 2000, learned_from: int = 500, seed: int = 0) -> None:
-        self.points, self.learned_from, self.seed = points, learned_from, seed
+    def __init__(self, points: int = 2000, kernel_points: int = 500, seed: int = 0) -> None:
+        self.points = points
+        self.kernel_points = kernel_points
+        self.seed = seed
 
     def fit(self, values: Array, target: Array) -> "SubsetProcess":
-        """Kernel, then weights."""
+        """Fit the kernel and then the process.
+
+        Args:
+            values: Inputs, shape (n, n_input).
+            target: Targets, shape (n, n_target).
+        """
         rows = np.random.default_rng(self.seed).permutation(len(values))[: self.points]
-        few, lengths = rows[: self.learned_from], np.full(values.shape[1], 2.0)
+        kernel_rows = rows[: self.kernel_points]
+        lengths = np.full(values.shape[1], 2.0)
         kernel = ConstantKernel(10.0, (1e-2, 1e5)) * RBF(lengths, (0.1, 100.0)) + WhiteKernel(1e-3, (1e-8, 1.0))
         with catch_warnings():
-            simplefilter("ignore", ConvergenceWarning)  # a length at its bound is an answer, too
-            learned = GaussianProcessRegressor(kernel, normalize_y=True).fit(values[few], target[few])
-        self.process_ = GaussianProcessRegressor(learned.kernel_, optimizer=None, normalize_y=True)
+            simplefilter("ignore", ConvergenceWarning)  # a length scale at its bound is acceptable
+            fitted = GaussianProcessRegressor(kernel, normalize_y=True).fit(values[kernel_rows], target[kernel_rows])
+        self.process_ = GaussianProcessRegressor(fitted.kernel_, optimizer=None, normalize_y=True)
         self.process_.fit(values[rows], target[rows])
         return self
 
     def predict(self, values: Array) -> Array:
-        """The posterior mean."""
-        parts = [self.process_.predict(values[k : k + BATCH]) for k in range(0, len(values), BATCH)]
-        return np.concatenate(parts)
+        """Compute the posterior mean, shape (n, n_target), of inputs of shape (n, n_input)."""
+        batches = [self.process_.predict(values[first : first + BATCH]) for first in range(0, len(values), BATCH)]
+        return np.concatenate(batches)

@@ -1,6 +1,7 @@
-"""Networks of several sizes, trained by the usual pipeline, and the released model.
+"""Networks for the comparison of methods: networks of several sizes, trained as usual, and the released model.
 
-The other methods give a contact and nothing else, so these networks run without deviations and misfit as well.
+The other methods of the comparison only estimate the contact, so these networks also run without standard deviations
+and misfit.
 """
 
 from collections.abc import Callable
@@ -16,9 +17,9 @@ from onnx.utils import Extractor
 
 from isocharge.common.arrays import Array
 from isocharge.serve import Predictor
-from isocharge.serve.model.session import INPUT, BoundPress, open_session
+from isocharge.serve.model.session import INPUT, SEVEN, BoundPress, open_session
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.train.baselines.rivals import GivenMethod
+from isocharge.train.baselines.compared_methods import GivenMethod
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.model_release.onnx_graph import write_contact_graph
 from isocharge.train.training.config import FitConfig, NetworkConfig, TrainingConfig
@@ -27,13 +28,16 @@ from isocharge.train.training.network import fold_contact_mean
 from isocharge.train.training.source import TrainingData
 
 RELEASED = "released network"
-"""Name of the released model among the methods."""
+"""Name of the released model in the comparison."""
+
+SMALL_MISFIT_WIDTH = 8
+"""Width of the hidden layers of a misfit perceptron that is not used."""
 
 
 class OnnxContact(GivenMethod):
-    """A graph with the input `charge_pC` and the output `contact` in ONNX Runtime, as `Predictor` runs it.
+    """ONNX graph with the input `charge_pC` and the output `contact`, run by ONNX Runtime as `Predictor` runs it.
 
-    Attributes:
+    Args:
         graph: The ONNX file.
     """
 
@@ -41,16 +45,23 @@ class OnnxContact(GivenMethod):
         self.graph = graph
 
     def predict(self, charge: Array) -> Array:
-        """Contacts, shape (n, 3)."""
-        return np.asarray(self._session.run(["contact"], {INPUT: charge.astype(np.float32)})[0], dtype=float)
+        """Estimate contacts, shape (n, 3), mm and N, from charges of shape (n, n_electrode), pC."""
+        (contact,) = self._session.run(["contact"], {INPUT: charge.astype(np.float32)})
+        return np.asarray(contact, dtype=float)
 
     def single(self, charge: Array) -> Callable[[], object]:
-        """One press, shape (n_electrode,), ready to be computed: through bound memory, as `Predictor` does it."""
-        press, row, out = BoundPress(self._session, charge.size), charge.astype(np.float32), np.zeros(3, np.float32)
+        """Return a function that computes one press with memory bound once, as `Predictor` does.
+
+        Args:
+            charge: Charges of the press, shape (n_electrode,), pC.
+        """
+        press = BoundPress(self._session, charge.size)
+        single_charge = charge.astype(np.float32)
+        contact = np.zeros(3, np.float32)
 
         def compute() -> object:
-            press.run_into(row, out)
-            return out
+            press.run_into(single_charge, contact)
+            return contact
 
         return compute
 
@@ -63,52 +74,77 @@ class OnnxContact(GivenMethod):
 
 
 class TrainedNetwork(OnnxContact):
-    """The contact network alone, of one size.
+    """Contact perceptron of one size, trained as usual.
 
-    Attributes:
-        data: For sensor and domain; the presses are those of `fit`.
-        hidden: Widths.
-        steps: Optimiser steps.
-        noise: On the charges while it trains.
-        seed: Of weights, batches and noise.
+    Args:
+        data: Sensor and domain; its presses are replaced by those of `fit`.
+        hidden: Widths of the hidden layers.
+        steps: Number of optimiser steps.
+        noise: Noise that is added to the charges in every step.
+        seed: Seed of weights, batches and noise.
     """
 
     def __init__(self, data: TrainingData, hidden: tuple[int, ...], steps: int, noise: NoiseModel, seed: int) -> None:
-        self.data, self.hidden, self.steps, self.noise, self.seed = data, hidden, steps, noise, seed
+        self.data = data
+        self.hidden = hidden
+        self.steps = steps
+        self.noise = noise
+        self.seed = seed
 
     def fit(self, charge: Array, contact: Array) -> Self:
-        """Train on clean presses."""
+        """Train the network.
+
+        Args:
+            charge: Charges without noise, shape (n, n_electrode), pC.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        """
         training = TrainingConfig(
             steps=self.steps, misfit_steps=1, misfit_charges=1000, hold_out=0.05, seed=self.seed, noise=self.noise
         )
-        sizes = NetworkConfig(hidden=self.hidden, misfit_hidden=(8,) * len(self.hidden))
-        data = replace(self.data, presses=LabelledPresses(contact, charge, self.data.presses.measured))
-        self.graph = write_contact_graph(fold_contact_mean(train_network(data, FitConfig(sizes, training)).network))
+        sizes = NetworkConfig(hidden=self.hidden, misfit_hidden=(SMALL_MISFIT_WIDTH,) * len(self.hidden))
+        presses = LabelledPresses(contact, charge, self.data.presses.measured)
+        trained = train_network(replace(self.data, presses=presses), FitConfig(sizes, training))
+        self.graph = write_contact_graph(fold_contact_mean(trained.network))
         return self
 
 
 class ReleasedModel(GivenMethod):
-    """A model folder through `Predictor`: contact, standard deviations and misfit.
+    """Model folder, run by `Predictor`.
 
-    Attributes:
-        folder: The version folder.
+    Args:
+        folder: Version folder of the model.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def predict(self, charge: Array) -> Array:
-        """Contacts, shape (n, 3)."""
-        return self.answer(charge)[0]
+        """Estimate contacts, shape (n, 3), mm and N, from charges of shape (n, n_electrode), pC."""
+        contact, _, _ = self.answer(charge)
+        return contact
 
     def answer(self, charge: Array) -> tuple[Array, Array, Array]:
-        """Contact (n, 3), standard deviations (n, 3) and misfit (n, 1)."""
-        columns = np.stack(self.predictor.predict_batch(charge), axis=1).astype(float)
-        return columns[:, :3], columns[:, 3:6], columns[:, 6:7]
+        """Estimate contacts with all outputs.
+
+        Args:
+            charge: Shape (n, n_electrode), pC.
+
+        Returns:
+            Contact (x, y, F), shape (n, 3), mm and N; its standard deviations, shape (n, 3); misfit, shape (n, 1).
+        """
+        answer = self.predictor.predict_batch(charge)
+        contact = np.stack([answer.x_mm, answer.y_mm, answer.force_N], axis=1)
+        std = np.stack([answer.x_std_mm, answer.y_std_mm, answer.force_std_N], axis=1)
+        misfit = np.reshape(answer.misfit, (-1, 1))
+        return contact.astype(float), std.astype(float), misfit.astype(float)
 
     def single(self, charge: Array) -> Callable[[], object]:
-        """One press, ready to be computed: `Predictor.predict_into`."""
-        return partial(self.predictor.predict_into, charge.astype(np.float32), np.zeros(7, np.float32))
+        """Return a function that computes one press with `Predictor.predict_into`.
+
+        Args:
+            charge: Charges of the press, shape (n_electrode,), pC.
+        """
+        return partial(self.predictor.predict_into, charge.astype(np.float32), np.zeros(SEVEN, np.float32))
 
     @cached_property
     def predictor(self) -> Predictor:
@@ -121,6 +157,7 @@ class ReleasedModel(GivenMethod):
         return (self.folder / "model.onnx").read_bytes()
 
     def contact_only(self) -> OnnxContact:
-        """Its contact alone, which is all that the other methods give."""
-        part = Extractor(onnx.load_model_from_string(self.graph)).extract_model([INPUT], ["contact"])
+        """Return the part of the graph that computes the contact, which is all that the other methods estimate."""
+        extractor = Extractor(onnx.load_model_from_string(self.graph))
+        part = extractor.extract_model([INPUT], ["contact"])
         return OnnxContact(part.SerializeToString())

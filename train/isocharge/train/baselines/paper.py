@@ -1,13 +1,14 @@
-"""The method of Mirbagheri et al. (2007), triangulation, and their two remedies, as regressors.
+"""The methods of Mirbagheri et al. (2007) as regressors: triangulation, the linear band and the lookup table.
 
-Linear band: up to 0.5 N the charges are taken as linear in the force, so that a position has one slope per electrode,
-Q = F s(x, y). The slopes are interpolated between the presses of the band by a polynomial of the position, and
-tabulated on a fine grid. Ratios of the charges give the nearest grid point; about it Q = F (s + ds/dx dx + ds/dy dy) is
-linear in F, F dx and F dy, and is solved. A slack film gives F^(2/3), not F: what that costs is what this method shows.
+Linear band: up to 0.5 N the charges are taken as proportional to the force, Q = F s(x, y), with one slope s for each
+electrode. The slopes are interpolated between the presses by a polynomial of the position and tabulated on a fine grid.
+The ratios of the charges give the nearest grid point. About this point, Q = F (s + ds/dx dx + ds/dy dy) is linear in F,
+F dx and F dy and is solved. On a slack film the charges are proportional to F^(2/3) instead, and the errors of this
+method show the consequence.
 
-Lookup table over forces and positions, interpolated: an entry is a contact with the mean of its presses; with it goes
-the affine map that fits its neighbourhood best. Large neighbourhoods of noisy presses average the noise, small ones of
-clean presses follow the map: validation decides. (Without interpolation a table is a nearest neighbour.)
+Lookup table: an entry is a contact with the mean features of its presses, and with the affine map that fits the presses
+in its neighbourhood best. Large neighbourhoods average the noise, and small ones follow the curvature of the map;
+validation chooses the size.
 """
 
 import numpy as np
@@ -21,152 +22,199 @@ from isocharge.simulate import ChargeMap, Triangulation
 
 
 class Triangulate(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """Where the contours meet; NaN where they do not, or twice.
+    """Regressor that intersects the charge contours; the answer is NaN if they do not meet at exactly one point.
 
-    Attributes:
-        charge_map: Where the contours come from.
-        given_force: Whether the true force, N, stands behind the charges of each press.
+    Args:
+        charge_map: Map from which the contours are computed.
+        given_force: Whether the inputs have a last column with the true force, N.
     """
 
     def __init__(self, charge_map: ChargeMap, *, given_force: bool = False) -> None:
-        self.charge_map, self.given_force = charge_map, given_force
+        self.charge_map = charge_map
+        self.given_force = given_force
 
     def fit(self, charge: Array, contact: Array) -> "Triangulate":
-        """Nothing is learned from presses."""
+        """Compute the contours of the charge map; the presses are not used."""
         del charge, contact
         self.contours_ = Triangulation(self.charge_map)
         return self
 
-    def predict(self, charge: Array) -> Array:
-        """Contacts, shape (n, 3)."""
+    def predict(self, inputs: Array) -> Array:
+        """Estimate contacts, shape (n, 3), mm and N.
+
+        Args:
+            inputs: Charges, shape (n, n_electrode), pC; with the true force, N, as an additional last column if
+                `given_force` is set.
+        """
         if not self.given_force:
-            return self.contours_.locate_with_force(charge).contact
-        force = np.clip(charge[:, -1], *self.charge_map.domain.force_range)
-        return self.contours_.locate(charge[:, :-1], force).contact
+            return self.contours_.locate_with_force(inputs).contact
+        charge, force = np.split(inputs, [inputs.shape[1] - 1], axis=1)
+        in_range = np.clip(force[:, 0], *self.charge_map.domain.force_range)
+        return self.contours_.locate(charge, in_range).contact
 
 
-BAND = 0.5
-"""Largest force of the band, N, as the paper has it."""
+MAX_BAND_FORCE = 0.5
+"""Largest force of the linear band in the paper, N."""
 
-FEWEST = 200
-"""Presses in the band below which slopes cannot be interpolated."""
+MIN_BAND_PRESSES = 200
+"""Number of presses in the band below which the slopes cannot be interpolated."""
 
-STEPS = 121
-"""Points of the grid across the working area."""
+GRID_POINTS = 121
+"""Number of grid points across the working area."""
 
-NEAR = 1e-4
-"""Step of the difference quotients over the radius."""
+DIFFERENCE_STEP = 1e-4
+"""Step of the central differences, relative to the radius of the working area."""
+
+LEAST_SQUARES_TOLERANCE = 1e-9
+"""Relative singular value below which the fit of the polynomial ignores a direction."""
+
+MIN_FORCE = 1e-6
+"""Smallest force of an answer, N."""
+
+MIN_DIVISOR = 1e-9
+"""Smallest force by which F dx and F dy are divided, N."""
 
 
 class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """Slopes on a grid.
+    """Regressor that assumes charges in proportion to the force.
 
-    Attributes:
-        radius: Of the working area, mm.
-        degree: Of the polynomial of the slopes.
+    Args:
+        radius: Radius of the working area, mm.
+        degree: Total degree of the polynomial of the slopes.
     """
 
     def __init__(self, radius: float, degree: int = 10) -> None:
-        self.radius, self.degree = radius, degree
+        self.radius = radius
+        self.degree = degree
 
     def fit(self, charge: Array, contact: Array) -> "LinearBand":
-        """Slopes from the presses of the band: ln(Q / F) as Chebyshev polynomials of x and y up to a total degree.
+        """Fit ln(Q / F) of the presses in the band by Chebyshev polynomials of x and y, and tabulate the slopes.
+
+        Args:
+            charge: Shape (n, n_electrode), pC.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Raises:
-            DatasetError: If there are too few presses of small force, or charges that are not positive.
+            DatasetError: If there are too few presses in the band, or charges that are not positive.
         """
-        band = contact[:, 2] <= BAND
-        if np.count_nonzero(band) < FEWEST:
+        in_band = contact[:, 2] <= MAX_BAND_FORCE
+        n_band = np.count_nonzero(in_band)
+        if n_band < MIN_BAND_PRESSES:
             raise DatasetError(
-                f"linear band: expected at least {FEWEST} presses of at most {BAND} N, got {np.count_nonzero(band)}; "
-                "sweep smaller forces"
+                f"linear band: expected at least {MIN_BAND_PRESSES} presses of at most {MAX_BAND_FORCE} N, got "
+                f"{n_band}; sweep smaller forces"
             )
-        if (charge[band] <= 0.0).any():
+        if (charge[in_band] <= 0.0).any():
             raise DatasetError("linear band: expected positive charges, for it interpolates their logarithms")
-        slope = np.log(charge[band] / contact[band, 2:])
-        series = np.linalg.lstsq(self._terms(contact[band, :2] / self.radius), slope, rcond=1e-9)[0]
-        axis = np.linspace(-1.0, 1.0, STEPS)
+        log_slope = np.log(charge[in_band] / contact[in_band, 2:])
+        terms = self._terms(contact[in_band, :2] / self.radius)
+        series, *_ = np.linalg.lstsq(terms, log_slope, rcond=LEAST_SQUARES_TOLERANCE)
+
+        axis = np.linspace(-1.0, 1.0, GRID_POINTS)
         square = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-        grid = square[np.hypot(*square.T) <= 1.0]
-        slopes = [np.exp(self._terms(grid) @ series)]
-        for step in NEAR * np.eye(2):
-            change = (self._terms(grid + step) - self._terms(grid - step)) @ series
-            slopes.append(slopes[0] * change / (2.0 * NEAR * self.radius))
-        self.position_, self.inverse_ = grid * self.radius, np.linalg.pinv(np.stack(slopes, axis=2))
-        self.tree_ = cKDTree(directions(slopes[0]))
+        grid = square[np.hypot(square[:, 0], square[:, 1]) <= 1.0]
+        slope = np.exp(self._terms(grid) @ series)
+        columns = [slope]
+        for step in DIFFERENCE_STEP * np.eye(2):
+            log_difference = (self._terms(grid + step) - self._terms(grid - step)) @ series
+            columns.append(slope * log_difference / (2.0 * DIFFERENCE_STEP * self.radius))
+        self.position_ = grid * self.radius
+        self.inverse_ = np.linalg.pinv(np.stack(columns, axis=2))
+        self.tree_ = cKDTree(unit_vectors(slope))
         return self
 
     def predict(self, charge: Array) -> Array:
-        """Contacts, shape (n, 3)."""
-        rows = self.tree_.query(directions(charge))[1]
-        parts = np.einsum("nke,ne->nk", self.inverse_[rows], charge)
-        most = 4.0 * self.radius / (STEPS - 1)  # a linear map holds no farther than to the next grid points
-        shift = np.clip(parts[:, 1:] / np.maximum(parts[:, :1], 1e-9), -most, most)
-        return np.column_stack([self.position_[rows] + shift, np.maximum(parts[:, 0], 1e-6)])
+        """Estimate contacts, shape (n, 3), mm and N, from charges of shape (n, n_electrode), pC."""
+        _, rows = self.tree_.query(unit_vectors(charge))
+        force, force_times_shift = np.split(np.einsum("nke,ne->nk", self.inverse_[rows], charge), [1], axis=1)
+        max_shift = 4.0 * self.radius / (GRID_POINTS - 1)  # the linear map is valid up to the next grid points
+        shift = np.clip(force_times_shift / np.maximum(force, MIN_DIVISOR), -max_shift, max_shift)
+        return np.column_stack([self.position_[rows] + shift, np.maximum(force, MIN_FORCE)])
 
-    def _terms(self, at: Array) -> Array:
-        """Products of the polynomials at positions over the radius, shape (n, n_term)."""
-        count = self.degree + 1
-        inside = np.triu(np.ones((count, count), dtype=bool))[:, ::-1].ravel()
-        terms: Array = chebyshev.chebvander2d(at[:, 0], at[:, 1], [self.degree, self.degree]).astype(float)
-        return terms[:, inside]
+    def _terms(self, position: Array) -> Array:
+        """Evaluate the products of Chebyshev polynomials up to the total degree.
+
+        Args:
+            position: Positions relative to the radius, shape (n, 2).
+
+        Returns:
+            Shape (n, n_term).
+        """
+        products = chebyshev.chebvander2d(position[:, 0], position[:, 1], [self.degree, self.degree])
+        x_degree, y_degree = np.indices((self.degree + 1, self.degree + 1))
+        in_total_degree = (x_degree + y_degree <= self.degree).ravel()
+        terms: Array = products.astype(float)[:, in_total_degree]
+        return terms
 
 
-def directions(charge: Array) -> Array:
-    """Ratios of charges, shape (n, n_electrode): each row of length one."""
+def unit_vectors(charge: Array) -> Array:
+    """Normalise each row of charges, shape (n, n_electrode), to length one, so that only ratios remain."""
     return np.asarray(charge / np.linalg.norm(charge, axis=1, keepdims=True))
 
 
 CHUNK = 100_000
-"""Neighbours gathered at once."""
+"""Number of neighbours that are gathered at once."""
 
 RIDGE = 1e-6
-"""Relative ridge of an affine map: neighbours may lie in a plane."""
+"""Ridge of an affine map, relative to the trace of the normal matrix; neighbours can lie in a plane."""
 
 
 class AffineTable(BaseEstimator, RegressorMixin):  # type: ignore[misc]
-    """Nearest entry and its affine map.
+    """Lookup table whose entries have affine maps.
 
-    Attributes:
-        neighbours: Presses that a map is fitted to.
+    Args:
+        neighbours: Number of presses to which the affine map of an entry is fitted.
     """
 
     def __init__(self, neighbours: int = 64) -> None:
         self.neighbours = neighbours
 
     def fit(self, values: Array, target: Array) -> "AffineTable":
-        """Entries and maps; rows with the same target are one entry."""
+        """Compute the entries and their affine maps; rows with the same target form one entry.
+
+        Args:
+            values: Features of presses, shape (n, n_feature).
+            target: Contacts in any coordinates, shape (n, n_target).
+        """
         _, entry, count = np.unique(target, axis=0, return_inverse=True, return_counts=True)
         sums = np.zeros((count.size, values.shape[1]))
         np.add.at(sums, entry.ravel(), values)
-        entries, presses = sums / count[:, None], cKDTree(values)
+        entries = sums / count[:, None]
+
+        presses = cKDTree(values)
+        neighbour_ranks = range(1, min(self.neighbours, len(values)) + 1)
         chunk = max(1, CHUNK // self.neighbours)
-        parts = []
-        for at in np.array_split(entries, len(entries) // chunk + 1):
-            rows = presses.query(at, range(1, min(self.neighbours, len(values)) + 1))[1]
-            parts.append(affine_maps(values[rows] - at[:, None], target[rows]))
-        self.tree_, self.maps_ = cKDTree(entries), np.concatenate(parts)
+        maps = []
+        for centres in np.array_split(entries, len(entries) // chunk + 1):
+            _, rows = presses.query(centres, neighbour_ranks)
+            maps.append(affine_maps(values[rows] - centres[:, None], target[rows]))
+        self.tree_ = cKDTree(entries)
+        self.maps_ = np.concatenate(maps)
         return self
 
     def predict(self, values: Array) -> Array:
-        """The nearest entries' maps."""
-        rows = self.tree_.query(values)[1]
-        linear = np.einsum("ne,nek->nk", values - self.tree_.data[rows], self.maps_[rows, :-1])
-        return np.asarray(linear + self.maps_[rows, -1])
+        """Apply the affine map of the nearest entry to features of shape (n, n_feature)."""
+        _, rows = self.tree_.query(values)
+        n_feature = values.shape[1]
+        slope, constant = np.split(self.maps_[rows], [n_feature], axis=1)
+        linear = np.einsum("ne,nek->nk", values - self.tree_.data[rows], slope)
+        return np.asarray(linear + constant[:, 0])
 
 
 def affine_maps(offset: Array, target: Array) -> Array:
-    """Least squares with a ridge on the slopes.
+    """Fit affine maps by least squares with a ridge on the slopes.
 
     Args:
-        offset: Presses about each entry, shape (m, k, p).
-        target: Theirs, shape (m, k, q).
+        offset: Features of the neighbours relative to each of m entries, shape (m, k, p).
+        target: Targets of the neighbours, shape (m, k, q).
 
     Returns:
-        Shape (m, p + 1, q): (offset, 1) times the map is the target.
+        Maps, shape (m, p + 1, q). The row (offset, 1) times the map is the target.
     """
-    columns = np.concatenate([offset, np.ones((*offset.shape[:2], 1))], axis=2)
+    n_entry, n_neighbour, n_feature = offset.shape
+    columns = np.concatenate([offset, np.ones((n_entry, n_neighbour, 1))], axis=2)
     normal = columns.transpose(0, 2, 1) @ columns
-    size = np.trace(normal[:, :-1, :-1], axis1=1, axis2=2)
-    normal[:, :-1, :-1] += RIDGE * size[:, None, None] * np.eye(offset.shape[2])
+    slopes = slice(0, n_feature)
+    trace = np.trace(normal[:, slopes, slopes], axis1=1, axis2=2)
+    normal[:, slopes, slopes] += RIDGE * trace[:, None, None] * np.eye(n_feature)
     return np.asarray(np.linalg.solve(normal, columns.transpose(0, 2, 1) @ target))

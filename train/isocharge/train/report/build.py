@@ -20,17 +20,17 @@ from isocharge.serve.benchmark import machine
 from isocharge.simulate import ChargeSpline, Dataset, Samples
 from isocharge.simulate.plots.figure import save_picture
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
-from isocharge.train.baselines.networks import RELEASED, ReleasedModel, TrainedNetwork
-from isocharge.train.baselines.rivals import (
+from isocharge.train.baselines.compared_methods import (
     BOOSTING,
     GAUSS_NEWTON,
     LINEAR_BAND,
     POLYNOMIAL,
     TABLE,
+    ComparedMethod,
     FittingTask,
-    Rival,
-    rivals,
+    compared_methods,
 )
+from isocharge.train.baselines.networks import RELEASED, ReleasedModel, TrainedNetwork
 from isocharge.train.data.presses import (
     LabelledPresses,
     check_enough,
@@ -186,11 +186,16 @@ class _Subject:
         test = replace(clean, charge=clean.noisy(case.noise, case.seed + TEST_NOISE))
         charges = ChargeSpline.of(exact[0])
         limits = ErrorBounds.of(case, charges, clean, test.charge[: settings.limited], executor)
-        methods, _ = fit_all([*self._models(), *rivals(self.task, charges), *self._networks()], self.task, test)
-        records, fitted = records_of(methods, test, settings, limits.bayes), {each.rival.name: each for each in methods}
+        methods, _ = fit_all(
+            [*self._models(), *compared_methods(self.task, charges), *self._networks()], self.task, test
+        )
+        records, fitted = (
+            records_of(methods, test, settings, limits.bayes),
+            {each.compared.name: each for each in methods},
+        )
         draws = studies.Draws.of(released, clean, case, settings.draws)
         threshold = alarm_threshold(draws.misfit)
-        compared = [fitted[name].rival for name in COMPARED]
+        compared = [fitted[name].compared for name in COMPARED]
         contacts = {name: fitted[name].contact for name in (RELEASED, *COMPARED)}
         lines = contacts if limits.bayes is None else {BAYES: limits.bayes, **contacts}
         different = [
@@ -211,7 +216,7 @@ class _Subject:
 
     def _measured(self, test: LabelledPresses) -> tuple[dict[str, Any], Drawings]:
         """The same of measured presses, as they are: what needs a simulator is left out."""
-        methods, refused = fit_all([*self._models(), *rivals(self.task), *self._networks()], self.task, test)
+        methods, refused = fit_all([*self._models(), *compared_methods(self.task), *self._networks()], self.task, test)
         records = records_of(methods, test, self.settings)
         section = {
             **self._about(len(test)),
@@ -222,18 +227,20 @@ class _Subject:
         }
         return section, {}
 
-    def _models(self) -> list[Rival]:
+    def _models(self) -> list[ComparedMethod]:
         """The models that are compared as they are, the released one first."""
         models = {RELEASED: self.released}
         models |= {Predictor(path).metadata.name: ReleasedModel(path) for path in self.students}
         rows = []
         for name, model in models.items():
-            rows.append(Rival(name, "network", "Predictor", model, choice="as released"))
+            rows.append(ComparedMethod(name, "network", "Predictor", model, choice="as released"))
             contact, choice = model.contact_only(), "as released, its contact alone"
-            rows.append(Rival(f"{name}, contact only", "network", "ONNX Runtime, bound", contact, choice=choice))
+            rows.append(
+                ComparedMethod(f"{name}, contact only", "network", "ONNX Runtime, bound", contact, choice=choice)
+            )
         return rows
 
-    def _networks(self) -> list[Rival]:
+    def _networks(self) -> list[ComparedMethod]:
         """Networks of several sizes."""
         case, noise, steps = self.case, self.case.noise, self.settings.steps
         data = TrainingData(
@@ -244,7 +251,7 @@ class _Subject:
             sha256=self.dataset.sha256,
         )
         return [
-            Rival(
+            ComparedMethod(
                 f"network {'-'.join(map(str, hidden))}",
                 "network",
                 "ONNX Runtime, bound",

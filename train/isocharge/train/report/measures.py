@@ -10,7 +10,7 @@ import scipy  # loads a part when it is used
 from isocharge.common.arrays import Array
 from isocharge.serve.benchmark import Timing
 from isocharge.simulate.numerics.statistics import rms
-from isocharge.train.baselines.rivals import Rival
+from isocharge.train.baselines.compared_methods import ComparedMethod
 from isocharge.train.data.presses import position_error
 
 
@@ -66,7 +66,7 @@ class MethodRecord:
     """What the report says about a method.
 
     Attributes:
-        rival: The method, fitted.
+        compared: The method, fitted.
         errors: On all test presses.
         over_bayes: Position error over the Bayes limit's on the same presses; None where there is no limit.
         one: Durations of single predictions.
@@ -76,7 +76,7 @@ class MethodRecord:
         best_on: Plots on which no method is better in both error and cost.
     """
 
-    rival: Rival
+    compared: ComparedMethod
     errors: Errors
     over_bayes: float | None
     one: Timing
@@ -88,12 +88,12 @@ class MethodRecord:
     @property
     def label(self) -> str:
         """Name, and what computes it."""
-        return f"{self.rival.name} ({self.rival.computed_by})"
+        return f"{self.compared.name} ({self.compared.computed_by})"
 
     @property
     def competes(self) -> bool:
         """Whether it answers what the others answer: all presses, from the charges alone."""
-        return not self.rival.given_force and self.errors.answered == 1.0
+        return not self.compared.given_force and self.errors.answered == 1.0
 
     @property
     def error_mm(self) -> float:
@@ -109,11 +109,11 @@ class MethodRecord:
         """As in `report.json`."""
         return {
             "label": self.label,
-            "name": self.rival.name,
-            "form": self.rival.computed_by,
-            "kind": self.rival.kind,
-            "choice": self.rival.choice,
-            "force_given": self.rival.given_force,
+            "name": self.compared.name,
+            "form": self.compared.computed_by,
+            "kind": self.compared.kind,
+            "choice": self.compared.choice,
+            "force_given": self.compared.given_force,
             "errors": asdict(self.errors),
             "over_bayes": self.over_bayes,
             "p50_us": rounded(self.one.p50_us),
@@ -182,8 +182,8 @@ def verdict(records: Sequence[MethodRecord]) -> dict[str, Any]:
         for plot in WORDS
     }
     groups = {
-        "other methods": [record for record in others if record.rival.kind != "network"],
-        "networks that give the contact alone": [record for record in others if record.rival.kind == "network"],
+        "other methods": [record for record in others if record.compared.kind != "network"],
+        "networks that give the contact alone": [record for record in others if record.compared.kind == "network"],
     }
     sentences = [_sentence(plot, released, group, kind) for kind, group in groups.items() if group for plot in WORDS]
     return {"both": both, "sentences": sentences}

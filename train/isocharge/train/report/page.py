@@ -105,8 +105,8 @@ def _methods(section: Section) -> Iterator[str]:
 def _cells(record: MethodRecord) -> list[str]:
     errors = record.errors
     cells = [
-        record.rival.name + (f" ({100 * errors.answered:.3g} % answered)" if errors.answered < 1.0 else ""),
-        record.rival.computed_by,
+        record.compared.name + (f" ({100 * errors.answered:.3g} % answered)" if errors.answered < 1.0 else ""),
+        record.compared.computed_by,
         *(_number(value) for value in (errors.position_rms_mm, errors.position_median_mm, errors.position_p95_mm)),
         _number(record.over_bayes),
         _number(errors.force_rms_percent),
@@ -141,7 +141,7 @@ def _case_cells(case: Mapping[str, Any], names: Sequence[str]) -> list[str]:
 
 def _choices(records: Sequence[MethodRecord]) -> Iterator[str]:
     yield "### Choices"
-    rows = [[record.rival.name, record.rival.choice, _number(record.fit_seconds)] for record in records]
+    rows = [[record.compared.name, record.compared.choice, _number(record.fit_seconds)] for record in records]
     yield table(["method", "chosen", "fitting, s"], rows, left=2)
 
 

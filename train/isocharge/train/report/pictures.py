@@ -56,18 +56,22 @@ def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: Mapping[str,
     shown = [record for record in records if record.errors.position_rms_mm]
     markers = {kind: cycle(MARKERS) for kind in KINDS}
     for record in sorted(shown, key=lambda record: record.error_mm):
-        colour, hollow = KINDS[record.rival.kind], not record.competes
-        marker, fill = next(markers[record.rival.kind]), "white" if hollow else colour
+        colour, hollow = KINDS[record.compared.kind], not record.competes
+        marker, fill = next(markers[record.compared.kind]), "white" if hollow else colour
         style: dict[str, Any] = {"color": colour, "mfc": fill, "marker": marker, "ms": 7}
-        if record.rival.name == RELEASED:
+        if record.compared.name == RELEASED:
             style = {"color": FELT, "marker": "*", "ms": 14}
         axes.plot(
-            record.cost(plot), record.error_mm, ls="", label=f"{record.rival.name}, {record.error_mm:.3g} mm", **style
+            record.cost(plot),
+            record.error_mm,
+            ls="",
+            label=f"{record.compared.name}, {record.error_mm:.3g} mm",
+            **style,
         )
     front = sorted((record.cost(plot), record.error_mm) for record in shown if plot in record.best_on)
     step = "steps-pre" if plot == "throughput" else "steps-post"
     axes.plot(*zip(*front, strict=True), ls="--", color=INK, lw=1.0, drawstyle=step, zorder=1, label="unbeaten")
-    highest = max(record.error_mm for record in shown if not record.rival.given_force)
+    highest = max(record.error_mm for record in shown if not record.compared.given_force)
     for name, value in limits.items():
         if value <= highest:  # unbiased near a fold: centimetres
             axes.axhline(value, color=INK, ls=OWN_STYLES[name]["ls"], zorder=1, label=f"{name}, {value:.3g} mm")

@@ -12,8 +12,8 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.simulate import Domain, NoiseModel, parse_probe
 from isocharge.simulate.numerics.statistics import rms
+from isocharge.train.baselines.compared_methods import ComparedMethod
 from isocharge.train.baselines.networks import ReleasedModel
-from isocharge.train.baselines.rivals import Rival
 from isocharge.train.data.presses import LabelledPresses, position_error
 from isocharge.train.report.case import CRAMER_RAO, EvaluationCase, Settings, press_on
 from isocharge.train.report.measures import Errors, coverage, rounded
@@ -149,13 +149,17 @@ def _wrong_gains(case: EvaluationCase, truth: Array, noisy: Array) -> Iterator[D
 
 
 def measured(
-    deviation: Deviation, name: str, released: ReleasedModel, rivals: Sequence[Rival], threshold: float
+    deviation: Deviation,
+    name: str,
+    released: ReleasedModel,
+    compared_methods: Sequence[ComparedMethod],
+    threshold: float,
 ) -> dict[str, Any]:
     """Errors of the released model, by its name, and of others, and how often its misfit gives the alarm."""
     contact, std, misfit = released.answer(deviation.charge)
     with np.errstate(over="ignore"):
-        answers = {rival.name: rival.regressor.predict(deviation.charge) for rival in rivals}
-    clipped = {rival: np.clip(answer, -FARTHEST, FARTHEST) for rival, answer in answers.items()}
+        answers = {compared.name: compared.regressor.predict(deviation.charge) for compared in compared_methods}
+    clipped = {compared: np.clip(answer, -FARTHEST, FARTHEST) for compared, answer in answers.items()}
     return {
         "group": deviation.group,
         "case": deviation.name,
@@ -163,6 +167,7 @@ def measured(
         "alarms_percent": rounded(100.0 * float(np.mean(misfit[:, 0] > threshold)), 3),
         "coverage_68": rounded(float(np.mean(np.abs(contact - deviation.truth) < std)), 3),
         "errors": {
-            rival: asdict(Errors.of(answer, deviation.truth)) for rival, answer in {name: contact, **clipped}.items()
+            compared: asdict(Errors.of(answer, deviation.truth))
+            for compared, answer in {name: contact, **clipped}.items()
         },
     }

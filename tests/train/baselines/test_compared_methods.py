@@ -12,11 +12,11 @@ from isocharge.common.errors import DatasetError
 from isocharge.serve import find_model
 from isocharge.simulate import Domain, FunctionMap, noise_model
 from isocharge.simulate.numerics.statistics import rms
+from isocharge.train.baselines.compared_methods import compared_methods, polynomial_ridge
 from isocharge.train.baselines.gauss_newton import GaussNewton
 from isocharge.train.baselines.learned import Logarithms
 from isocharge.train.baselines.networks import OnnxContact, ReleasedModel
 from isocharge.train.baselines.paper import Triangulate
-from isocharge.train.baselines.rivals import polynomial_ridge, rivals
 from isocharge.train.data.presses import LabelledPresses, position_error
 from isocharge.train.model_release.onnx_graph import write_contact_graph
 from isocharge.train.training.config import NetworkConfig
@@ -40,19 +40,19 @@ its own."""
 @pytest.fixture(scope="module")
 def fitted(task):
     """Every method, fitted once, by its name."""
-    return {rival.name: rival.fit(task) for rival in rivals(task)}
+    return {method.name: method.fit(task) for method in compared_methods(task)}
 
 
 @pytest.mark.parametrize("name", ALLOWED)
 def test_close_to_the_contacts_that_gave_the_charges(name, fitted, test_presses):
-    rival, charge, (most_mm, most_force) = fitted[name], test_presses.charge, ALLOWED[name]
-    answers = rival.regressor.predict(charge)
+    method, charge, (most_mm, most_force) = fitted[name], test_presses.charge, ALLOWED[name]
+    answers = method.regressor.predict(charge)
     assert rms(position_error(answers, test_presses.contact)) < most_mm
     assert rms(answers[:, 2] / test_presses.contact[:, 2] - 1.0) < most_force
-    np.testing.assert_allclose(rival.regressor.predict(charge[:1]), answers[:1], rtol=1e-9, atol=1e-9)
-    restored = pickle.loads(pickle.dumps(rival.regressor))  # the report counts these bytes
+    np.testing.assert_allclose(method.regressor.predict(charge[:1]), answers[:1], rtol=1e-9, atol=1e-9)
+    restored = pickle.loads(pickle.dumps(method.regressor))  # the report counts these bytes
     np.testing.assert_array_equal(restored.predict(charge), answers)
-    assert f"{3000} " in rival.choice
+    assert f"{3000} " in method.choice
 
 
 def test_a_polynomial_does_not_explode_outside_of_what_it_saw(fitted, task):
@@ -68,22 +68,22 @@ def test_logarithms_of_charges_of_both_signs_are_asinh_of_twice_their_share_of_t
 @pytest.mark.parametrize(("electrodes", "degrees"), [(3, [10, 12]), (5, [4, 6]), (8, [4]), (40, [1])])
 def test_many_electrodes_lower_the_degree(electrodes, degrees):
     task = KnownMap(electrodes).task()
-    rival = polynomial_ridge(task)
-    assert rival.candidates["regressor__monomials__degree"] == degrees
+    method = polynomial_ridge(task)
+    assert method.candidates["regressor__monomials__degree"] == degrees
     if electrodes >= 8:
-        assert np.isfinite(rival.fit(task).regressor.predict(task.validation.charge)).all()
+        assert np.isfinite(method.fit(task).regressor.predict(task.validation.charge)).all()
 
 
 def test_validation_chooses_and_the_choice_is_said():
     task = KnownMap(3).task(quick=False)
-    band = next(rival for rival in rivals(task) if rival.name == "linear band").fit(task)
+    band = next(method for method in compared_methods(task) if method.name == "linear band").fit(task)
     assert "best of 3 by validation" in band.choice
     assert band.regressor.degree in (6, 10, 14)
 
 
 def test_a_band_without_presses_is_refused(task):
     strong = task.train[task.train.contact[:, 2] > 0.5]
-    band = next(rival for rival in rivals(task) if rival.name == "linear band")
+    band = next(method for method in compared_methods(task) if method.name == "linear band")
     with pytest.raises(DatasetError, match=r"at least 200 presses of at most 0.5 N, got 0"):
         band.regressor.fit(strong.charge, strong.contact)
 

@@ -1,0 +1,293 @@
+"""The methods that a report compares: regressors with the interface of scikit-learn, from charges to contacts."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import comb
+from typing import Any, Literal, Protocol, Self
+
+import numpy as np
+from sklearn.base import BaseEstimator, RegressorMixin, clone
+from sklearn.ensemble import HistGradientBoostingRegressor
+from sklearn.linear_model import Ridge
+from sklearn.model_selection import ParameterGrid
+from sklearn.multioutput import MultiOutputRegressor
+from sklearn.neighbors import KNeighborsRegressor
+from sklearn.preprocessing import FunctionTransformer, MinMaxScaler, PolynomialFeatures
+
+from isocharge.common.arrays import Array
+from isocharge.simulate import ChargeMap, Domain, NoiseModel
+from isocharge.simulate.numerics.statistics import rms
+from isocharge.train.baselines.gauss_newton import GaussNewton
+from isocharge.train.baselines.learned import AXIS_SCALES, ResidualRegressor, SubsetProcess, on_logarithms, scale_axes
+from isocharge.train.baselines.paper import AffineTable, LinearBand, Triangulate
+from isocharge.train.data.presses import LabelledPresses, position_error
+
+Kind = Literal["paper", "learnt", "fitted map", "network"]
+"""Kind of a method, which decides about its colour in pictures."""
+
+FIRST_COPY_SEED = 1000
+"""Seed of the noise on the first copy of the training presses, relative to the seed of the task."""
+
+VALIDATION_SEED = 999
+"""Seed of the noise on the validation presses, relative to the seed of the task."""
+
+
+class GivenMethod(BaseEstimator, RegressorMixin):  # type: ignore[misc]
+    """A method that is not fitted to presses."""
+
+    def fit(self, charge: Array, contact: Array) -> Self:
+        """Return the unchanged method."""
+        del charge, contact
+        return self
+
+
+class Regressor(Protocol):
+    """Interface of the methods. A method also derives from scikit-learn's `BaseEstimator`, so that it can be cloned."""
+
+    def fit(self, charge: Array, contact: Array) -> Any:
+        """Fit the method to presses.
+
+        Args:
+            charge: Shape (n, n_electrode), pC.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Raises:
+            DatasetError: If the method cannot be fitted to these presses.
+        """
+
+    def predict(self, charge: Array) -> Array:
+        """Estimate contacts, shape (n, 3), mm and N; NaN where the method has no answer."""
+
+
+@dataclass(frozen=True)
+class FittingTask:
+    """Presses and conditions to which methods are fitted.
+
+    Attributes:
+        train: Presses for training, measured or without noise.
+        validation: Presses at other positions, for the choice of parameters.
+        domain: Contacts that can occur: uniform over a disk, log-uniform in force.
+        noise: Noise of the charges in use.
+        seed: Seed of noise and subsets.
+        quick: Whether to use only the first candidate of the parameters and one copy with noise, for a trial.
+    """
+
+    train: LabelledPresses
+    validation: LabelledPresses
+    domain: Domain
+    noise: NoiseModel
+    seed: int = 0
+    quick: bool = False
+
+    def presses(self, copies: int) -> LabelledPresses:
+        """Return copies of the training presses with different noise.
+
+        Args:
+            copies: Number of copies; 0 for the presses without noise. Measured presses are returned as they are.
+        """
+        if self.train.measured or copies == 0:
+            return self.train
+        count = 1 if self.quick else copies
+        first_seed = self.seed + FIRST_COPY_SEED
+        charge = [self.train.noisy(self.noise, first_seed + copy) for copy in range(count)]
+        return LabelledPresses(np.tile(self.train.contact, (count, 1)), np.concatenate(charge))
+
+    @cached_property
+    def validation_charge(self) -> Array:
+        """Charges of the validation presses with noise, shape (n, n_electrode), pC."""
+        if self.validation.measured:
+            return self.validation.charge
+        return self.validation.noisy(self.noise, self.seed + VALIDATION_SEED)
+
+
+@dataclass(frozen=True)
+class ComparedMethod:
+    """A method of the comparison, with everything that is needed to fit it.
+
+    Attributes:
+        name: Name in tables and pictures.
+        kind: Kind, which decides about the colour in pictures.
+        computed_by: Library that computes the method.
+        regressor: The method; not fitted before `fit`.
+        copies: Number of copies of the presses with noise to which it is fitted; 0 for presses without noise.
+        candidates: Values of its parameters, among which validation chooses.
+        given_force: Whether it gets the true force beside the charges, which no sensor measures.
+        choice: The chosen parameters in words, and how they were chosen; empty before `fit`.
+    """
+
+    name: str
+    kind: Kind
+    computed_by: str
+    regressor: Regressor
+    copies: int = 0
+    candidates: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    given_force: bool = False
+    choice: str = ""
+
+    def inputs(self, charge: Array, force: Array) -> Array:
+        """Return the inputs of the method.
+
+        Args:
+            charge: Shape (n, n_electrode), pC.
+            force: True forces, shape (n,), N.
+
+        Returns:
+            The charges; with the force as an additional last column if `given_force` is set.
+        """
+        return np.column_stack([charge, force]) if self.given_force else charge
+
+    def fit(self, task: FittingTask) -> "ComparedMethod":
+        """Fit the method with each candidate and return the one with the smallest error on validation presses.
+
+        Raises:
+            DatasetError: If the method cannot be fitted to these presses.
+        """
+        presses = task.presses(self.copies)
+        validation = task.validation
+        inputs = self.inputs(task.validation_charge, validation.contact[:, 2])
+        grid = list(ParameterGrid(dict(self.candidates)))
+        if task.quick:
+            grid = grid[:1]
+        fitted = []
+        errors = []
+        for parameters in grid:
+            regressor = clone(self.regressor).set_params(**parameters)
+            regressor.fit(presses.charge, presses.contact)
+            fitted.append(regressor)
+            errors.append(rms(position_error(regressor.predict(inputs), validation.contact)))
+        best = int(np.argmin(errors))
+        words = [describe_parameter(name, value) for name, value in grid[best].items()]
+        words.append(f"{len(presses)} {'noisy' if self.copies else 'clean'} presses")
+        if len(grid) > 1:
+            words.append(f"best of {len(grid)} by validation ({errors[best]:.3f} mm rms)")
+        return replace(self, regressor=fitted[best], choice=self.choice or ", ".join(words))
+
+
+def describe_parameter(name: str, value: object) -> str:
+    """Describe a parameter of a pipeline in words; factors of axes are described by the names of the axes."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{axis} axis x {factor:g}" for axis, factor in value.items())
+    _, _, short_name = name.rpartition("__")
+    return f"{short_name} {value:g}" if isinstance(value, int | float) else f"{name} {value}"
+
+
+GAUSS_NEWTON = "Gauss-Newton"
+POLYNOMIAL = "polynomial ridge"
+TABLE = "lookup table, interpolated"
+BOOSTING = "gradient boosting"
+LINEAR_BAND = "linear band"
+
+POLYNOMIAL_DEGREES = (4, 6, 8, 10, 12)
+"""Candidates for the degree of the polynomial."""
+
+MAX_MONOMIALS = 500
+"""Largest number of monomials of the polynomial. More do not reduce the error under noise and cost time."""
+
+SKLEARN = "scikit-learn"
+KD_TREE = "SciPy KD-tree"
+NUMPY = "NumPy"
+
+
+def compared_methods(task: FittingTask, charge_map: ChargeMap | None = None) -> list[ComparedMethod]:
+    """Return all methods of the comparison except networks.
+
+    Args:
+        task: Presses and conditions.
+        charge_map: Map for the methods that need one; None to leave these methods out.
+    """
+    domain = task.domain
+    return [
+        *_triangulations(charge_map),
+        ComparedMethod(LINEAR_BAND, "paper", KD_TREE, LinearBand(domain.radius), 0, {"degree": (6, 10, 14)}),
+        ComparedMethod(
+            "lookup table, nearest entry", "paper", SKLEARN, on_logarithms(domain, entry=KNeighborsRegressor(1))
+        ),
+        _interpolated_table(task),
+        _nearest_neighbours(task),
+        polynomial_ridge(task),
+        _gradient_boosting(task),
+        _gaussian_process(task),
+        ComparedMethod(GAUSS_NEWTON, "fitted map", NUMPY, GaussNewton(domain, task.noise, seed=task.seed)),
+    ]
+
+
+def polynomial_ridge(task: FittingTask) -> ComparedMethod:
+    """Return ridge regression on all monomials up to a degree.
+
+    The logarithms are clipped to the range of the training presses, because a polynomial of high degree grows fast
+    beyond it.
+    """
+    n_electrode = task.train.charge.shape[1]
+    copies = 5
+    allowed = [
+        degree
+        for degree in range(1, max(POLYNOMIAL_DEGREES) + 1)
+        if comb(n_electrode + degree, degree) <= MAX_MONOMIALS
+    ]
+    degrees = [degree for degree in POLYNOMIAL_DEGREES if degree in allowed][-2:] or [max(allowed)]
+    regressor = on_logarithms(
+        task.domain,
+        box=MinMaxScaler((-1.0, 1.0), clip=True),
+        monomials=PolynomialFeatures(),
+        ridge=Ridge(solver="cholesky"),
+    )
+    candidates: dict[str, Sequence[Any]] = {
+        "regressor__monomials__degree": degrees,
+        "regressor__ridge__alpha": [share * copies * len(task.train) for share in (1e-11, 1e-8)],
+    }
+    return ComparedMethod(POLYNOMIAL, "learnt", SKLEARN, regressor, copies, candidates)
+
+
+def _triangulations(charge_map: ChargeMap | None) -> list[ComparedMethod]:
+    """Return triangulation without and with the true force; nothing without a charge map."""
+    if charge_map is None:
+        return []
+    choice = "contours of the simulated charges"
+    with_force = Triangulate(charge_map, given_force=True)
+    return [
+        ComparedMethod("triangulation", "paper", NUMPY, Triangulate(charge_map), choice=choice),
+        ComparedMethod("triangulation, force given", "paper", NUMPY, with_force, given_force=True, choice=choice),
+    ]
+
+
+def _scaled_axes() -> FunctionTransformer:
+    """Return the transformer that scales the principal axes before distances are computed."""
+    return FunctionTransformer(scale_axes, kw_args=AXIS_SCALES[0])
+
+
+def _axis_scale_candidates(task: FittingTask) -> dict[str, Sequence[Any]]:
+    """Return the candidates for the factors of the principal axes."""
+    return {"regressor__scales__kw_args": AXIS_SCALES[1:2] if task.quick else AXIS_SCALES}
+
+
+def _interpolated_table(task: FittingTask) -> ComparedMethod:
+    """Return the lookup table with affine maps."""
+    regressor = on_logarithms(task.domain, scales=_scaled_axes(), table=AffineTable())
+    candidates = _axis_scale_candidates(task) | {"regressor__table__neighbours": (64, 128)}
+    return ComparedMethod(TABLE, "paper", KD_TREE, regressor, 5, candidates)
+
+
+def _nearest_neighbours(task: FittingTask) -> ComparedMethod:
+    """Return the mean residual of the nearest neighbours, added to a linear regression."""
+    neighbours = ResidualRegressor(KNeighborsRegressor())
+    regressor = on_logarithms(task.domain, scales=_scaled_axes(), near=neighbours)
+    counts = [count for count in (16, 32, 64) if count <= len(task.train)]
+    candidates = _axis_scale_candidates(task) | {"regressor__near__regressor__n_neighbors": counts}
+    return ComparedMethod("k-nearest neighbours", "learnt", SKLEARN, regressor, 5, candidates)
+
+
+def _gradient_boosting(task: FittingTask) -> ComparedMethod:
+    """Return gradient boosting of regression trees on the residuals of a linear regression."""
+    iterations = 30 if task.quick else 250
+    trees = HistGradientBoostingRegressor(max_iter=iterations, early_stopping=False, random_state=task.seed)
+    regressor = on_logarithms(task.domain, trees=ResidualRegressor(MultiOutputRegressor(trees)))
+    candidates = {"regressor__trees__regressor__estimator__max_leaf_nodes": (31, 63)}
+    return ComparedMethod(BOOSTING, "learnt", SKLEARN, regressor, 3, candidates)
+
+
+def _gaussian_process(task: FittingTask) -> ComparedMethod:
+    """Return a Gaussian process on a subset of the presses."""
+    process = SubsetProcess(300, 150, task.seed) if task.quick else SubsetProcess(2000, 500, task.seed)
+    regressor = on_logarithms(task.domain, process=process)
+    return ComparedMethod("Gaussian process", "learnt", SKLEARN, regressor, 1)
