@@ -166,10 +166,13 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
         """Names of the fields that this record is written with, in their order."""
         return field_names(with_tracking=self.tracking is not None, with_film=self.film is not None)
 
-    @cached_property
+    @property
     def json_values(self) -> dict[str, Any]:
         """The values of the record by name as JSON shows them, numbers rounded to six decimals."""
-        return {name: _json_value(getattr(self, name)) for name in self.field_names}
+        values = structs.asdict(self)
+        if self.tracking is not None:
+            values |= structs.asdict(self.tracking)
+        return {name: _json_value(values[name]) for name in self.field_names}
 
     def to_json(self) -> str:
         """Return the record as one line of strictly valid JSON, numbers rounded to six decimals.
@@ -234,6 +237,9 @@ def field_names(*, with_tracking: bool = False, with_film: bool = False) -> tupl
     return _NAMES[with_tracking, with_film]
 
 
+_UNCHANGED = frozenset({str, int, bool, tuple, type(None)})
+"""Classes of values that JSON shows without a change."""
+
 _ENCODE = json.JSONEncoder(allow_nan=False).encode
 
 
@@ -245,8 +251,8 @@ def _json_value(value: Any) -> Any:
     kind = value.__class__
     if kind is float:
         return round(value, DECIMALS)
+    if kind in _UNCHANGED:
+        return value
     if kind is dict:
         return {name: charge if charge is None else round(charge, DECIMALS) for name, charge in value.items()}
-    if isinstance(value, Struct):
-        return {name: _json_value(getattr(value, name)) for name in value.__struct_fields__}
-    return value
+    return {name: _json_value(getattr(value, name)) for name in value.__struct_fields__}
