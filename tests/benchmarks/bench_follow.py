@@ -1,0 +1,185 @@
+"""How well a film is followed: films that changed, and unchanged films that warm fingers touch.
+
+    python tests/benchmarks/bench_follow.py [--sensor four-25um-biaxial] [--films 6] [--sessions 1] [--seed 0]
+        [--offsets constant,varying,decaying,none] [--json]
+
+Each film is drawn from the prior, with a pretension of 1 MPa, and calibrated by 20 presses. A session is 60 or 120
+touches of unknown place and force, 5 s apart; the follower gets the hardest frame of each that does not make the film
+yield.
+
+Changed films: root-mean-square errors of the contacts after 60 touches, the share of forces within two reported
+standard deviations, and the share of touches with the flag `film`.
+
+Unchanged films: an offset is added to all charges of the session. `held` is the share of the sessions after which the
+followed pretension is within two reported standard deviations of the calibrated one, or the film is flagged. `wrong` is
+the share of the ten next touches, without an offset, that have an error of more than four reported standard deviations
+and no flag.
+"""
+
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+from shared import arguments, print_results
+
+from isocharge.serve import Contact, MeasuredPresses, Predictor
+from isocharge.serve.tracking.film_follower import FilmFollower
+from isocharge.simulate import Circle, ForwardMap, load_sensor
+from isocharge.simulate.numerics.statistics import rms
+from isocharge.train import CalibrationProblem, calibrate, write_calibration
+from isocharge.train.data.presses import draw_contacts, position_error
+
+PRETENSION_MPa = 1.0
+CHANGES_MPa = (0.0, 0.35, -0.35, 0.8)
+OFFSETS_pC = (3.0, -3.0, 10.0, -10.0, 30.0, -30.0, 100.0, -100.0)
+TOUCH_INTERVAL_s = 5.0
+WARM_FINGER_s = 150.0
+COLD_TOUCHES = 10
+PRESSES = 20
+CONTACTS = 300
+"""Contacts by which the errors after a session are measured."""
+
+
+class Film(NamedTuple):
+    """A calibrated film: its problem, its model, and its forward map by the change of its pretension, MPa."""
+
+    problem: CalibrationProblem
+    predictor: Predictor
+    maps: dict[float, ForwardMap]
+
+    def touches(self, change_MPa: float, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw contacts below the yield force, shape (n, 3), and their noisy charges, shape (n, n_electrode), pC."""
+        contact = draw_contacts(rng, self.problem.domain, count)
+        contact[:, 2] = np.minimum(contact[:, 2], 0.95 * self.predictor.validity.yield_force_N)
+        return contact, self.problem.noise.add(self.maps[change_MPa].charges(contact), rng)
+
+
+def calibrated_film(sensor: str, seed: int, folder: Path) -> Film:
+    """Draw a film, and calibrate it."""
+    problem = CalibrationProblem.of(load_sensor(sensor), Circle(1.0))
+    rng = np.random.default_rng([seed, 11])
+    parameters = problem.prior.draw(rng, 1)[0]
+    maps = {}
+    for change_MPa in CHANGES_MPa:
+        parameters[0] = PRETENSION_MPa + change_MPa
+        maps[change_MPa] = problem.charges.forward_map(parameters.copy())
+    contact = draw_contacts(rng, problem.domain, PRESSES)
+    charge = problem.noise.add(maps[0.0].charges(contact), rng)
+    contact[:, 2] *= np.exp(0.01 * rng.standard_normal(PRESSES))
+    contact[:, :2] += 0.1 * rng.standard_normal((PRESSES, 2))
+    position_std_mm = np.full(PRESSES, 0.1)
+    force_std = np.full(PRESSES, 0.01)
+    lines = tuple(range(2, PRESSES + 2))
+    presses = MeasuredPresses(contact, charge, position_std_mm, force_std, problem.electrodes, lines)
+    write_calibration(calibrate(presses, problem), folder / "mine")
+    return Film(problem, Predictor(folder / "mine"), maps)
+
+
+def session_offsets(kind: str, size_pC: float, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the offset of each touch of a session, shape (count,), pC."""
+    if kind == "varying":
+        return size_pC * (1.0 + 0.5 * rng.standard_normal(count))
+    if kind == "decaying":
+        return size_pC * np.exp(-TOUCH_INTERVAL_s * np.arange(count) / WARM_FINGER_s)
+    return np.full(count, size_pC)
+
+
+def observe(follower: FilmFollower, charges: np.ndarray) -> tuple[float, list[float]]:
+    """Let a follower observe touches; return the share with the flag `film`, and the time of each touch, s."""
+    flagged = 0
+    times = []
+    for number, charge in enumerate(charges):
+        contact = follower.predictor.predict(charge)
+        flags = follower.predictor.flags(contact)
+        clock_s = TOUCH_INTERVAL_s * number
+        follower.observe_frame(charge, contact, flags, clock_s)
+        begin = time.perf_counter()
+        follower.observe_frame(None, None, (), clock_s + 1.0)
+        times.append(time.perf_counter() - begin)
+        flagged += follower.is_lost
+    return flagged / len(charges), times
+
+
+def answers(follower: FilmFollower, charges: np.ndarray) -> list[Contact]:
+    """Return the contacts of charges, with the uncertainty of the pretension."""
+    return [follower.add_pretension_error(follower.predictor.predict(charge), charge) for charge in charges]
+
+
+def changed_film(film: Film, change_MPa: float, seed: list[int]) -> dict[str, float]:
+    """Errors after 60 touches of a film whose pretension changed."""
+    rng = np.random.default_rng(seed)
+    follower = FilmFollower(film.predictor)
+    _, charge = film.touches(change_MPa, 60, rng)
+    flagged, times = observe(follower, charge)
+    contact, charge = film.touches(change_MPa, CONTACTS, rng)
+    answer = answers(follower, charge)
+    force_error = np.array([one.force_N for one in answer]) - contact[:, 2]
+    force_std = np.array([one.force_std_N for one in answer])
+    return {
+        "position_mm": rms(position_error(np.array([one[:3] for one in answer]), contact)),
+        "force_percent": 100.0 * rms(force_error / contact[:, 2]),
+        "force_coverage": float(np.mean(np.abs(force_error) < 2.0 * force_std)),
+        "flagged": flagged,
+        "touch_ms": 1e3 * float(np.median(times)),
+    }
+
+
+def warm_session(film: Film, kind: str, size_pC: float, count: int, seed: list[int]) -> dict[str, float]:
+    """What an offset of the charges does to an unchanged film."""
+    rng = np.random.default_rng(seed)
+    follower = FilmFollower(film.predictor)
+    calibrated_MPa = follower.film.pretension_MPa
+    contact, charge = film.touches(0.0, count + COLD_TOUCHES, rng)
+    observe(follower, charge[:count] + session_offsets(kind, size_pC, count, rng)[:, None])
+    change_MPa = abs(follower.film.pretension_MPa - calibrated_MPa)
+    is_flagged = follower.is_lost
+    wrong = 0
+    for truth, row in zip(contact[count:], charge[count:], strict=True):
+        (answer,) = answers(follower, row[None])
+        std = np.array([answer.x_std_mm, answer.y_std_mm, answer.force_std_N])
+        is_wrong = bool((np.abs(np.array(answer[:3]) - truth) > 4.0 * std).any())
+        wrong += is_wrong and not follower.is_lost and not follower.predictor.flags(answer)
+        observe(follower, row[None])
+    return {
+        "held": float(is_flagged or change_MPa < 2.0 * follower.film.pretension_std_MPa),
+        "flagged": float(is_flagged),
+        "moved_MPa": change_MPa,
+        "wrong": wrong / COLD_TOUCHES,
+    }
+
+
+def mean(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Return the means over films and sessions."""
+    return {key: round(float(np.mean([row[key] for row in rows])), 4) for key in rows[0]}
+
+
+def main() -> None:
+    asked = arguments(
+        __doc__,
+        sensor="four-25um-biaxial",
+        films=6,
+        sessions=1,
+        seed=0,
+        offsets="none,constant,varying,decaying",
+        json=False,
+    )
+    results = {}
+    with TemporaryDirectory() as folder:
+        films = [calibrated_film(asked.sensor, seed, Path(folder) / str(seed)) for seed in range(asked.films)]
+        seeds = [(film, [asked.seed, number, n]) for n, film in enumerate(films) for number in range(asked.sessions)]
+        for kind in asked.offsets.split(","):
+            if kind == "none":
+                for change_MPa in CHANGES_MPa:
+                    rows = [changed_film(film, change_MPa, seed) for film, seed in seeds]
+                    results[f"changed by {change_MPa:+g} MPa"] = mean(rows)
+            for size_pC in (0.0,) if kind == "none" else OFFSETS_pC:
+                for count in (60, 120):
+                    rows = [warm_session(film, kind, size_pC, count, seed) for film, seed in seeds]
+                    results[f"{kind} {size_pC:+g} pC, {count} touches"] = mean(rows)
+    print_results("follow", asked, results)
+
+
+if __name__ == "__main__":
+    main()
