@@ -17,7 +17,7 @@ from onnx.utils import Extractor
 
 from isocharge.common.arrays import Array
 from isocharge.serve import Predictor
-from isocharge.serve.model.session import INPUT, SEVEN, BoundPress, open_session
+from isocharge.serve.model.session import INPUT, N_WITHOUT_CORRELATION, BoundPress, open_session
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.train.baselines.compared_methods import GivenMethod
 from isocharge.train.data.presses import LabelledPresses
@@ -144,7 +144,9 @@ class ReleasedModel(GivenMethod):
         Args:
             charge: Charges of the press, shape (n_electrode,), pC.
         """
-        return partial(self.predictor.predict_into, charge.astype(np.float32), np.zeros(SEVEN, np.float32))
+        return partial(
+            self.predictor.predict_into, charge.astype(np.float32), np.zeros(N_WITHOUT_CORRELATION, np.float32)
+        )
 
     @cached_property
     def predictor(self) -> Predictor:
