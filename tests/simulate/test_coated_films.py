@@ -51,7 +51,7 @@ def test_strain_of_a_film_with_a_round_coat_is_the_closed_form(stiffening):
     slope = mesh.gradient(element, xi, eta) @ field[mesh.template.nodes[element]]
     mixed = np.stack([slope[:, 0, 0], slope[:, 1, 1], slope[:, 0, 1] + slope[:, 1, 0]], axis=1)
     expected = np.stack([c + 0.75 * at**2 / inner, c + 0.25 * at**2 / inner], axis=1)
-    np.testing.assert_allclose(mesh.coat.of_film(at + 0j, mixed)[:, :2], expected, rtol=3e-3 * stiffening)
+    np.testing.assert_allclose(mesh.coat.film_strain(at + 0j, mixed)[:, :2], expected, rtol=3e-3 * stiffening)
 
 
 def test_a_coat_on_both_sides_is_one_that_is_twice_as_stiff():
@@ -74,5 +74,5 @@ def test_a_coat_on_both_sides_is_one_that_is_twice_as_stiff():
 def test_what_is_pressed_and_what_is_read_must_be_the_same_film():
     with pytest.raises(SensorError, match=r"another film: expected .*Coat"):
         touch_charge(INK, press(INK.film, PROBE, AT, FORCE))
-    with pytest.raises(SceneError, match=r"alike all round, got .*coat"):
+    with pytest.raises(SceneError, match=r"axisymmetric film, got .*coat"):
         ForwardMap.build(INK, PROBE)

@@ -75,5 +75,5 @@ def test_crosstalk_adds_a_share_of_the_others():
 
 @pytest.mark.parametrize("changes", [{"oval": 0.01}, {"deviator": (0.1, 0.0)}])
 def test_maps_refuse_what_is_not_alike_all_round(changes):
-    with pytest.raises(SceneError, match=f"alike all round, got .*{next(iter(changes))}"):
+    with pytest.raises(SceneError, match=f"axisymmetric film, got .*{next(iter(changes))}"):
         ForwardMap.build(replace(SENSOR, film=replace(SENSOR.film, **changes)), PROBE)

@@ -10,7 +10,7 @@ from isocharge.simulate import press, touch_charge
 from isocharge.simulate.forward import film_modes
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.forward.film_modes import MODES, FilmModes
-from isocharge.simulate.mechanics.stress import stress_turn
+from isocharge.simulate.mechanics.stress import stress_rotation
 from kept import kept
 
 CONTACTS = np.array([[2.0, 1.0, 0.9], [-0.5, -1.5, 1.1]])
@@ -65,7 +65,7 @@ def test_d12_and_crosstalk_modes_equal_the_change_of_the_readout(family_and_film
     sensor = replace(sensor, piezo=replace(sensor.piezo, d31=20.0, d32=2.0))
     film = family.forward_map(sensor, probe)
     jacobian = family.mode_map(sensor, probe, ["crosstalk", "d12"]).mode_jacobian(CONTACTS)
-    d31, d32, double = np.array([20.0, 2.0, 0.0]) @ np.linalg.inv(stress_turn(0.01))
+    d31, d32, double = np.array([20.0, 2.0, 0.0]) @ np.linalg.inv(stress_rotation(0.01))
     turned = replace(sensor, piezo=replace(sensor.piezo, d31=d31, d32=d32, d12=0.5 * double))
     wired = replace(sensor, calibration=replace(sensor.calibration, crosstalk=0.01))
     assert turned.piezo.d12 == pytest.approx(9.0 * np.sin(0.02), rel=1e-3)

@@ -11,7 +11,7 @@ import numpy as np
 from isocharge.common.errors import SensorError, cut
 from isocharge.common.extras import require
 from isocharge.simulate.numerics.polygon import area_of, to_complex
-from isocharge.simulate.sensor.sensor import MOST_ELECTRODES, Electrode, check_polygon
+from isocharge.simulate.sensor.sensor import MAX_ELECTRODES, Electrode, check_polygon
 
 with require("design"):
     import ezdxf
@@ -102,4 +102,4 @@ def _names(document: Any, groups: list[list[Electrode]], scale: float) -> list[s
     texts = {text.plain_text(): scale * complex(*text.dxf.insert.vec2) for text in shown}
     pads = [to_complex(np.array(group[0].corners)) for group in groups]
     names = [min(texts, key=lambda text: np.abs(pad - texts[text]).min()) for pad in pads if texts]
-    return names if len(set(names)) == len(groups) else [*ascii_uppercase, *map(str, range(MOST_ELECTRODES))]
+    return names if len(set(names)) == len(groups) else [*ascii_uppercase, *map(str, range(MAX_ELECTRODES))]

@@ -138,10 +138,10 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
         raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {low} to {high}")
     if not (np.isfinite(radius) and radius > 0.0):
         raise SceneError(f"radius: expected a positive number, got {radius} mm")
-    if not film.turns:
+    if not film.is_axisymmetric:
         raise SceneError(
-            f"film: expected one that is alike all round, got {film.around}: charges of presses at all angles follow "
-            "from those along one radius; `press` and `isocharge simulate point` solve such a film, press by press"
+            f"film: expected an axisymmetric film, got {film.asymmetries}: a forward map computes charges of presses "
+            "in all directions from presses along one radius; use `press` or `isocharge simulate point` for this film"
         )
     if radius + probe.reach >= film.radius:
         raise SceneError(

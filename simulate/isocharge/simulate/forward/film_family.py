@@ -230,8 +230,8 @@ class FilmFamily:
                 f"film: expected the family's Poisson's ratio {self.poisson} and surface {self.surface!r}, got "
                 f"{film.poisson} and {surface!r}"
             )
-        if not film.turns:
-            raise SceneError(f"film: expected one that is alike all round, got {film.around}; modes stand for these")
+        if not film.is_axisymmetric:
+            raise SceneError(f"film: expected an axisymmetric film, got {film.asymmetries}; use modes for these")
         for name, value in groups.items():
             low, high = self.limits[name]
             if not low * (1.0 - SLACK) - 1e-15 <= value <= high * (1.0 + SLACK):

@@ -20,7 +20,7 @@ from isocharge.common.errors import SensorError
 from isocharge.simulate.numerics.interpolation import gauss_line, gauss_square
 from isocharge.simulate.numerics.polygon import gauss_polygon, gauss_quadrilateral
 from isocharge.simulate.sensor.probe import Probe
-from isocharge.simulate.sensor.sensor import LONGEST_PART, Electrode, Readout, Sensor
+from isocharge.simulate.sensor.sensor import MAX_PART_SIDE, Electrode, Readout, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
 
 DIRECT, FINE, COARSE = 20, 12, 4
@@ -166,7 +166,7 @@ def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
     elif len(electrode.parts) == 1:
         points, share = gauss_polygon(electrode.parts[0], per_side)
     else:
-        rules = [gauss_quadrilateral(part, per_side, LONGEST_PART) for part in electrode.parts]
+        rules = [gauss_quadrilateral(part, per_side, MAX_PART_SIDE) for part in electrode.parts]
         points, weights = (np.concatenate(values) for values in zip(*rules, strict=True))
         share = weights / weights.sum()
     return points, np.repeat(share[:, None], 3, axis=1)

@@ -1,11 +1,14 @@
-"""The dimensionless groups of a press, and the amplitude that makes its solution a number of order one.
+"""The dimensionless groups of a press, and the amplitude that makes the scaled solution of order one.
 
-Under a central force F a slack membrane, a taut one and a plate sink by
+Under a central force F, the deflection of the centre is w = a A. The force F / (E h a) is proportional to
 
-    w / a = A,   F / (E h a) ~ A^3,   (pretension / E) A,   16 pi b A   with b = (h / a)^2 / (12 (1 - poisson^2))
+    A^3                     for a membrane without pretension,
+    (pretension / E) A      for a membrane with a large pretension,
+    16 pi b A               for a plate, with b = (h / a)^2 / (12 (1 - poisson^2))
 
-(Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). Their sum is a cubic for A that holds everywhere
-between. The in-plane displacement goes with A^2. What is left of the press are ratios.
+(Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). The sum of the three terms is a cubic equation for A,
+which is a good approximation also between the limiting cases. The in-plane displacement is proportional to A^2. After
+this scaling, only the ratios of the terms remain as parameters of the press.
 """
 
 from dataclasses import dataclass, replace
@@ -14,23 +17,26 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.mechanics.stress import rotate_stress, stress, stress_turn
+from isocharge.simulate.mechanics.stress import rotate_stress, stress, stress_rotation
 from isocharge.simulate.sensor.film import Film
 
 MEMBRANE_STIFFNESS = 1.6
-"""Force over deflection of a taut membrane, in units of pretension * thickness: 2 pi / ln(a / R), R = 0.02 a."""
+"""Force over deflection of a membrane with a large pretension, in units of pretension times thickness.
+
+The value is 2 pi / ln(a / R) for a probe radius R = 0.02 a."""
 
 PLATE_STIFFNESS = 16.0 * np.pi
-"""Force over deflection of a clamped plate under a central point load, in units of its stiffness over a^2."""
+"""Force over deflection of a clamped plate under a central point load, in units of the plate stiffness over a^2."""
 
 
 @dataclass(frozen=True, eq=False)
 class Anisotropy:
-    """What a film has that is not the same in all directions, seen from the press.
+    """Direction-dependent properties of a film, in axes that are rotated with the press.
 
     Attributes:
-        moduli: Added to the isotropic C over E, shape (3, 3); see `mechanics.stress.stress`.
-        tension: Added to the mean pretension over E A^2: (T11, T22, T12), shape (3,).
+        moduli: Difference between the elasticity matrix C over E and that of the isotropic film, shape (3, 3); see
+            `mechanics.stress.stress`.
+        tension: Difference (T11, T22, T12) between the pretension and its mean, over E A^2, shape (3,).
     """
 
     moduli: Array
@@ -39,15 +45,17 @@ class Anisotropy:
 
 @dataclass(frozen=True)
 class DimensionlessGroups:
-    """The dimensionless groups that fix the problem; E is Young's modulus, h the thickness, a the film's radius.
+    """The dimensionless groups that define the scaled problem.
+
+    E is Young's modulus, h the thickness and a the radius of the film.
 
     Attributes:
-        amplitude2: A^2, the square of the amplitude that scales deflection by film radius.
+        amplitude2: Square A^2 of the amplitude A, which scales the deflection in film radii.
         load: Force over E h a A^3.
-        tension: Pretension over E A^2.
-        bending: Bending stiffness over E h a^2 A^2, that is b / A^2; 0 leaves bending out.
+        tension: Mean pretension over E A^2.
+        bending: Bending stiffness over E h a^2 A^2, which is b / A^2. Zero omits bending.
         poisson: Poisson's ratio.
-        anisotropy: What is not the same in all directions, if anything.
+        anisotropy: Direction-dependent properties; None if the film is isotropic.
     """
 
     amplitude2: float
@@ -59,7 +67,14 @@ class DimensionlessGroups:
 
     @classmethod
     def of(cls, film: Film, force: float, *, bending: bool, angle: float = 0.0) -> "DimensionlessGroups":
-        """The groups of a film under a force (N), with or without bending; the press lies at an angle (rad)."""
+        """Compute the groups of a press.
+
+        Args:
+            film: The film.
+            force: Force, N.
+            bending: Whether the theory includes bending.
+            angle: Direction of the press from the centre of the film, rad.
+        """
         amplitude2 = float(amplitude_squared(film, force))
         return cls(
             amplitude2=amplitude2,
@@ -67,53 +82,73 @@ class DimensionlessGroups:
             tension=film.pretension / (film.young * amplitude2),
             bending=slenderness(film) / amplitude2 if bending else 0.0,
             poisson=film.poisson,
-            anisotropy=_anisotropy(film, amplitude2, angle) if film.anisotropic else None,
+            anisotropy=_anisotropy(film, amplitude2, angle) if film.is_anisotropic else None,
         )
 
     @property
     def height(self) -> float:
-        """Approximate deflection of the middle in units of a A: one for groups from `of`."""
+        """Approximate deflection of the centre in units of a A, which is one for groups that `of` computes."""
         linear = MEMBRANE_STIFFNESS * max(self.tension, 0.0) + PLATE_STIFFNESS * self.bending
         return float(_root(linear, self.load))
 
     @property
     def induced(self) -> float:
-        """Approximate share of the load that the stress induced by the deflection carries: 0 linear, 1 slack."""
+        """Approximate share of the load that the induced stress carries: 0 in a linear theory, 1 without pretension."""
         return self.height**3 / self.load
 
     def stiffened(self, tension: float) -> "DimensionlessGroups":
-        """The same press with more tension."""
+        """Return the groups with an additional tension, in units of E A^2."""
         return replace(self, tension=self.tension + tension)
 
 
 def scaled_stress(strained: Array, groups: DimensionlessGroups) -> Array:
-    """C : E' of a scaled strain, shape (..., 3), in units of E_young A^2; see `mechanics.stress.stress`."""
-    return stress(strained, groups.poisson, None if groups.anisotropy is None else groups.anisotropy.moduli)
+    """Compute the scaled stress C : E' of a scaled strain.
+
+    Args:
+        strained: Scaled strain (E11, E22, 2 E12), shape (..., 3), in units of A^2.
+        groups: Dimensionless groups of the press.
+
+    Returns:
+        (S11, S22, S12), shape (..., 3), in units of E_young A^2.
+    """
+    moduli = None if groups.anisotropy is None else groups.anisotropy.moduli
+    return stress(strained, groups.poisson, moduli)
 
 
 def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:
-    turn, plane = stress_turn(film.axis - angle), 1.0 / (1.0 - film.poisson**2)
+    """Compute the direction-dependent properties of a film, in axes rotated by the direction of the press (rad)."""
+    rotation = stress_rotation(film.axis - angle)
+    plane = 1.0 / (1.0 - film.poisson**2)
     ratio = np.sqrt(film.young_ratio)
-    shear = 0.0 if film.shear is None else film.shear / film.young - 0.5 / (1.0 + film.poisson)
-    moduli = turn @ np.diag([plane * (ratio - 1.0), plane * (1.0 / ratio - 1.0), shear]) @ turn.T
-    difference, shear = film.deviator
-    tension = rotate_stress(np.array([difference, -difference, shear]), -angle) / (film.young * amplitude2)
+    shear_modulus = 0.0 if film.shear is None else film.shear / film.young - 0.5 / (1.0 + film.poisson)
+    in_film_axes = np.diag([plane * (ratio - 1.0), plane * (1.0 / ratio - 1.0), shear_modulus])
+    moduli = rotation @ in_film_axes @ rotation.T
+    difference, shear_tension = film.deviator
+    tension = rotate_stress(np.array([difference, -difference, shear_tension]), -angle) / (film.young * amplitude2)
     return Anisotropy(moduli, tension)
 
 
 def slenderness(film: Film) -> float:
-    """b: bending stiffness over E h a^2."""
+    """Return the dimensionless bending stiffness b, which is the bending stiffness over E h a^2."""
     return (film.thickness / film.radius) ** 2 / (12.0 * (1.0 - film.poisson**2))
 
 
 def amplitude_squared(film: Film, force: Array | float) -> Any:
-    """A^2, of the shape and type of `force` (N)."""
+    """Compute the square A^2 of the amplitude of a press; see the module.
+
+    Args:
+        film: The film.
+        force: Force, N, a number or an array of any shape.
+
+    Returns:
+        A^2, of the shape and type of `force`.
+    """
     linear = MEMBRANE_STIFFNESS * max(film.pretension, 0.0) / film.young + PLATE_STIFFNESS * slenderness(film)
     return _root(linear, force / (film.young * film.thickness * film.radius)) ** 2
 
 
 def _root(linear: float, right: Array | float) -> Any:
-    """The real root of x^3 + linear x = right, both not negative."""
+    """Return the real root x of x^3 + linear * x = right, where `linear` and `right` are not negative."""
     scale = np.sqrt(linear / 3.0)
     if linear == 0.0:
         return np.cbrt(right)

@@ -1,4 +1,4 @@
-"""Strain, stress, principal stresses, and a stress seen from a rotated frame."""
+"""Strain, stress, principal stresses, and the rotation of stresses."""
 
 import numpy as np
 
@@ -6,23 +6,24 @@ from isocharge.common.arrays import Array
 
 
 def principal_stresses(total: Array) -> tuple[float, float]:
-    """Smallest and largest principal value of (S11, S22, S12), shape (..., 3)."""
+    """Compute the smallest and the largest principal stress of an array of stresses (S11, S22, S12), shape (..., 3)."""
     mean = 0.5 * (total[..., 0] + total[..., 1])
     radius = np.hypot(0.5 * (total[..., 0] - total[..., 1]), total[..., 2])
     return float((mean - radius).min()), float((mean + radius).max())
 
 
 def strain(slope: Array, amplitude2: float) -> Array:
-    """Scaled Green-Lagrange strain E' from grad (U1, U2, W).
+    """Compute the scaled Green-Lagrange strain E' from the derivatives of the scaled displacements.
 
     Args:
-        slope: d(U1, U2, W)/d(X1, X2), shape (..., 2, 3): derivative first, component second.
-        amplitude2: A^2.
+        slope: Derivatives d(U1, U2, W)/d(X1, X2), shape (..., 2, 3): the derivative, then the component.
+        amplitude2: Square A^2 of the amplitude.
 
     Returns:
         (E11, E22, 2 E12), shape (..., 3).
     """
-    first, second = slope[..., 0, :], slope[..., 1, :]
+    first = slope[..., 0, :]
+    second = slope[..., 1, :]
     scale = np.array([amplitude2, amplitude2, 1.0])
     return np.stack(
         [
@@ -34,31 +35,48 @@ def strain(slope: Array, amplitude2: float) -> Array:
     )
 
 
-def stress(strain: Array, poisson: float, more: Array | None = None) -> Array:
-    """C : E' in units of E_young A^2, plane stress; (S11, S22, S12), shape (..., 3), without pretension.
+def stress(strain: Array, poisson: float, moduli: Array | None = None) -> Array:
+    """Compute the plane stress C : E' of a strain, without pretension.
 
-    `more` is added to the isotropic C over E_young, as a symmetric matrix from (E11, E22, 2 E12), shape (3, 3).
+    Args:
+        strain: (E11, E22, 2 E12), shape (..., 3).
+        poisson: Poisson's ratio.
+        moduli: Symmetric matrix that is added to the isotropic elasticity matrix C over E_young, shape (3, 3).
+
+    Returns:
+        (S11, S22, S12), shape (..., 3), in units of E_young times the unit of the strain.
     """
-    e11, e22, shear = strain[..., 0], strain[..., 1], strain[..., 2]
+    e11 = strain[..., 0]
+    e22 = strain[..., 1]
+    shear = strain[..., 2]
     plane = 1.0 / (1.0 - poisson**2)
     isotropic = np.stack(
         [plane * (e11 + poisson * e22), plane * (e22 + poisson * e11), 0.5 * shear / (1.0 + poisson)], axis=-1
     )
-    return isotropic if more is None else isotropic + strain @ more
+    return isotropic if moduli is None else isotropic + strain @ moduli
 
 
-def stress_turn(angle: float) -> Array:
-    """Matrix of `rotate_stress` for one angle, shape (3, 3); T C T^T turns an elasticity matrix."""
+def stress_rotation(angle: float) -> Array:
+    """Return the matrix T of `rotate_stress` for an angle (rad), shape (3, 3). T C T^T rotates an elasticity matrix
+    C."""
     return rotate_stress(np.eye(3), angle).T
 
 
 def rotate_stress(local: Array, angle: float | Array) -> Array:
-    """Stress (s11, s22, s12), shape (..., 3), of a frame rotated by `angle` (rad), in the unrotated frame."""
-    mean, half, shear = (
-        0.5 * (local[..., 0] + local[..., 1]),
-        0.5 * (local[..., 0] - local[..., 1]),
-        local[..., 2],
-    )
-    c, s = np.cos(2.0 * np.asarray(angle)), np.sin(2.0 * np.asarray(angle))
-    first, second = half * c - shear * s, half * s + shear * c
-    return np.stack([mean + first, mean - first, second], axis=-1)
+    """Transform stresses from a rotated frame to the unrotated frame.
+
+    Args:
+        local: Stress (s11, s22, s12) in the rotated frame, shape (..., 3).
+        angle: Angle of the rotated frame, anticlockwise, rad, a number or of the shape (...).
+
+    Returns:
+        Stress (s11, s22, s12) in the unrotated frame, shape (..., 3).
+    """
+    mean = 0.5 * (local[..., 0] + local[..., 1])
+    half_difference = 0.5 * (local[..., 0] - local[..., 1])
+    shear = local[..., 2]
+    cosine = np.cos(2.0 * np.asarray(angle))
+    sine = np.sin(2.0 * np.asarray(angle))
+    rotated_difference = half_difference * cosine - shear * sine
+    rotated_shear = half_difference * sine + shear * cosine
+    return np.stack([mean + rotated_difference, mean - rotated_difference, rotated_shear], axis=-1)

@@ -1,9 +1,10 @@
-"""Which terms a press needs: the choice between the film's theories, and the error of leaving terms out.
+"""The choice between the theories of the film, and the error of the terms that a theory omits.
 
-One formulation, two switches. *Bending* matters within l = sqrt(D / N) of the rim, the probe and any readout at the
-film's surface, N the tension force between them; where pretension and induced tension are small it carries the load.
-*Stretching* is the stress that the deflection induces acting back on the deflection: without it the film is linear, and
-the charges follow from the linear deflection in a second step. Pretension costs nothing and is always in.
+One formulation has two optional terms. *Bending* matters within the bending length l = sqrt(D / N) of the rim and of
+the probe, where N is the tension force per length, and for stress at the surface of the film. If the pretension and the
+induced tension are small, bending carries the load. *Stretching* is the effect of the induced stress on the deflection.
+Without stretching the film is linear, and the charges are computed from the linear deflection in a second step. The
+pretension is always included.
 
     stretching  bending   theory
     no          yes       linear plate, pre-tensioned linear plate
@@ -23,35 +24,38 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 ACCURACY = 1e-3
-"""Default target for the relative error of a charge, dimensionless."""
+"""Default target of the relative error of a charge, dimensionless."""
 
 LINEAR_WEIGHT = 4.0
-"""Relative charge error of the linear theories per unit of the share of the load that induced stress carries."""
+"""Relative error of a charge by a linear theory, per share of the load that the induced stress carries."""
 
 LOCAL_WEIGHT = 0.4
-"""Relative charge error per unit of (strain induced at the footprint / pretension strain), for a taut film."""
+"""Relative error of a charge by a linear theory of a taut film, per ratio of the strain that the footprint induces to
+the strain of the pretension."""
 
 BENDING_WEIGHT = 1.5
-"""Largest relative charge error without bending per unit of bending length over film radius: 1.41 in tests/data."""
+"""Largest relative error of a charge without bending, per ratio of the bending length to the film radius. The largest
+value in the reference cases of tests/data is 1.41."""
 
-MOSTLY_BENT = 0.3
-"""Bending length over film radius above which a membrane is no model of a film; its error is then infinite."""
+MAX_MEMBRANE_BENDING_LENGTH = 0.3
+"""Bending length, in film radii, above which a membrane does not describe the film. The error is then infinite."""
 
 PROBE_WEIGHT = 4.0
-"""Relative charge error of a taut film without bending per unit of (bending length at the probe / probe reach)^2."""
+"""Relative error of a charge of a taut film without bending, per squared ratio of the bending length at the probe to
+the reach of the probe."""
 
 INDUCED_STRAIN = 0.44
-"""Radial strain at the rim of a slack membrane, in units of A^2."""
+"""Radial strain at the rim of a membrane without pretension, in units of the squared amplitude A^2."""
 
 
 @dataclass(frozen=True)
 class Theory:
-    """The terms that are modelled.
+    """The terms of the film theory that are modelled.
 
     Attributes:
-        stretching: Whether the stress that the deflection induces acts back on it.
+        stretching: Whether the induced stress affects the deflection.
         bending: Whether the film resists bending.
-        pretensioned: Whether there is pretension.
+        pretensioned: Whether the film has a pretension.
     """
 
     stretching: bool
@@ -60,7 +64,7 @@ class Theory:
 
     @property
     def name(self) -> str:
-        """Name in engineering terms, such as "nonlinear membrane + bending"."""
+        """Name of the theory in engineering terms, such as "nonlinear membrane + bending"."""
         if self.stretching:
             return "nonlinear membrane + bending" if self.bending else "nonlinear membrane"
         kind = "linear plate" if self.bending else "linear membrane"
@@ -68,40 +72,56 @@ class Theory:
 
 
 def bending_length(film: Film, force: float) -> float:
-    """l / a: length over which a clamped edge bends the film, in units of the film's radius."""
+    """Compute the length over which a clamped edge bends the film, in film radii.
+
+    Args:
+        film: The film.
+        force: Force of the press, N.
+    """
     groups = DimensionlessGroups.of(film, force, bending=True)
     tension = max(groups.tension, 0.0) + INDUCED_STRAIN * groups.height**2
     return float(np.sqrt(groups.bending / tension))
 
 
 def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
-    """Relative change of a charge by bending at the footprint, for a film held by pretension.
+    """Estimate the relative change of a charge by bending at the footprint, for a film with pretension.
 
-    It is proportional to the square of the bending length over the footprint's reach. The tension at the footprint is
-    the pretension plus that of a slack membrane under this load, S = E W'^2 / 2 with S W' in balance with the load, so
-    W'^3 = F / (pi R h E). Where the induced tension is the larger one, charges hardly change.
+    The change is proportional to the squared ratio of the bending length to the reach of the footprint. The tension at
+    the footprint is the sum of the pretension and of the stress S = E W'^2 / 2 of a membrane without pretension. The
+    equilibrium of S W' with the load gives W'^3 = F / (pi R h E). If the induced stress dominates, the charges hardly
+    change.
     """
-    slope2 = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young)) ** 2
-    pretension = film.pretension / film.young
-    strain = pretension + 0.5 * slope2
-    length2 = slenderness(film) / strain * (film.radius / probe.reach) ** 2
-    return PROBE_WEIGHT * float(length2 * pretension / strain)
+    squared_slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young)) ** 2
+    pretension_strain = film.pretension / film.young
+    strain = pretension_strain + 0.5 * squared_slope
+    squared_length = slenderness(film) / strain * (film.radius / probe.reach) ** 2
+    return PROBE_WEIGHT * float(squared_length * pretension_strain / strain)
 
 
 def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
-    """Strain that the slope F / (2 pi R h T) of a taut film induces at the footprint, over that of the pretension T.
+    """Estimate the strain that the footprint induces in a taut film, relative to the strain of the pretension T.
 
-    Where the bending length exceeds the footprint, bending keeps the slope smaller.
+    The slope at the footprint is F / (2 pi R h T). If the bending length exceeds the footprint, bending reduces it.
     """
     if film.pretension == 0.0:
         return 0.0
     slope = force / (2.0 * np.pi * probe.reach * film.thickness * film.pretension)
-    length2 = slenderness(film) * film.young / film.pretension * (film.radius / probe.reach) ** 2
-    return float(0.5 * slope**2 * film.young / film.pretension / (1.0 + length2) ** 2)
+    squared_length = slenderness(film) * film.young / film.pretension * (film.radius / probe.reach) ** 2
+    return float(0.5 * slope**2 * film.young / film.pretension / (1.0 + squared_length) ** 2)
 
 
 def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
-    """Expected relative error of a charge from the terms that a theory leaves out; infinite where it has no meaning."""
+    """Estimate the relative error of a charge by the terms that a theory omits.
+
+    Args:
+        film: The film.
+        probe: The probe.
+        force: Force of the press, N.
+        theory: The theory.
+
+    Returns:
+        The error, which is infinite if the theory cannot describe the film.
+    """
     error = 0.0
     if not theory.stretching:
         if not theory.bending and film.pretension == 0.0:
@@ -111,42 +131,66 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
     if not theory.bending:
         length = bending_length(film, force)
         error += BENDING_WEIGHT * length + bending_at_probe(film, probe, force)
-        error += np.inf if length > MOSTLY_BENT else 0.0
+        if length > MAX_MEMBRANE_BENDING_LENGTH:
+            return np.inf
     return error
 
 
 def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Theory:
-    """The cheapest theory whose error stays within half of the accuracy; the full one if no theory does."""
-    tense = film.pretension > 0.0
-    full = Theory(stretching=True, bending=True, pretensioned=tense)
-    if film.pretension < 0.0 or not film.turns:  # the errors above are those of a film that is alike all round
+    """Return the cheapest theory whose error is at most half of the accuracy, or the full theory if there is none.
+
+    Args:
+        film: The film.
+        probe: The probe.
+        force: Force of the press, N.
+        accuracy: Target of the relative error of a charge.
+    """
+    is_tense = film.pretension > 0.0
+    full = Theory(stretching=True, bending=True, pretensioned=is_tense)
+    if film.pretension < 0.0 or not film.is_axisymmetric:  # the error estimates hold for axisymmetric films only
         return full
-    cheap_first = (
-        Theory(stretching=False, bending=False, pretensioned=tense),
-        Theory(stretching=False, bending=True, pretensioned=tense),
-        Theory(stretching=True, bending=False, pretensioned=tense),
+    cheapest_first = (
+        Theory(stretching=False, bending=False, pretensioned=is_tense),
+        Theory(stretching=False, bending=True, pretensioned=is_tense),
+        Theory(stretching=True, bending=False, pretensioned=is_tense),
     )
-    return next((each for each in cheap_first if modelling_error(film, probe, force, each) <= 0.5 * accuracy), full)
+    for theory in cheapest_first:
+        if modelling_error(film, probe, force, theory) <= 0.5 * accuracy:
+            return theory
+    return full
 
 
 def theory_for(sensor: Sensor, probe: Probe, force_range: tuple[float, float], accuracy: float = ACCURACY) -> Theory:
-    """The fewest terms that suffice for every force (N) of a range and for the surface that a sensor reads."""
-    ends = [choose_theory(sensor.film, probe, force, accuracy) for force in force_range]
+    """Return the theory with the fewest terms that suffice for all forces of a range and for the surface of the
+    readout.
+
+    Args:
+        sensor: The sensor.
+        probe: The probe.
+        force_range: Smallest and largest force, N.
+        accuracy: Target of the relative error of a charge.
+    """
+    theories = [choose_theory(sensor.film, probe, force, accuracy) for force in force_range]
     return Theory(
-        stretching=any(end.stretching for end in ends),
-        bending=any(end.bending for end in ends) or sensor.surface != "middle",
-        pretensioned=ends[0].pretensioned,
+        stretching=any(theory.stretching for theory in theories),
+        bending=any(theory.bending for theory in theories) or sensor.surface != "middle",
+        pretensioned=theories[0].pretensioned,
     )
 
 
 def theory_by_name(name: str, film: Film) -> Theory:
-    """The theory of this name, "linear plate", "linear membrane", "nonlinear membrane" or with " + bending".
+    """Return the theory with a given name.
+
+    Args:
+        name: "linear plate", "linear membrane", "nonlinear membrane" or "nonlinear membrane + bending". The prefix
+            "pre-tensioned " of a linear theory is optional.
+        film: The film, whose pretension decides whether the theory has one.
 
     Raises:
-        SceneError: If no theory has this name, or it has no stiffness for this film.
+        SceneError: If no theory has this name, or the film has no stiffness in this theory.
     """
-    tense = film.pretension > 0.0
-    options = [Theory(stretching, bending, tense) for stretching in (False, True) for bending in (False, True)]
+    is_tense = film.pretension > 0.0
+    options = [Theory(stretching, bending, is_tense) for stretching in (False, True) for bending in (False, True)]
     matching = [theory for theory in options if name in (theory.name, theory.name.removeprefix("pre-tensioned "))]
     if not matching:
         raise SceneError(f"theory: expected one of {[theory.name for theory in options]}, got {name!r}")

@@ -47,7 +47,7 @@ class Coating:
         shares, stiffness, strains = self._phases(points)
         return np.asarray(np.einsum("...i,iab,...ibc->...ac", shares, stiffness, strains) - self.bare)
 
-    def of_film(self, points: Complexes, strained: Array) -> Array:
+    def film_strain(self, points: Complexes, strained: Array) -> Array:
         """Strain of the film at points, shape (n, 3), as coated as each is, from that of the mixture."""
         strains = self._phases(points)[2]
         return np.asarray(np.einsum("nab,nb->na", strains[np.arange(points.size), self._depth(points)], strained))

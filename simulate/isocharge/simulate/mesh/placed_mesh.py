@@ -160,7 +160,7 @@ class PlacedMesh:
 
 def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> PlacedMesh:
     """Place the template of a probe under a press; `layer` is the width of the thin rings over the film's radius."""
-    template, angle = template_for(probe, resolution, not film.turns), float(np.arctan2(at[1], at[0]))
+    template, angle = template_for(probe, resolution, not film.is_axisymmetric), float(np.arctan2(at[1], at[0]))
     placement = Placement.of(template, probe.rotated(-angle), np.array(np.hypot(*at)), film.radius, layer)
     return PlacedMesh(template, placement, layer, film.oval * np.exp(2j * (film.oval_axis - angle)))
 

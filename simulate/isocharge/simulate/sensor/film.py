@@ -1,4 +1,4 @@
-"""The film and its piezoelectric coefficients."""
+"""Properties of the film, and its piezoelectric coefficients."""
 
 import math
 from dataclasses import dataclass
@@ -8,68 +8,78 @@ from isocharge.common.errors import SensorError
 from isocharge.simulate.sensor.size_check import check_length, check_stress
 
 Surface = Literal["middle", "top", "bottom"]
-"""Where in the thickness the stress is read; the probe touches the top."""
+"""Surface in the thickness of the film at which the stress is read. The probe touches the top."""
 
-LEAST_RADIUS, LEAST_THICKNESS = 1.0, 1e-4
-"""Smallest radius and thickness of a film, mm: smaller numbers are in metres."""
+MIN_RADIUS = 1.0
+"""Smallest radius of a film, mm. Smaller values are probably in metres."""
 
-MOST_PIEZO = 1e5
-"""Largest coefficient, pC/N or pC/(mm^2 K): thirty times that of the strongest crystals."""
+MIN_THICKNESS = 1e-4
+"""Smallest thickness of a film, mm. Smaller values are probably in metres."""
 
-LEAST_PIEZO = 1e-3
-"""Smallest coefficient d31, d32 or d33 other than 0, pC/N: smaller numbers are in C/N; PVDF has 1 to 30 pC/N."""
+MAX_PIEZO = 1e5
+"""Largest piezoelectric or pyroelectric coefficient, pC/N or pC/(mm^2 K): thirty times that of the strongest
+crystals."""
 
-LEAST_YOUNG, MOST_YOUNG, MOST_PRETENSION = 1e-6, 1e7, 1e4
-"""Bounds of Young's modulus and of the pretension of a film, MPa: larger numbers are in pascals."""
+MIN_PIEZO = 1e-3
+"""Smallest coefficient d31, d32, d33 or d12 other than zero, pC/N. Smaller values are probably in C/N."""
 
+MIN_YOUNG = 1e-6
+"""Smallest Young's modulus of a film, MPa."""
 
-MOST_RATIO, MOST_OVAL = 10.0, 0.1
-"""Largest E1 / E2 and largest e of an oval clamp: beyond, the mesh and the start of a solve are not tried."""
+MAX_YOUNG = 1e7
+"""Largest Young's modulus of a film, MPa. Larger values are probably in Pa."""
 
+MAX_PRETENSION = 1e4
+"""Largest pretension of a film, MPa. Larger values are probably in Pa."""
 
-MOST_SLACK = 10.0
-"""Largest pretension below 0, MPa: a film that is too long by 0.2 %; light presses wrinkle a slack one."""
+MAX_SLACK = 10.0
+"""Largest magnitude of a negative pretension, MPa. A slack film wrinkles under small forces."""
 
+MAX_YOUNG_RATIO = 10.0
+"""Largest ratio E1 / E2 for which the solver has been tested, dimensionless."""
 
-MOST_COAT = 5.0
-"""Largest stiffness of a coat over the film's: tested up to this; beyond, the coat's bending counts, too."""
+MAX_OVAL = 0.1
+"""Largest parameter e of an oval clamp for which the mesh has been tested, dimensionless."""
+
+MAX_COAT_STIFFNESS = 5.0
+"""Largest stiffness of a coat over the stiffness of the film. The bending of a stiffer coat cannot be neglected."""
 
 
 @dataclass(frozen=True)
 class Coat:
-    """Metal or ink that stiffens parts of a film: isotropic, of the film's Poisson's ratio, without tension of its own.
+    """Metal or ink that stiffens parts of a film. It is isotropic, has Poisson's ratio of the film, and no pretension.
 
     Attributes:
-        stiffness: Young's modulus times thickness, N/mm.
-        layers: What is coated at least once, and what twice, on both sides: convex polygons without common area,
-            anticlockwise corners (x, y) on the real film, mm.
+        stiffness: Young's modulus times thickness of one layer, N/mm.
+        layers: Areas with at least one layer and, if there are any, areas with two layers (one on each side). Each area
+            is a tuple of convex polygons that do not overlap, with anticlockwise corners (x, y) on the real film, mm.
     """
 
     stiffness: float
     layers: tuple[tuple[tuple[tuple[float, float], ...], ...], ...]
 
     def __repr__(self) -> str:
-        """Without the corners."""
+        """Return the stiffness and the number of parts, without the corners."""
         return f"Coat({self.stiffness:.4g} N/mm, {len(self.layers[0])} parts)"
 
 
 @dataclass(frozen=True)
 class Film:
-    """The clamped circular film.
+    """A film that is clamped along its edge.
 
     Attributes:
-        radius: mm.
-        thickness: mm.
-        young: Young's modulus, MPa.
-        poisson: Poisson's ratio, 0 <= poisson < 0.5; of an orthotropic film sqrt(nu12 nu21).
-        pretension: Uniform second Piola-Kirchhoff stress without load, MPa, tension positive: the mean of T11 and T22.
-        deviator: (T11 - T22) / 2 and T12 of a pretension that is not the same in all directions, MPa.
-        young_ratio: E1 / E2 of an orthotropic film; `young` is then sqrt(E1 E2).
-        shear: Its shear modulus G12, MPa; None for young / (2 (1 + poisson)).
-        axis: Angle of its axis 1 from x, rad, anticlockwise.
-        oval: e of a clamp that is no circle: its half axes are radius * (1 + e) and radius * (1 - e).
-        oval_axis: Angle of the longer one from x, rad.
-        coat: What stiffens parts of it, if anything.
+        radius: Radius of the clamped edge, mm.
+        thickness: Thickness, mm.
+        young: Young's modulus, MPa; sqrt(E1 E2) of an orthotropic film.
+        poisson: Poisson's ratio, 0 <= poisson < 0.5; sqrt(nu12 nu21) of an orthotropic film.
+        pretension: Uniform second Piola-Kirchhoff stress without load, mean of T11 and T22, MPa, tension positive.
+        deviator: (T11 - T22) / 2 and T12 of a pretension that depends on the direction, MPa.
+        young_ratio: Ratio E1 / E2 of an orthotropic film, dimensionless.
+        shear: Shear modulus G12 of an orthotropic film, MPa; None for young / (2 (1 + poisson)).
+        axis: Angle of axis 1 of an orthotropic film from x, anticlockwise, rad.
+        oval: Parameter e of an oval clamp, whose semi-axes are radius * (1 + e) and radius * (1 - e), dimensionless.
+        oval_axis: Angle of the longer semi-axis from x, anticlockwise, rad.
+        coat: Coat that stiffens parts of the film; None if there is no coat.
     """
 
     radius: float
@@ -86,44 +96,45 @@ class Film:
     coat: Coat | None = None
 
     @property
-    def anisotropic(self) -> bool:
-        """Whether elasticity or pretension differ between directions."""
+    def is_anisotropic(self) -> bool:
+        """Whether the elasticity or the pretension depends on the direction."""
         return self.deviator != (0.0, 0.0) or self.young_ratio != 1.0 or self.shear is not None
 
     @property
-    def around(self) -> dict[str, object]:
-        """All that is not alike all round the film, by the names of the attributes."""
+    def asymmetries(self) -> dict[str, object]:
+        """Names and values of the attributes that make the film differ from an axisymmetric film."""
         names = ("deviator", "young_ratio", "shear", "axis", "oval", "oval_axis", "coat")
         return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(Film, name)}
 
     @property
-    def turns(self) -> bool:
-        """Whether the film turned about its centre is the same film: a press at (r, theta) is then one at (r, 0)."""
-        return not self.anisotropic and self.oval == 0.0 and self.coat is None
+    def is_axisymmetric(self) -> bool:
+        """Whether a rotation of the film about its centre changes nothing."""
+        return not self.is_anisotropic and self.oval == 0.0 and self.coat is None
 
     def __post_init__(self) -> None:
-        check_length("film radius", self.radius, LEAST_RADIUS, SensorError)
-        check_length("film thickness", self.thickness, LEAST_THICKNESS, SensorError)
-        check_stress("film young", self.young, LEAST_YOUNG, MOST_YOUNG, SensorError)
-        check_stress("film pretension", self.pretension, -MOST_SLACK, MOST_PRETENSION, SensorError)
+        check_length("film radius", self.radius, MIN_RADIUS, SensorError)
+        check_length("film thickness", self.thickness, MIN_THICKNESS, SensorError)
+        check_stress("film young", self.young, MIN_YOUNG, MAX_YOUNG, SensorError)
+        check_stress("film pretension", self.pretension, -MAX_SLACK, MAX_PRETENSION, SensorError)
         if not 0.0 <= self.poisson < 0.5:
             raise SensorError(f"film poisson: expected 0 <= poisson < 0.5, got {self.poisson}")
-        stiffest = MOST_COAT * self.young * self.thickness
-        if self.coat is not None and not 0.0 < self.coat.stiffness <= stiffest:
+        max_stiffness = MAX_COAT_STIFFNESS * self.young * self.thickness
+        if self.coat is not None and not 0.0 < self.coat.stiffness <= max_stiffness:
             raise SensorError(
-                f"film coat: expected Young's modulus times thickness up to {MOST_COAT:g} times the film's, "
-                f"{stiffest:.4g} N/mm, got {self.coat.stiffness:.4g} N/mm"
+                f"film coat: expected Young's modulus times thickness up to {MAX_COAT_STIFFNESS:g} times the film's, "
+                f"{max_stiffness:.4g} N/mm, got {self.coat.stiffness:.4g} N/mm"
             )
         for name, value in zip(("(T11 - T22) / 2", "T12"), self.deviator, strict=True):
-            check_stress(f"film pretension, {name}", value, -MOST_PRETENSION, MOST_PRETENSION, SensorError)
+            check_stress(f"film pretension, {name}", value, -MAX_PRETENSION, MAX_PRETENSION, SensorError)
         if self.shear is not None:
-            check_stress("film shear", self.shear, LEAST_YOUNG, MOST_YOUNG, SensorError)
-        if not 1.0 / MOST_RATIO <= self.young_ratio <= MOST_RATIO:
+            check_stress("film shear", self.shear, MIN_YOUNG, MAX_YOUNG, SensorError)
+        if not 1.0 / MAX_YOUNG_RATIO <= self.young_ratio <= MAX_YOUNG_RATIO:
             raise SensorError(
-                f"film young: expected E1 / E2 from 1/{MOST_RATIO:g} to {MOST_RATIO:g}, got {self.young_ratio:g}"
+                f"film young: expected E1 / E2 from 1/{MAX_YOUNG_RATIO:g} to {MAX_YOUNG_RATIO:g}, got "
+                f"{self.young_ratio:g}"
             )
-        if not abs(self.oval) <= MOST_OVAL:
-            raise SensorError(f"film oval: expected a share up to {MOST_OVAL:g}, got {self.oval}")
+        if not abs(self.oval) <= MAX_OVAL:
+            raise SensorError(f"film oval: expected a share up to {MAX_OVAL:g}, got {self.oval}")
         if not (math.isfinite(self.axis) and math.isfinite(self.oval_axis)):
             raise SensorError(f"film axis, oval_axis: expected finite angles, got {self.axis}, {self.oval_axis}")
         if self.thickness > 0.1 * self.radius:
@@ -135,18 +146,20 @@ class Film:
 
 @dataclass(frozen=True)
 class Piezo:
-    """Piezoelectric strain coefficients in pC/N, and the pyroelectric one.
+    """Piezoelectric strain coefficients and pyroelectric coefficient of a film.
 
-    Charge counts as positive as that of a stretch does where d31 > 0. PVDF is polarised by what it holds in its
-    thickness: what thins the film raises the charge, what thickens it lowers it. So beside d31 = 20 pC/N it has
-    d33 = -33 (pressure thins) and pyro = -30 (heat thickens; Kepler and Anderson 1978), whatever data sheets print
-    without a sign. A film that is wired the other way round has all signs turned.
+    The sign of the charge is that of a tension along x if d31 > 0. In PVDF, a decrease of the thickness increases the
+    charge, and an increase of the thickness decreases it. With d31 = 20 pC/N, PVDF therefore has d33 = -33 pC/N and
+    pyro = -30 pC/(mm^2 K), because warming increases the thickness (Kepler and Anderson 1978). Data sheets often omit
+    these signs. If the wires of a film are exchanged, all signs change.
 
     Attributes:
-        d31, d32: Charge of tension along x and y, pC/N.
-        d33: Charge of tension through the thickness, pC/N.
-        d12: Charge of shear, 2 d12 s12, pC/N: of turned axes (d31 - d32) / 2 times sin of twice their angle.
-        pyro: Charge of warming a film that is free to expand, pC/(mm^2 K).
+        d31: Charge per force of tension along x, pC/N.
+        d32: Charge per force of tension along y, pC/N.
+        d33: Charge per force of tension through the thickness, pC/N.
+        d12: Coefficient of the shear stress, pC/N: the charge density is 2 d12 s12. If the piezoelectric axes are
+            rotated by an angle, d12 is (d31 - d32) / 2 times the sine of twice this angle.
+        pyro: Charge per area and temperature of a film that is free to expand, pC/(mm^2 K).
     """
 
     d31: float
@@ -156,10 +169,13 @@ class Piezo:
     d12: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, d in vars(self).items():
-            if not abs(d) <= MOST_PIEZO:
-                raise SensorError(f"piezo {name}: expected a number up to {MOST_PIEZO:g} in size, got {d}")
-            if name != "pyro" and 0.0 < abs(d) < LEAST_PIEZO:
-                raise SensorError(f"piezo {name}: expected pC/N, got {d:.6g} pC/N; {d:.6g} C/N are {1e12 * d:.6g} pC/N")
+        for name, coefficient in vars(self).items():
+            if not abs(coefficient) <= MAX_PIEZO:
+                raise SensorError(f"piezo {name}: expected a number up to {MAX_PIEZO:g} in size, got {coefficient}")
+            if name != "pyro" and 0.0 < abs(coefficient) < MIN_PIEZO:
+                raise SensorError(
+                    f"piezo {name}: expected pC/N, got {coefficient:.6g} pC/N; {coefficient:.6g} C/N are "
+                    f"{1e12 * coefficient:.6g} pC/N"
+                )
         if self.d31 == self.d32 == self.d12 == 0.0:
             raise SensorError("piezo d31 and d32 are both 0: such a film gives no charge")

@@ -370,7 +370,7 @@ class FilmPrior:
             ("d33 (pC/N)", sensor.piezo.d33, described.piezo.d33),
             ("d12 (pC/N)", sensor.piezo.d12, described.piezo.d12),
             ("crosstalk", sensor.calibration.crosstalk, described.calibration.crosstalk),
-            ("what is not alike all round the film", sensor.film.around, described.film.around),
+            ("asymmetry of the film", sensor.film.asymmetries, described.film.asymmetries),
         ):
             if value != expected:
                 raise SensorError(f"{sensor.name}: {what}: expected those of {described.name}, {expected}, got {value}")

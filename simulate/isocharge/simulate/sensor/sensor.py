@@ -1,7 +1,8 @@
-"""What a sensor is: film, piezoelectric coefficients, electrodes, readout, calibration. mm, N, MPa and pC throughout.
+"""Description of a sensor: film, piezoelectric coefficients, electrodes, readout and calibration.
 
-Coordinates: origin at the film's centre, x along the drawn direction (1), y transverse (2), seen from the side of the
-probe. Force and deflection are positive in the direction of the push (README.md, Coordinates).
+The origin of the coordinates is the centre of the film. The x axis is the drawn direction (1), the y axis is the
+transverse direction (2), and both are seen from the side of the probe. Force and deflection are positive in the
+direction of the push. Units are mm, N, MPa and pC.
 """
 
 from dataclasses import dataclass, field, replace
@@ -20,49 +21,51 @@ from isocharge.simulate.sensor.film import Coat, Film, Piezo, Surface
 from isocharge.simulate.sensor.size_check import check_length
 
 Readout = Literal["area", "edge"]
+"""Mean of the stress over the area of an electrode, or over its edges (Mirbagheri et al. 2007, eq. 2 and 3)."""
 
-MOST_CORNERS = 256
+MAX_CORNERS = 256
 """Largest number of corners of a polygon."""
 
-MOST_OF_ALL = 2048
-"""Largest number of corners of all polygons of an electrode: where their edges cross is looked for pair by pair."""
+MAX_ELECTRODE_CORNERS = 2048
+"""Largest number of corners of all polygons of an electrode, because intersections are searched for in all pairs."""
 
-LEAST_EXTENT = 0.02
-"""Smallest extent of an electrode along x or y, the larger of both, mm: smaller numbers are in metres."""
+MIN_EXTENT = 0.02
+"""Smallest accepted value of the larger extent of an electrode along x and y, mm. Smaller values are probably in
+metres."""
 
-LONGEST_PART = 3.0
-"""Longest side of the parts into which what is no convex polygon is cut, mm."""
+MAX_PART_SIDE = 3.0
+"""Longest side of the parts into which an electrode that is not convex is cut, mm."""
 
-MOST_CROSSTALK = 0.2
-"""Largest crosstalk, dimensionless: beyond, the wires are wrong."""
+MAX_CROSSTALK = 0.2
+"""Largest accepted crosstalk, dimensionless."""
 
-LONGEST_NAME = 100
-"""Longest name of an electrode, characters."""
+MAX_NAME_LENGTH = 100
+"""Largest number of characters of the name of an electrode."""
 
-OTHER_COLUMNS = (
+RESERVED_NAMES = (
     *("side_mm", "coating_N_per_mm", "x_mm", "y_mm", "force_N", "position_std_mm", "force_std", "temperature_C"),
     *("probe", "orientation_deg", "t_us", "t_ms", "t_s", "seq"),
 )
-"""What else stands among the names of electrodes: keys of the sensor file, columns of presses, fields of a frame."""
+"""Names that an electrode cannot have: keys of the sensor file, columns of presses and fields of a frame."""
 
-MOST_ELECTRODES = 64
-"""Largest number of electrodes on a film; each is checked against all others."""
+MAX_ELECTRODES = 64
+"""Largest number of electrodes on a film, because each electrode is compared with all others."""
 
 
 Corners = tuple[tuple[float, float], ...]
-"""Corners (x, y) of a polygon, anticlockwise, mm; it may have dents, but not cross itself."""
+"""Corners (x, y) of a simple polygon, anticlockwise, mm. The polygon need not be convex."""
 
 
 @dataclass(frozen=True)
 class Electrode:
-    """One sensing element: what its metal on the front and that on the back have in common collects.
+    """A sensing element. It collects charge where its metal on the front overlaps its metal on the back.
 
     Attributes:
-        name: As in the sensor file.
-        corners: The pad.
-        square: Whether it comes from `of_square`; only squares have the edges that the edge readout averages over.
-        more: Further metal of the front, such as traces; where polygons overlap, their area counts once.
-        back: Metal of the back; none stands for a back that is metal all over.
+        name: Name in the sensor file.
+        corners: Corners of the pad.
+        square: Whether `of_square` created the electrode. The edge readout accepts squares only.
+        more: Further metal on the front, such as traces. Overlapping areas count once.
+        back: Metal on the back. If empty, the back is completely covered with metal.
     """
 
     name: str
@@ -77,16 +80,30 @@ class Electrode:
 
     @classmethod
     def of_square(cls, name: str, centre: tuple[float, float], side: float) -> "Electrode":
-        """A square along the axes, centre and side in mm; the first corner is the lower left one."""
-        (x, y), half = centre, 0.5 * side
+        """Create a square electrode with sides along the axes.
+
+        Args:
+            name: Name of the electrode.
+            centre: Centre (x, y), mm.
+            side: Length of the sides, mm.
+
+        Returns:
+            The electrode, whose first corner is the lower left one.
+        """
+        x, y = centre
+        half = 0.5 * side
         corners = ((x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half))
         return cls(name, corners, square=True)
 
     def with_trace(self, path: Corners, width: float) -> "Electrode":
-        """The electrode with a trace on its front, a line through the points of `path` with a width, mm.
+        """Return the electrode with an additional trace on the front.
+
+        Args:
+            path: Points (x, y) of the centre line of the trace, mm.
+            width: Width of the trace, mm.
 
         Raises:
-            SensorError: If the path has fewer than two points or the same twice, or the trace crosses itself.
+            SensorError: If the path has fewer than two points or repeats a point, or if the trace crosses itself.
         """
         outline = to_corners(trace_outline(to_complex(np.array(path)), width))
         polygon = tuple((float(x), float(y)) for x, y in outline)
@@ -95,76 +112,97 @@ class Electrode:
 
     @property
     def front(self) -> tuple[Corners, ...]:
-        """The pad and the further metal of the front."""
+        """All polygons of the metal on the front: the pad, and further metal."""
         return (self.corners, *self.more)
 
     @cached_property
-    def uncut(self) -> tuple[Array, ...]:
-        """What collects, without common area: a convex polygon, or trapezoids; (n, 2) each, mm.
+    def collecting_polygons(self) -> tuple[Array, ...]:
+        """The collecting area as polygons that do not overlap: one convex polygon, or several trapezoids.
+
+        Each polygon has the shape (n, 2), mm.
 
         Raises:
             SensorError: If a polygon crosses itself, or there are too few or too many corners.
         """
         for polygon in (*self.front, *self.back):
             check_polygon(f"electrode {self.name!r}", polygon)
-        if (count := sum(map(len, (*self.front, *self.back)))) > MOST_OF_ALL:
+        count = sum(len(polygon) for polygon in (*self.front, *self.back))
+        if count > MAX_ELECTRODE_CORNERS:
             raise SensorError(
-                f"electrode {self.name!r}: expected at most {MOST_OF_ALL} corners of all polygons, got {count}"
+                f"electrode {self.name!r}: expected at most {MAX_ELECTRODE_CORNERS} corners of all polygons, got "
+                f"{count}"
             )
         if self._is_convex:
             return (np.array(self.corners),)
-        front, back = ([to_complex(np.array(polygon)) for polygon in side] for side in (self.front, self.back))
+        front = [to_complex(np.array(polygon)) for polygon in self.front]
+        back = [to_complex(np.array(polygon)) for polygon in self.back]
         return tuple(to_corners(part) for part in union_parts(front, back))
 
     @cached_property
     def parts(self) -> tuple[Array, ...]:
-        """What collects, as `uncut`, but trapezoids are cut into quadrilaterals and triangles of `LONGEST_PART`."""
+        """The collecting area as convex parts that do not overlap, each of shape (n, 2), mm.
+
+        A convex electrode is one part. Others are cut into quadrilaterals and triangles with sides of at most
+        `MAX_PART_SIDE`.
+        """
         if self._is_convex:
-            return self.uncut
-        return tuple(to_corners(piece) for part in self.uncut for piece in pieces(to_complex(part), LONGEST_PART))
+            return self.collecting_polygons
+        return tuple(
+            to_corners(piece)
+            for polygon in self.collecting_polygons
+            for piece in pieces(to_complex(polygon), MAX_PART_SIDE)
+        )
 
     @property
     def _is_convex(self) -> bool:
+        """Whether the collecting area is the pad, and the pad is convex."""
         return not (self.more or self.back) and is_convex(np.array(self.corners))
 
     @property
     def area(self) -> float:
-        """Area that collects, mm^2."""
+        """Collecting area, mm^2."""
         return sum(area_of(part) for part in self.parts)
 
     @cached_property
     def metal(self) -> tuple[Array, ...]:
-        """What is metal on the front, whether it collects or not, as `parts`."""
+        """Metal on the front, whether or not it collects charge, as convex parts like `parts`."""
         return replace(self, back=()).parts if self.back else self.parts
 
     @cached_property
     def boxes(self) -> tuple[Array, Array]:
-        """Lower left and upper right corners of the boxes round `metal`, each of shape (n_part, 2), mm."""
-        low, high = (np.array([end(part, axis=0) for part in self.metal]) for end in (np.min, np.max))
+        """Lower left and upper right corners of the bounding boxes of `metal`, each of shape (n_part, 2), mm."""
+        low = np.array([part.min(axis=0) for part in self.metal])
+        high = np.array([part.max(axis=0) for part in self.metal])
         return low, high
 
     def overlaps(self, other: "Electrode", within: float = 0.0) -> bool:
-        """Whether the metal of the two touches on the front, or is apart by less than `within`, mm."""
-        (low, high), (other_low, other_high) = self.boxes, other.boxes
+        """Return whether the metal of two electrodes overlaps on the front.
+
+        Args:
+            other: The other electrode.
+            within: Distance below which the electrodes also count as overlapping, mm.
+        """
+        low, high = self.boxes
+        other_low, other_high = other.boxes
         near = (low[:, None] <= other_high + within) & (other_low - within <= high[:, None])
         return any(overlap(self.metal[i], other.metal[j], within) for i, j in np.argwhere(near.all(axis=2)))
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Mean of the pad's corners, mm."""
+        """Mean of the corners of the pad, mm."""
         x, y = np.mean(self.corners, axis=0)
         return float(x), float(y)
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Gains and positions measured on a real film.
+    """Gains and positions of the electrodes, as measured on a real film.
 
     Attributes:
-        gain: Charge read over charge collected, by electrode name; missing names count as 1.
-        shift: Displacement of the electrodes from the layout, mm.
-        rotation: Angle by which they are rotated about the film's centre before the shift, rad, anticlockwise.
-        crosstalk: Share of every other electrode's charge that an electrode reads, dimensionless.
+        gain: Ratio of the charge that is read to the charge that is collected, by electrode name. A missing gain is 1.
+        shift: Displacement of the electrodes from the layout along x and y, mm.
+        rotation: Rotation of the electrodes about the centre of the film before the shift, anticlockwise, rad.
+        crosstalk: Share of the charge of every other electrode that an electrode reads, dimensionless.
     """
 
     gain: dict[str, float] = field(default_factory=dict)
@@ -173,31 +211,47 @@ class Calibration:
     crosstalk: float = 0.0
 
     def read(self, charge: Array) -> Array:
-        """What is read of charges (..., n_electrode), pC, with the crosstalk."""
+        """Add the crosstalk to collected charges.
+
+        Args:
+            charge: Charges, shape (..., n_electrode), pC.
+
+        Returns:
+            Charges that are read, same shape, pC.
+        """
         if self.crosstalk == 0.0:
             return charge
         return np.asarray(charge + self.crosstalk * (charge.sum(axis=-1, keepdims=True) - charge))
 
     def place(self, points: Array) -> Array:
-        """Layout positions, shape (..., 2), to positions on the real film."""
-        c, s = np.cos(self.rotation), np.sin(self.rotation)
-        return np.asarray(points @ np.array([[c, s], [-s, c]]) + np.array(self.shift))
+        """Convert positions in the layout into positions on the real film.
+
+        Args:
+            points: Positions (x, y), shape (..., 2), mm.
+
+        Returns:
+            Positions, same shape, mm.
+        """
+        cosine = np.cos(self.rotation)
+        sine = np.sin(self.rotation)
+        rotation = np.array([[cosine, sine], [-sine, cosine]])
+        return np.asarray(points @ rotation + np.array(self.shift))
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A film with electrodes; see `isocharge.simulate.sensor.sensor_file` for its file.
+    """A film with electrodes. The module `sensor_file` reads and writes its file.
 
     Attributes:
-        name: Its name.
-        film: The bare film.
-        piezo: Its coefficients.
-        electrodes: What collects.
-        readout: Mean over an electrode or over its edges.
-        surface: Where in the thickness the stress is read.
-        calibration: What was measured on a real film.
-        coating: Young's modulus times thickness of the electrodes' metal or ink, N/mm, on the front and on a back that
-            is not metal all over; 0 where it does not stiffen the film.
+        name: Name of the sensor.
+        film: Film without electrodes.
+        piezo: Piezoelectric coefficients.
+        electrodes: Electrodes, in the order of the charges.
+        readout: Mean over the area of an electrode, or over its edges.
+        surface: Surface in the thickness of the film at which the stress is read.
+        calibration: Gains and positions that were measured on a real film.
+        coating: Young's modulus times thickness of the metal or ink of the electrodes, N/mm. It applies to the front,
+            and to the back if the back is not completely covered. Zero if the coating does not stiffen the film.
     """
 
     name: str
@@ -214,18 +268,19 @@ class Sensor:
         for value, options in ((self.readout, get_args(Readout)), (self.surface, get_args(Surface))):
             if value not in options:
                 raise SensorError(f"expected one of {options}, got {value!r}")
-        names, gains = self.electrode_names, self.calibration.gain
-        if not (1 <= len(names) <= MOST_ELECTRODES and len(set(names)) == len(names)):
+        names = self.electrode_names
+        gains = self.calibration.gain
+        if not (1 <= len(names) <= MAX_ELECTRODES and len(set(names)) == len(names)):
             raise SensorError(
-                f"electrodes: expected 1 to {MOST_ELECTRODES} different names, got {len(names)}: {cut(str(names))}"
+                f"electrodes: expected 1 to {MAX_ELECTRODES} different names, got {len(names)}: {cut(str(names))}"
             )
         for name in names:
             _check_name(name)
         if not all(np.isfinite(gain) and gain > 0.0 for gain in gains.values()):
             raise SensorError(f"calibration gain: expected positive numbers, got {shown(gains)}")
-        if not abs(self.calibration.crosstalk) <= MOST_CROSSTALK:
+        if not abs(self.calibration.crosstalk) <= MAX_CROSSTALK:
             raise SensorError(
-                f"calibration crosstalk: expected a share up to {MOST_CROSSTALK:g}, got {self.calibration.crosstalk}"
+                f"calibration crosstalk: expected a share up to {MAX_CROSSTALK:g}, got {self.calibration.crosstalk}"
             )
         if not set(gains) <= set(names):
             unknown = sorted(set(gains) - set(names))
@@ -238,19 +293,28 @@ class Sensor:
 
     @property
     def electrode_names(self) -> tuple[str, ...]:
-        """Names in the order of the charges."""
+        """Names of the electrodes, in the order of the charges."""
         return tuple(electrode.name for electrode in self.electrodes)
 
     @cached_property
     def coated_film(self) -> Film:
-        """The film with the metal of the electrodes, as it is pressed; the bare one if that does not stiffen it."""
+        """The film with the metal of the electrodes, which is the film without electrodes if `coating` is zero."""
         if self.coating == 0.0:
             return self.film
-        once = [replace(e, more=(*e.more, *e.back), back=(), square=False) for e in self.electrodes]
-        twice = [electrode for electrode in self.electrodes if electrode.back]
-        layers = [[self.calibration.place(part) for e in layer for part in e.parts] for layer in (once, twice) if layer]
-        corners = tuple(tuple(tuple((float(x), float(y)) for x, y in part) for part in layer) for layer in layers)
-        return replace(self.film, coat=Coat(self.coating, corners))
+        on_either_side = [
+            replace(electrode, more=(*electrode.more, *electrode.back), back=(), square=False)
+            for electrode in self.electrodes
+        ]
+        on_both_sides = [electrode for electrode in self.electrodes if electrode.back]
+        layers = [self._placed_parts(on_either_side)]
+        if on_both_sides:
+            layers.append(self._placed_parts(on_both_sides))
+        return replace(self.film, coat=Coat(self.coating, tuple(layers)))
+
+    def _placed_parts(self, electrodes: list[Electrode]) -> tuple[Corners, ...]:
+        """Return the corners of the parts of electrodes at their calibrated positions, mm."""
+        parts = [self.calibration.place(part) for electrode in electrodes for part in electrode.parts]
+        return tuple(tuple((float(x), float(y)) for x, y in part) for part in parts)
 
     @cached_property
     def part_circles(self) -> tuple[tuple[Complexes, Array], ...]:
@@ -259,13 +323,13 @@ class Sensor:
         Returns:
             For each electrode the centres x + iy and the radii, each of shape (n_part,), mm.
         """
-        part_circles = []
+        circles = []
         for electrode in self.electrodes:
             parts = [self.calibration.place(part) for part in electrode.parts]
-            centre = np.array([part.mean(axis=0) for part in parts])
-            reach = [np.linalg.norm(part - at, axis=1).max() for part, at in zip(parts, centre, strict=True)]
-            part_circles.append((to_complex(centre), np.array(reach)))
-        return tuple(part_circles)
+            centres = np.array([part.mean(axis=0) for part in parts])
+            radii = [np.linalg.norm(part - centre, axis=1).max() for part, centre in zip(parts, centres, strict=True)]
+            circles.append((to_complex(centres), np.array(radii)))
+        return tuple(circles)
 
     @property
     def gains(self) -> Array:
@@ -274,10 +338,10 @@ class Sensor:
 
 
 def electrode_index(sensor: Sensor, name: str) -> int:
-    """Place of an electrode in the order of the charges.
+    """Return the index of an electrode in the order of the charges.
 
     Raises:
-        SensorError: If the sensor has no electrode of that name.
+        SensorError: If the sensor has no electrode with this name.
     """
     if name not in sensor.electrode_names:
         raise SensorError(f"no electrode {name!r} on {sensor.name}: it has {', '.join(sensor.electrode_names)}")
@@ -285,42 +349,48 @@ def electrode_index(sensor: Sensor, name: str) -> int:
 
 
 def _as_tuples(value: object) -> object:
-    """Lists and arrays as tuples all the way down, so that layouts can be compared; other values as they are."""
-    return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple | np.ndarray) else value
+    """Convert nested lists and arrays into nested tuples, which can be compared. Return other values unchanged."""
+    if isinstance(value, list | tuple | np.ndarray):
+        return tuple(_as_tuples(item) for item in value)
+    return value
 
 
 def _check_name(name: str) -> None:
-    """Refuse a name that cannot head a column of charges.
+    """Raise an error if a name cannot be the header of a column of charges.
 
     Raises:
-        SensorError: If it is empty or too long, has a comma or what cannot be printed, or means something else there.
+        SensorError: If the name is empty, too long or reserved, or contains a comma or characters that are not
+        printable.
     """
-    if not (0 < len(name) <= LONGEST_NAME and is_printable(name) and name == name.strip() and "," not in name):
+    has_valid_length = 0 < len(name) <= MAX_NAME_LENGTH
+    if not (has_valid_length and is_printable(name) and name == name.strip() and "," not in name):
         raise SensorError(
-            f"electrode {shown(name)}: expected a name of 1 to {LONGEST_NAME} printable characters, without commas and "
-            "without blanks at its ends: it heads a column of CSV files"
+            f"electrode {shown(name)}: expected a name of 1 to {MAX_NAME_LENGTH} printable characters, without commas "
+            "and without blanks at its ends: it heads a column of CSV files"
         )
-    if name in OTHER_COLUMNS:
+    if name in RESERVED_NAMES:
         raise SensorError(f"electrode {name!r}: this name means something else in files of charges; choose another one")
 
 
 @lru_cache(maxsize=64)
 def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
-    """Refuse electrodes that cannot exist on any film; the many films of one layout are looked at once.
+    """Raise an error if electrodes cannot exist on any film. The result for a layout is cached.
 
     Raises:
-        SensorError: If a polygon crosses itself, nothing collects, one is tiny, a square is none, or two overlap.
+        SensorError: If a polygon crosses itself, an electrode collects no charge or is too small, a square has other
+            corners, or two electrodes overlap.
     """
     for electrode in electrodes:
         name = f"electrode {electrode.name!r}"
-        if not electrode.uncut:
+        if not electrode.collecting_polygons:
             raise SensorError(f"{name}: its front and its back have no area in common, so nothing collects; move one")
         corners = np.array(electrode.corners)
-        check_length(name, float(np.ptp(corners, axis=0).max()), LEAST_EXTENT, SensorError)
+        check_length(name, float(np.ptp(corners, axis=0).max()), MIN_EXTENT, SensorError)
         side = float(corners[1, 0] - corners[0, 0])
         square = Electrode.of_square(electrode.name, electrode.centre, side).corners
-        alone = len(corners) == 4 and not (electrode.more or electrode.back)
-        if electrode.square and not (alone and np.allclose(corners, square, rtol=0.0, atol=1e-9 * side)):
+        is_pad_only = not (electrode.more or electrode.back)
+        is_square = len(corners) == 4 and np.allclose(corners, square, rtol=0.0, atol=1e-9 * side)
+        if electrode.square and not (is_pad_only and is_square):
             raise SensorError(
                 f"{name}: expected the corners of a square along the axes, got {corners.tolist()} mm; make squares "
                 "with Electrode.of_square"
@@ -331,32 +401,41 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
 
 
 def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -> None:
-    """Refuse an electrode that does not lie wholly on a film.
+    """Raise an error if an electrode does not lie completely on a film.
 
     Raises:
-        SensorError: If a part of it lies beyond the rim.
+        SensorError: If a part of the electrode lies beyond the rim.
     """
-    placed = calibration.place(np.concatenate(electrode.uncut))
-    if not np.linalg.norm(placed, axis=1).max() < film.radius:
-        x, y = placed.mean(axis=0)
-        reach = np.linalg.norm(placed - placed.mean(axis=0), axis=1).max()
-        half = 0.5 * (electrode.corners[1][0] - electrode.corners[0][0])
-        size = f"half side {_short(half)} mm" if electrode.square else f"corners up to {_short(reach)} mm from it"
-        raise SensorError(
-            f"electrode {electrode.name!r} lies outside the film: centre ({_short(x)}, {_short(y)}) mm, {size}, "
-            f"film radius {_short(film.radius)} mm" + "; end its traces before the rim" * bool(electrode.more)
-        )
+    placed = calibration.place(np.concatenate(electrode.collecting_polygons))
+    if np.linalg.norm(placed, axis=1).max() < film.radius:
+        return
+    x, y = placed.mean(axis=0)
+    if electrode.square:
+        half_side = 0.5 * (electrode.corners[1][0] - electrode.corners[0][0])
+        size = f"half side {_short(half_side)} mm"
+    else:
+        farthest = np.linalg.norm(placed - placed.mean(axis=0), axis=1).max()
+        size = f"corners up to {_short(farthest)} mm from it"
+    hint = "; end its traces before the rim" if electrode.more else ""
+    raise SensorError(
+        f"electrode {electrode.name!r} lies outside the film: centre ({_short(x)}, {_short(y)}) mm, {size}, "
+        f"film radius {_short(film.radius)} mm{hint}"
+    )
 
 
 def check_polygon(where: str, polygon: Corners) -> None:
-    """Refuse what is no simple polygon.
+    """Raise an error if corners do not form a simple polygon.
+
+    Args:
+        where: Beginning of the error message.
+        polygon: Corners, mm.
 
     Raises:
-        SensorError: If it crosses itself, runs clockwise, or has too few or too many corners.
+        SensorError: If the polygon crosses itself, is clockwise, or has too few or too many corners.
     """
     corners = np.array(polygon)
-    if corners.ndim != 2 or not 3 <= len(corners) <= MOST_CORNERS or corners.shape[1] != 2:
-        raise SensorError(f"{where}: expected 3 to {MOST_CORNERS} corners (x, y), got {shown(corners.tolist())}")
+    if corners.ndim != 2 or not 3 <= len(corners) <= MAX_CORNERS or corners.shape[1] != 2:
+        raise SensorError(f"{where}: expected 3 to {MAX_CORNERS} corners (x, y), got {shown(corners.tolist())}")
     if not (np.isfinite(corners).all() and (is_convex(corners) or is_simple(to_complex(corners)))):
         raise SensorError(
             f"{where}: expected a polygon that does not cross itself, with its corners anticlockwise, got "
@@ -365,5 +444,5 @@ def check_polygon(where: str, polygon: Corners) -> None:
 
 
 def _short(value: float) -> str:
-    """A number with six digits, for messages."""
+    """Return a number with six digits, for error messages."""
     return str(float(f"{value:.6g}"))

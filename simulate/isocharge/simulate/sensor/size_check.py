@@ -1,4 +1,4 @@
-"""Sizes: those that cannot be, or were plainly given in metres and pascals, are refused; others are written tidily."""
+"""Checks of lengths and stresses, which also detect values in metres and pascals, and rounding for files."""
 
 import math
 
@@ -6,19 +6,34 @@ from isocharge.common.errors import InputError
 
 
 def tidy(value: float) -> float:
-    """Without the last digits that unit conversion leaves behind."""
+    """Round a number to twelve digits, which removes the round-off of unit conversions."""
     return float(f"{value:.12g}")
 
 
-def check_length(what: str, value: float, least: float, error: type[InputError]) -> None:
-    """Refuse a length (mm) that is not finite or below the smallest that can be meant; `what` is that long."""
-    if not least <= value < math.inf:
-        metres = f"; {value:.6g} m are {1e3 * value:.6g} mm" if 0.0 < value < least else ""
-        raise error(f"{what}: expected at least {least:g} mm, got {value:.6g} mm{metres}")
+def check_length(what: str, value: float, minimum: float, error: type[InputError]) -> None:
+    """Raise an error if a length is infinite or too small to be meant in millimetres.
+
+    Args:
+        what: Name of the length in the error message.
+        value: The length, mm.
+        minimum: Smallest accepted length, mm.
+        error: Class of the error.
+    """
+    if not minimum <= value < math.inf:
+        hint = f"; {value:.6g} m are {1e3 * value:.6g} mm" if 0.0 < value < minimum else ""
+        raise error(f"{what}: expected at least {minimum:g} mm, got {value:.6g} mm{hint}")
 
 
-def check_stress(what: str, value: float, least: float, most: float, error: type[InputError]) -> None:
-    """Refuse a stress (MPa) outside what can be meant."""
-    if not least <= value <= most:
-        pascals = f"; {value:.6g} Pa are {1e-6 * value:.6g} MPa" if most < value < math.inf else ""
-        raise error(f"{what}: expected {least:g} to {most:g} MPa, got {value:.6g} MPa{pascals}")
+def check_stress(what: str, value: float, minimum: float, maximum: float, error: type[InputError]) -> None:
+    """Raise an error if a stress is outside the accepted range.
+
+    Args:
+        what: Name of the stress in the error message.
+        value: The stress, MPa.
+        minimum: Smallest accepted stress, MPa.
+        maximum: Largest accepted stress, MPa.
+        error: Class of the error.
+    """
+    if not minimum <= value <= maximum:
+        hint = f"; {value:.6g} Pa are {1e-6 * value:.6g} MPa" if maximum < value < math.inf else ""
+        raise error(f"{what}: expected {minimum:g} to {maximum:g} MPa, got {value:.6g} MPa{hint}")

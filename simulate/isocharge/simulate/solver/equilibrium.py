@@ -1,7 +1,8 @@
-"""The film at rest under a press, and its deflection and stress at any point.
+"""The equilibrium of the film under a press, and its deflection and stress at any point.
 
-Every press is solved on the positive x axis, the film turned with it, and rotated when it is read. If the film is round
-and its elasticity isotropic, one equilibrium serves all angles, electrode layouts and piezoelectric coefficients.
+Every press is rotated onto the positive x axis before it is solved, together with the film. The results are rotated
+back when they are read. If the film is axisymmetric, one equilibrium is valid for all directions of the press, all
+electrode layouts and all piezoelectric coefficients.
 """
 
 from dataclasses import dataclass
@@ -20,30 +21,32 @@ from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.probe import Probe
 
-SIDE = {"middle": 0.0, "top": 1.0, "bottom": -1.0}
-"""Place of each surface in the thickness: 1 on the side that the probe touches."""
+HEIGHT = {"middle": 0.0, "top": 1.0, "bottom": -1.0}
+"""Position of each surface in the thickness, in half thicknesses, positive towards the probe."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Equilibrium:
-    """The film at rest under a press: what `deflection`, `touch_stress` and `touch_charge` read.
+    """The equilibrium of a film under a press, from which `deflection`, `touch_stress` and `touch_charge` are computed.
 
     Attributes:
         film: The film.
-        probe: The footprint.
-        at: Centroid of the footprint (x, y), mm.
-        force: N.
-        theory: Which terms were modelled.
-        mesh: The mesh, where it lies under the press rotated onto the x axis.
-        field: Nodal (U1, U2, W), dimensionless, of the press rotated onto the x axis; shape (n_node, 3).
+        probe: The probe.
+        at: Centroid (x, y) of the footprint, mm.
+        force: Force, N, positive in the direction of the push.
+        theory: Terms of the film theory that were modelled.
+        mesh: Mesh under the press, which is rotated onto the x axis.
+        field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3), dimensionless. The press is rotated
+            onto the x axis.
         groups: Dimensionless groups of the press.
         status: "converged" or "failed".
-        message: One sentence.
-        iterations: Newton steps, each with its tangent; of a linear theory, solves with its only tangent.
-        residual: Out-of-balance force over load; of a linear theory, the size of the last correction in the
+        message: Description of the outcome in one sentence.
+        iterations: Number of Newton steps with a new tangent. For a linear theory, the number of linear solves.
+        residual: Out-of-balance force relative to the load. For a linear theory, the size of the last correction in the
             energy norm.
-        seconds: Process CPU time of mesh and solve, s.
-        proven_error: Difference of the charges from those on a mesh of one order less, if that was solved too.
+        seconds: Process CPU time for meshing and solving, s.
+        proven_error: Relative difference of the charges between this mesh and a mesh of one order less; None if only
+            one mesh was solved.
     """
 
     film: Film
@@ -62,28 +65,30 @@ class Equilibrium:
     proven_error: float | None = None
 
     def __repr__(self) -> str:
-        """The press, its deflection and its largest stress, beside that at which PVDF yields."""
-        (depth,), most = deflection(self, np.array([self.at])), principal_stress(self)[1]
-        yields = f", beyond {DEFAULT_STRESS_LIMIT:g} MPa: PVDF yields" * (most > DEFAULT_STRESS_LIMIT)
+        """Return a summary: the press, the deflection, the largest stress, and a warning if PVDF would yield."""
+        (depth,) = deflection(self, np.array([self.at]))
+        _, largest_stress = principal_stress(self)
+        exceeds_limit = largest_stress > DEFAULT_STRESS_LIMIT
+        warning = f", beyond {DEFAULT_STRESS_LIMIT:g} MPa: PVDF yields" if exceeds_limit else ""
         x, y = self.at
         return (
             f"Equilibrium({self.force:g} N under {self.probe.notation} at ({x:g}, {y:g}) mm: {self.status}, deflection "
-            f"{depth:.4g} mm, stress up to {most:.3g} MPa{yields})"
+            f"{depth:.4g} mm, stress up to {largest_stress:.3g} MPa{warning})"
         )
 
 
 def deflection(equilibrium: Equilibrium, points: Array) -> Array:
-    """Deflection w at film points.
+    """Compute the deflection at points of the film.
 
     Args:
         equilibrium: The solved press.
-        points: (x, y), shape (n, 2), mm, on the film.
+        points: Points (x, y) on the film, shape (n, 2), mm.
 
     Returns:
-        Shape (n,), mm, positive in the direction of the push.
+        Deflection, shape (n,), mm, positive in the direction of the push.
 
     Raises:
-        SceneError: If a point is off the film.
+        SceneError: If a point lies outside the film.
     """
     mesh = equilibrium.mesh
     element, xi, eta, _ = _locate(equilibrium, points)
@@ -93,89 +98,128 @@ def deflection(equilibrium: Equilibrium, points: Array) -> Array:
 
 
 def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "middle") -> Array:
-    """Second Piola-Kirchhoff stress that the press adds to the pretension.
+    """Compute the second Piola-Kirchhoff stress that the press adds to the pretension.
 
     Args:
         equilibrium: The solved press.
-        points: (x, y), shape (n, 2), mm, on the film.
-        surface: Where in the thickness: "top" is the side that the probe touches. The stress of bending is linear
-            through the thickness and exists whether or not the theory lets the film resist it.
+        points: Points (x, y) on the film, shape (n, 2), mm.
+        surface: Surface in the thickness; the probe touches "top". The bending stress is linear through the thickness.
+            It is included also if the theory neglects the resistance of the film to bending.
 
     Returns:
-        (s11, s22, s12) in the film's axes, shape (n, 3), MPa, tension positive.
+        Stress (s11, s22, s12) in the axes of the film, shape (n, 3), MPa, tension positive.
 
     Raises:
-        SceneError: If a point is off the film.
+        SceneError: If a point lies outside the film.
     """
     mesh, groups = equilibrium.mesh, equilibrium.groups
     element, xi, eta, mirrored = _locate(equilibrium, points)
     gradient = mesh.gradient(element, xi, eta)
     strained = strain(gradient @ equilibrium.field[mesh.template.nodes[element]], groups.amplitude2)
     if surface != "middle":
-        strained += _bent_strain(equilibrium, surface, gradient @ node_slope(equilibrium)[element, :, :, 2])
+        strained += _bending_strain(equilibrium, surface, gradient @ node_slope(equilibrium)[element, :, :, 2])
     if mesh.coat is not None:
-        strained = mesh.coat.of_film(_rotated(equilibrium, points), strained)
+        strained = mesh.coat.film_strain(_rotated(equilibrium, points), strained)
     local = equilibrium.film.young * groups.amplitude2 * scaled_stress(strained, groups)
     local[mirrored, 2] *= -1.0
     return rotate_stress(local, np.arctan2(equilibrium.at[1], equilibrium.at[0]))
 
 
 def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array:
-    """Scaled touch stress C : E' at the nodes of every element, the press rotated onto the x axis.
+    """Compute the scaled touch stress C : E' at the nodes of every element, with the press rotated onto the x axis.
 
-    Shape (n_element, n_local, 3): (S11, S22, S12) over E_young A^2; see `touch_stress` for the surface.
+    Args:
+        equilibrium: The solved press.
+        surface: Surface in the thickness; see `touch_stress`.
+
+    Returns:
+        (S11, S22, S12) in units of E_young A^2, shape (n_element, n_local, 3).
     """
     slope = node_slope(equilibrium)
     strained = strain(slope, equilibrium.groups.amplitude2)
     if surface != "middle":
-        strained += _bent_strain(equilibrium, surface, equilibrium.mesh.node_derivatives(slope[..., 2]))
+        strained += _bending_strain(equilibrium, surface, equilibrium.mesh.node_derivatives(slope[..., 2]))
     return scaled_stress(strained, equilibrium.groups)
 
 
 def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
-    """Smallest and largest principal stress anywhere in the film, pretension included, MPa, tension positive.
+    """Compute the smallest and the largest principal stress in the film, including the pretension.
 
-    At the mid-surface, and where the theory has bending at both surfaces for the largest.
+    The smallest stress is that of the mid-surface. If the theory includes bending, the largest stress is that of the
+    mid-surface and of both outer surfaces.
+
+    Returns:
+        Smallest and largest stress, MPa, tension positive.
     """
     groups = equilibrium.groups
     deviator = np.zeros(3) if groups.anisotropy is None else groups.anisotropy.tension
     smallest, largest = principal_stresses(nodal_stress(equilibrium) + deviator)
     if equilibrium.theory.bending:
-        outer = (principal_stresses(nodal_stress(equilibrium, surface) + deviator)[1] for surface in ("top", "bottom"))
-        largest = max(largest, *outer)
+        for surface in ("top", "bottom"):
+            _, surface_stress = principal_stresses(nodal_stress(equilibrium, surface) + deviator)
+            largest = max(largest, surface_stress)
     scale = equilibrium.film.young * groups.amplitude2
     return scale * smallest + equilibrium.film.pretension, scale * largest + equilibrium.film.pretension
 
 
 def node_slope(equilibrium: Equilibrium) -> Array:
-    """d(U1, U2, W)/d(X1, X2) at the nodes of every element, shape (n_element, n_local, 2, 3)."""
+    """Compute the derivatives of (U1, U2, W) with respect to (X1, X2) at the nodes of every element.
+
+    Returns:
+        Shape (n_element, n_local, 2, 3): the derivative, then the component.
+    """
     mesh = equilibrium.mesh
     return mesh.node_derivatives(equilibrium.field[mesh.template.nodes])
 
 
-def _bent_strain(equilibrium: Equilibrium, surface: Surface, hessian: Array) -> Array:
-    """Scaled strain (E11, E22, 2 E12) of bending at a surface, `hessian` that of W."""
+def _bending_strain(equilibrium: Equilibrium, surface: Surface, hessian: Array) -> Array:
+    """Compute the scaled bending strain at a surface.
+
+    Args:
+        equilibrium: The solved press.
+        surface: Surface in the thickness.
+        hessian: Second derivatives of W, shape (..., 2, 2).
+
+    Returns:
+        (E11, E22, 2 E12), shape (..., 3), in units of A^2.
+    """
     film = equilibrium.film
-    half = 0.5 * film.thickness / (film.radius * np.sqrt(equilibrium.groups.amplitude2))
-    return np.asarray(
-        (SIDE[surface] * half)
-        * np.stack([hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1] + hessian[..., 1, 0]], axis=-1)
+    half_thickness = 0.5 * film.thickness / (film.radius * np.sqrt(equilibrium.groups.amplitude2))
+    curvature = np.stack(
+        [hessian[..., 0, 0], hessian[..., 1, 1], hessian[..., 0, 1] + hessian[..., 1, 0]],
+        axis=-1,
     )
+    return np.asarray((HEIGHT[surface] * half_thickness) * curvature)
 
 
 def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, Array, Booleans]:
-    """Element, xi, eta of each point and whether it was mirrored into a half template; SceneError off the film."""
-    points, radius = np.asarray(points, dtype=float), equilibrium.film.radius
-    alpha, oval = equilibrium.film.oval_axis, equilibrium.film.oval
-    rim = radius * (1.0 + oval * np.cos(2.0 * (np.arctan2(points[:, 1], points[:, 0]) - alpha))) if oval else radius
-    off = ~(np.hypot(points[:, 0], points[:, 1]) <= rim * (1.0 + 1e-9))
-    if off.any():
-        first = points[np.argmax(off)]
-        raise SceneError(f"point ({first[0]:.4g}, {first[1]:.4g}) mm is off the film of radius {radius:.4g} mm")
+    """Find the elements that contain points.
+
+    Args:
+        equilibrium: The solved press.
+        points: Points (x, y), shape (n, 2), mm.
+
+    Returns:
+        Index of the element, xi, eta, and whether the point was reflected into the meshed half, each of shape (n,).
+
+    Raises:
+        SceneError: If a point lies outside the film.
+    """
+    points = np.asarray(points, dtype=float)
+    film = equilibrium.film
+    distance = np.hypot(points[:, 0], points[:, 1])
+    rim: Array | float = film.radius
+    if film.oval:
+        angle = np.arctan2(points[:, 1], points[:, 0])
+        rim = film.radius * (1.0 + film.oval * np.cos(2.0 * (angle - film.oval_axis)))
+    outside = ~(distance <= rim * (1.0 + 1e-9))
+    if outside.any():
+        x, y = points[np.argmax(outside)]
+        raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {film.radius:.4g} mm")
     return equilibrium.mesh.locate(_rotated(equilibrium, points))
 
 
 def _rotated(equilibrium: Equilibrium, points: Array) -> Complexes:
-    """Points (x, y), mm, as x + iy in film radii, the press rotated onto the x axis."""
+    """Convert points (x, y), mm, into x + iy in film radii, with the press rotated onto the x axis."""
     z = (points[:, 0] + 1j * points[:, 1]) / equilibrium.film.radius
     return np.asarray(z * np.exp(-1j * np.arctan2(equilibrium.at[1], equilibrium.at[0])))

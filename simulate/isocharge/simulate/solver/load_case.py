@@ -1,4 +1,4 @@
-"""What is decided about a press before it is solved: settings, theory, and a mesh as coarse as the accuracy allows."""
+"""Decisions about a press before it is solved: checks, theory, and the coarsest mesh that the accuracy allows."""
 
 import math
 from collections.abc import Iterator
@@ -23,51 +23,56 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.solver.error_estimate import shape_error
 
 TOLERANCE = 1e-7
-"""Out-of-balance force over load, dimensionless: far below the error of the mesh, well above round-off."""
+"""Out-of-balance force over load at which a solve has converged. It is far below the error of the mesh and well above
+round-off."""
 
 Auto = Literal["auto"]
-"""Choose it to suit the press, or all presses of a forward map."""
+"""Value of a setting that is chosen automatically for a press, or for all presses of a forward map."""
 
-LAYER = 6.0
-"""Width of the thin rings at the rim in bending lengths: any width from 4 to 14 changes a charge by at most 1e-4."""
+LAYER_WIDTH = 6.0
+"""Width of the thin rings at the rim, in bending lengths. Widths from 4 to 14 change a charge by at most 1e-4."""
 
-LAYER_REUSE = (0.75, 2.0)
-"""Width of the start's thin rings over six bending lengths: between these ratios the width is kept, so that the start's
-field still fits."""
+MIN_LAYER_REUSE = 0.75
+"""Smallest ratio of the width of the thin rings of a starting equilibrium to `LAYER_WIDTH` at which it is reused."""
 
-LARGEST_AMPLITUDE2 = 0.1
-"""A^2, the size of the strains, dimensionless, above which St. Venant-Kirchhoff elasticity fails: 100 N at 25 um."""
+MAX_LAYER_REUSE = 2.0
+"""Largest ratio of the width of the thin rings of a starting equilibrium to `LAYER_WIDTH` at which it is reused."""
 
-SMALLEST_PROBE = 1e-5
-"""Probe reach over film radius: below it the grading of the template exceeds what float64 resolves."""
+MAX_AMPLITUDE2 = 0.1
+"""Largest squared amplitude A^2, which is the order of the strains, for which St. Venant-Kirchhoff elasticity is
+valid."""
 
-FINER = ((0, 1), (1, 1), (0, 2), (2, 1), (1, 2), (0, 3), (2, 2), (1, 3), (2, 3), (3, 3))
-"""Meshes that are tried in turn: (order added, factor on the number of elements round the circle)."""
+MIN_PROBE_REACH = 1e-5
+"""Smallest reach of a probe, in film radii. The grading of the mesh for smaller probes exceeds the resolution of
+float64."""
 
-RIM_RINGS = 0.8
-"""Number of thin rings at the rim per factor of three that their widths span, dimensionless."""
+REFINEMENTS = ((0, 1), (1, 1), (0, 2), (2, 1), (1, 2), (0, 3), (2, 2), (1, 3), (2, 3), (3, 3))
+"""Meshes that are tried in turn: (increase of the order, factor of the number of elements round the circle)."""
 
-TOO_COARSE = 0.05
-"""Predicted relative error of a charge above which a press is refused as too near the rim."""
+THIN_RINGS_PER_FACTOR = 0.8
+"""Number of thin rings at the rim per factor of three between their largest and smallest width."""
 
-INNER = 0.6
-"""Share of the film's radius within which the element shapes predict the error."""
+MAX_SHAPE_ERROR = 0.05
+"""Predicted relative error of a charge on the finest mesh above which a press is rejected as too near the rim."""
 
-LARGE = 0.08
-"""Polygons with a larger reach (relative to the film's radius) need a second mesh: the element shapes no longer predict
-the error."""
+RELIABLE_RADIUS = 0.6
+"""Distance from the centre within which the shapes of the elements predict the error reliably, in film radii."""
+
+RELIABLE_REACH = 0.08
+"""Largest reach of a footprint that is not circular for which the shapes of the elements predict the error reliably, in
+film radii."""
 
 
 @dataclass(frozen=True)
 class SolveSettings:
-    """How the film is solved.
+    """Settings of a solve.
 
     Attributes:
-        accuracy: Target for the relative error of a charge.
-        theory: Which terms to model; "auto" for the fewest that the accuracy allows.
-        resolution: Mesh of the template; "auto" for the coarsest that reaches the accuracy.
-        layer: Width of the thin rings at the rim over the film's radius; "auto" for six bending lengths, or for the
-            width of the equilibrium that the solve starts from if that is near.
+        accuracy: Target of the relative error of a charge.
+        theory: Terms of the film theory; "auto" for the fewest terms that the accuracy allows.
+        resolution: Fineness of the mesh; "auto" for the coarsest mesh that reaches the accuracy.
+        layer: Width of the thin rings at the rim, in film radii; "auto" for six bending lengths, or for the width of
+            the starting equilibrium if that is similar.
         tolerance: Out-of-balance force over load at which a solve has converged.
     """
 
@@ -79,17 +84,24 @@ class SolveSettings:
 
 
 def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float) -> None:
-    """Refuse presses that cannot exist or that stretch the film beyond the range of St. Venant-Kirchhoff elasticity.
+    """Raise an error if a press cannot exist or exceeds the range of St. Venant-Kirchhoff elasticity.
+
+    Args:
+        film: The film.
+        probe: The probe.
+        at: Centroid (x, y) of the footprint, mm.
+        force: Force, N.
 
     Raises:
-        SceneError: If the footprint is too small or not wholly on the film, the force is not positive and finite, or
-            the film is stretched beyond small strains.
+        SceneError: If the footprint is too small or not completely on the film, if the force is not positive and
+        finite,
+            or if the strains are not small.
     """
     if not (np.isfinite(force) and force > 0.0):
         raise SceneError(f"force: expected a positive number of newtons (F > 0 pushes), got {force}")
-    if probe.reach < SMALLEST_PROBE * film.radius:
+    if probe.reach < MIN_PROBE_REACH * film.radius:
         raise SceneError(
-            f"probe: expected a reach of at least {SMALLEST_PROBE:g} of the film's radius ({film.radius:.4g} mm), got "
+            f"probe: expected a reach of at least {MIN_PROBE_REACH:g} of the film's radius ({film.radius:.4g} mm), got "
             f"{probe.reach:.4g} mm"
         )
     if not probe.farthest_distance(at) < film.radius * (1.0 - 1e-6):
@@ -98,32 +110,32 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
             f"{probe.farthest_distance(at):.4g} mm from the film's centre, film radius {film.radius:.4g} mm"
         )
     amplitude2 = amplitude_squared(film, force)
-    if amplitude2 > LARGEST_AMPLITUDE2:
+    if amplitude2 > MAX_AMPLITUDE2:
         raise SceneError(
             f"force {force:.4g} N stretches a film of {film.thickness:.4g} mm beyond small strains: expected "
-            f"(F / (E h a))^(2/3) up to {LARGEST_AMPLITUDE2:g}, got {amplitude2:.3g}"
+            f"(F / (E h a))^(2/3) up to {MAX_AMPLITUDE2:g}, got {amplitude2:.3g}"
         )
 
 
 def layer_for(film: Film, force: float) -> float:
-    """Width of the thin rings at the rim over the film's radius."""
-    return LAYER * bending_length(film, force)
+    """Return the width of the thin rings at the rim for a force (N), in film radii."""
+    return LAYER_WIDTH * bending_length(film, force)
 
 
 @dataclass(frozen=True)
 class LoadCase:
-    """A press with all that is decided about it but the mesh.
+    """A press, and all decisions about its solve except the resolution of the mesh.
 
     Attributes:
         film: The film.
-        probe: The footprint.
-        at: Its centroid (x, y), mm.
-        force: N.
-        theory: Which terms to model.
-        layer: Width of the thin rings at the rim over the film's radius.
-        accuracy: Target for the relative error of a charge.
-        tolerance: Out-of-balance force over load.
-        began: Process CPU time when the work on the press began, s.
+        probe: The probe.
+        at: Centroid (x, y) of the footprint, mm.
+        force: Force, N.
+        theory: Terms of the film theory.
+        layer: Width of the thin rings at the rim, in film radii.
+        accuracy: Target of the relative error of a charge.
+        tolerance: Out-of-balance force over load at which the solve has converged.
+        began: Process CPU time at the beginning of the work on the press, s.
     """
 
     film: Film
@@ -146,70 +158,96 @@ class LoadCase:
         settings: SolveSettings,
         start: PlacedMesh | None,
     ) -> Self:
-        """Decide what the settings leave open; `start` is the mesh of the equilibrium that the solve starts from.
+        """Check a press, and replace the settings that are "auto".
+
+        Args:
+            film: The film.
+            probe: The probe.
+            at: Centroid (x, y) of the footprint, mm.
+            force: Force, N.
+            settings: Settings of the solve.
+            start: Mesh of the equilibrium from which the solve starts; None if there is none.
 
         Raises:
             SceneError: If the press cannot exist.
         """
         began = process_time()
         check_press(film, probe, at, force)
-        theory = choose_theory(film, probe, force, settings.accuracy) if settings.theory == "auto" else settings.theory
-        layer = _layer(film, force, probe, settings, start) if settings.layer == "auto" else settings.layer
+        theory = settings.theory
+        if theory == "auto":
+            theory = choose_theory(film, probe, force, settings.accuracy)
+        layer = settings.layer
+        if layer == "auto":
+            layer = _choose_layer(film, force, probe, settings, start)
         return cls(film, probe, at, force, theory, layer, settings.accuracy, settings.tolerance, began)
 
     def place(self, resolution: Resolution) -> PlacedMesh:
-        """A mesh under this press."""
+        """Return the mesh of a resolution under this press."""
         return place_coated(self.film, self.probe, self.at, resolution, self.layer)
 
 
 def place_coated(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> PlacedMesh:
-    """As `place`, with the film's coat if it has one."""
-    mesh, angle = place(film, probe, at, resolution, layer), float(np.arctan2(at[1], at[0]))
+    """Place a mesh under a press, as `place` does, and refine it along the edges of the coat if the film has one.
+
+    Args:
+        film: The film.
+        probe: The probe.
+        at: Centroid (x, y) of the footprint, mm.
+        resolution: Fineness of the mesh.
+        layer: Width of the thin rings at the rim, in film radii.
+    """
+    mesh = place(film, probe, at, resolution, layer)
     if film.coat is None:
         return mesh
-    turn = np.exp(-1j * angle) / film.radius
-    layers = tuple(tuple(to_complex(np.array(part)) * turn for part in layer) for layer in film.coat.layers)
-    bare = scaled_stress(np.eye(3), DimensionlessGroups.of(film, 1.0, bending=False, angle=angle))
-    added = film.coat.stiffness / (film.young * film.thickness) * stress(np.eye(3), film.poisson)
-    return coated(mesh, layers, bare, added)
+    angle = float(np.arctan2(at[1], at[0]))
+    rotation_and_scale = np.exp(-1j * angle) / film.radius
+    coat_layers = tuple(
+        tuple(to_complex(np.array(part)) * rotation_and_scale for part in coat_layer) for coat_layer in film.coat.layers
+    )
+    film_moduli = scaled_stress(np.eye(3), DimensionlessGroups.of(film, 1.0, bending=False, angle=angle))
+    coat_moduli = film.coat.stiffness / (film.young * film.thickness) * stress(np.eye(3), film.poisson)
+    return coated(mesh, coat_layers, film_moduli, coat_moduli)
 
 
-def _layer(film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None) -> float:
-    """Width of the thin rings: six bending lengths, or the start's width if that is near and its mesh the same."""
+def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSettings, start: PlacedMesh | None) -> float:
+    """Choose the width of the thin rings, in film radii.
+
+    The width is six bending lengths. If the starting equilibrium has the same mesh and a similar width, its width is
+    reused, so that its field can be the first iterate.
+    """
     layer = layer_for(film, force)
-    if start is None or not LAYER_REUSE[0] < start.layer / layer < LAYER_REUSE[1]:
+    if start is None or not MIN_LAYER_REUSE < start.layer / layer < MAX_LAYER_REUSE:
         return layer
-    same_mesh = settings.resolution in ("auto", start.resolution) and probe.topology == start.template.topology
-    return start.layer if same_mesh else layer
+    is_same_mesh = settings.resolution in ("auto", start.resolution) and probe.topology == start.template.topology
+    return start.layer if is_same_mesh else layer
 
 
 def choose_mesh(case: LoadCase) -> PlacedMesh:
-    """The coarsest mesh whose shapes predict the accuracy for a press, or the finest if none does.
-
-    More rings for a small probe, more of everything towards the rim, where the template is stretched.
+    """Return the coarsest mesh whose element shapes predict the required accuracy, or the finest mesh if none does.
 
     Raises:
         SceneError: If the press is so near the rim that even the finest mesh is too distorted.
     """
-    for resolution in _ladder(case):
+    for resolution in _candidate_resolutions(case):
         mesh = case.place(resolution)
         error = shape_error(mesh)
         if error <= 0.5 * case.accuracy:
             return mesh
-    if error > TOO_COARSE:
+    if error > MAX_SHAPE_ERROR:
         raise too_near_the_rim(case, resolution)
     return mesh
 
 
 def needs_second_mesh(case: LoadCase) -> bool:
-    """Whether a press must be solved on two meshes to know its error; see `error_estimate`."""
+    """Return whether a press must be solved on two meshes to estimate its error; see `error_estimate`."""
     radius = case.film.radius
-    large = not case.probe.topology.fills_circle and case.probe.reach > LARGE * radius
-    return large or case.probe.farthest_distance(case.at) > INNER * radius or case.accuracy < ACCURACY
+    is_large = not case.probe.topology.fills_circle and case.probe.reach > RELIABLE_REACH * radius
+    is_near_rim = case.probe.farthest_distance(case.at) > RELIABLE_RADIUS * radius
+    return is_large or is_near_rim or case.accuracy < ACCURACY
 
 
 def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
-    """The error for a press whose mesh is too distorted."""
+    """Return the error for a press whose mesh of a resolution is too distorted."""
     return SceneError(
         f"press at ({case.at[0]:.4g}, {case.at[1]:.4g}) mm comes within "
         f"{case.film.radius - case.probe.farthest_distance(case.at):.3g} mm of the rim, too near for a mesh of order "
@@ -217,30 +255,48 @@ def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
     )
 
 
-def _ladder(case: LoadCase) -> Iterator[Resolution]:
-    """Meshes from coarse to fine; the first is enough in the inner half of the film."""
-    film, probe, at = case.film, case.probe, case.at
-    placement = place(film, probe, at, Resolution(2, 8, 1), 0.1).placement
-    stretch = float((1.0 + placement.c) / (1.0 - placement.c))
-    crowded = not probe.topology.fills_circle and probe.farthest_distance(at) + CLEARANCE * probe.reach > film.radius
-    sharper = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.accuracy)))
+def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
+    """Generate the resolutions of a press from coarse to fine.
+
+    A small probe needs more rings. Near the rim, where the conformal map stretches the template, the mesh needs more
+    rings and more elements round the circle. In the inner half of the film the first resolution suffices.
+    """
+    film = case.film
+    probe = case.probe
+    placement = place(film, probe, case.at, Resolution(2, 8, 1), 0.1).placement
+    stretch = _stretch(placement)
+    needed_radius = probe.farthest_distance(case.at) + CLEARANCE * probe.reach
+    is_crowded = not probe.topology.fills_circle and needed_radius > film.radius
+    extra_order = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.accuracy)))
+    first_order = 5 if case.theory.bending and film.coat is None else 4
+    rings = math.ceil(-1.3 * math.log(float(placement.rho)) + min(2.0 * math.log(stretch), 4.0))
     base = Resolution(
-        order=(5 if case.theory.bending and film.coat is None else 4) + sharper,
-        around=16 if crowded else 8,
-        rings=max(3, math.ceil(-1.3 * math.log(float(placement.rho)) + min(2.0 * math.log(stretch), 4.0)))
-        + sharper // 2,
+        order=first_order + extra_order,
+        around=16 if is_crowded else 8,
+        rings=max(3, rings) + extra_order // 2,
         rim=_thin_rings(placement, case.layer) if case.theory.bending else 0,
     )
-    for order, around in FINER:
+    for order, around in REFINEMENTS:
         yield replace(base, order=base.order + order, around=base.around * around)
 
 
 def _thin_rings(placement: Placement, layer: float) -> int:
-    """Number of rings at the rim.
+    """Return the number of thin rings at the rim.
 
-    Each ring is a third of the one before. They lead from the layer's width next to the probe to its width on the far
-    side of the film, where the conformal map compresses it.
+    Each ring is a third as wide as the one before. The rings cover the widths from that of the layer next to the probe
+    to that on the far side of the film, where the conformal map compresses the layer.
+
+    Args:
+        placement: Placement of the mesh under the press.
+        layer: Width of the thin rings, in film radii.
     """
-    stretch, depth = float((1.0 + placement.c) / (1.0 - placement.c)), -float(np.log(placement.rho))
-    near, far = min(layer * stretch / depth, 1.0 / 8.0), min(min(layer, 0.2) / stretch / depth, 1.0 / 8.0)
-    return 1 + math.floor(RIM_RINGS * math.log(near / far, 3.0))
+    stretch = _stretch(placement)
+    depth = -float(np.log(placement.rho))
+    near = min(layer * stretch / depth, 1.0 / 8.0)
+    far = min(min(layer, 0.2) / stretch / depth, 1.0 / 8.0)
+    return 1 + math.floor(THIN_RINGS_PER_FACTOR * math.log(near / far, 3.0))
+
+
+def _stretch(placement: Placement) -> float:
+    """Return the factor by which the conformal map stretches the rim next to the probe."""
+    return float((1.0 + placement.c) / (1.0 - placement.c))

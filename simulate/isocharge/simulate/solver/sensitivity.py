@@ -19,7 +19,7 @@ from isocharge.common.arrays import Array
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import Anisotropy
-from isocharge.simulate.mechanics.stress import stress_turn
+from isocharge.simulate.mechanics.stress import stress_rotation
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.solver.assembly import assembly
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
@@ -58,7 +58,7 @@ def _stiffness(angle: float) -> Change:
     """ln(E1 / E2), axis 1 at an angle."""
 
     def change(solved: Equilibrium, share: float) -> Equilibrium:
-        turn, plane = stress_turn(angle), 1.0 / (1.0 - solved.groups.poisson**2)
+        turn, plane = stress_rotation(angle), 1.0 / (1.0 - solved.groups.poisson**2)
         moduli = turn @ np.diag([0.5 * share * plane, -0.5 * share * plane, 0.0]) @ turn.T
         return replace(solved, groups=replace(solved.groups, anisotropy=Anisotropy(moduli, np.zeros(3))))
 

@@ -1,14 +1,15 @@
-"""The stress of a film under its hardest press, and the force that keeps it below a limit.
+"""The largest stress of a film under a press, and the force that keeps this stress below a limit.
 
-The largest principal stress lies under the probe, at the surface of the film, and hardly depends on where on the film
-that is up to 0.7 of its radius: one press at the centre tells it. Nearer the rim it is larger, 1.4 times at 0.8 and 3.7
-times at 0.93 of the radius. Under a tip it grows a little slower than F^(2/3), as in a membrane.
+The largest principal stress occurs under the probe, at the surface of the film. It hardly depends on the position of
+the press within 0.7 of the film radius, so it is computed for a press at the centre. Nearer the rim it is larger: 1.4
+times at 0.8 and 3.7 times at 0.93 of the radius. Under a small probe it grows slightly slower than F^(2/3), as in a
+membrane.
 """
 
 from functools import lru_cache
 
 import numpy as np
-import scipy  # loads a part when it is used
+import scipy  # scipy.optimize is imported when it is used
 
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
@@ -20,7 +21,15 @@ from isocharge.simulate.solver.press import press
 
 @lru_cache(maxsize=256)
 def largest_stress(film: Film, probe: Probe, force: float) -> float:
-    """Largest principal stress under a press (N) at the centre, pretension included, MPa, tension positive.
+    """Compute the largest principal stress under a press at the centre, including the pretension.
+
+    Args:
+        film: The film.
+        probe: The probe.
+        force: Force, N.
+
+    Returns:
+        Stress, MPa, tension positive.
 
     Raises:
         SceneError: If the press cannot exist.
@@ -30,7 +39,18 @@ def largest_stress(film: Film, probe: Probe, force: float) -> float:
 
 
 def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAULT_STRESS_LIMIT) -> str:
-    """A sentence if a press (N) stresses a film beyond a limit (MPa), else nothing; raises as `largest_stress`."""
+    """Return a warning if a press exceeds a stress limit, and an empty text otherwise.
+
+    Args:
+        film: The film.
+        probe: The probe.
+        force: Force, N.
+        limit: Stress limit, MPa.
+
+    Raises:
+        SceneError: If the press cannot exist.
+        SolveError: If no equilibrium is reached.
+    """
     stress = largest_stress(film, probe, force)
     if stress <= limit:
         return ""
@@ -41,30 +61,35 @@ def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAUL
 
 
 def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tuple[float, float]) -> float:
-    """Largest force of a range whose press stays within a stress, N, to 0.1 %.
+    """Compute the largest force of a range that does not exceed a stress limit, with a relative error below 0.1 %.
 
     Args:
-        film: What is pressed.
-        probe: What presses.
-        limit: MPa.
-        force_range: N.
+        film: The film.
+        probe: The probe.
+        limit: Stress limit, MPa.
+        force_range: Smallest and largest force, N.
+
+    Returns:
+        Force, N.
 
     Raises:
         SceneError: If even the smallest force exceeds the limit, or a press cannot exist.
         SolveError: If no equilibrium is reached.
     """
     low, high = force_range
-    if (least := largest_stress(film, probe, low)) > limit:
+    smallest_stress = largest_stress(film, probe, low)
+    if smallest_stress > limit:
         raise SceneError(
-            f"stress limit: expected more than {least:.3g} MPa, which {low:.3g} N under {probe.notation} make in this "
-            f"film, got {limit:.3g} MPa"
+            f"stress limit: expected more than {smallest_stress:.3g} MPa, which {low:.3g} N under {probe.notation} "
+            f"make in this film, got {limit:.3g} MPa"
         )
     if largest_stress(film, probe, high) <= limit:
         return high
 
-    def beyond(log_force: float) -> float:  # nearly straight: the stress grows like a power of the force
+    def log_stress_ratio(log_force: float) -> float:
+        """Return ln(stress / limit), which is nearly linear in ln F because the stress is nearly a power of F."""
         return float(np.log(largest_stress(film, probe, float(np.exp(log_force))) / limit))
 
-    # secants: a last step of 1 % is exact to 0.01 %
-    found = scipy.optimize.newton(beyond, np.log(low), x1=np.log(high), tol=0.01)
-    return float(np.exp(found))
+    # The secant method ends after a step of 1 %, when its error is about 0.01 %.
+    log_force = scipy.optimize.newton(log_stress_ratio, np.log(low), x1=np.log(high), tol=0.01)
+    return float(np.exp(log_force))
