@@ -1,9 +1,9 @@
-"""The Bayes limit: the errors of the posterior mean, which no estimator of x, y, F can beat on average.
+"""The Bayes limit: the errors of the posterior mean. No estimator of x, y and F has smaller mean squared errors.
 
     problem = BayesProblem(load_sensor("three-25um-biaxial"), Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
     print(bayes_limit(problem).position_rms_mm)
 
-It depends on the film, the probe, the noise and the range of presses.
+The limit depends on the film, the probe, the noise and the range of presses.
 """
 
 from concurrent.futures import Executor
@@ -18,20 +18,21 @@ from isocharge.simulate import ChargeSpline, ForwardMap, NoiseModel, Probe, Sens
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.bayes.posterior import Posterior
 
-PRESSES = 4000
-"""Test presses of `bayes_limit`: the rms is then known to 3 %, its ratio to an estimator's on the same ones better."""
+N_PRESSES = 4000
+"""Number of presses of `bayes_limit`. The rms then has a statistical error of 3 %; its ratio to the rms of an estimator
+on the same presses has a smaller one."""
 
 
 @dataclass(frozen=True)
 class BayesProblem:
-    """All that the limit depends on, besides the presses.
+    """The conditions on which the limit depends.
 
     Attributes:
         sensor: The sensor.
-        probe: The footprint, in the orientation that it has.
-        radius: Of the working area, mm; positions are uniform in it.
-        force_range: Smallest and largest force, N; log-uniform.
-        noise: Of the readings.
+        probe: Footprint of the probe, with its orientation.
+        radius: Radius of the working area, mm. The positions are uniform in it.
+        force_range: Smallest and largest force, N. The forces are log-uniform.
+        noise: Noise of the charges.
     """
 
     sensor: Sensor
@@ -41,7 +42,7 @@ class BayesProblem:
     noise: NoiseModel = field(default_factory=lambda: noise_model("reference"))
 
     def forward_map(self, executor: Executor | None = None) -> ForwardMap:
-        """The simulator's charges: some 5 s."""
+        """Simulate the map from contacts to charges, which takes about 5 s."""
         return ForwardMap.build(self.sensor, self.probe, self.radius, self.force_range, executor=executor)
 
 
@@ -51,8 +52,11 @@ class BayesLimit:
 
     Attributes:
         presses: Number of presses.
-        position_median_mm, position_rms_mm, position_p95_mm: Of the distance from the true position.
-        force_median_percent, force_rms_percent: Of the relative error of the force.
+        position_median_mm: Median of the distance from the true position, mm.
+        position_rms_mm: Root mean square of this distance, mm.
+        position_p95_mm: 95th percentile of this distance, mm.
+        force_median_percent: Median of the absolute relative error of the force, %.
+        force_rms_percent: Root mean square of the relative error of the force, %.
     """
 
     presses: int
@@ -64,8 +68,9 @@ class BayesLimit:
 
     @classmethod
     def of(cls, contact: Array, truth: Array) -> "BayesLimit":
-        """From estimates and the true contacts (x, y, F), each (n, 3), mm and N."""
-        position = np.hypot(*(contact - truth)[:, :2].T)
+        """Compute the errors of contacts (x, y, F), shape (n, 3), mm and N, from the true contacts of this shape."""
+        error = contact - truth
+        position = np.hypot(error[:, 0], error[:, 1])
         force = 100.0 * (contact[:, 2] / truth[:, 2] - 1.0)
         return cls(
             presses=len(truth),
@@ -84,17 +89,19 @@ def bayes_estimate(
     charge_map: ForwardMap | ChargeSpline | None = None,
     executor: Executor | None = None,
 ) -> tuple[Array, Array]:
-    """Posterior means for noisy charges: some 15 ms for each.
+    """Compute the posterior means of charges with noise, which takes about 15 ms for each press.
 
     Args:
         problem: Sensor, probe, prior and noise.
-        charge: Noisy touch charges, shape (n, n_electrode), pC.
-        charge_map: The problem's, if it exists; it may reach farther, with exactly the problem's forces.
-        executor: Solves and integrates; None for this process. That of a `ResumableRun` keeps what is done.
+        charge: Touch charges with noise, shape (n, n_electrode), pC.
+        charge_map: Map from contacts to charges; None to simulate it. Its range of forces must be that of the problem,
+            and its radius at least that of the problem.
+        executor: Executor for the solves and integrals; None for this process. The executor of a `ResumableRun` saves
+            completed results.
 
     Returns:
-        Contact (x, y, F), mm and N, and standard deviation of each, both (n, 3). The force is E[1/F] / E[1/F^2],
-        which has the least mean square relative error.
+        Posterior means (x, y, F), mm and N, and standard deviations, shape (n, 3) each. The force is
+        E[1/F] / E[1/F^2], which has the smallest mean squared relative error.
 
     Raises:
         ChargeError: If there are no charges, or they are not finite or of another number of electrodes.
@@ -111,22 +118,23 @@ def bayes_estimate(
 
 def bayes_limit(
     problem: BayesProblem,
-    presses: int = PRESSES,
+    presses: int = N_PRESSES,
     seed: int = 0,
     *,
     charge_map: ForwardMap | ChargeSpline | None = None,
     executor: Executor | None = None,
 ) -> BayesLimit:
-    """The limit of a problem on presses drawn from its prior: a minute.
+    """Compute the limit of a problem on presses drawn from its prior, which takes about a minute.
 
     Args:
         problem: Sensor, probe, prior and noise.
         presses: Number of presses.
-        seed: Of presses and noise.
-        charge_map: As for `bayes_estimate`.
-        executor: As for `bayes_estimate`.
+        seed: Seed of presses and noise.
+        charge_map: Map from contacts to charges; None to simulate it. See `bayes_estimate`.
+        executor: Executor for the solves and integrals; None for this process.
     """
     charges = charge_map or problem.forward_map(executor)
     contact = Sweep(problem.radius, problem.force_range, presses, seed, sampling="random").contacts()
     charge = problem.noise.add(charges.charges(contact), np.random.default_rng([seed, 1]))
-    return BayesLimit.of(bayes_estimate(problem, charge, charge_map=charges, executor=executor)[0], contact)
+    estimate, _ = bayes_estimate(problem, charge, charge_map=charges, executor=executor)
+    return BayesLimit.of(estimate, contact)

@@ -1,21 +1,24 @@
-"""The posterior of a contact given noisy charges, by dense integration: what no estimator can beat on average.
+"""The posterior of a contact given charges with noise, by numerical integration.
 
-The prior is uniform over the disk and in the logarithm of the force. Charges are Gaussian about Q(c) with the sigma of
-the true charge, so the likelihood carries its normalisation,
+The mean of the posterior has the smallest mean squared error of all estimators. The prior is uniform over a disk and
+in the logarithm of the force. The charges are Gaussian about Q(c), with the standard deviation of the true charge, so
+the likelihood includes its normalisation:
 
     p(Q | x, y, ln F) = prod_e exp(-(Q_e - q_e)^2 / (2 sigma_e^2)) / sigma_e,   q = Q(x, y, F),   sigma_e = sigma(q_e).
 
-Positions are integrated over square cells, cut in four where the posterior may have mass until they are small against
-its width; wherever that mass lies, in one place or several, in an ellipse or a sickle, none of it is lost: a cell is
-dropped only when no contact in it can explain the charges. In each cell the force is integrated about its best value by
-Gauss and Legendre's rule, cut off at the ends of the range. The midpoint rule on a Gaussian is exact to 1e-5 with cells
-of 1.25 standard deviations (Trefethen and Weideman 2014); only the edge of the disk wants more.
+The positions are integrated over square cells. A cell is dropped only if no contact in it can explain the charges, so
+posteriors of any shape are covered, also with several maxima. The other cells are divided into four until they are
+small compared with the width of the posterior. In each cell the logarithm of the force is integrated about its best
+value by Gauss-Legendre quadrature, within the range of forces. The midpoint rule on a Gaussian has a relative error of
+1e-5 with cells of 1.25 standard deviations (Trefethen and Weideman 2014). Only cells at the edge of the disk must be
+smaller.
 """
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,39 +33,44 @@ from isocharge.simulate.identifiability.force_profile import ForceProfile
 from isocharge.simulate.numerics.disk import onto_disk
 
 CHUNK = 64
-"""Presses integrated at once: keeps the working arrays within some 100 MB."""
+"""Number of presses that are integrated at once; the working arrays then stay within about 100 MB."""
 
-ACROSS = 32
-"""Cells across the disk to begin with."""
+CELLS_ACROSS = 32
+"""Number of first cells across the disk."""
 
-EDGE = 8
-"""Points across a cell on the edge of the disk; each counts as inside or outside."""
+EDGE_POINTS = 8
+"""Number of points across a cell at the edge of the disk; each point is either inside or outside."""
 
-MOST_CUTS = 10
-"""Cuts of a cell in four at most: down to a thirty-thousandth of the disk."""
+MAX_DIVISIONS = 10
+"""Largest number of times that a cell is divided into four: down to a thirty-thousandth of the disk."""
 
-STEP = 1.25
-"""Largest side of a cell in standard deviations of the position, in the direction that the charges tell best."""
+MAX_SIDE_STD = 1.25
+"""Largest side of a cell, in standard deviations of the position along its most certain direction."""
 
-MARGIN = 36.0
-"""Excess of a cell's chi-squared over the press's smallest above which it holds nothing: exp(-18)."""
+NEGLIGIBLE_CHI2 = 36.0
+"""Excess of a cell's chi-squared over the smallest one of its press above which the cell is dropped. The density of
+such a cell is smaller by a factor of exp(-18)."""
 
-NEAR = 9.0
-"""The same below which a cell on the edge of the disk matters: the press is then integrated with more care."""
+EDGE_CHI2 = 9.0
+"""Excess of chi-squared below which a cell at the edge of the disk matters, so that the cells of this press are refined
+once more."""
 
-WIDTH, NODES = 5.0, 12
-"""Half width of the force's integral in standard deviations, and its points: to 1e-4 together."""
+FORCE_HALF_WIDTH_STD = 5.0
+"""Half width of the integral over the logarithm of the force, in standard deviations."""
+
+N_FORCE_NODES = 12
+"""Number of nodes of the integral over the force. Together with the half width the relative error is 1e-4."""
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Squares in the plane of positions, each for one press.
+    """Square cells of positions, each for one press.
 
     Attributes:
         press: Number of the press, ascending, shape (n,).
-        root: Number of the first cell that it was cut from, shape (n,).
-        centre: Shape (n, 2), mm.
-        side: Of every cell, mm.
+        root: Number of the first cell from which the cell was divided, shape (n,).
+        centre: Centres (x, y), shape (n, 2), mm.
+        side: Side of all cells, mm.
     """
 
     press: Integers
@@ -72,10 +80,10 @@ class Cells:
 
     @classmethod
     def roots(cls, radius: float) -> "Cells":
-        """The first cells of one press, all over the disk."""
-        side = 2.0 * radius / ACROSS
-        centre = _grid(ACROSS, side)
-        centre = centre[_is_within(centre, side, radius)]
+        """Return the first cells of one press, which cover a disk with this radius, mm."""
+        side = 2.0 * radius / CELLS_ACROSS
+        centre = _grid(CELLS_ACROSS, side)
+        centre = centre[_overlaps_disk(centre, side, radius)]
         return cls(np.zeros(len(centre), dtype=np.intp), np.arange(len(centre)), centre, side)
 
     def __len__(self) -> int:
@@ -84,61 +92,88 @@ class Cells:
     def __getitem__(self, rows: np.ndarray) -> "Cells":
         return Cells(self.press[rows], self.root[rows], self.centre[rows], self.side)
 
-    def cut(self, radius: float) -> "Cells":
-        """Each in four; those without a share in the disk are dropped."""
-        parts = self._four(0.25)
-        return parts[_is_within(parts.centre, parts.side, radius)]
+    def divided(self, radius: float) -> "Cells":
+        """Divide each cell into four and drop those outside the disk with this radius, mm."""
+        parts = self._quarters(0.25)
+        return parts[_overlaps_disk(parts.centre, parts.side, radius)]
 
     def finer(self, radius: float) -> Iterator["Cells"]:
-        """Whole ones as Gauss and Legendre's four points, others in sixteen."""
-        edge = self.on_edge(radius)
-        yield self[~edge]._four(1.0 / np.sqrt(12.0))
-        yield self[edge].cut(radius).cut(radius)
+        """Yield finer cells: the four Gauss-Legendre points of cells inside the disk, and sixteenths of the others."""
+        is_on_edge = self.on_edge(radius)
+        yield self[~is_on_edge]._quarters(1.0 / np.sqrt(12.0))
+        yield self[is_on_edge].divided(radius).divided(radius)
 
-    def _four(self, offset: float) -> "Cells":
-        """Four half as wide in place of each, their centres `offset` sides off its middle in both directions."""
+    def _quarters(self, offset: float) -> "Cells":
+        """Replace each cell by four cells of half the side.
+
+        Args:
+            offset: Distance of their centres from the centre of the cell along x and y, in sides of the cell.
+        """
         centre = (self.centre[:, None] + _grid(2, 2.0 * offset * self.side)).reshape(-1, 2)
         return Cells(np.repeat(self.press, 4), np.repeat(self.root, 4), centre, 0.5 * self.side)
 
     def on_edge(self, radius: float) -> Booleans:
-        """Which may stick out of the disk, shape (n,)."""
-        return np.asarray(np.hypot(*self.centre.T) + np.sqrt(0.5) * self.side > radius)
+        """Return which cells can extend beyond the disk with this radius, mm, shape (n,)."""
+        half_diagonal = np.sqrt(0.5) * self.side
+        return np.asarray(np.hypot(self.centre[:, 0], self.centre[:, 1]) + half_diagonal > radius)
 
     def inside(self, radius: float) -> tuple[Array, Array]:
-        """Share of each cell that lies in the disk, shape (n,), and that share's centre, shape (n, 2).
+        """Compute the part of each cell that lies in the disk.
 
-        A corner without any of the counted points has half of one point's share.
+        Args:
+            radius: Radius of the disk, mm.
+
+        Returns:
+            Area of the part relative to the cell, shape (n,), and its centroid, shape (n, 2), mm. A part without any of
+            the points counts as half of a point.
         """
-        share, centre = np.ones(len(self)), self.centre.copy()
+        fraction = np.ones(len(self))
+        centroid = self.centre.copy()
         edge = np.flatnonzero(self.on_edge(radius))
-        points = centre[edge, None] + _grid(EDGE, self.side / EDGE)
-        counts = np.hypot(points[..., 0], points[..., 1]) <= radius
-        total = counts.sum(axis=1, keepdims=True)
-        share[edge] = np.maximum(total[:, 0], 0.5) / EDGE**2
-        middle = np.einsum("np,npi->ni", counts, points) / np.maximum(total, 1)
-        centre[edge] = np.where(total > 0, middle, onto_disk(centre[edge], radius))
-        return share, centre
+        points = centroid[edge, None] + _grid(EDGE_POINTS, self.side / EDGE_POINTS)
+        is_inside = np.hypot(points[..., 0], points[..., 1]) <= radius
+        count = is_inside.sum(axis=1)
+        fraction[edge] = np.maximum(count, 0.5) / EDGE_POINTS**2
+        mean_point = np.einsum("np,npi->ni", is_inside, points) / np.maximum(count, 1)[:, None]
+        nearest_point = onto_disk(centroid[edge], radius)
+        centroid[edge] = np.where(count[:, None] > 0, mean_point, nearest_point)
+        return fraction, centroid
 
 
 def _grid(count: int, step: float) -> Array:
-    """`count` x `count` points about the origin, shape (count^2, 2)."""
+    """Return count x count points about the origin with a distance of `step`, shape (count^2, 2)."""
     line = step * (np.arange(count) - 0.5 * (count - 1))
     return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
 
 
-def _is_within(centre: Array, side: float, radius: float) -> Booleans:
-    """Which squares have a share in the disk."""
-    return np.asarray(np.hypot(*np.maximum(np.abs(centre) - 0.5 * side, 0.0).T) < radius)
+def _overlaps_disk(centre: Array, side: float, radius: float) -> Booleans:
+    """Return which squares with centres of shape (n, 2) overlap the disk."""
+    nearest_corner = np.maximum(np.abs(centre) - 0.5 * side, 0.0)
+    return np.asarray(np.hypot(nearest_corner[:, 0], nearest_corner[:, 1]) < radius)
+
+
+class _RootCells(NamedTuple):
+    """The first cells of a press.
+
+    Attributes:
+        cells: The cells, n of them.
+        terms: Terms of the charges at their centres, shape (n, n_term, n_electrode).
+        largest_slope: Largest slope of each scaled charge in each cell, shape (n, n_electrode), 1/mm.
+    """
+
+    cells: Cells
+    terms: Array
+    largest_slope: Array
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Integrates over the contacts that may have given some charges.
+    """The posterior of contacts.
 
     Attributes:
-        charges: Charges of a contact.
-        noise: Of the readings.
-        radius: Of the disk of the prior, mm.
+        charges: Map from contacts to charges.
+        noise: Noise of the charges.
+        radius: Radius of the disk of the prior, mm.
     """
 
     charges: ChargeSpline
@@ -151,18 +186,26 @@ class Posterior:
         check_radius(self.radius, self.charges.domain.radius, "charge table")
 
     def mean_and_std(self, charge: Array, executor: Executor | None = None) -> tuple[Array, Array]:
-        """Mean and standard deviation of (x, y, F), mm and N, each (n, 3), from noisy charges (n, n_electrode), pC.
+        """Compute mean and standard deviation of the posterior.
 
-        The mean of the force is E[1/F] / E[1/F^2], of all estimates the one with the least mean square relative error.
+        The mean of the force is E[1/F] / E[1/F^2], the estimate with the smallest mean squared relative error.
 
         Args:
-            charge: Noisy charges, shape (n, n_electrode), pC.
-            executor: Integrates `CHUNK` presses in a task; None for this process.
+            charge: Charges with noise, shape (n, n_electrode), pC.
+            executor: Executor whose tasks integrate `CHUNK` presses each; None for this process.
+
+        Returns:
+            Mean and standard deviation of (x, y, F), shape (n, 3) each, mm and N.
+
+        Raises:
+            ChargeError: If there are no charges, or they are not finite or of another number of electrodes.
         """
-        charge, electrodes = np.asarray(charge, dtype=float), len(self.charges.electrodes)
-        if charge.ndim != 2 or charge.shape[1] != electrodes or not len(charge) or not np.isfinite(charge).all():
+        charge = np.asarray(charge, dtype=float)
+        n_electrode = len(self.charges.electrodes)
+        has_shape = charge.ndim == 2 and charge.shape[1] == n_electrode and len(charge) > 0
+        if not has_shape or not np.isfinite(charge).all():
             raise ChargeError(
-                f"expected finite charges of shape (n, {electrodes}), n at least 1, got shape {charge.shape}"
+                f"expected finite charges of shape (n, {n_electrode}), n at least 1, got shape {charge.shape}"
             )
         chunks = [charge[start : start + CHUNK] for start in range(0, len(charge), CHUNK)]
         moments = in_order(executor, self._integrate, chunks)
@@ -170,98 +213,179 @@ class Posterior:
         return mean, std
 
     @cached_property
-    def _curve(self) -> ForceProfile:
+    def _profile(self) -> ForceProfile:
+        """Charges as a function of the force."""
         return ForceProfile.of(self.charges.by_force, self.charges.domain.force_range)
 
     @cached_property
-    def _roots(self) -> tuple[Cells, Array, Array]:
-        """The first cells, their terms, and the steepest slope of each scaled charge in them, (n, n_electrode)."""
+    def _roots(self) -> _RootCells:
+        """The first cells."""
         cells = Cells.roots(self.radius)
-        about = onto_disk((cells.centre[:, None] + _grid(3, 0.5 * cells.side)).reshape(-1, 2), self.radius)
-        steepest = np.linalg.norm(self.charges.slopes(about), axis=-1).max(axis=1)
-        terms = self.charges.terms(onto_disk(cells.centre, self.radius))
-        return cells, terms, steepest.reshape(len(cells), 9, -1).max(axis=1)
+        points = (cells.centre[:, None] + _grid(3, 0.5 * cells.side)).reshape(-1, 2)
+        slopes = self.charges.slopes(onto_disk(points, self.radius))
+        point_slope = np.linalg.norm(slopes, axis=-1).max(axis=1)
+        largest_slope = point_slope.reshape(len(cells), 9, -1).max(axis=1)
+        return _RootCells(cells, self._terms(cells), largest_slope)
+
+    def _terms(self, cells: Cells) -> Array:
+        """Compute the terms of the charges at the centres of cells, shape (n, n_term, n_electrode)."""
+        return self.charges.terms(onto_disk(cells.centre, self.radius))
 
     def _integrate(self, charge: Array) -> Array:
-        """Means and standard deviations, shape (2, n, 3)."""
-        levels = list(self._cells(charge))
+        """Compute means and standard deviations, shape (2, n, 3), for charges of shape (n, n_electrode), pC."""
+        levels = list(self._integration_cells(charge))
         side = np.concatenate([np.full(len(cells), cells.side) for cells in levels])
         press = np.concatenate([cells.press for cells in levels])
-        shares, centres = zip(*(cells.inside(self.radius) for cells in levels), strict=True)
+        fractions, centroids = zip(*(cells.inside(self.radius) for cells in levels), strict=True)
         order = np.argsort(press, kind="stable")
-        share, press, centre = np.concatenate(shares)[order], press[order], np.concatenate(centres)[order]
-        logs, weight = self._over_force(centre, charge[press])
-        weight += np.log(share * side[order] ** 2)[:, None]
-        return _moments(press, centre, logs, weight)
+        area = (np.concatenate(fractions) * side**2)[order]
+        position = np.concatenate(centroids)[order]
+        press = press[order]
+        log_force, log_weight = self._integrate_force(position, charge[press])
+        log_weight += np.log(area)[:, None]
+        return _moments(press, position, log_force, log_weight)
 
-    def _cells(self, charge: Array) -> Iterator[Cells]:
-        """Cells that hold all of the mass, small against its width; every press in cells of one size."""
-        roots, terms, steepest = self._roots
-        press, root = (axis.ravel() for axis in np.indices((len(charge), len(roots))))
-        cells, terms = Cells(press, root, roots.centre[root], roots.side), terms[root]
-        for cut in range(MOST_CUTS + 1):
-            logs = self._curve.best(terms, charge[cells.press], self.noise)
-            chi2, reach = self._fit(terms, logs, charge[cells.press], steepest[cells.root])
-            best = np.full(len(charge), np.inf)
-            np.minimum.at(best, cells.press, chi2)
-            excess = np.maximum(np.sqrt(chi2) - np.sqrt(0.5) * cells.side * reach, 0.0) ** 2 - best[cells.press]
-            alive = np.flatnonzero(excess <= MARGIN)
-            stiffest, stiffness = np.zeros(len(charge)), self._stiffness(cells[alive], terms[alive], logs[alive])
-            np.maximum.at(stiffest, cells.press[alive], stiffness)
-            cut_off = np.zeros(len(charge), dtype=bool)
-            cut_off[cells.press[cells.on_edge(self.radius) & (chi2 <= best[cells.press] + NEAR)]] = True
-            done = (stiffest * cells.side <= STEP)[cells.press] | (cut == MOST_CUTS)
-            ready = cells[done & (chi2 <= best[cells.press] + MARGIN)]
-            yield ready[~cut_off[ready.press]]
-            yield from ready[cut_off[ready.press]].finer(self.radius)
-            cells = cells[alive][~done[alive]].cut(self.radius)
+    def _integration_cells(self, charge: Array) -> Iterator[Cells]:
+        """Yield cells that cover the posterior and are small compared with its width.
+
+        All cells of a press have the same side.
+
+        Args:
+            charge: Shape (n, n_electrode), pC.
+        """
+        n_press = len(charge)
+        roots = self._roots
+        press, root = (numbers.ravel() for numbers in np.indices((n_press, len(roots.cells))))
+        cells = Cells(press, root, roots.cells.centre[root], roots.cells.side)
+        terms = roots.terms[root]
+        for division in range(MAX_DIVISIONS + 1):
+            cell_charge = charge[cells.press]
+            log_force = self._profile.best(terms, cell_charge, self.noise)
+            chi2, slope = self._chi2_and_slope(terms, log_force, cell_charge, roots.largest_slope[cells.root])
+            smallest_chi2 = np.full(n_press, np.inf)
+            np.minimum.at(smallest_chi2, cells.press, chi2)
+
+            # A lower bound of chi-squared in the whole cell: no position is farther from the centre than the corners.
+            half_diagonal = np.sqrt(0.5) * cells.side
+            lower_bound = np.maximum(np.sqrt(chi2) - half_diagonal * slope, 0.0) ** 2
+            possible = np.flatnonzero(lower_bound - smallest_chi2[cells.press] <= NEGLIGIBLE_CHI2)
+
+            smallest_std_inverse = np.zeros(n_press)
+            std_inverse = self._inverse_std(cells[possible], terms[possible], log_force[possible])
+            np.maximum.at(smallest_std_inverse, cells.press[possible], std_inverse)
+            is_last = division == MAX_DIVISIONS
+            is_fine = (smallest_std_inverse * cells.side <= MAX_SIDE_STD)[cells.press] | is_last
+
+            touches_edge = np.zeros(n_press, dtype=bool)
+            is_near_best = chi2 <= smallest_chi2[cells.press] + EDGE_CHI2
+            touches_edge[cells.press[cells.on_edge(self.radius) & is_near_best]] = True
+            has_mass = chi2 <= smallest_chi2[cells.press] + NEGLIGIBLE_CHI2
+            finished = cells[is_fine & has_mass]
+            yield finished[~touches_edge[finished.press]]
+            yield from finished[touches_edge[finished.press]].finer(self.radius)
+
+            cells = cells[possible][~is_fine[possible]].divided(self.radius)
             if not len(cells):
                 return
-            terms = self.charges.terms(onto_disk(cells.centre, self.radius))
+            terms = self._terms(cells)
 
-    def _fit(self, terms: Array, logs: Array, charge: Array, steepest: Array) -> tuple[Array, Array]:
-        """Chi-squared at each cell, and how fast its root can change with the place at most, 1/mm."""
-        by_force = self.charges.by_force(logs)
-        known = np.einsum("nk,nke->ne", by_force, terms)
-        deviation = (charge - known) / self.noise.sigma(known)
-        steep = steepest * by_force.sum(axis=1)[:, None] / self.noise.sigma(known)
-        return np.einsum("ne,ne->n", deviation, deviation), np.sqrt(np.einsum("ne,ne->n", steep, steep))
+    def _chi2_and_slope(
+        self, terms: Array, log_force: Array, charge: Array, largest_slope: Array
+    ) -> tuple[Array, Array]:
+        """Compute chi-squared at the centres of cells, and a bound of its change with the position.
 
-    def _stiffness(self, cells: Cells, terms: Array, logs: Array) -> Array:
-        """One over the smallest standard deviation of the position if it lay here, the force unknown; shape (n,)."""
-        by_force, slopes = self.charges.by_force(logs), self.charges.slopes(onto_disk(cells.centre, self.radius))
-        known = np.einsum("nk,nke->ne", by_force, terms)
-        moved = np.einsum("nk,nkei->nei", by_force, slopes)
-        jacobian = np.concatenate([moved, self._curve.slope(logs, known)[..., None]], axis=2)
-        return singular_values(jacobian / self.noise.sigma(known)[..., None])[:, 0]
+        Args:
+            terms: Terms of the charges, shape (n, n_term, n_electrode).
+            log_force: Logarithms of the best forces, shape (n,).
+            charge: Charges with noise, shape (n, n_electrode), pC.
+            largest_slope: Largest slopes of the scaled charges in the cells, shape (n, n_electrode), 1/mm.
 
-    def _over_force(self, position: Array, charge: Array) -> tuple[Array, Array]:
-        """Points of the integral over the force's logarithm at each place, and the logarithms of their weights times
-        the likelihood; both (n, NODES)."""
+        Returns:
+            Chi-squared, shape (n,), and the largest slope of its square root, shape (n,), 1/mm.
+        """
+        force_weights = self.charges.by_force(log_force)
+        expected = np.einsum("nk,nke->ne", force_weights, terms)
+        sigma = self.noise.sigma(expected)
+        deviation = (charge - expected) / sigma
+        slope = largest_slope * force_weights.sum(axis=1)[:, None] / sigma
+        return np.einsum("ne,ne->n", deviation, deviation), np.sqrt(np.einsum("ne,ne->n", slope, slope))
+
+    def _inverse_std(self, cells: Cells, terms: Array, log_force: Array) -> Array:
+        """Compute the inverse of the smallest standard deviation of the position with unknown force.
+
+        Args:
+            cells: Cells at whose centres the contact is assumed.
+            terms: Terms of the charges there, shape (n, n_term, n_electrode).
+            log_force: Logarithms of the forces, shape (n,).
+
+        Returns:
+            Shape (n,), 1/mm.
+        """
+        force_weights = self.charges.by_force(log_force)
+        slopes = self.charges.slopes(onto_disk(cells.centre, self.radius))
+        expected = np.einsum("nk,nke->ne", force_weights, terms)
+        position_jacobian = np.einsum("nk,nkei->nei", force_weights, slopes)
+        force_jacobian = self._profile.slope(log_force, expected)[..., None]
+        jacobian = np.concatenate([position_jacobian, force_jacobian], axis=2)
+        values = singular_values(jacobian / self.noise.sigma(expected)[..., None])
+        return np.asarray(values[:, 0])
+
+    def _integrate_force(self, position: Array, charge: Array) -> tuple[Array, Array]:
+        """Return the nodes of the integral over the logarithm of the force, and their weights times the likelihood.
+
+        Args:
+            position: Shape (n, 2), mm.
+            charge: Charges with noise, shape (n, n_electrode), pC.
+
+        Returns:
+            Logarithms of the forces, and logarithms of weight times likelihood, shape (n, N_FORCE_NODES) each.
+        """
         terms = self.charges.terms(position)
-        best = self._curve.best(terms, charge, self.noise)
-        known = self._curve.charge(best, terms)
-        reach = WIDTH / np.linalg.norm(self._curve.slope(best, known) / self.noise.sigma(known), axis=1)
-        low, high = np.maximum(best - reach, self._curve.ends[0]), np.minimum(best + reach, self._curve.ends[1])
-        nodes, weights = np.polynomial.legendre.leggauss(NODES)
-        logs = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * nodes
-        known = np.einsum("nmk,nke->enm", self.charges.by_force(logs), terms)
-        variance = self.noise.variance(known)
-        exponents = ((charge.T[:, :, None] - known) ** 2 / variance).sum(axis=0) + np.log(variance.prod(axis=0))
-        return logs, np.log(weights * (high - low)[:, None]) - 0.5 * exponents
+        best = self._profile.best(terms, charge, self.noise)
+        expected = self._profile.charge(best, terms)
+        inverse_std = np.linalg.norm(self._profile.slope(best, expected) / self.noise.sigma(expected), axis=1)
+        half_width = FORCE_HALF_WIDTH_STD / inverse_std
+        smallest, largest = self._profile.ends
+        low = np.maximum(best - half_width, smallest)[:, None]
+        high = np.minimum(best + half_width, largest)[:, None]
+        nodes, weights = np.polynomial.legendre.leggauss(N_FORCE_NODES)
+        log_force = 0.5 * (low + high) + 0.5 * (high - low) * nodes
+        expected = np.einsum("nmk,nke->enm", self.charges.by_force(log_force), terms)
+        variance = self.noise.variance(expected)
+        chi2 = ((charge.T[:, :, None] - expected) ** 2 / variance).sum(axis=0)
+        log_likelihood = -0.5 * (chi2 + np.log(variance.prod(axis=0)))
+        return log_force, np.log(weights * (high - low)) + log_likelihood
 
 
-def _moments(press: Integers, place: Array, logs: Array, weight: Array) -> Array:
-    """Mean and standard deviation of (x, y, F) of every press, from the points at its places, `press` ascending; shape
-    (2, n, 3)."""
+def _moments(press: Integers, position: Array, log_force: Array, log_weight: Array) -> Array:
+    """Compute mean and standard deviation of (x, y, F) of every press.
+
+    Args:
+        press: Number of the press of each position, ascending, shape (n_position,).
+        position: Shape (n_position, 2), mm.
+        log_force: Logarithms of the forces at each position, shape (n_position, n_node).
+        log_weight: Logarithms of the weights of these contacts, shape (n_position, n_node).
+
+    Returns:
+        Shape (2, n_press, 3), mm and N.
+    """
     first = np.flatnonzero(np.diff(press, prepend=-1))
-    largest = np.maximum.reduceat(weight.max(axis=1), first)
-    mass = np.exp(weight - np.repeat(largest, np.diff(first, append=press.size))[:, None])
-    force, total = np.exp(logs), mass.sum(axis=1)
-    columns = [total, *(total * place.T), *(total * place.T**2)]
-    columns += [(mass * force**power).sum(axis=1) for power in (1, 2, -1, -2)]
-    sums = np.add.reduceat(np.stack(columns, axis=1), first)
-    x, y, x2, y2, f, f2, inverse, inverse2 = (sums[:, 1:] / sums[:, :1]).T
-    mean = np.stack([x, y, inverse / inverse2], axis=1)
-    variance = np.stack([x2 - x**2, y2 - y**2, f2 - f**2], axis=1)
+    count = np.diff(first, append=press.size)
+    largest = np.maximum.reduceat(log_weight.max(axis=1), first)
+    weight = np.exp(log_weight - np.repeat(largest, count)[:, None])
+    force = np.exp(log_force)
+    position_weight = weight.sum(axis=1)
+
+    def expectation(weighted: Array) -> Array:
+        """Return the sum over the positions of each press, relative to the sum of the weights."""
+        return np.asarray(np.add.reduceat(weighted, first, axis=0) / total)
+
+    total = np.add.reduceat(position_weight, first)
+    x, y = (expectation(position_weight * coordinate) for coordinate in position.T)
+    x_square, y_square = (expectation(position_weight * coordinate**2) for coordinate in position.T)
+    force_mean, force_square, inverse_force, inverse_square = (
+        expectation((weight * force**power).sum(axis=1)) for power in (1, 2, -1, -2)
+    )
+    mean = np.stack([x, y, inverse_force / inverse_square], axis=1)
+    variance = np.stack([x_square - x**2, y_square - y**2, force_square - force_mean**2], axis=1)
     return np.stack([mean, np.sqrt(np.maximum(variance, 0.0))])
