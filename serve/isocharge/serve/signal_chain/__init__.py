@@ -1,4 +1,4 @@
-"""From readings to touch charges: gain, hum, tare, leak, contact, thermal drift.
+"""The signal chain: stages that turn the numbers of a board into touch charges.
 
 May import: flags.
 """

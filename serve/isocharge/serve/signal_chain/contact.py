@@ -1,7 +1,7 @@
-"""Whether something touches: the total charge, with hysteresis.
+"""Detection of a touch by the total charge, with hysteresis.
 
-A touch begins when the total charge rises out of the noise, and ends when it falls below a share of that press's own
-peak: an absolute release threshold would never release once the base has drifted.
+A touch begins when the total charge rises out of the noise. It ends when the total charge falls below a share of the
+peak of this press. An absolute threshold would never end a touch after the charge at rest has drifted above it.
 """
 
 import math
@@ -14,15 +14,15 @@ from isocharge.serve.signal_chain.rule import Rule, Setting
 
 
 class TouchRule(Rule, frozen=True, kw_only=True):
-    """When something touches.
+    """Thresholds of a touch; the section `[touch]` of a device file.
 
-    The smallest press we care about, 0.05 N on a 25 um film, gives 340 pC in total; reference noise makes the touch
-    threshold 20 pC. A press that falls from 2 N (4000 pC) to 0.05 N keeps 8 % of its peak.
+    With the reference noise, the touch threshold is 20 pC. A press of 0.05 N on a film of 25 um gives 340 pC in total.
+    A press whose force falls from 2 N to 0.05 N keeps 8 % of its peak, so it is not released.
 
     Attributes:
-        sigmas: Part of the touch threshold in standard deviations of the total charge at rest.
-        floor_pC: Constant part of the touch threshold, pC, added to the other.
-        release_share: Release threshold as a share of the press's peak; it is at least half the touch threshold.
+        sigmas: First part of the touch threshold, in standard deviations of the total charge at rest.
+        floor_pC: Second part of the touch threshold, pC, which is added to the first.
+        release_share: Release threshold as a share of the peak of the press. It is at least half the touch threshold.
     """
 
     sigmas: Setting = 6.0
@@ -31,13 +31,14 @@ class TouchRule(Rule, frozen=True, kw_only=True):
 
 
 class Touch(NamedTuple):
-    """Whether something touches.
+    """State of the touch detection after a frame.
 
     Attributes:
         contact: Whether something touches.
-        peak_pC: Largest total charge in this press that two frames in a row reached, pC: a spike is no peak.
+        peak_pC: Largest total charge in this press that two consecutive frames reached, pC. A spike is not a peak.
         last_pC: Total charge of the latest frame, pC.
-        base_pC: Smallest total charge since the last release, pC; a touch is a rise above it, so drift is no touch.
+        base_pC: Smallest total charge since the last release, pC. A touch is a rise above it, so a slow drift is not
+            taken for a touch.
         below: Whether the total charge lies below zero by more than the touch threshold.
     """
 
@@ -51,30 +52,32 @@ class Touch(NamedTuple):
 NO_TOUCH = Touch()
 """The state before the first touch."""
 
-UNKNOWN_SIGMAS = 2.0
-"""Deviations of what is not known of the film's memory by which a press is released earlier."""
+SCALE_STD_FACTOR = 2.0
+"""Number of common standard deviations of the charges by which the release threshold is raised."""
 
 
 def update_contact(
-    rule: TouchRule, touch: Touch, total_pC: float, noise_pC: Array, decay: float = 1.0, unknown: float = 0.0
+    rule: TouchRule, touch: Touch, total_pC: float, noise_pC: Array, decay: float = 1.0, scale_std: float = 0.0
 ) -> Touch:
-    """Contact with hysteresis.
+    """Return the state of the touch detection after the next frame.
 
     Args:
         rule: The thresholds.
-        touch: After the frame before.
-        total_pC: Total touch charge of this frame, pC; a press makes it positive.
+        touch: State after the frame before.
+        total_pC: Total touch charge of this frame, pC. A press makes it positive.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
-        decay: Factor of the base from frame to frame; below 1 where the charge itself relaxes to zero.
-        unknown: Relative standard deviation of this charge, for what the film remembers.
+        decay: Factor of the base from frame to frame; below 1 if the charge itself decays to zero.
+        scale_std: Relative standard deviation that all charges have in common, because the film's memory is not known
+            exactly.
     """
-    threshold = rule.floor_pC + rule.sigmas * math.sqrt(float(np.dot(noise_pC, noise_pC)))
+    touch_threshold_pC = rule.floor_pC + rule.sigmas * math.sqrt(float(np.dot(noise_pC, noise_pC)))
     if touch.contact:
-        peak = max(touch.peak_pC, min(total_pC, touch.last_pC))
-        rest_pC = rule.release_share * peak + UNKNOWN_SIGMAS * unknown * total_pC
-        released = total_pC < max(rest_pC, 0.5 * threshold)
-        return Touch(last_pC=total_pC, base_pC=total_pC) if released else Touch(True, peak, total_pC)
+        peak_pC = max(touch.peak_pC, min(total_pC, touch.last_pC))
+        remaining_pC = rule.release_share * peak_pC + SCALE_STD_FACTOR * scale_std * total_pC
+        if total_pC < max(remaining_pC, 0.5 * touch_threshold_pC):
+            return Touch(last_pC=total_pC, base_pC=total_pC)
+        return Touch(True, peak_pC, total_pC)
     base_pC = decay * touch.base_pC
-    if total_pC > base_pC + threshold:
+    if total_pC > base_pC + touch_threshold_pC:
         return Touch(True, min(total_pC, touch.last_pC), total_pC)
-    return Touch(last_pC=total_pC, base_pC=min(base_pC, total_pC), below=total_pC < -threshold)
+    return Touch(last_pC=total_pC, base_pC=min(base_pC, total_pC), below=total_pC < -touch_threshold_pC)

@@ -1,10 +1,10 @@
-"""Mains hum, removed by an adaptive notch.
+"""Removal of mains hum by an adaptive notch filter.
 
-A fixed notch rings after every touch: a step of 850 pC through a notch 1 Hz wide takes a second to settle. So the hum
-itself is estimated, a sine of known frequency and slowly changing amplitude and phase in each channel, and subtracted
-(Widrow et al., "Adaptive noise cancelling", 1975; normalised least mean squares). It is learned on the *differences* of
-consecutive frames, which hum changes all the time and a touch only briefly, and each difference is clipped. Nothing is
-delayed.
+A fixed notch filter rings after every touch: a step of 850 pC through a notch of 1 Hz takes a second to settle.
+Therefore the hum itself is estimated and subtracted (Widrow et al., "Adaptive noise cancelling", 1975; normalised least
+mean squares). In each channel it is a sine of known frequency whose amplitude and phase change slowly. The estimate is
+updated with the *differences* of consecutive frames, because hum changes them all the time, whereas a touch changes
+them only briefly. Each difference is clipped. The filter does not delay the signal.
 """
 
 import cmath
@@ -17,16 +17,16 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
 LEAST_TURN = 0.02
-"""Smallest squared step of the unit phasor between two frames, dimensionless, from which hum can be learned."""
+"""Smallest squared change of the unit phasor between two frames, dimensionless, with which the hum is updated."""
 
 
 class HumRule(Rule, frozen=True, kw_only=True):
-    """How hum is followed.
+    """How hum is estimated; the section `[hum]` of a device file.
 
     Attributes:
         frequency_Hz: Frequency of the mains, 50 or 60 Hz.
-        settle_s: Time constant of learning, s; the notch is 1 / (pi * settle_s) wide.
-        limit_pC: Limit of a difference in learning, pC.
+        settle_s: Time constant of the estimate, s. The width of the notch is 1 / (pi * settle_s).
+        limit_pC: Limit to which a difference of two frames is clipped, pC.
     """
 
     frequency_Hz: Setting = 50.0
@@ -35,12 +35,12 @@ class HumRule(Rule, frozen=True, kw_only=True):
 
 
 class Hum(NamedTuple):
-    """The hum.
+    """State of the estimate after a frame.
 
     Attributes:
         phasor_pC: Amplitude and phase in each channel, shape (electrodes,), complex, pC.
-        turn: Unit phasor of the mains at the frame before.
-        raw_pC: Charges of the frame before, shape (electrodes,), pC; None before the first.
+        turn: Unit phasor of the mains at this frame.
+        raw_pC: Charges of this frame, shape (electrodes,), pC; None before the first frame.
     """
 
     phasor_pC: Complexes
@@ -49,19 +49,22 @@ class Hum(NamedTuple):
 
     @classmethod
     def start(cls, electrodes: int) -> "Hum":
-        """Before the first frame."""
+        """Return the state before the first frame."""
         return cls(np.zeros(electrodes, dtype=complex))
 
 
 def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) -> tuple[Hum, Array]:
-    """The hum after this frame, and the charges without it.
+    """Subtract the hum from a frame, and update the estimate.
 
     Args:
-        rule: How to follow it.
-        hum: After the frame before.
-        raw_pC: Shape (electrodes,), pC.
-        t_s: The device's clock, s.
-        dt_s: Since the frame before, s.
+        rule: How hum is estimated.
+        hum: State after the frame before.
+        raw_pC: Charges of the frame, shape (electrodes,), pC.
+        t_s: Time on the clock of the device, s.
+        dt_s: Time since the frame before, s.
+
+    Returns:
+        The state after this frame, and the charges without hum, shape (electrodes,), pC.
     """
     turn = cmath.exp(2j * math.pi * rule.frequency_Hz * t_s)
     phasor_pC = hum.phasor_pC
@@ -70,5 +73,6 @@ def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) 
     if hum.raw_pC is not None and norm > LEAST_TURN:
         error_pC = raw_pC - hum.raw_pC - (phasor_pC * step).real
         error_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
-        phasor_pC = phasor_pC + error_pC * (min(1.0, 2.0 * dt_s / rule.settle_s) / norm * step.conjugate())
+        gain = min(1.0, 2.0 * dt_s / rule.settle_s)
+        phasor_pC = phasor_pC + error_pC * (gain / norm * step.conjugate())
     return Hum(phasor_pC, turn, raw_pC), raw_pC - (phasor_pC * turn).real

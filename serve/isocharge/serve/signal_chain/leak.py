@@ -1,17 +1,18 @@
-"""The leak of a charge amplifier undone.
+"""Compensation of the leak of a charge amplifier.
 
 A charge amplifier is a leaky integrator with the time constant tau = R C. The touch charge q follows from its output v
 frame by frame,
 
     q[n] = q[n-1] + i[n] - b dt,        i[n] = v[n] - a v[n-1],        a = exp(-dt / tau),
 
-where i is the innovation and b the current that leaks in (pC/s): offset, bias and slow warming. b is learned on the
-innovation, and only out of contact, where i is nothing but b dt and noise; learned on the output v it would diverge.
-The first frames of a touch must not change b: each innovation is clipped, a touch begins with the b of `look_back_s`
-before, and after a release learning waits for `hold_off_s`.
+where i is the innovation and b is the inflow (pC/s), the current that flows in because of offset, bias and slow
+warming. The inflow is estimated from the innovation and only out of contact, where the innovation consists of b dt and
+noise. An estimate from the output v would diverge. The first frames of a touch must not change the inflow. Therefore
+each innovation is clipped, a touch begins with the inflow of `look_back_s` before, and after a release the estimate
+pauses for `hold_off_s`.
 
-Out of contact the charge relaxes to zero, because any charge then is an error or a slow warming of the film, which
-gives every electrode the same charge.
+Out of contact the charge decays to zero, because any charge that remains then is an error, or comes from a slow warming
+of the film, which gives every electrode the same charge.
 """
 
 import math
@@ -24,16 +25,16 @@ from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
 
 class LeakRule(Rule, frozen=True, kw_only=True):
-    """How the offset of the amplifiers is learned.
+    """How the inflow of the amplifiers is estimated; a part of the section `[leak]` of a device file.
 
     Attributes:
-        learn: Whether to learn the inflow b.
-        settle_s: Time constant of learning, s.
-        hold_off_s: Pause of learning after a release, s.
-        clip_sigmas: Limit of an innovation in learning, in its standard deviations at rest.
+        learn: Whether the inflow b is estimated.
+        settle_s: Time constant of the estimate, s.
+        hold_off_s: Pause of the estimate after a release, s.
+        clip_sigmas: Limit to which an innovation is clipped, in its standard deviations at rest.
         clip_pC: Smallest value of that limit, pC.
-        relax_s: Time constant with which the charge relaxes to zero out of contact, s.
-        look_back_s: Age of the inflow with which a touch begins, s; it may be up to twice as old.
+        relax_s: Time constant with which the charge decays to zero out of contact, s.
+        look_back_s: Age of the inflow with which a touch begins, s. The inflow may be up to twice as old.
     """
 
     learn: bool = True
@@ -46,17 +47,17 @@ class LeakRule(Rule, frozen=True, kw_only=True):
 
 
 class Leak(NamedTuple):
-    """What the stage remembers.
+    """State of the compensation after a frame.
 
     Attributes:
         charge_pC: Touch charge q, shape (electrodes,), pC.
-        output_pC: Output v of the frame before, above tare, shape (electrodes,), pC.
+        output_pC: Output v above the tare, shape (electrodes,), pC.
         inflow_pC_per_s: Inflow b, shape (electrodes,), pC/s.
-        trusted_pC_per_s: Inflow as learned at least `look_back_s` ago, before the touch could affect it.
+        trusted_pC_per_s: Inflow as it was estimated at least `look_back_s` ago, before a touch could affect it.
         candidate_pC_per_s: Inflow that becomes the trusted one when it is `look_back_s` old.
-        candidate_age_s: Its age, s.
-        learned_s: Effective averaging time of b so far, s; starts at 1 s with b = 0 as the prior.
-        hold_s: Time for which learning still pauses, s.
+        candidate_age_s: Age of the candidate, s.
+        learned_s: Time over which the inflow was averaged, s. It starts at 1 s, with an inflow of 0 as the prior.
+        hold_s: Time for which the estimate still pauses, s.
     """
 
     charge_pC: Array
@@ -70,44 +71,73 @@ class Leak(NamedTuple):
 
     @classmethod
     def start(cls, output_pC: Array) -> "Leak":
-        """At the first frame after the tare."""
-        nothing = np.zeros_like(output_pC)
-        return cls(nothing, output_pC, nothing, nothing, nothing)
+        """Return the state at the first frame after the tare."""
+        zeros = np.zeros_like(output_pC)
+        return cls(zeros, output_pC, zeros, zeros, zeros)
 
 
 def undo_leak(
     rule: LeakRule, tau_s: Array, leak: Leak, output_pC: Array, noise_pC: Array, dt_s: float, *, contact: bool
 ) -> Leak:
-    """Charge and inflow after the next frame.
+    """Return the state after the next frame.
 
     Args:
-        rule: How the inflow is learned.
+        rule: How the inflow is estimated.
         tau_s: Time constant of each amplifier, shape (electrodes,), s.
-        leak: After the frame before.
-        output_pC: The amplifier's output above tare, shape (electrodes,), pC.
+        leak: State after the frame before.
+        output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
-        dt_s: Since the frame before, s.
+        dt_s: Time since the frame before, s.
         contact: Whether something touched in the frame before.
     """
     innovation_pC = output_pC - np.exp(-dt_s / tau_s) * leak.output_pC
     surplus_pC = innovation_pC - leak.inflow_pC_per_s * dt_s
     charge_pC = leak.charge_pC + surplus_pC
     if contact:
-        trusted = leak.trusted_pC_per_s
-        return Leak(charge_pC, output_pC, trusted, trusted, trusted, 0.0, leak.learned_s, rule.hold_off_s)
-    leak = Leak(charge_pC * math.exp(-dt_s / rule.relax_s), output_pC, *leak[2:])
+        return in_touch(leak, charge_pC, output_pC, rule.hold_off_s)
+    decayed_pC = charge_pC * math.exp(-dt_s / rule.relax_s)
+    leak = leak._replace(charge_pC=decayed_pC, output_pC=output_pC)
     if leak.hold_s > 0.0 or not rule.learn:
         return leak._replace(hold_s=leak.hold_s - dt_s)
     return learn_inflow(rule, leak, surplus_pC, noise_pC, dt_s)
 
 
+def in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) -> Leak:
+    """Return the state of a frame in contact: the inflow is the trusted one, and its estimate pauses.
+
+    Args:
+        leak: State after the frame before.
+        charge_pC: Touch charge of this frame, shape (electrodes,), pC.
+        output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
+        hold_off_s: Pause of the estimate after the release, s.
+    """
+    trusted = leak.trusted_pC_per_s
+    return Leak(charge_pC, output_pC, trusted, trusted, trusted, 0.0, leak.learned_s, hold_off_s)
+
+
 def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array, dt_s: float) -> Leak:
-    """Correct the inflow by the clipped surplus; every `look_back_s` the candidate becomes the trusted inflow."""
+    """Return the state with a corrected inflow.
+
+    Args:
+        rule: How the inflow is estimated.
+        leak: State of this frame with the inflow of the frame before.
+        surplus_pC: Innovation that the inflow does not explain, shape (electrodes,), pC. It is clipped.
+        noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
+        dt_s: Time since the frame before, s.
+
+    Returns:
+        The state. Every `look_back_s` the candidate becomes the trusted inflow.
+    """
     limit_pC = np.maximum(rule.clip_pC, rule.clip_sigmas * math.sqrt(2.0) * noise_pC)
     clipped_pC = np.minimum(np.maximum(surplus_pC, -limit_pC), limit_pC)
-    learned_s, age_s = leak.learned_s + dt_s, leak.candidate_age_s + dt_s
-    inflow = leak.inflow_pC_per_s + clipped_pC / max(min(rule.settle_s, learned_s), dt_s)  # at most the whole surplus
-    trusted, candidate = leak.trusted_pC_per_s, leak.candidate_pC_per_s
+    learned_s = leak.learned_s + dt_s
+    averaging_s = max(min(rule.settle_s, learned_s), dt_s)  # the correction is at most the whole surplus
+    inflow = leak.inflow_pC_per_s + clipped_pC / averaging_s
+    trusted = leak.trusted_pC_per_s
+    candidate = leak.candidate_pC_per_s
+    age_s = leak.candidate_age_s + dt_s
     if age_s >= rule.look_back_s:
-        trusted, candidate, age_s = candidate, inflow, 0.0
+        trusted = candidate
+        candidate = inflow
+        age_s = 0.0
     return Leak(leak.charge_pC, leak.output_pC, inflow, trusted, candidate, age_s, learned_s)

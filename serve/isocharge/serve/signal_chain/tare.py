@@ -1,4 +1,4 @@
-"""Tare: the charge of each electrode at rest, mean and noise, from frames in which nothing moves."""
+"""Measurement of the tare: mean and noise of the charge of each electrode at rest, from quiet frames."""
 
 from typing import NamedTuple
 
@@ -10,14 +10,14 @@ from isocharge.serve.signal_chain.rule import Count, Rule, Setting
 
 
 class TareRule(Rule, frozen=True, kw_only=True):
-    """Which frames are quiet enough for a tare.
+    """Which frames are quiet enough for a tare; the section `[tare]` of a device file.
 
     Attributes:
         frames: Number of frames in a tare; 100 are 0.5 s at 200 Hz.
-        noise_limit_pC: Largest standard deviation of a quiet electrode, pC. The reference noise is 1 pC.
-        offset_limit_pC: Largest mean of an idle electrode, pC. Any press from 0.05 N on a 25 um film gives more on the
-            average of three electrodes, also one that is held still during the tare.
-        patience: Frames after which the search for quiet ones is given up; 0 for never.
+        noise_limit_pC: Largest standard deviation of an electrode at rest, pC. The reference noise is 1 pC.
+        offset_limit_pC: Largest mean of an electrode at rest, pC. A press of 0.05 N or more on a film of 25 um gives a
+            larger mean over three electrodes, even if it is held still during the tare.
+        patience: Number of frames after which the search for quiet frames is given up; 0 for never.
     """
 
     frames: Count = 100
@@ -27,7 +27,13 @@ class TareRule(Rule, frozen=True, kw_only=True):
 
 
 class Tare(NamedTuple):
-    """Charge at rest: `charge_pC` (electrodes,) and its standard deviation `noise_pC` (electrodes,), from `frames`."""
+    """The charge at rest.
+
+    Attributes:
+        charge_pC: Mean charge, shape (electrodes,), pC.
+        noise_pC: Standard deviation of the charge, shape (electrodes,), pC.
+        frames: Number of frames from which it was measured.
+    """
 
     charge_pC: Array
     noise_pC: Array
@@ -35,12 +41,12 @@ class Tare(NamedTuple):
 
 
 def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None:
-    """The tare of the latest frames, if they are enough and quiet.
+    """Return the tare of the latest frames, or None if they are too few or not quiet.
 
     Args:
-        rule: How many frames, and how quiet.
-        waiting_pC: The latest frames, at most `rule.frames`, shape (k, electrodes), pC.
-        frames: Frames seen during the search.
+        rule: Number of frames, and how quiet they have to be.
+        waiting_pC: Charges of the latest frames, at most `rule.frames`, shape (k, electrodes), pC.
+        frames: Number of frames since the search began.
 
     Raises:
         TareError: If the search is given up.
@@ -56,25 +62,26 @@ def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None
 
 
 def measure_tare(rule: TareRule, raw_pC: Array) -> Tare:
-    """Mean and noise of frames with nothing on the film.
+    """Return the mean and the noise of frames in which nothing touches the film.
 
     Args:
-        rule: How quiet they must be.
-        raw_pC: Charges as they came, shape (n, electrodes), pC.
+        rule: How quiet the frames have to be.
+        raw_pC: Charges of the frames, shape (n, electrodes), pC.
 
     Raises:
-        TareError: If the film is touched: a charge varies, or rests far from zero.
+        TareError: If something touches the film: a charge varies, or rests far from zero.
     """
     tare = Tare(raw_pC.mean(axis=0), raw_pC.std(axis=0), len(raw_pC))
-    noise, offset = float(tare.noise_pC.max()), float(np.abs(tare.charge_pC).max())
-    if noise > rule.noise_limit_pC:
+    noise_pC = float(tare.noise_pC.max())
+    offset_pC = float(np.abs(tare.charge_pC).max())
+    if noise_pC > rule.noise_limit_pC:
         raise TareError(
-            f"cannot tare on the last {tare.frames} frames: the charge of an electrode varies by {noise:.3g} pC rms, "
-            f"expected at most {rule.noise_limit_pC:g} pC; leave the film alone and start again"
+            f"cannot tare on the last {tare.frames} frames: the charge of an electrode varies by {noise_pC:.3g} pC "
+            f"rms, expected at most {rule.noise_limit_pC:g} pC; leave the film alone and start again"
         )
-    if offset > rule.offset_limit_pC:
+    if offset_pC > rule.offset_limit_pC:
         raise TareError(
-            f"cannot tare on the last {tare.frames} frames: an electrode rests at {offset:.4g} pC, expected at most "
+            f"cannot tare on the last {tare.frames} frames: an electrode rests at {offset_pC:.4g} pC, expected at most "
             f"{rule.offset_limit_pC:g} pC; take off what lies on the film, or raise the limit if the amplifier "
             "rests there"
         )

@@ -1,13 +1,15 @@
-"""Warming of the film during a press, separated from force by the model where that is possible.
+"""Estimation of the warming of the film during a press, with the misfit of the model.
 
-A change of temperature gives every electrode a charge (pyroelectricity), the same one or in ratios that are known, and
-during a touch the charge at rest cannot be measured. A contact has three unknowns, so four electrodes leave one charge
-over: the common charge p is estimated as the one without which the charges fit a single contact best. The squared
-misfit is a parabola in p, and its curvature gives the variance of that estimate. A Kalman filter follows p as a random
-walk from 0 at the start of every touch; where the film's memory predicts its warmth, the walk is that of p's slope.
+A change of temperature gives every electrode a charge (pyroelectricity): the same charge, or charges in known ratios.
+During a touch the charge at rest cannot be measured. A contact has three unknowns, so with four electrodes one charge
+is left over for a check. The common charge p is estimated as the value without which the charges fit a single contact
+best. The squared misfit is a parabola in p, and its curvature gives the variance of the estimate. A Kalman filter
+describes p as a random walk that begins at 0 with every touch. If the memory of the film predicts the warmth, the slope
+of p is the random walk.
 
-Where a press raises all charges alike, warming looks like force and the curvature vanishes: everywhere with three
-electrodes, and near the centre of a biaxial film. There p stays as it is, and the record is flagged `blind`.
+Where a press raises all charges by the same amount, warming looks like force and the curvature vanishes. This is so
+everywhere with three electrodes, and near the centre of a biaxial film. There p is not changed, and the record is
+flagged `blind`.
 """
 
 import math
@@ -20,22 +22,22 @@ from isocharge.common.arrays import Array, Reals
 from isocharge.serve.signal_chain.rule import Rule, Setting
 
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
-"""Changes of the common charge at which the misfit is evaluated, pC."""
+"""Changes of the common charge at which the misfit is evaluated, pC; a parabola is fitted to its square."""
 
 _PARABOLA_FIT = np.linalg.pinv(np.column_stack([np.ones(5), TRIED_PC, TRIED_PC**2]))
 
 Misfit = Callable[[Array], Reals]
-"""Charges of shape (n, electrodes), pC, to misfits of shape (n,), in standard deviations."""
+"""Function that returns misfits of shape (n,), in standard deviations, for charges of shape (n, electrodes), pC."""
 
 
 class ThermalRule(Rule, frozen=True, kw_only=True):
-    """How warming is followed.
+    """How warming is estimated; a part of the section `[common_mode]` of a device file.
 
     Attributes:
         every_s: Time between two estimates, s.
-        wander_pC: Standard deviation of the change of p in one second, pC; 50 pC are 0.19 K on 9 mm^2: half a kelvin,
-            which 25 um of PVDF in air follow within 2.7 s.
-        noise: Factor by which the model's own errors widen the standard deviation of an estimate.
+        wander_pC: Standard deviation of the change of p in one second, pC. The default of 50 pC is a change of 0.19 K
+            on 9 mm^2. A film of 25 um in air follows a step of half a kelvin within 2.7 s, about as fast.
+        noise: Factor by which the errors of the model increase the standard deviation of an estimate.
         blind_pC: Standard deviation of an estimate above which temperature counts as inseparable from force, pC.
         tell_pC: Smallest |p| that is flagged `thermal`, pC.
     """
@@ -48,15 +50,16 @@ class ThermalRule(Rule, frozen=True, kw_only=True):
 
 
 class ThermalDrift(NamedTuple):
-    """Warming in this touch.
+    """State of the estimate in this touch.
 
     Attributes:
-        charge_pC: The common charge p, pC.
-        variance_pC2: Its variance, pC^2.
+        charge_pC: Common charge p, pC.
+        variance_pC2: Variance of p, pC^2.
         waited_s: Time since the last estimate, s.
         blind: Whether temperature was inseparable from force at the last estimate.
-        rate_pC_per_s: By how much p's slope, if it is predicted, has to change with this estimate, pC/s.
-        covariance, rate_variance: Of p and its slope, pC^2/s, and of the slope, pC^2/s^2.
+        rate_pC_per_s: Change of the slope of p with this estimate, if the slope is predicted, pC/s.
+        covariance: Covariance of p and its slope, pC^2/s.
+        rate_variance: Variance of the slope, pC^2/s^2.
     """
 
     charge_pC: float = 0.0
@@ -80,16 +83,16 @@ def track_thermal_drift(
     ratios: Array | float = 1.0,
     warmth_s: float | None = None,
 ) -> ThermalDrift:
-    """The warming after the next frame in contact.
+    """Return the state after the next frame in contact.
 
     Args:
-        rule: How to follow it.
-        state: After the frame before.
+        rule: How warming is estimated.
+        state: State after the frame before.
         charge_pC: Touch charges without the warming so far, shape (electrodes,), pC.
-        misfit: Of the model.
-        dt_s: Since the frame before, s.
+        misfit: Misfit of the model that answers.
+        dt_s: Time since the frame before, s.
         ratios: Charge of each electrode over p, shape (electrodes,), dimensionless.
-        warmth_s: Time in which the slope of p decays, s, if it is predicted.
+        warmth_s: Time constant with which the slope of p decays, s; None if the slope is not predicted.
     """
     waited_s = state.waited_s + dt_s
     if waited_s < rule.every_s:
@@ -115,11 +118,26 @@ def track_thermal_drift(
 def _predicted(
     rule: ThermalRule, state: ThermalDrift, waited_s: float, warmth_s: float | None
 ) -> tuple[float, float, float]:
-    """Variance of p, its covariance with its slope, and that one's variance, after a while."""
+    """Return the predicted variance of p, its covariance with the slope, and the variance of the slope.
+
+    Args:
+        rule: How warming is estimated.
+        state: State at the last estimate.
+        waited_s: Time since the last estimate, s.
+        warmth_s: Time constant with which the slope of p decays, s; None if the slope is not predicted.
+    """
     if warmth_s is None:
         return state.variance_pC2 + rule.wander_pC**2 * waited_s, 0.0, 0.0
-    walk = 3.0 * rule.wander_pC**2 * waited_s  # of the slope: p's is as large after a second
-    left = math.exp(-waited_s / warmth_s)
-    reach_s, both, rate = warmth_s * (1.0 - left), state.covariance, state.rate_variance
-    variance_pC2 = state.variance_pC2 + reach_s * (2.0 * both + reach_s * rate) + walk * waited_s**2 / 3.0
-    return variance_pC2, left * (both + reach_s * rate) + 0.5 * walk * waited_s, left * left * rate + walk
+    # The process noise of the slope is such that p changes by `wander_pC` in one second.
+    slope_noise = 3.0 * rule.wander_pC**2 * waited_s
+    decay = math.exp(-waited_s / warmth_s)
+    slope_effect_s = warmth_s * (1.0 - decay)  # change of p for a slope of 1
+    covariance = state.covariance
+    rate_variance = state.rate_variance
+    variance_pC2 = (
+        state.variance_pC2
+        + slope_effect_s * (2.0 * covariance + slope_effect_s * rate_variance)
+        + slope_noise * waited_s**2 / 3.0
+    )
+    predicted_covariance = decay * (covariance + slope_effect_s * rate_variance) + 0.5 * slope_noise * waited_s
+    return variance_pC2, predicted_covariance, decay * decay * rate_variance + slope_noise
