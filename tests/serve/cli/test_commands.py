@@ -76,7 +76,7 @@ def test_check_of_a_film_that_fits(measured, models, command):
 
 def test_check_of_a_film_that_does_not_fit_and_of_too_few_presses(measured, models, command):
     code, out, _ = command("serve", "check", "linear", measured(scale=0.9), "--models", models)
-    assert (code, "forces are 1.111 +- 0.0041 times the known ones" in out) == (1, True)
+    assert (code, "forces are 1.111 +- 0.0041 times the measured ones" in out) == (1, True)
     code, out, _ = command("serve", "check", "linear", measured(count=1), "--models", models)
     assert (code, "too few presses to say" in out) == (1, True)
 

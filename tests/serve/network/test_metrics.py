@@ -139,9 +139,9 @@ def test_counters_do_not_fall_when_a_model_is_loaded_again(handler):
     assert value(samples, "model_ready", model="linear", version="2") == 1
 
 
-def test_versions_that_serve_and_that_were_refused(film, tmp_path):
+def test_metrics_list_loaded_and_refused_versions(film, tmp_path):
     film.write(tmp_path)
-    film.write(tmp_path, version=2, sensor={"name": 'a "quoted"\nname\\', "film": {"radius_mm": 45.0}})
+    film.write(tmp_path, version=2, sensor={"name": 'a "quoted" name\\', "film": {"radius_mm": 45.0}})
     (film.write(tmp_path, version=3) / "golden.json").unlink()
     store = open_model_store(tmp_path)
     samples = scrape(Handler(store))

@@ -1,9 +1,8 @@
-"""What measured presses say about a model: of the linear film, whose inverse and noise are known in closed form.
+"""Comparison of a model with measured presses, for a linear film whose inverse and noise are known in closed form.
 
-The model's standard deviations are 50 mm pC / sum of charges, and 7e-4 N for the force. Answers are moved by just such
-noise, so that chi-squared, its distribution and every share of the errors are known.
-
-The chi-squared distribution beside SciPy's.
+The standard deviations of the model are 50 mm pC / (sum of the charges) for the position and 7e-4 N for the force. The
+contacts are moved by noise of this size, so that chi-squared, its distribution and each part of the errors are known.
+The chi-squared distribution is compared with SciPy.
 """
 
 import math
@@ -19,14 +18,15 @@ from scipy.special import gammaincc
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses, Predictor, check_presses
-from isocharge.serve.prediction.press_errors import Common, ErrorSummary, chi_squared_survival
+from isocharge.serve.prediction.press_errors import CommonError, ErrorSummary, chi_squared_survival
 
-RIG_MM, RIG_SHARE = 0.05, 0.004
+RIG_STD_MM = 0.05
+RIG_FORCE_STD = 0.004
 
 
 @pytest.fixture
 def measure(film):
-    """Presses of a film whose places and forces the rig knows with its noise, and whose charges make the model err."""
+    """Return a function that measures presses with noise of the charges, errors of the rig and errors of the model."""
 
     def measure(n, *, seed=0, force_scale=1.0, shift_mm=(0.0, 0.0), known=(True, True), noise=1.0, radius_mm=5.0):
         rng = np.random.default_rng(seed)
@@ -36,18 +36,17 @@ def measure(film):
         moved = contact + noise * rng.normal(size=(n, 3)) * np.column_stack([std, std, np.full(n, 7e-4)])
         moved += [*shift_mm, 0.0]
         moved[:, 2] *= force_scale
-        contact[:, :2] += RIG_MM * rng.normal(size=(n, 2))
-        contact[:, 2] /= 1.0 + RIG_SHARE * rng.normal(size=n)
+        contact[:, :2] += RIG_STD_MM * rng.normal(size=(n, 2))
+        contact[:, 2] /= 1.0 + RIG_FORCE_STD * rng.normal(size=n)
         contact[:, :2] *= 1.0 if known[0] else np.nan
         contact[:, 2] *= 1.0 if known[1] else np.nan
-        stds = np.full(n, RIG_MM), np.full(n, RIG_SHARE)
+        stds = np.full(n, RIG_STD_MM), np.full(n, RIG_FORCE_STD)
         return MeasuredPresses(contact, film.charge_pC(*moved.T), *stds, film.electrodes, tuple(range(2, n + 2)))
 
     return measure
 
 
-def test_errors_of_single_presses(film, predictor):
-    """Exact charges of displaced presses: the errors are the displacements."""
+def test_errors_of_single_presses_equal_their_displacements(film, predictor):
     contact = np.array([[1.0, 2.0, 0.5], [-3.0, 0.5, 1.0], [np.nan, np.nan, 1.0], [0.0, 1.0, np.nan]])
     pressed = np.array([[1.3, 1.6, 0.55], [-3.0, 0.5, 0.98], [0.0, 0.0, 1.02], [0.0, 1.5, 1.0]])
     stds = np.full(4, 0.1), np.full(4, 0.01)
@@ -56,39 +55,38 @@ def test_errors_of_single_presses(film, predictor):
     nan = np.nan
     np.testing.assert_allclose(errors.position_error_mm, [0.5, 0.0, nan, 0.5], atol=1e-5)
     np.testing.assert_allclose(errors.error[:, 2], [0.1, -0.02, 0.02, nan], atol=1e-6)
-    np.testing.assert_allclose(errors.answer[:, :3], pressed, atol=1e-5)
+    np.testing.assert_allclose(errors.predicted[:, :3], pressed, atol=1e-5)
     std = 50.0 / (2400.0 * pressed[:, 2])
     np.testing.assert_allclose(errors.noise_std[:, 0], np.where([1, 1, 0, 1], std, nan), rtol=1e-5)
     np.testing.assert_allclose(errors.noise_std[:, 2], [7e-4 / 0.5, 7e-4, 7e-4, nan], rtol=1e-5)
     np.testing.assert_array_equal(errors.rig_std[:, 2], [0.01, 0.01, 0.01, nan])
 
 
-def test_a_film_that_fits(predictor, measure):
+def test_model_that_fits_has_no_unexplained_error(predictor, measure):
     check = check_presses(predictor, measure(400, seed=3))
     assert (check.fits, check.verdict, check.notes) == (True, "fits: noise explains the errors", ())
     assert check.agreement.degrees == 1200
     assert check.agreement.chi_squared / 1200 == pytest.approx(1.0, abs=3 * (2 / 1200) ** 0.5)
-    for part, rig in ((check.position_mm, RIG_MM * 2**0.5), (check.force_percent, 100 * RIG_SHARE)):
+    for part, rig in ((check.position_mm, RIG_STD_MM * 2**0.5), (check.force_percent, 100 * RIG_FORCE_STD)):
         assert part.rms == pytest.approx(part.explained, rel=0.1)
         assert part.rig == pytest.approx(rig)
         assert part.beyond < 0.45 * part.rms
 
 
-def test_a_film_that_fits_is_hardly_ever_called_another(predictor, measure):
-    """p values of films that fit are uniform, and the verdict errs as rarely as it says."""
+def test_p_values_are_uniform_and_verdicts_rarely_wrong_for_a_model_that_fits(predictor, measure):
     checks = [check_presses(predictor, measure(12, seed=seed)) for seed in range(150)]
     assert stats.kstest([check.agreement.p_value for check in checks], "uniform").pvalue > 0.01
-    assert sum(not check.fits for check in checks) <= 5  # 1 % of 150, and three deviations
+    assert sum(not check.fits for check in checks) <= 5  # 1 % of 150, plus three standard deviations
 
 
-def test_a_scatter_that_is_hardly_larger_is_accepted_however_sure(predictor, measure):
+def test_chi_squared_up_to_ten_percent_too_large_is_accepted_whatever_the_p_value(predictor, measure):
     agreement = check_presses(predictor, measure(12)).agreement
     larger = [replace(agreement, p_value=1e-9, chi_squared=share * agreement.degrees) for share in (1.05, 1.2)]
     assert [each.acceptable for each in larger] == [True, False]
     assert replace(larger[1], p_value=0.2).acceptable
 
 
-def test_a_scale_of_the_force_is_recognised(predictor, measure):
+def test_force_scale_is_reported(predictor, measure):
     check = check_presses(predictor, measure(20, force_scale=1.05))
     assert (check.fits, check.verdict[:14]) == (False, "does not fit: ")
     assert check.agreement.force.mean == pytest.approx(0.05, abs=4 * check.agreement.force.std)
@@ -99,7 +97,7 @@ def test_a_scale_of_the_force_is_recognised(predictor, measure):
     assert "forces are 1.0" in check.notes[2]
 
 
-def test_a_common_shift_is_recognised_before_the_sum_of_squares_tells(predictor, measure):
+def test_common_shift_is_detected_with_a_smaller_p_value_than_chi_squared(predictor, measure):
     check = check_presses(predictor, measure(40, seed=1, shift_mm=(0.06, 0.0)))
     assert check.fits is False
     assert check.agreement.p_value > check.agreement.common_p_value
@@ -107,8 +105,10 @@ def test_a_common_shift_is_recognised_before_the_sum_of_squares_tells(predictor,
     assert any(note.startswith("positions are off by (0.0") for note in check.notes)
 
 
-@pytest.mark.parametrize(("known", "degrees"), [((True, False), 40), ((False, True), 20)])
-def test_place_or_force_alone(predictor, measure, known, degrees):
+@pytest.mark.parametrize(
+    ("known", "degrees"), [((True, False), 40), ((False, True), 20)], ids=["positions only", "forces only"]
+)
+def test_presses_with_only_positions_or_only_forces(predictor, measure, known, degrees):
     check = check_presses(predictor, measure(20, known=known))
     assert (check.fits, check.agreement.degrees) == (True, degrees)
     assert (check.position_mm is None, check.force_percent is None) == (not known[0], not known[1])
@@ -118,32 +118,32 @@ def test_place_or_force_alone(predictor, measure, known, degrees):
 
 
 @pytest.mark.parametrize(("count", "fits"), [(1, None), (2, None), (3, True)])
-def test_few_presses(predictor, measure, count, fits):
+def test_verdict_needs_three_presses(predictor, measure, count, fits):
     check = check_presses(predictor, measure(count, seed=4))
     assert check.fits is fits
     assert fits or check.verdict == f"too few presses to say: {count} can be compared, 3 are needed"
 
 
-def test_a_bad_press_is_named_and_does_not_condemn_the_film(predictor, measure):
+def test_bad_press_is_reported_and_excluded(predictor, measure):
     presses = measure(12, seed=5)
     presses.contact[7, :2] += 2.0
     check = check_presses(predictor, presses)
-    assert (check.fits, check.counted) == (True, 11)
+    assert (check.fits, check.compared) == (True, 11)
     assert check.notes == ("line 9: nothing like the other presses, left out; look at it",)
     assert check.position_mm.max < 1.0
     presses.contact[3:5, :2] -= 2.0  # three of twelve are too many
     assert check_presses(predictor, presses).fits is False
 
 
-def test_presses_that_do_not_count(predictor, measure):
+def test_presses_outside_the_domain_or_with_unknown_values_are_excluded(predictor, measure):
     presses = measure(10, seed=6)
     presses.contact[0, 2] = 40.0  # N: meant as g
     presses.contact[1, :2] = 30.0  # mm
     presses.contact[2] = np.nan
     presses.charge_pC[3, 1] = np.nan
     check = check_presses(predictor, presses)
-    assert (check.presses, check.counted, check.fits) == (10, 6, True)
-    assert check.errors.left_out[:5] == (
+    assert (check.presses, check.compared, check.fits) == (10, 6, True)
+    assert check.errors.exclusion_reasons[:5] == (
         *("not trained for", "not trained for", "neither place nor force is known", "a charge is unknown", ""),
     )
     assert "0.05 to 2 N); if these are most, look at the units (lines 2, 3)" in check.notes[2]
@@ -151,8 +151,8 @@ def test_presses_that_do_not_count(predictor, measure):
     assert (row["x_mm"], row["x_error_mm"], row["left_out"]) == (None, None, "a charge is unknown")
 
 
-def test_flags_of_the_answers(film, tmp_path, measure):
-    """Misfit against the model's own 1 %; the linear model's misfit is the sum of negative charges."""
+def test_misfit_flags_use_the_limit_of_the_model(film, tmp_path, measure):
+    """The misfit of the linear model is the sum of the negative charges."""
     film.write(tmp_path, errors={"misfit_p99": 2.5, "misfit_p999": 9.0})
     presses = measure(6)
     presses.charge_pC[0] = film.charge_pC([20.0], [0.0], [1.0])[0]
@@ -165,8 +165,8 @@ def test_flags_of_the_answers(film, tmp_path, measure):
     )
 
 
-def test_a_calibrated_film_that_does_not_fit(film, tmp_path, measure):
-    """Another calibration is not the first remedy; with the rig that is named, the same presses fit."""
+def test_note_for_a_calibrated_film_that_does_not_fit_states_the_explaining_rig_std(film, tmp_path, measure):
+    """With the standard deviations that the note states, the same presses fit."""
     film.write(tmp_path, sensor={"name": "linear-film", "calibration": {"gain": {"A": 1.02}}})
     predictor, presses = Predictor("linear", models=tmp_path), measure(30, seed=1)
     presses.contact[:, :2] += np.random.default_rng(0).normal(0.0, 0.2, (30, 2))
@@ -175,14 +175,14 @@ def test_a_calibrated_film_that_does_not_fit(film, tmp_path, measure):
     assert "calibrated already" in check.notes[1]
     assert "from 50 presses on" in check.notes[1]
     position_std, force_std = map(float, re.findall(r"-std ([\d.e-]+)", check.notes[0]))
-    assert position_std == pytest.approx(np.hypot(0.2, RIG_MM), rel=0.3)
+    assert position_std == pytest.approx(np.hypot(0.2, RIG_STD_MM), rel=0.3)
     known = replace(presses, position_std_mm=np.full(30, position_std), force_std=np.full(30, force_std))
     assert check_presses(predictor, known).fits
 
 
 @pytest.mark.parametrize(("misfits", "fits"), [(2, True), (4, False)])
-def test_the_verdict_counts_misfits(film, tmp_path, measure, misfits, fits):
-    """Of 30 presses with their forces: two beyond the limit of 1 % are chance, four are not."""
+def test_verdict_depends_on_the_number_of_misfits(film, tmp_path, measure, misfits, fits):
+    """Two of 30 presses above the limit that 1 % of good presses exceed are chance, four are not."""
     film.write(tmp_path, errors={"misfit_p99": 0.5})
     presses = measure(30)
     presses.charge_pC[:misfits] = [-1.0, 900.0, 900.0]
@@ -192,29 +192,29 @@ def test_the_verdict_counts_misfits(film, tmp_path, measure, misfits, fits):
     assert (check.fits, "4 of 30 presses have a misfit above 0.5" in check.verdict) == (fits, not fits)
 
 
-def test_electrodes_are_taken_by_their_names(predictor, measure):
+def test_electrodes_are_assigned_by_name(predictor, measure):
     presses = measure(3)
     named = replace(presses, charge_pC=presses.charge_pC[:, ::-1], electrodes=("C", "B", "A"))
     np.testing.assert_array_equal(
-        check_presses(predictor, named).errors.answer, check_presses(predictor, presses).errors.answer
+        check_presses(predictor, named).errors.predicted, check_presses(predictor, presses).errors.predicted
     )
     with pytest.raises(PressError, match=r"expected charges of the electrodes \('A', 'B', 'C'\) of linear/1, got"):
         check_presses(predictor, replace(presses, electrodes=("A", "B", "D")))
 
 
-def test_common_part_is_the_weighted_mean():
+def test_common_error_is_the_weighted_mean():
     rng = np.random.default_rng(0)
     std = rng.uniform(0.5, 2.0, 500)
     for scatter in (1.0, 3.0):
         error = 0.3 + scatter * std * rng.normal(size=500)
-        common = Common.of(np.append(error, np.nan), np.append(std, 1.0) ** 2)
+        common = CommonError.of(np.append(error, np.nan), np.append(std, 1.0) ** 2)
         mean, weight = np.average(error, weights=std**-2, returned=True)
         widening = max(1.0, np.sum(((error - mean) / std) ** 2) / 499) ** 0.5  # as the Particle Data Group averages
         assert (common.mean, common.std) == pytest.approx((mean, widening * weight**-0.5))
         assert widening == pytest.approx(scatter, rel=0.1)
 
 
-def test_summary_of_known_numbers():
+def test_error_summary_of_known_numbers():
     summary = ErrorSummary.of(np.array([3.0, 4.0]), np.array([2.0, 4.0]), np.array([1.0, 0.0]))
     assert (summary.rms, summary.median, summary.max) == (12.5**0.5, 3.5, 4.0)
     assert (summary.noise, summary.rig, summary.explained, summary.beyond) == (3**0.5, 0.5**0.5, 3.5**0.5, 3.0)
@@ -227,12 +227,12 @@ def test_summary_of_known_numbers():
 @example(degrees=2, sigmas=0.0)
 @example(degrees=3_000_000, sigmas=2.0)
 @settings(derandomize=True, deadline=None)
-def test_as_scipy_has_it(degrees, sigmas):
+def test_chi_squared_survival_equals_scipy(degrees, sigmas):
     statistic = max(0.0, degrees + sigmas * math.sqrt(2.0 * degrees))
     expected = gammaincc(0.5 * degrees, 0.5 * statistic)
     assert chi_squared_survival(statistic, degrees) == pytest.approx(expected, rel=1e-6 if degrees > 2000 else 1e-11)
 
 
 @pytest.mark.parametrize(("statistic", "expected"), [(0.0, 1.0), (math.inf, 0.0), (1e300, 0.0), (1e-320, 1.0)])
-def test_ends(statistic, expected):
+def test_chi_squared_survival_of_extreme_statistics(statistic, expected):
     assert chi_squared_survival(statistic, 3) == expected

@@ -233,4 +233,4 @@ def test_flags_of_one_contact_equal_those_in_a_batch():
         for domain in (square, away):
             batch = Contacts(*np.array(contact)[:, np.newaxis])
             assert domain.flags(contact) == domain.batch_flags(batch)[0]
-    assert (square.safe_mm2, away.safe_mm2) == (9.0, 0.0)
+    assert (square.inscribed_radius_squared_mm2, away.inscribed_radius_squared_mm2) == (9.0, 0.0)

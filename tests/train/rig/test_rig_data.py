@@ -41,7 +41,7 @@ def test_the_errors_are_what_serve_check_says_of_presses_that_nobody_trained_on(
     assert held == presses[held_out(presses.contact)]
     assert seen == presses[~held_out(presses.contact)]
     check, errors = check_presses(Predictor(model.folder), held), model.metadata.errors
-    assert errors["measured_presses"] == len(held) == check.counted >= 10
+    assert errors["measured_presses"] == len(held) == check.compared >= 10
     said = [errors[name] for name in ("position_rms_mm", "position_median_mm", "force_rms_percent")]
     assert said == pytest.approx([check.position_mm.rms, check.position_mm.median, check.force_percent.rms], rel=1e-3)
 

@@ -1,8 +1,9 @@
-"""`isocharge serve check`: how wrong a model is on measured presses."""
+"""`isocharge serve check`: comparison of a model with measured presses."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -14,8 +15,8 @@ from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses
 from isocharge.serve.prediction.press_errors import ErrorSummary
 
-MOST_ROWS = 40
-"""Presses in the table for people; of more, the worst are shown."""
+MAX_ROWS = 40
+"""Largest number of presses in the table. If there are more, the presses with the largest errors are listed."""
 
 
 def check_command(
@@ -33,9 +34,9 @@ def check_command(
     json: JsonOption = False,
     models: ModelsOption = None,
 ) -> None:
-    """Say how wrong a model is on measured presses, and whether noise explains it.
+    """Compare a model with measured presses, and test whether noise explains its errors.
 
-    Exit code: 0 if the model fits, 1 if it does not or there are too few presses to say, 2 if the input is wrong.
+    Exit code: 0 if the model fits, 1 if it does not fit or there are too few presses, 2 if the input is wrong.
 
     Example: isocharge serve check three-25um-biaxial presses.csv --position-std 0.05
     """
@@ -49,50 +50,63 @@ def check_command(
 
 
 def _text(check: PressCheck) -> Iterator[str]:
-    """The lines for people: presses, summary, common part, verdict, notes."""
+    """Yield the lines of the report: presses, summary of the errors, statistical tests, verdict and notes."""
     yield from _press_lines(check)
     yield ""
-    yield f"{check.model}, {check.counted} of {check.presses} presses"
+    yield f"{check.model}, {check.compared} of {check.presses} presses"
     yield f"{'error':14}{'rms':>9}{'median':>9}{'max':>9}{'noise':>9}{'rig':>9}{'beyond':>9}"
     yield from _summary_line("position, mm", check.position_mm)
     yield from _summary_line("force, %", check.force_percent)
-    both = check.agreement
-    if both.degrees:
+    agreement = check.agreement
+    if agreement.degrees:
         yield (
-            f"chi-squared per degree of freedom {both.chi_squared / both.degrees:.3g} ({both.degrees}), "
-            f"p value {both.p_value:.2g}"
+            f"chi-squared per degree of freedom {agreement.chi_squared / agreement.degrees:.3g} ({agreement.degrees}), "
+            f"p value {agreement.p_value:.2g}"
         )
-    if check.position_mm:
-        yield (
-            f"shift ({both.shift_x.mean:.3f} +- {both.shift_x.std:.3f}, "
-            f"{both.shift_y.mean:.3f} +- {both.shift_y.std:.3f}) mm"
-        )
-    if check.force_percent:
-        yield f"scale of the force {1.0 + both.force.mean:.4f} +- {both.force.std:.4f}"
+    if check.position_mm is not None:
+        x = agreement.shift_x
+        y = agreement.shift_y
+        yield f"shift ({x.mean:.3f} +- {x.std:.3f}, {y.mean:.3f} +- {y.std:.3f}) mm"
+    if check.force_percent is not None:
+        yield f"scale of the force {1.0 + agreement.force.mean:.4f} +- {agreement.force.std:.4f}"
     yield ""
     yield check.verdict
     yield from (f"- {note}" for note in check.notes)
 
 
 def _press_lines(check: PressCheck) -> Iterator[str]:
-    """A table of the presses; if they are many, of those with the largest errors."""
-    squares = np.nansum(check.errors.error**2 / check.errors.variance, axis=1)
-    chosen = sorted(np.argsort(-squares, kind="stable")[:MOST_ROWS].tolist())
-    if check.presses > MOST_ROWS:
-        yield f"the {MOST_ROWS} worst of {check.presses} presses; --json has all"
+    """Yield a table of the presses, in the order of the file."""
+    chi_squared = np.nansum(check.errors.squared_ratio, axis=1)
+    largest = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
+    if check.presses > MAX_ROWS:
+        yield f"the {MAX_ROWS} worst of {check.presses} presses; --json has all"
     yield f"{check.errors.row_noun:>6}{'x, mm':>9}{'y, mm':>9}{'force, N':>10}{'off, mm':>9}{'off, %':>9}  flags"
-    for press in chosen:
-        row = check.errors.row(press)
-        cells = [(row["x_mm"], 9, 2), (row["y_mm"], 9, 2), (row["force_N"], 10, 3)]
-        cells += [(row["position_error_mm"], 9, 3), (row["force_error_percent"], 9, 2)]
-        words = [*row["flags"], *([row["left_out"]] if row["left_out"] else [])]
-        numbers = "".join(
-            f"{'-' if value != value else f'{value:.{digits}f}':>{width}}" for value, width, digits in cells
-        )
-        yield f"{row['line']:>6}{numbers}  {', '.join(words)}".rstrip()
+    for press in sorted(largest.tolist()):
+        yield _press_line(check.errors.row(press))
+
+
+def _press_line(row: dict[str, Any]) -> str:
+    """Return the line of one press from the values of `PressErrors.row`."""
+    numbers = [
+        _number_cell(row["x_mm"], width=9, decimals=2),
+        _number_cell(row["y_mm"], width=9, decimals=2),
+        _number_cell(row["force_N"], width=10, decimals=3),
+        _number_cell(row["position_error_mm"], width=9, decimals=3),
+        _number_cell(row["force_error_percent"], width=9, decimals=2),
+    ]
+    words = list(row["flags"])
+    if row["left_out"]:
+        words.append(row["left_out"])
+    return f"{row['line']:>6}{''.join(numbers)}  {', '.join(words)}".rstrip()
+
+
+def _number_cell(value: float, width: int, decimals: int) -> str:
+    """Return a number aligned to the right; a dash for NaN."""
+    text = "-" if math.isnan(value) else f"{value:.{decimals}f}"
+    return text.rjust(width)
 
 
 def _summary_line(name: str, errors: ErrorSummary | None) -> Iterator[str]:
-    if errors:
+    if errors is not None:
         values = (errors.rms, errors.median, errors.max, errors.noise, errors.rig, errors.beyond)
         yield f"{name:14}" + "".join(f"{value:9.3g}" for value in values)

@@ -1,9 +1,10 @@
-"""From charges to contacts in process.
+"""Prediction of contacts from charges in the same process.
 
-A single press uses buffers that are bound to the session once: to write three numbers, run and read the answer back
-allocates no array and is faster than a plain `session.run`. Batches go through `session.run`.
+A single press uses memory that is bound to the session once, so that a prediction allocates no arrays and is faster
+than `session.run`. Batches use `session.run`.
 
-The loop of a host program uses `predict_into` with its two arrays; people use `predict`, which checks and explains.
+`predict` checks the charges and returns a named tuple. `predict_into` is for the loop of a host program: it copies one
+array into another without checks of the values.
 """
 
 import logging
@@ -33,14 +34,15 @@ log = logging.getLogger(__name__)
 
 
 class Predictor:
-    """A loaded model. Its buffers serve one press at a time: use one Predictor per thread.
+    """A loaded model that computes contacts from charges.
 
-    `predict` and `predict_into` use the buffers; `predict_batch` does not and may be called from any thread.
+    `predict` and `predict_into` share memory for one press, so each thread needs its own Predictor. `predict_batch`
+    does not use this memory and may be called from any thread.
 
     Attributes:
-        folder: Its version folder.
-        metadata: What the model says about itself: sensor, electrodes, working area, measured errors.
-        validity: Where the model may be trusted; its `batch_flags` are those of `predict_batch`.
+        folder: Version folder of the model.
+        metadata: Metadata of the model: sensor, electrodes, working area, measured errors.
+        validity: Domain in which the model is valid. `validity.batch_flags` returns the flags of a batch.
 
     Example:
         >>> from isocharge.serve import Predictor
@@ -48,7 +50,7 @@ class Predictor:
         >>> contact = touch.predict([593.9, 573.5, 435.2])
         >>> contact
         Contact(x_mm=2.989 +- 0.054, y_mm=-1.991 +- 0.036, force_N=0.5014 +- 0.0012, misfit=0.023)
-        >>> touch.flags(contact)  # a reason for each doubt
+        >>> touch.flags(contact)  # empty: the contact is valid
         ()
     """
 
@@ -56,76 +58,84 @@ class Predictor:
         """Load a model.
 
         Args:
-            model: Name or path, as `find_model` takes it.
+            model: Name or path of the model, as `find_model` takes it.
             models: Repository in which a name is looked up first.
 
         Raises:
-            ModelError: If it is missing, damaged or of another format.
+            ModelError: If the model is missing or damaged, or has an unsupported format.
         """
         loaded = load_model(find_model(model, models))
-        self.folder, self.metadata, self._graph = loaded.folder, loaded.metadata, loaded.graph
-        self._session = loaded.session
+        self.folder = loaded.folder
+        self.metadata = loaded.metadata
         self.validity = Validity.of(loaded.metadata)
+        self._graph = loaded.graph
+        self._session = loaded.session
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
-        self._middle_x_mm, self._middle_y_mm = self.validity.middle_mm
-        self._far_mm2, self._far_N = self.validity.far
-        self._warned = False
+        # The limits are looked up once, because they are compared with every contact.
+        self._centre_x_mm, self._centre_y_mm = self.validity.centre_mm
+        self._limit_mm2, self._limit_N = self.validity.implausible_limits
+        self._has_warned = False
         self._constants: Mapping[str, Singles] = {}
-        _check_shared(self._press, loaded)
+        _check_bound_memory(self._press, loaded)
 
     def with_constants(self, constants: Mapping[str, Singles]) -> "Predictor":
-        """The same model with other numbers in the place of its graph's constants, by name; takes a millisecond.
+        """Return a predictor of the same graph with other values of some constants. This takes about a millisecond.
+
+        Args:
+            constants: New values by the names of the graph's constants.
 
         Raises:
-            ModelError: If the graph has not these constants, or not of these shapes.
+            ModelError: If the graph has no constant of a name, or the shapes differ.
         """
         other = copy(self)
-        other._constants = constants  # onnxruntime computes in their memory
+        other._constants = constants  # keeps the arrays alive, because onnxruntime uses their memory
         other._session = open_session(self._graph, self.metadata.label, constants)
         other._press = BoundPress(other._session, len(self.metadata.electrodes))
         return other
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
-        """The contact of one press; `flags` says whether to trust it.
+        """Compute the contact of one press. `flags` returns whether the contact is valid.
 
-        The first answer that is no measurement at all is logged as a warning.
+        The first contact that cannot be a measurement is logged as a warning.
 
         Args:
             charge_pC: Touch charges, shape (electrodes,), pC, in the order of `metadata.electrodes`.
 
         Raises:
-            ChargeError: If the number of charges is another, or one is not finite.
+            ChargeError: If the number of charges is wrong, or a charge is not finite.
         """
         values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
-        if not write_finite(self._press.write, values):  # raises what is wrong, or converts
+        if not write_finite(self._press.write, values):
+            # The slow conversion accepts other number types, and raises an error that names the electrode.
             self._press.write(*as_press(charge_pC, self.metadata.electrodes))
         self._press.run()
         contact = Contact(*self._press.read())
-        x_mm = contact.x_mm - self._middle_x_mm
-        y_mm = contact.y_mm - self._middle_y_mm
-        if contact.force_N > self._far_N or x_mm * x_mm + y_mm * y_mm > self._far_mm2:
-            self._warn(charge_pC, contact)
+        x_mm = contact.x_mm - self._centre_x_mm
+        y_mm = contact.y_mm - self._centre_y_mm
+        if contact.force_N > self._limit_N or x_mm * x_mm + y_mm * y_mm > self._limit_mm2:
+            self._warn_once(charge_pC, contact)
         return contact
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
-        """The reasons not to trust a contact of this model: `outside`, `beyond`, `misfit`; none if empty.
+        """Return the reasons why a contact of this model may be wrong: `outside`, `beyond`, `misfit`, `stress`.
 
-        Three charges and three unknowns: with three electrodes, a wrong charge mostly looks like another press, and
-        only one that leads out of the working area or the forces is seen.
+        With three electrodes, the three charges determine the three unknowns without redundancy. A wrong charge then
+        usually gives the charges of another press, and is detected only if the resulting contact lies outside the
+        working area or the range of forces.
         """
         return self.validity.flags(contact)
 
     def predict_into(self, charge_pC: Singles, out: Singles) -> None:
-        """The contact of one press, for the hot loop: from an array into an array, and nothing else.
+        """Compute the contact of one press from an array into another array, without checks of the charges.
 
         Args:
-            charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. They
-                are not checked: NaN in, NaN out.
-            out: Receives the numbers of a Contact in their order, shape (10,), float32, or the first seven of them,
-                which are all that a model without correlations gives.
+            charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. If a
+                charge is NaN, the result is NaN.
+            out: Receives the values of a Contact in their order, shape (10,), float32, or only the first seven of them,
+                shape (7,). A model without correlations computes only seven values.
 
         Raises:
-            ChargeError: If an array is not float32 or of another shape; nothing is written then.
+            ChargeError: If an array is not float32 or has another shape. Nothing is written in this case.
 
         Example:
             >>> charges, contact = np.zeros(3, np.float32), np.zeros(7, np.float32)
@@ -137,17 +147,17 @@ class Predictor:
             raise ChargeError(
                 f"expected charges {self.metadata.electrodes} and a writable `out` of the {self._press.size} numbers "
                 f"of a Contact that the model gives, or of the first {N_WITHOUT_CORRELATION}, both float32 arrays, got "
-                f"{_kind(charge_pC)} and {_kind(out)} ({error})"
+                f"{_describe(charge_pC)} and {_describe(out)} ({error})"
             ) from error
 
     def predict_batch(self, charge_pC: ArrayLike) -> Contacts:
-        """The contacts of n presses.
+        """Compute the contacts of n presses.
 
         Args:
             charge_pC: Touch charges, shape (n, electrodes), pC; n may be 0.
 
         Raises:
-            ChargeError: If the shape is another, or a charge is not finite; its electrode and row are named.
+            ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
         """
         columns = self._press.columns
         outputs = run(self._session, as_batch(charge_pC, self.metadata.electrodes), tuple(columns))
@@ -157,44 +167,51 @@ class Predictor:
         return Contacts(*contacts.T)
 
     def __repr__(self) -> str:
-        """Model, electrodes and domain."""
+        """Return the label of the model, its sensor and electrodes, and the domain in which it is valid."""
         metadata = self.metadata
-        low, high = self.validity.force_range_N
+        low_N, high_N = self.validity.force_range_N
         return (
             f"Predictor({metadata.label}: sensor {metadata.frame_id}, charges {' '.join(metadata.electrodes)} (pC), "
-            f"positions {self.validity.places}, forces {low:.3g} to {high:.3g} N)"
+            f"positions {self.validity.area_text}, forces {low_N:.3g} to {high_N:.3g} N)"
         )
 
-    def _warn(self, charge_pC: object, contact: Contact) -> None:
-        """Log, once, that an answer is no measurement."""
-        if not self._warned:
-            self._warned = True
-            log.warning(
-                "%s: %s pC are far from any press that the model knows, and (%.2f, %.2f) mm, %.6g N is no measurement; "
-                "check unit, gain and tare. Predictor.flags says so of each contact, this line only once",
-                self.metadata.label,
-                shown(charge_pC),
-                *contact[:3],
-            )
+    def _warn_once(self, charge_pC: object, contact: Contact) -> None:
+        """Log that a contact cannot be a measurement, the first time that this happens."""
+        if self._has_warned:
+            return
+        self._has_warned = True
+        log.warning(
+            "%s: the charges %s pC are far from those of any press in the training, and the contact (%.2f, %.2f) mm, "
+            "%.6g N cannot be a measurement; check unit, gain and tare. Further contacts of this kind are not logged; "
+            "Predictor.flags reports each of them",
+            self.metadata.label,
+            shown(charge_pC),
+            contact.x_mm,
+            contact.y_mm,
+            contact.force_N,
+        )
 
 
-def _kind(value: object) -> str:
-    """What an argument is that is no float32 array of the right shape, for messages."""
-    return f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+def _describe(value: object) -> str:
+    """Return the number type and shape of an array, or the type of another object, for an error message."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} of shape {value.shape}"
+    return type(value).__name__
 
 
-def _check_shared(press: BoundPress, model: Model) -> None:
-    """Make sure that this onnxruntime computes in the bound memory and not in copies of it.
+def _check_bound_memory(press: BoundPress, model: Model) -> None:
+    """Check that this version of onnxruntime computes in the bound memory and not in copies of it.
 
     Raises:
-        ModelError: If the bound press and a plain run disagree.
+        ModelError: If the bound press and `session.run` give different results.
     """
     charges = model.golden.charge_pC[:1]
     press.write(*charges[0])
     press.run()
-    plain = np.concatenate([rows[0] for rows in run(model.session, charges, tuple(press.columns)).values()])
-    if not np.allclose(press.read(), plain, rtol=1e-4, atol=1e-4):
+    outputs = run(model.session, charges, tuple(press.columns))
+    expected = np.concatenate([rows[0] for rows in outputs.values()])
+    if not np.allclose(press.read(), expected, rtol=1e-4, atol=1e-4):
         raise ModelError(
-            f"{model.folder}: onnxruntime {ort.__version__} answers {press.read()} through bound memory and "
-            f"{tuple(plain.tolist())} without; report this with the version and the machine"
+            f"{model.folder}: onnxruntime {ort.__version__} computes {press.read()} in bound memory and "
+            f"{tuple(expected.tolist())} without it; report this with the version and the machine"
         )

@@ -1,8 +1,8 @@
-"""How wrong a model is on measured presses: its errors, the part that noise and rig explain, and a verdict.
+"""Comparison of a model with measured presses: its errors, the part that noise and rig explain, and a verdict.
 
-The model's standard deviations say how far noise of the charges moves an answer, the file how well the rig knows place
-and force. If the errors are larger than both together, the film is not the model's: it has aged, its pretension has
-crept, or it was never calibrated. Such drift shows first as a common scale of the forces and a common shift.
+If the errors are larger than the noise of the charges and the uncertainty of the rig explain, the model does not
+describe the film: the film has aged, its pretension has crept, or it was never calibrated. Such a drift first appears
+as a common scale of the forces and as a common shift of the positions.
 """
 
 import math
@@ -20,52 +20,66 @@ from isocharge.serve.prediction.contact import Validity
 from isocharge.serve.prediction.measured_presses import MeasuredPresses, row_words
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_errors import (
+    FORCE,
     NOT_TRAINED,
     Agreement,
     ErrorSummary,
     PressErrors,
+    X,
+    Y,
     chi_squared_survival,
     misfit_limit,
     press_errors,
 )
 
-FEWEST = 3
-"""Presses below which nothing is said: one bad press among two cannot be told from a bad film."""
+MIN_PRESSES = 3
+"""Smallest number of presses for a verdict. With fewer presses, a single bad press cannot be recognised."""
 
-BAD_PROBABILITY = 1e-3
-"""Probability that noise makes the worst of all presses look bad."""
+BAD_PRESS_PROBABILITY = 1e-3
+"""Probability with which noise makes at least one of all presses look bad."""
 
-BAD_SHARE = 0.1
-"""Largest share of bad presses, at least one, that a film may have and still fit."""
+MAX_BAD_FRACTION = 0.1
+"""Largest fraction of bad presses, at least one press, with which a model may still fit."""
 
-MISFIT_SHARE, MISFIT_PROBABILITY = 0.01, 2e-3
-"""Share of good presses with a misfit beyond the model's limit; probability below which more of them are too many."""
+BAD_PRESS_MIN_CHI_SQUARED = 9.0
+"""Sum of the squared error ratios of a press below which the press is certainly not bad."""
 
-MOST_LISTED = 5
+MISFIT_FRACTION = 0.01
+"""Fraction of good presses whose misfit is above the limit `misfit_p99` of the model."""
+
+MISFIT_PROBABILITY = 2e-3
+"""Probability below which a number of presses with a misfit is no longer attributed to chance."""
+
+MIN_COMMON_SIGNIFICANCE = 3.0
+"""Significance above which a common shift or a common scale is reported, in standard deviations."""
+
+MAX_LISTED_PRESSES = 5
 """Largest number of presses that a note lists."""
 
-ENOUGH_TO_FIT = 50
-"""Presses from which `train fit` learns a model from them."""
+MIN_FIT_PRESSES = 50
+"""Smallest number of presses from which `isocharge train fit` trains a model."""
 
 
 @dataclass(frozen=True)
 class PressCheck:
-    """What measured presses say about a model.
+    """Result of the comparison of a model with measured presses.
 
     Attributes:
-        model: `name/version`.
-        presses, counted: Number of presses in the file, and of those that the figures below are about.
-        position_mm, force_percent: Errors; None if no place, or no force, is known.
-        agreement: Sum of squares and common part.
-        fits: Whether noise explains the errors; None if there are too few presses to say.
-        verdict: The answer in words.
-        notes: What else a reader should know, a sentence each.
-        errors: The presses one by one.
+        model: Label of the model, `name/version`.
+        presses: Number of presses in the file.
+        compared: Number of presses from which the values below are computed.
+        position_mm: Errors of the positions; None if no position is known.
+        force_percent: Errors of the forces; None if no force is known.
+        agreement: Statistical tests of the errors.
+        fits: Whether noise and rig explain the errors; None if there are too few presses.
+        verdict: The result in words.
+        notes: Further findings, one sentence each.
+        errors: Errors of the single presses.
     """
 
     model: str
     presses: int
-    counted: int
+    compared: int
     position_mm: ErrorSummary | None
     force_percent: ErrorSummary | None
     agreement: Agreement
@@ -75,26 +89,27 @@ class PressCheck:
     errors: PressErrors
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, names with units; None where something is unknown."""
-        both, degrees = self.agreement, self.agreement.degrees
+        """Return plain values for JSON by names that contain the units; unknown values are None."""
+        agreement = self.agreement
+        degrees = agreement.degrees
         values = {
             "model": self.model,
             "fits": self.fits,
             "verdict": self.verdict,
             "notes": self.notes,
             "presses": self.presses,
-            "counted": self.counted,
-            "position_mm": self.position_mm and asdict(self.position_mm),
-            "force_percent": self.force_percent and asdict(self.force_percent),
-            "chi_squared": both.chi_squared,
+            "counted": self.compared,
+            "position_mm": None if self.position_mm is None else asdict(self.position_mm),
+            "force_percent": None if self.force_percent is None else asdict(self.force_percent),
+            "chi_squared": agreement.chi_squared,
             "degrees_of_freedom": degrees,
-            "chi_squared_per_degree": both.chi_squared / degrees if degrees else None,
-            "p_value": both.p_value,
-            "shift_mm": [both.shift_x.mean, both.shift_y.mean],
-            "shift_std_mm": [both.shift_x.std, both.shift_y.std],
-            "force_scale": 1.0 + both.force.mean,
-            "force_scale_std": both.force.std,
-            "common_p_value": both.common_p_value,
+            "chi_squared_per_degree": agreement.chi_squared / degrees if degrees else None,
+            "p_value": agreement.p_value,
+            "shift_mm": [agreement.shift_x.mean, agreement.shift_y.mean],
+            "shift_std_mm": [agreement.shift_x.std, agreement.shift_y.std],
+            "force_scale": 1.0 + agreement.force.mean,
+            "force_scale_std": agreement.force.std,
+            "common_p_value": agreement.common_p_value,
             "each": [self.errors.row(press) for press in range(self.presses)],
         }
         return {name: plain_values(value) for name, value in values.items()}
@@ -103,151 +118,215 @@ class PressCheck:
 def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     """Compare a model with measured presses.
 
-    A press counts if all its charges are known, its place or its force is known, and what is known lies in the model's
-    working area and range of forces. A few bad presses are named and left out if all others agree with the model.
+    A press is compared if all its charges are known, its position or its force is known, and the known values lie in
+    the working area and the range of forces of the model. A few bad presses are reported and excluded if all other
+    presses agree with the model.
 
     Raises:
-        PressError: If a charge of one of the model's electrodes is missing.
+        PressError: If the charges of one of the model's electrodes are missing.
     """
+    metadata = predictor.metadata
     errors = press_errors(predictor, presses)
-    rows, bad = _without_bad(errors)
-    agreement, count = Agreement.of(errors, rows), int(rows.sum())
-    position, force = _summaries(errors, rows)
-    misfits = _too_many(errors, rows, predictor.metadata)
-    fits = agreement.acceptable and not misfits if count >= FEWEST else None
+    is_bad = _bad_presses(errors)
+    rows = errors.is_compared & ~is_bad
+    count = int(rows.sum())
+    agreement = Agreement.of(errors, rows)
+    position = _position_summary(errors, rows)
+    force = _force_summary(errors, rows)
+    misfit_text = _frequent_misfits(errors, rows, metadata)
+
+    fits = None
+    if count >= MIN_PRESSES:
+        fits = agreement.acceptable and not misfit_text
+    notes: list[str] = []
+    if fits is False:
+        notes += _remedies(metadata, position, force)
+    notes += _exclusion_notes(errors, metadata)
+    notes += _bad_press_notes(errors, is_bad)
+    notes += _misfit_notes(errors, metadata)
+    notes += _common_notes(agreement)
     return PressCheck(
-        model=predictor.metadata.label,
+        model=metadata.label,
         presses=len(presses),
-        counted=count,
+        compared=count,
         position_mm=position,
         force_percent=force,
         agreement=agreement,
         fits=fits,
-        verdict=_verdict(fits, count, position, force, misfits),
-        notes=(
-            *(_remedies(predictor.metadata, position, force) if fits is False else ()),
-            *_notes(errors, rows, bad, agreement, predictor.metadata),
-        ),
+        verdict=_verdict(fits, count, position, force, misfit_text),
+        notes=tuple(notes),
         errors=errors,
     )
 
 
-def _without_bad(errors: PressErrors) -> tuple[Booleans, Booleans]:
-    """The rows to judge by, and the bad ones that were left out: only where all others then agree with the model."""
-    counted = errors.counted
-    if not Agreement.of(errors, counted).acceptable:
-        bad = _bad(errors, counted)
-        few = 0 < bad.sum() <= max(1.0, BAD_SHARE * counted.sum()) and counted.sum() - bad.sum() >= FEWEST
-        if few and Agreement.of(errors, counted & ~bad).acceptable:
-            return counted & ~bad, bad
-    return counted, np.zeros_like(counted)
+def _bad_presses(errors: PressErrors) -> Booleans:
+    """Return which presses are bad, shape (n,): presses whose exclusion makes all others agree with the model.
+
+    No press is bad if all presses agree with the model, or if too many presses would have to be excluded.
+    """
+    is_compared = errors.is_compared
+    count = int(is_compared.sum())
+    nothing = np.zeros_like(is_compared)
+    if Agreement.of(errors, is_compared).acceptable:
+        return nothing
+    is_improbable = _improbable_presses(errors, is_compared)
+    bad_count = int(is_improbable.sum())
+    max_bad_count = max(1.0, MAX_BAD_FRACTION * count)
+    if not 0 < bad_count <= max_bad_count or count - bad_count < MIN_PRESSES:
+        return nothing
+    if not Agreement.of(errors, is_compared & ~is_improbable).acceptable:
+        return nothing
+    return is_improbable
 
 
-def _bad(errors: PressErrors, counted: Booleans) -> Booleans:
-    """Presses that noise would hardly make, shape (n,)."""
-    bad, limit = np.zeros_like(counted), BAD_PROBABILITY / max(1, counted.sum())
-    squares = errors.error**2 / errors.variance
-    for press in np.flatnonzero(counted & (np.nansum(squares, axis=1) > 9.0)):  # others are not worth the function
-        known = squares[press][~np.isnan(squares[press])]
-        bad[press] = chi_squared_survival(float(known.sum()), known.size) < limit
-    return bad
+def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
+    """Return which of the compared presses have errors that noise and rig hardly cause, shape (n,)."""
+    max_probability = BAD_PRESS_PROBABILITY / max(1, int(is_compared.sum()))
+    squared_ratio = errors.squared_ratio
+    is_candidate = is_compared & (np.nansum(squared_ratio, axis=1) > BAD_PRESS_MIN_CHI_SQUARED)
+    is_improbable = np.zeros_like(is_compared)
+    for press in np.flatnonzero(is_candidate):
+        known = squared_ratio[press][~np.isnan(squared_ratio[press])]
+        is_improbable[press] = chi_squared_survival(float(known.sum()), known.size) < max_probability
+    return is_improbable
 
 
-def _summaries(errors: PressErrors, rows: Booleans) -> tuple[ErrorSummary | None, ErrorSummary | None]:
-    """Of the positions, mm, and of the forces, %; None where none is known."""
-    kinds = (errors.position_error_mm, slice(0, 2), 1.0), (np.abs(errors.error[:, 2]), slice(2, 3), 100.0)
-    summaries = []
-    for size, columns, unit in kinds:
-        known = rows & ~np.isnan(size)
-        noise, rig = (np.sum((unit * std[known, columns]) ** 2, axis=1) for std in (errors.noise_std, errors.rig_std))
-        summaries.append(ErrorSummary.of(unit * size[known], noise, rig))
-    return summaries[0], summaries[1]
+def _position_summary(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
+    """Summarise the position errors of some presses, mm; None if no position is known."""
+    known = rows & ~np.isnan(errors.position_error_mm)
+    noise_variance = errors.noise_std[known, X] ** 2 + errors.noise_std[known, Y] ** 2
+    rig_variance = errors.rig_std[known, X] ** 2 + errors.rig_std[known, Y] ** 2
+    return ErrorSummary.of(errors.position_error_mm[known], noise_variance, rig_variance)
 
 
-def _too_many(errors: PressErrors, rows: Booleans, metadata: ModelMetadata) -> str:
-    """How many of some presses have a misfit that few good ones have; empty if chance explains that."""
-    flags = [flags for flags, chosen in zip(errors.flags, rows.tolist(), strict=True) if chosen]
-    count, most = len(flags), sum(MISFIT in words for words in flags)
-    ways = (math.lgamma(count + 1) - math.lgamma(k + 1) - math.lgamma(count - k + 1) for k in range(most))
-    odds, none = math.log(MISFIT_SHARE / (1.0 - MISFIT_SHARE)), count * math.log1p(-MISFIT_SHARE)
-    shares = (math.exp(way + k * odds + none) for k, way in enumerate(ways))  # the numbers overflow, not the product
-    if 1.0 - sum(shares) >= MISFIT_PROBABILITY:
+def _force_summary(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
+    """Summarise the force errors of some presses, %; None if no force is known."""
+    error_percent = 100.0 * np.abs(errors.error[:, FORCE])
+    known = rows & ~np.isnan(error_percent)
+    noise_variance = (100.0 * errors.noise_std[known, FORCE]) ** 2
+    rig_variance = (100.0 * errors.rig_std[known, FORCE]) ** 2
+    return ErrorSummary.of(error_percent[known], noise_variance, rig_variance)
+
+
+def _frequent_misfits(errors: PressErrors, rows: Booleans, metadata: ModelMetadata) -> str:
+    """Return a statement about the presses with a misfit above the limit; empty if chance explains their number."""
+    has_misfit = np.array([MISFIT in flags for flags in errors.flags], dtype=np.bool_)
+    count = int(rows.sum())
+    misfit_count = int((has_misfit & rows).sum())
+    if 1.0 - _probability_of_fewer(misfit_count, count) >= MISFIT_PROBABILITY:
         return ""
-    return f"{most} of {count} presses have a misfit above {misfit_limit(metadata):.3g}, which 1 % of good ones have"
+    limit = misfit_limit(metadata)
+    return f"{misfit_count} of {count} presses have a misfit above {limit:.3g}, which 1 % of good ones have"
+
+
+def _probability_of_fewer(misfit_count: int, count: int) -> float:
+    """Return the probability that fewer than `misfit_count` of `count` good presses have a misfit above the limit.
+
+    The number follows a binomial distribution. Its terms are computed by logarithms, because the binomial coefficients
+    overflow.
+    """
+    log_odds = math.log(MISFIT_FRACTION / (1.0 - MISFIT_FRACTION))
+    log_probability_of_none = count * math.log1p(-MISFIT_FRACTION)
+    probability = 0.0
+    for k in range(misfit_count):
+        log_binomial = math.lgamma(count + 1) - math.lgamma(k + 1) - math.lgamma(count - k + 1)
+        probability += math.exp(log_binomial + k * log_odds + log_probability_of_none)
+    return probability
 
 
 def _verdict(
-    fits: bool | None, count: int, position: ErrorSummary | None, force: ErrorSummary | None, misfits: str
+    fits: bool | None, count: int, position: ErrorSummary | None, force: ErrorSummary | None, misfit_text: str
 ) -> str:
     if fits is None:
-        return f"too few presses to say: {count} can be compared, {FEWEST} are needed"
+        return f"too few presses to say: {count} can be compared, {MIN_PRESSES} are needed"
     if fits:
         return "fits: noise explains the errors"
-    parts = [f"{position.beyond:.2g} mm"] if position else []
-    parts += [f"{force.beyond:.2g} %"] if force else []
-    return f"does not fit: {' and '.join(parts)} beyond noise" + (f"; {misfits}" if misfits else "")
+    unexplained = []
+    if position is not None:
+        unexplained.append(f"{position.beyond:.2g} mm")
+    if force is not None:
+        unexplained.append(f"{force.beyond:.2g} %")
+    verdict = f"does not fit: {' and '.join(unexplained)} beyond noise"
+    return f"{verdict}; {misfit_text}" if misfit_text else verdict
 
 
 def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: ErrorSummary | None) -> Iterator[str]:
-    """What would help, by what was done already."""
-    stds = [f"--position-std {_rig(position) / 2**0.5:.2g}"] if position else []
-    stds += [f"--force-std {0.01 * _rig(force):.2g}"] if force else []
-    yield f"the errors would be the rig's if that were as uncertain as {' '.join(stds)}"
+    """Yield notes about the remedies for a model that does not fit, depending on an earlier calibration."""
+    options = []
+    if position is not None:
+        options.append(f"--position-std {_explaining_rig_std(position) / math.sqrt(2.0):.2g}")
+    if force is not None:
+        options.append(f"--force-std {0.01 * _explaining_rig_std(force):.2g}")
+    yield f"the errors would be the rig's if that were as uncertain as {' '.join(options)}"
+
     calibration = metadata.sensor.get("calibration")
-    if not (isinstance(calibration, dict) and any(calibration.get(key) for key in ("gain", "rotation_deg"))):
+    is_calibrated = isinstance(calibration, dict) and any(calibration.get(key) for key in ("gain", "rotation_deg"))
+    if not is_calibrated:
         yield "this model is of the film as described: calibrate it (isocharge train calibrate)"
         return
     yield (
         "this film is calibrated already: do so again only if it has changed since (isocharge train calibrate --from); "
-        + f"what no film explains, `isocharge train fit PRESSES.csv` learns from {ENOUGH_TO_FIT} presses on"
+        f"what no film explains, `isocharge train fit PRESSES.csv` learns from {MIN_FIT_PRESSES} presses on"
     )
 
 
-def _rig(errors: ErrorSummary) -> float:
-    """What a rig would have to explain, in the unit of the errors."""
-    return float(np.sqrt(max(errors.rms**2 - errors.noise**2, 0.0)))
+def _explaining_rig_std(errors: ErrorSummary) -> float:
+    """Return the standard deviation of the rig with which the errors would be explained, in the unit of the errors."""
+    return math.sqrt(max(errors.rms**2 - errors.noise**2, 0.0))
 
 
-def _notes(
-    errors: PressErrors, rows: Booleans, bad: Booleans, agreement: Agreement, metadata: ModelMetadata
-) -> Iterator[str]:
-    """What else a reader should know."""
-    for reason in sorted(set(filter(None, errors.left_out))):
-        chosen = [line for line, other in zip(errors.lines, errors.left_out, strict=True) if other == reason]
-        words = row_words(chosen, errors.row_noun, MOST_LISTED)
-        yield f"{len(chosen)} of {len(rows)} presses do not count: {_explained(reason, metadata)} ({words})"
-    if bad.any():
-        words = row_words(np.array(errors.lines)[bad].tolist(), errors.row_noun, MOST_LISTED)
-        yield f"{words}: nothing like the other presses, left out; look at it"
-    if misfits := _too_many(errors, np.ones_like(rows), metadata):
-        yield (
-            f"{misfits}: no single press on the model's film gives such charges (gain, tare, swapped or dead electrode)"
-        )
-    yield from _common_notes(agreement)
+def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
+    """Yield a note for each reason for which presses were excluded."""
+    reasons = errors.exclusion_reasons
+    for reason in sorted(set(reasons) - {""}):
+        lines = [line for line, line_reason in zip(errors.lines, reasons, strict=True) if line_reason == reason]
+        words = row_words(lines, errors.row_noun, MAX_LISTED_PRESSES)
+        explanation = _explain_exclusion(reason, metadata)
+        yield f"{len(lines)} of {len(reasons)} presses do not count: {explanation} ({words})"
 
 
-def _explained(reason: str, metadata: ModelMetadata) -> str:
+def _explain_exclusion(reason: str, metadata: ModelMetadata) -> str:
     if reason != NOT_TRAINED:
         return reason
-    low, high = metadata.force_range_N
+    low_N, high_N = metadata.force_range_N
     validity = Validity.of(metadata)
-    places = f"{validity.places} from the centre" if validity.is_centred else validity.places
+    area = f"{validity.area_text} from the centre" if validity.is_centred else validity.area_text
     return (
-        f"outside the model's working area ({places}) or forces ({low:.3g} to {high:.3g} N); if these are most, look "
+        f"outside the model's working area ({area}) or forces ({low_N:.3g} to {high_N:.3g} N); if these are most, look "
         "at the units"
     )
 
 
+def _bad_press_notes(errors: PressErrors, is_bad: Booleans) -> Iterator[str]:
+    """Yield a note that lists the bad presses, if there are any."""
+    if is_bad.any():
+        words = row_words(np.array(errors.lines)[is_bad].tolist(), errors.row_noun, MAX_LISTED_PRESSES)
+        yield f"{words}: nothing like the other presses, left out; look at it"
+
+
+def _misfit_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
+    """Yield a note if too many of all presses, including the excluded ones, have a misfit above the limit."""
+    all_rows = np.ones(len(errors.lines), dtype=np.bool_)
+    misfit_text = _frequent_misfits(errors, all_rows, metadata)
+    if misfit_text:
+        yield (
+            f"{misfit_text}: no single press on the model's film gives such charges (gain, tare, swapped or dead "
+            "electrode)"
+        )
+
+
 def _common_notes(agreement: Agreement) -> Iterator[str]:
-    """The common shift and scale, if noise does not explain them."""
-    x, y, force = agreement.shift_x, agreement.shift_y, agreement.force
-    if max(abs(x.significance), abs(y.significance)) > 3.0:
+    """Yield notes about the common shift and the common scale, if they are significant."""
+    x = agreement.shift_x
+    y = agreement.shift_y
+    force = agreement.force
+    if max(abs(x.significance), abs(y.significance)) > MIN_COMMON_SIGNIFICANCE:
         yield (
             f"positions are off by ({x.mean:.2g}, {y.mean:.2g}) +- {max(x.std, y.std):.2g} mm on the average: "
             "electrodes or rig are shifted"
         )
-    if abs(force.significance) > 3.0:
+    if abs(force.significance) > MIN_COMMON_SIGNIFICANCE:
         yield (
-            f"forces are {1.0 + force.mean:.4g} +- {force.std:.2g} times the known ones on the average, as after a "
+            f"forces are {1.0 + force.mean:.4g} +- {force.std:.2g} times the measured ones on the average, as after a "
             "change of pretension, d31 or gains"
         )

@@ -1,6 +1,8 @@
-"""Errors of a model on measured presses, one by one, beside the deviations that noise and rig explain.
+"""Errors of a model on measured presses, and statistical tests whether noise and rig explain them.
 
-Whether these explain them: a summary, the part that all presses share, and the sum of squares.
+The expected variance of an error is the sum of two parts: the variance that the model reports for the noise of the
+charges, and the variance of the position or force that the rig sets. The tests use the sum of the squared errors and
+the mean error of all presses.
 """
 
 import math
@@ -17,143 +19,188 @@ from isocharge.serve.prediction.contact import MISFIT_LIMIT, Contacts, Validity,
 from isocharge.serve.prediction.measured_presses import MeasuredPresses
 from isocharge.serve.prediction.predictor import Predictor
 
-NO_CHARGE, NOTHING_KNOWN, NOT_TRAINED = "a charge is unknown", "neither place nor force is known", "not trained for"
-"""Reasons why a press does not count."""
+CHARGE_UNKNOWN = "a charge is unknown"
+CONTACT_UNKNOWN = "neither place nor force is known"
+NOT_TRAINED = "not trained for"
+"""Reasons why a press is excluded from the comparison."""
+
+X = 0
+Y = 1
+FORCE = 2
+"""Columns of the errors and standard deviations of `PressErrors`."""
+
+STD_COLUMNS = slice(3, 6)
+"""Columns of a `Contact` with the standard deviations of x, y and the force."""
+
+MISFIT_COLUMN = Contacts._fields.index("misfit")
+"""Column of a `Contact` with the misfit."""
 
 
 @dataclass(frozen=True)
 class PressErrors:
-    """A model's answers to n measured presses, and how far they are off.
+    """Contacts that a model computed for n measured presses, and their errors.
 
     Attributes:
         lines: Number of each press in its file.
-        row_noun: What `lines` counts: "line" of a CSV file, "row" of a Parquet file.
-        answer: The numbers of a `Contact`, shape (n, 10); NaN where they or a charge are unknown.
-        error: Predicted less known x and y, mm, and force, a share of the known one, shape (n, 3); NaN where unknown.
-        noise_std: The model's own standard deviations, in the units of `error`, shape (n, 3): noise of the charges.
-        rig_std: Those of what is known, in the units of `error`, shape (n, 3).
-        flags: `outside` (the answer, as `Validity` has it) and `misfit` (beyond 1 % of good presses) of each press.
-        left_out: Why a press does not count, empty if it does.
+        row_noun: What `lines` counts: "line" of a CSV file, "row" of a Parquet file, or "press".
+        predicted: Values of a `Contact`, shape (n, 10); NaN where a charge is unknown.
+        error: Predicted minus measured x and y, mm, and force, relative to the measured force, shape (n, 3); NaN where
+            the measured value is unknown.
+        noise_std: Standard deviations that the model reports for the noise, in the units of `error`, shape (n, 3).
+        rig_std: Standard deviations of the measured values, in the units of `error`, shape (n, 3).
+        flags: Flags of each press: `outside` as `Validity` defines it, and `misfit` above the misfit that 1 % of good
+            presses exceed.
+        exclusion_reasons: Reason why each press is excluded from the comparison; empty if it is compared.
     """
 
     lines: tuple[int, ...]
     row_noun: str
-    answer: Array
+    predicted: Array
     error: Array
     noise_std: Array
     rig_std: Array
     flags: tuple[tuple[str, ...], ...]
-    left_out: tuple[str, ...]
+    exclusion_reasons: tuple[str, ...]
 
     @property
-    def counted(self) -> Booleans:
-        """Presses that count, shape (n,)."""
-        return np.array([not reason for reason in self.left_out], dtype=np.bool_)
+    def is_compared(self) -> Booleans:
+        """Whether each press is compared, shape (n,)."""
+        return np.array([not reason for reason in self.exclusion_reasons], dtype=np.bool_)
 
     @property
     def variance(self) -> Array:
-        """Expected squares of the errors, shape (n, 3)."""
+        """Expected variances of the errors, shape (n, 3)."""
         return self.noise_std**2 + self.rig_std**2
 
     @property
+    def squared_ratio(self) -> Array:
+        """Squared errors relative to their expected variances, shape (n, 3)."""
+        return self.error**2 / self.variance
+
+    @property
     def position_error_mm(self) -> Array:
-        """Distance from the known place, shape (n,), mm; NaN where unknown."""
-        return np.hypot(self.error[:, 0], self.error[:, 1])
+        """Distance from the measured position, shape (n,), mm; NaN where the position is unknown."""
+        return np.hypot(self.error[:, X], self.error[:, Y])
 
     def row(self, press: int) -> dict[str, Any]:
-        """One press, names with units."""
-        error, noise, rig = self.error[press], self.noise_std[press], self.rig_std[press]
+        """Return the values of one press by names that contain the units."""
+        error = self.error[press]
+        noise_std = self.noise_std[press]
+        rig_std = self.rig_std[press]
+        predicted = self.predicted[press, :N_WITHOUT_CORRELATION].tolist()
         return {
             "line": self.lines[press],
-            **dict(zip(Contacts._fields[:N_WITHOUT_CORRELATION], self.answer[press].tolist(), strict=False)),
-            "x_error_mm": error[0],
-            "y_error_mm": error[1],
+            **dict(zip(Contacts._fields[:N_WITHOUT_CORRELATION], predicted, strict=True)),
+            "x_error_mm": error[X],
+            "y_error_mm": error[Y],
             "position_error_mm": self.position_error_mm[press],
-            "force_error_percent": 100.0 * error[2],
-            "noise_std_percent": 100.0 * noise[2],
-            "position_std_mm": rig[0],
-            "force_std_percent": 100.0 * rig[2],
+            "force_error_percent": 100.0 * error[FORCE],
+            "noise_std_percent": 100.0 * noise_std[FORCE],
+            "position_std_mm": rig_std[X],
+            "force_std_percent": 100.0 * rig_std[FORCE],
             "flags": list(self.flags[press]),
-            "left_out": self.left_out[press] or None,
+            "left_out": self.exclusion_reasons[press] or None,
         }
 
 
 def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
-    """Predict measured presses and compare.
+    """Predict measured presses and compute the errors.
 
     Raises:
-        PressError: If a charge of one of the model's electrodes is missing.
+        PressError: If the charges of one of the model's electrodes are missing.
     """
     metadata = predictor.metadata
     presses = presses.of_electrodes(metadata.electrodes, metadata.label)
-    answer = _answers(predictor, presses.charge_pC)
-    known = presses.contact
-    scale = np.column_stack([np.ones((len(presses), 2)), known[:, 2]])
+    measured = presses.contact
+    predicted = _predicted_contacts(predictor, presses.charge_pC)
+
+    scale = np.ones((len(presses), 3))  # the error of the force is relative to the force
+    scale[:, FORCE] = measured[:, FORCE]
     rig_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
-    unknown = np.where(np.isnan(known), np.nan, 1.0)
+    is_unknown = np.isnan(measured)
     return PressErrors(
-        presses.lines,
-        presses.row_noun,
-        answer,
-        (answer[:, :3] - known) / scale,
-        answer[:, 3:6] / scale * unknown,
-        rig_std * unknown,
-        _flags(metadata, answer),
-        _reasons(metadata, presses),
+        lines=presses.lines,
+        row_noun=presses.row_noun,
+        predicted=predicted,
+        error=(predicted[:, :3] - measured) / scale,
+        noise_std=np.where(is_unknown, np.nan, predicted[:, STD_COLUMNS] / scale),
+        rig_std=np.where(is_unknown, np.nan, rig_std),
+        flags=_flags(metadata, predicted),
+        exclusion_reasons=_exclusion_reasons(metadata, presses),
     )
 
 
 def misfit_limit(metadata: ModelMetadata) -> float:
-    """Misfit that 1 % of good presses exceed, as the model states it."""
+    """Return the misfit that 1 % of good presses exceed, which the metadata of a model state."""
     return float(metadata.errors.get("misfit_p99", MISFIT_LIMIT))
 
 
-def _answers(predictor: Predictor, charge_pC: Array) -> Array:
-    answer = np.full((len(charge_pC), len(Contacts._fields)), np.nan)
-    whole = ~np.isnan(charge_pC).any(axis=1)
-    answer[whole] = np.column_stack(predictor.predict_batch(charge_pC[whole]))
-    return answer
+def _predicted_contacts(predictor: Predictor, charge_pC: Array) -> Array:
+    """Predict presses from charges of shape (n, electrodes), pC; the rows with an unknown charge are NaN."""
+    predicted = np.full((len(charge_pC), len(Contacts._fields)), np.nan)
+    is_complete = ~np.isnan(charge_pC).any(axis=1)
+    predicted[is_complete] = np.column_stack(predictor.predict_batch(charge_pC[is_complete]))
+    return predicted
 
 
-def _flags(metadata: ModelMetadata, answer: Array) -> tuple[tuple[str, ...], ...]:
-    outside = [OUTSIDE in flags for flags in Validity.of(metadata).batch_flags(Contacts(*answer.astype(np.float32).T))]
-    misfit, whole = answer[:, N_WITHOUT_CORRELATION - 1] > misfit_limit(metadata), ~np.isnan(answer[:, 0])
-    return tuple(
-        (OUTSIDE,) * (is_outside and is_whole) + (MISFIT,) * is_misfit
-        for is_outside, is_misfit, is_whole in zip(outside, misfit.tolist(), whole.tolist(), strict=True)
+def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], ...]:
+    """Return the flags `outside` and `misfit` of predicted contacts, shape (n, 10)."""
+    batch_flags = Validity.of(metadata).batch_flags(Contacts(*predicted.astype(np.float32).T))
+    is_complete = np.asarray(~np.isnan(predicted).all(axis=1))
+    has_misfit = np.asarray(predicted[:, MISFIT_COLUMN] > misfit_limit(metadata))
+    all_flags = []
+    for row, words in enumerate(batch_flags):
+        flags = []
+        if OUTSIDE in words and is_complete[row]:
+            flags.append(OUTSIDE)
+        if has_misfit[row]:
+            flags.append(MISFIT)
+        all_flags.append(tuple(flags))
+    return tuple(all_flags)
+
+
+def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tuple[str, ...]:
+    """Return why each press is excluded; empty if it is compared.
+
+    Whether a press lies in the domain of the model is decided by the measured position and force, not by the predicted
+    ones.
+    """
+    x_mm, y_mm, force_N = presses.contact.T
+    low_N, high_N = metadata.force_range_N
+    is_outside = ~np.isnan(x_mm) & ~inside_polygon(x_mm, y_mm, np.array(metadata.working_area_mm))
+    is_outside |= (force_N < low_N) | (force_N > high_N)
+    is_contact_unknown = np.isnan(presses.contact).all(axis=1)
+    is_charge_unknown = np.isnan(presses.charge_pC).any(axis=1)
+    reasons = np.select(
+        [is_charge_unknown, is_contact_unknown, is_outside], [CHARGE_UNKNOWN, CONTACT_UNKNOWN, NOT_TRAINED], default=""
     )
-
-
-def _reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tuple[str, ...]:
-    """Why a press does not count; a press is in the model's domain by what is known of it, not by the answer."""
-    (x_mm, y_mm, force_N), (low, high) = presses.contact.T, metadata.force_range_N
-    off = ~np.isnan(x_mm) & ~inside_polygon(x_mm, y_mm, np.array(metadata.working_area_mm))
-    off |= (force_N < low) | (force_N > high)
-    nothing = np.isnan(presses.contact).all(axis=1)
-    partial = np.isnan(presses.charge_pC).any(axis=1)
-    return tuple(np.select([partial, nothing, off], [NO_CHARGE, NOTHING_KNOWN, NOT_TRAINED], "").tolist())
+    return tuple(reasons.tolist())
 
 
 SIGNIFICANCE = 0.01
-"""Probability with which a film that fits is said not to; half each for the sum of squares and the common part."""
+"""Probability with which a model that fits is refused: half each by the sum of squares and by the mean error."""
 
-SLACK = 1.1
-"""Chi-squared per degree of freedom that is always accepted: standard deviations are known to 5 %, not better."""
+MAX_ACCEPTED_CHI_SQUARED = 1.1
+"""Chi-squared per degree of freedom that is always accepted, because standard deviations are known to 5 % at best."""
 
-COMMON_SHARE = 0.2
-"""Share of its deviation by which a rig may be off in all presses alike: a stage has an offset, a load cell a scale."""
+COMMON_RATIO = 0.2
+"""Fraction of a rig's standard deviation that may be equal in all presses, dimensionless. For example, a stage has a
+constant offset, and a load cell has an error of scale."""
 
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """Errors of one kind, mm or %.
+    """Summary of the errors of the positions, mm, or of the forces, %.
 
     Attributes:
         presses: Number of presses.
-        rms, median, max: Of the errors' sizes.
-        noise, rig: Root mean square that noise of the charges explains, and that the rig's uncertainty explains.
-        explained: Both together.
-        beyond: Root of the difference of rms^2 and explained^2, 0 if that is negative.
+        rms: Root mean square of the errors.
+        median: Median of the absolute errors.
+        max: Largest absolute error.
+        noise: Root mean square of the errors that noise of the charges causes.
+        rig: Root mean square of the errors that the uncertainty of the rig causes.
+        explained: Root mean square of the errors that noise and rig cause together.
+        beyond: Square root of rms^2 - explained^2; 0 if the difference is negative.
     """
 
     presses: int
@@ -167,22 +214,41 @@ class ErrorSummary:
 
     @classmethod
     def of(cls, size: Array, noise_variance: Array, rig_variance: Array) -> "ErrorSummary | None":
-        """Of the sizes of errors and their expected squares, each of shape (n,); None without presses."""
+        """Summarise errors.
+
+        Args:
+            size: Absolute errors, shape (n,).
+            noise_variance: Variances that noise of the charges causes, shape (n,).
+            rig_variance: Variances that the uncertainty of the rig causes, shape (n,).
+
+        Returns:
+            The summary; None if there are no presses.
+        """
         if not size.size:
             return None
-        square, noise, rig = (float(np.mean(values)) for values in (size**2, noise_variance, rig_variance))
-        roots = np.sqrt([noise, rig, noise + rig, max(square - noise - rig, 0.0)]).tolist()
-        return cls(size.size, square**0.5, float(np.median(size)), float(size.max()), *roots)
+        mean_square = float(np.mean(size**2))
+        noise = float(np.mean(noise_variance))
+        rig = float(np.mean(rig_variance))
+        return cls(
+            presses=size.size,
+            rms=math.sqrt(mean_square),
+            median=float(np.median(size)),
+            max=float(size.max()),
+            noise=math.sqrt(noise),
+            rig=math.sqrt(rig),
+            explained=math.sqrt(noise + rig),
+            beyond=math.sqrt(max(mean_square - noise - rig, 0.0)),
+        )
 
 
 @dataclass(frozen=True)
-class Common:
-    """The part of an error that all presses share: its weighted mean.
+class CommonError:
+    """The error that all presses have in common, estimated by the weighted mean.
 
     Attributes:
-        mean: mm, or a share of the force; NaN if nothing is known.
-        std: Standard error, from noise and rig, widened where the presses scatter more than these explain.
-        significance: Mean over the standard error that includes what a rig may be off in all presses alike.
+        mean: Weighted mean, mm, or relative to the force; NaN if no error is known.
+        std: Standard error of the mean. It is increased if the errors scatter more than noise and rig explain.
+        significance: Mean divided by a standard error that allows for a constant error of the rig.
     """
 
     mean: float
@@ -190,75 +256,109 @@ class Common:
     significance: float
 
     @classmethod
-    def of(cls, error: Array, variance: Array) -> "Common":
-        """Of errors and their expected squares, shape (n,), NaN where unknown."""
-        known = ~np.isnan(error)
-        if not known.any():
+    def of(cls, error: Array, variance: Array) -> "CommonError":
+        """Estimate the common error from errors and their expected variances, shape (n,), NaN where unknown."""
+        is_known = ~np.isnan(error)
+        count = int(np.count_nonzero(is_known))
+        if not count:
             return cls(np.nan, np.nan, 0.0)
-        error, weight = error[known], 1.0 / variance[known]
-        mean, square = float(weight @ error / weight.sum()), 1.0 / float(weight.sum())
-        scatter = float(weight @ (error - mean) ** 2) / max(len(error) - 1, 1)
-        wide = square * (1.0 + COMMON_SHARE**2 * len(error))
-        return cls(mean, (square * max(scatter, 1.0)) ** 0.5, mean / wide**0.5)
+        known_error = error[is_known]
+        weight = 1.0 / variance[is_known]
+        mean = float(weight @ known_error / weight.sum())
+        mean_variance = 1.0 / float(weight.sum())
+        chi_squared_per_degree = float(weight @ (known_error - mean) ** 2) / max(count - 1, 1)
+        std = math.sqrt(mean_variance * max(chi_squared_per_degree, 1.0))
+        # A constant error of the rig does not become smaller by averaging over the presses.
+        std_with_rig = math.sqrt(mean_variance * (1.0 + COMMON_RATIO**2 * count))
+        return cls(mean, std, mean / std_with_rig)
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Whether noise and rig explain the errors of some presses.
+    """Statistical tests whether noise and rig explain the errors of some presses.
 
     Attributes:
-        chi_squared, degrees: Sum of squared errors over expected squares, and their number.
-        p_value: Probability of a larger sum from noise and rig alone; NaN without presses.
-        shift_x, shift_y: Common part of the position errors, mm.
-        force: Common part of the force errors, a share.
-        common_p_value: Probability of larger common parts from noise and rig alone; NaN without presses.
+        chi_squared: Sum of the squared errors relative to their expected variances.
+        degrees: Number of known errors, which is the number of degrees of freedom.
+        p_value: Probability that noise and rig alone cause a larger sum; NaN without presses.
+        shift_x: Common error of x, mm.
+        shift_y: Common error of y, mm.
+        force: Common error of the force, relative to the force.
+        common_p_value: Probability that noise and rig alone cause larger common errors; NaN without presses.
     """
 
     chi_squared: float
     degrees: int
     p_value: float
-    shift_x: Common
-    shift_y: Common
-    force: Common
+    shift_x: CommonError
+    shift_y: CommonError
+    force: CommonError
     common_p_value: float
 
     @classmethod
     def of(cls, errors: PressErrors, rows: Booleans) -> "Agreement":
-        """Of some rows, shape (n,)."""
-        error, variance = errors.error[rows], errors.variance[rows]
-        chi_squared, degrees = float(np.nansum(error**2 / variance)), int(np.count_nonzero(~np.isnan(error)))
-        x, y, force = (Common.of(error[:, kind], variance[:, kind]) for kind in range(3))
-        known = [part.significance for part in (x, y, force) if not np.isnan(part.mean)]
-        common_p_value = _p_value(sum(value**2 for value in known), len(known))
-        return cls(chi_squared, degrees, _p_value(chi_squared, degrees), x, y, force, common_p_value)
+        """Test the presses of a mask of shape (n,)."""
+        error = errors.error[rows]
+        variance = errors.variance[rows]
+        chi_squared = float(np.nansum(errors.squared_ratio[rows]))
+        degrees = int(np.count_nonzero(~np.isnan(error)))
+        shift_x = CommonError.of(error[:, X], variance[:, X])
+        shift_y = CommonError.of(error[:, Y], variance[:, Y])
+        force = CommonError.of(error[:, FORCE], variance[:, FORCE])
+        significances = [part.significance for part in (shift_x, shift_y, force) if not math.isnan(part.mean)]
+        return cls(
+            chi_squared=chi_squared,
+            degrees=degrees,
+            p_value=_p_value(chi_squared, degrees),
+            shift_x=shift_x,
+            shift_y=shift_y,
+            force=force,
+            common_p_value=_p_value(sum(value**2 for value in significances), len(significances)),
+        )
 
     @property
     def acceptable(self) -> bool:
         """Whether noise and rig explain the errors."""
-        scatters = self.p_value < 0.5 * SIGNIFICANCE and self.chi_squared > SLACK * self.degrees
-        return not scatters and not self.common_p_value < 0.5 * SIGNIFICANCE
+        scatter_is_large = (
+            self.p_value < 0.5 * SIGNIFICANCE and self.chi_squared > MAX_ACCEPTED_CHI_SQUARED * self.degrees
+        )
+        common_error_is_large = self.common_p_value < 0.5 * SIGNIFICANCE
+        return not scatter_is_large and not common_error_is_large
 
 
 def _p_value(chi_squared: float, degrees: int) -> float:
-    return chi_squared_survival(chi_squared, degrees) if degrees else np.nan
+    return chi_squared_survival(chi_squared, degrees) if degrees else math.nan
 
 
 def chi_squared_survival(statistic: float, degrees: int) -> float:
-    """Probability that a chi-squared variable exceeds a value.
+    """Compute the probability that a chi-squared variable exceeds a value.
 
-    The tail is a finite sum (Abramowitz and Stegun 1964, 26.4.4 and 26.4.5): with x = statistic / 2, and erfc(sqrt(x))
-    added for odd degrees,
+    The probability is a finite sum (Abramowitz and Stegun 1964, 26.4.4 and 26.4.5): with x = statistic / 2,
 
-        sum of x^s exp(-x) / Gamma(s + 1) over s = degrees / 2 - 1, degrees / 2 - 2, ... down to 0 or 1/2.
+        sum of x^s exp(-x) / Gamma(s + 1) over s = degrees / 2 - 1, degrees / 2 - 2, ... down to 0 or 1/2,
+
+    plus erfc(sqrt(x)) if the number of degrees is odd.
 
     Args:
-        statistic: Sum of squares, not negative; infinity gives 0.
+        statistic: Sum of squares, not negative. The probability is 0 for an infinite sum.
         degrees: Degrees of freedom, 1 or more.
     """
-    x, odd = 0.5 * statistic, degrees % 2
-    if x == 0.0 or math.isinf(x):
-        return 0.0 if x else 1.0
-    first = 0.5 * odd * math.log(4.0 * x / math.pi) - x  # the term of s = 0 or 1/2, of which the others are multiples
-    ratios = np.log(x / (np.arange(1, degrees // 2) + 0.5 * odd))
-    logarithms = first + np.concatenate([[0.0], np.cumsum(ratios)])[: degrees // 2]
-    return min(1.0, odd * math.erfc(math.sqrt(x)) + float(np.exp(logarithms).sum()))
+    x = 0.5 * statistic
+    if x == 0.0:
+        return 1.0
+    if math.isinf(x):
+        return 0.0
+    is_odd = degrees % 2 == 1
+    smallest_s = 0.5 if is_odd else 0.0
+    smallest_log_term = -x
+    if is_odd:
+        smallest_log_term += 0.5 * math.log(4.0 * x / math.pi)
+
+    # Each term is the previous term times x / s. Logarithms are added, because the factors overflow.
+    count = degrees // 2
+    s = smallest_s + np.arange(1, count)
+    log_terms = smallest_log_term + np.concatenate([[0.0], np.cumsum(np.log(x / s))])[:count]
+    probability = float(np.exp(log_terms).sum())
+    if is_odd:
+        probability += math.erfc(math.sqrt(x))
+    return min(1.0, probability)
