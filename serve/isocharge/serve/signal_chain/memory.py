@@ -1,23 +1,26 @@
-"""The memory of the film undone together with the amplifier's leak: creep, the thermoelastic step, and warmth.
+"""Compensation of the film's memory together with the leak of the amplifiers: creep, thermoelastic step and warmth.
 
 The film answers a step of the touch charge q with that step times
 
-    h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / warmth_s):
+    h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / warmth_s).
 
-it creeps with the logarithm of time, so that a charge is what it is after a second; and what is stretched cools, whose
-pyroelectric charge is gone when the film has its temperature again. The logarithm is a sum of exponentials with one
-time constant in each decade (a Prony series; its ripple is 2 % of `creep`), so the film's charge
+The film creeps with the logarithm of time, so a charge has its nominal value after one second. A film that is stretched
+cools, and the pyroelectric charge of this cooling vanishes when the film has its temperature again. The logarithm is
+approximated by a sum of exponentials with one time constant in each decade (a Prony series, whose ripple is 2 % of
+`creep`). The charge of the film is then
 
     y[n] = h(0) q[n] - sum_j w_j r_j[n] + d[n],     r_j[n] = e r_j[n-1] + (1 - e) q[n-1],     e = exp(-dt / tau_j)
 
-is solved for q frame by frame, y being the amplifier's output with its leak undone (`signal_chain.leak`), r_j the touch
-charge smoothed over tau_j. d is the pyroelectric charge of each electrode. The film follows the air within warmth_s, so
-d's slope decays with that time. All of this is one product of a matrix with the rows r_j, d, its slope and q. Out of
-contact q is 0 and d is what is seen: a fading memory filter (g = 1 - f^2, h = (1 - f)^2; Brookner 1998, chapter 1)
-follows both. In a touch they are predicted, from `look_back_s` before it.
+and is solved for q frame by frame. Here y is the output of the amplifier after the leak is compensated
+(`isocharge.serve.signal_chain.leak`), r_j is the touch charge smoothed with the time constant tau_j, and d is the
+pyroelectric charge of each electrode. The film follows the air within warmth_s, so the slope of d decays with this time
+constant. One product of a matrix with the state (r_j, d, slope of d, q) advances all of this.
 
-What is left on the film after a release says how well creep and step are known: a Kalman filter of their two scales
-takes it in, as far as it is more than warmth may have done since the touch began.
+Out of contact q is 0, and d is observed. A fading-memory filter (g = 1 - f^2, h = (1 - f)^2; Brookner 1998, chapter 1)
+estimates d and its slope. During a touch both are predicted from their values of `look_back_s` before the touch.
+
+The charge that remains after a release shows how well creep and thermoelastic step are known. A Kalman filter of their
+two scale factors is updated with it, as far as it exceeds what warmth may have changed since the touch began.
 """
 
 import math
@@ -28,57 +31,69 @@ import numpy as np
 from msgspec import Meta
 
 from isocharge.common.arrays import Array
-from isocharge.serve.signal_chain.leak import Leak, LeakRule, learn_inflow
+from isocharge.serve.signal_chain.leak import Leak, LeakRule, in_touch, learn_inflow
 from isocharge.serve.signal_chain.rule import Rule, Share, TimeConstant
 
 DECADES_S = 10.0 ** np.arange(-3, 5)
-"""Time constants of creep, s: good from 1 ms to some minutes."""
+"""Time constants of the creep terms, s. They represent creep from 1 ms to some minutes."""
 
-WARM, SLOPE, HELD = -3, -2, -1
-"""Rows of the warmth, of its slope and of the touch charge, after those of the terms: creep's, and the step's last."""
+WARMTH_ROW, SLOPE_ROW, CHARGE_ROW = -3, -2, -1
+"""Rows of the warmth d, of its slope and of the touch charge q in the state.
 
-WARMTH = slice(WARM, HELD)
-"""The warmth and its slope."""
+They follow the rows of the creep terms and of the thermoelastic term.
+"""
 
-NOW = np.diag([*np.ones(len(DECADES_S) + 3), 0.0])
-"""What rows are without any time for change, shape (rows, rows); the touch charge is not known yet."""
+WARMTH_ROWS = slice(WARMTH_ROW, CHARGE_ROW)
+"""Rows of the warmth and of its slope."""
 
-OF_SCALES = np.array(
+INITIAL_PROPAGATION = np.diag([*np.ones(len(DECADES_S) + 3), 0.0])
+"""Propagation of the state over no time, shape (rows, rows). The touch charge of the next frame is not known yet."""
+
+SCALE_RESPONSE = np.array(
     [
         [*-np.ones(len(DECADES_S)), 0.0, 0.0, 0.0, -np.expm1(-1.0 / DECADES_S).sum()],
         [*np.zeros(len(DECADES_S)), -1.0, 0.0, 0.0, 1.0],
     ]
 )
-"""What is seen more of each row with a creep of 1, and with a step of 1, shape (2, rows), dimensionless."""
+"""Contribution of each row to the charge of the film, for a creep of 1 and for a step of 1, shape (2, rows)."""
 
 LEARN_S = 5.0
-"""Time after a release in which the film's scales are learned, s."""
+"""Time after a release in which the scale factors of the film are updated, s."""
 
 MOST_CREEP = 0.2
-"""Share in a decade from which nothing would be left of a charge after some days."""
+"""Upper bound of the creep in a decade. With more, nothing would remain of a charge after some days."""
 
 LINGER_S = 0.1
-"""Time after a release in which a finger still leaves the film, s: its last charges are not warmth yet."""
+"""Time after a release in which a finger still leaves the film, s. Its last charges are not warmth."""
 
-WANDER_PC, UNLIKE = 1.0, 0.05
-"""Noise of that: wandering warmth of an electrode in a second, pC; share of what creeps that is no such law."""
+WANDER_PC = 1.0
+"""Standard deviation of the change of the warmth of an electrode in one second, pC."""
+
+UNLIKE = 0.05
+"""Relative deviation of real creep from the logarithmic law."""
 
 OUTLIER = 4.0
-"""Deviations from which what is left after a release is something else: a hand that warms the film."""
+"""Number of standard deviations from which the charge after a release is not creep, but a hand that warms the film."""
 
 CALM_PC_PER_S = 2.0
-"""Slope of the warmth above which the amplifiers' inflow is not learned, pC/s: it would last, and warmth does not."""
+"""Slope of the warmth above which the inflow of the amplifiers is not updated, because warmth is temporary, pC/s."""
+
+MIN_STEP_S = 1e-9
+"""Smallest time between two frames by which the filter divides, s."""
+
+MIN_CREEP_PC = 1e-9
+"""Total charge of creep and step below which nothing can be learned from a release, pC."""
 
 
 class MemoryRule(Rule, frozen=True, kw_only=True):
-    """What a held press does to the film's charges; the section `[memory]` of a device file.
+    """How a held press changes the charges of the film; the section `[memory]` of a device file.
 
     Attributes:
         creep: Share of a charge that is lost in each decade of time.
-        thermoelastic: Share that a touch has more at first, until the film has its temperature again.
-        warmth_s: Time in which the film follows the temperature of the air, s.
-        known: Relative standard deviation of `creep` and `thermoelastic`, for the deviations of contacts.
-        settle_s: Time in which warmth is followed out of contact, s.
+        thermoelastic: Share by which a touch is larger at first, until the film has its temperature again.
+        warmth_s: Time constant with which the film follows the temperature of the air, s.
+        known: Relative standard deviation of `creep` and `thermoelastic`, which enters the deviations of contacts.
+        settle_s: Time constant with which warmth is estimated out of contact, s.
     """
 
     creep: Annotated[float, Meta(ge=0.0, lt=MOST_CREEP)] = 0.0
@@ -89,59 +104,77 @@ class MemoryRule(Rule, frozen=True, kw_only=True):
 
 
 @lru_cache(maxsize=8)
-def _relaxed(warmth_s: float) -> tuple[Array, Array]:
-    """Time constants of the rows, shape (rows, 1), s, and what the rows are in the end, shape (rows, rows)."""
-    limit = np.zeros_like(NOW)
-    limit[:WARM, HELD], limit[WARM, WARM:HELD] = 1.0, (1.0, warmth_s)
-    return np.array([*DECADES_S, *[warmth_s] * 4])[:, np.newaxis], limit
+def _relaxation(warmth_s: float) -> tuple[Array, Array]:
+    """Return the time constants of the rows, shape (rows, 1), s, and the propagation over a very long time.
+
+    The propagation has the shape (rows, rows).
+    """
+    steady_state = np.zeros_like(INITIAL_PROPAGATION)
+    steady_state[:WARMTH_ROW, CHARGE_ROW] = 1.0
+    steady_state[WARMTH_ROW, WARMTH_ROW] = 1.0
+    steady_state[WARMTH_ROW, SLOPE_ROW] = warmth_s
+    time_constants_s = np.array([*DECADES_S, *[warmth_s] * 4])
+    return time_constants_s[:, np.newaxis], steady_state
 
 
 @lru_cache(maxsize=256)
-def _passage(warmth_s: float, dt_s: float) -> Array:
-    """What the rows become in a time dt_s, as a product with this, shape (rows, rows)."""
-    times_s, limit = _relaxed(warmth_s)
-    return np.asarray(limit + np.exp(-dt_s / times_s) * (NOW - limit))
+def _propagation(warmth_s: float, dt_s: float) -> Array:
+    """Return the matrix that advances the state by a time dt_s, shape (rows, rows)."""
+    time_constants_s, steady_state = _relaxation(warmth_s)
+    decay = np.exp(-dt_s / time_constants_s)
+    return np.asarray(steady_state + decay * (INITIAL_PROPAGATION - steady_state))
+
+
+class ScaleVariances(NamedTuple):
+    """Variances of the scale factors of creep and thermoelastic step, and their covariance, dimensionless."""
+
+    creep: float
+    step: float
+    covariance: float
 
 
 class Film(NamedTuple):
-    """What is known of a film.
+    """Properties of a film.
 
     Attributes:
-        creep, thermoelastic: As in `MemoryRule`, by what was learned since.
-        seen: What is seen of each row, shape (rows,), dimensionless.
-        at_once: What is seen at once of a step of 1: h(0).
-        variances: Of the scales of creep and step, and their covariance, dimensionless.
+        creep: Share of a charge that is lost in each decade of time, as it was learned.
+        thermoelastic: Share by which a touch is larger at first, as it was learned.
+        response: Contribution of each row of the state to the film's charge, shape (rows,), dimensionless.
+        step_response: Charge of the film directly after a step of 1: h(0).
+        variances: Variances of the scale factors of creep and step.
     """
 
     creep: float
     thermoelastic: float
-    seen: Array
-    at_once: float
-    variances: tuple[float, float, float]
+    response: Array
+    step_response: float
+    variances: ScaleVariances
 
     @classmethod
-    def of(cls, creep: float, thermoelastic: float, variances: tuple[float, float, float]) -> "Film":
-        """From its two numbers."""
-        seen = creep * OF_SCALES[0] + thermoelastic * OF_SCALES[1]
-        seen[WARM] = 1.0
-        seen[HELD] += 1.0
-        return cls(creep, thermoelastic, seen, float(seen[HELD]), variances)
+    def of(cls, creep: float, thermoelastic: float, variances: ScaleVariances) -> "Film":
+        """Return the film with this creep and this thermoelastic step."""
+        response = creep * SCALE_RESPONSE[0] + thermoelastic * SCALE_RESPONSE[1]
+        response[WARMTH_ROW] = 1.0
+        response[CHARGE_ROW] += 1.0
+        return cls(creep, thermoelastic, response, float(response[CHARGE_ROW]), variances)
 
 
 class Memory(NamedTuple):
-    """What the stage remembers.
+    """State of the compensation after a frame.
 
     Attributes:
-        film: What is known of the film.
-        leak: Touch charge, amplifier's output and inflow.
-        film_pC: The film's charge y, shape (electrodes,), pC.
-        rows_pC: The state, shape (rows, electrodes): r, pC, d, pC, and its slope, pC/s, and q, pC, 0 out of contact.
-        trusted_pC: d and its slope at least `look_back_s` ago, before a touch could affect it, shape (2, electrodes).
-        candidate_pC: What becomes trusted when it is that old.
-        expected_pC: What d and its slope were expected to be before they were seen again, after a release.
-        trusted_s, candidate_s: How old the first two are, s.
-        unseen_s: Time in which d was not seen, s.
-        learn_s: Time for which the film is still learned, s; a finger still leaves while it is above LEARN_S.
+        film: Properties of the film.
+        leak: Touch charge, output and inflow of the amplifiers.
+        film_pC: Charge y of the film, shape (electrodes,), pC.
+        rows_pC: The state, shape (rows, electrodes): r_j, pC; d, pC; the slope of d, pC/s; and q, pC, which is 0 out of
+            contact.
+        trusted_pC: d and its slope at least `look_back_s` ago, before a touch could affect them, shape (2, electrodes).
+        candidate_pC: d and its slope that become trusted when they are `look_back_s` old.
+        expected_pC: d and its slope as they were predicted for the time after the release.
+        trusted_s: Age of the trusted values, s.
+        candidate_s: Age of the candidate, s.
+        unseen_s: Time in which d was not observed, s.
+        learn_s: Time for which the film is still learned, s. While it is above LEARN_S, a finger still leaves.
     """
 
     film: Film
@@ -163,12 +196,12 @@ class Memory(NamedTuple):
 
     @classmethod
     def start(cls, rule: MemoryRule, output_pC: Array) -> "Memory":
-        """At the first frame after the tare."""
-        rows_pC = np.zeros((len(NOW), output_pC.size))
-        film = Film.of(rule.creep, rule.thermoelastic, (rule.known**2, rule.known**2, 0.0))
-        leak = Leak.start(output_pC)._replace(charge_pC=output_pC / film.at_once)
-        cold_pC = rows_pC[WARMTH]
-        return cls(film, leak, output_pC, rows_pC, cold_pC, cold_pC, cold_pC)
+        """Return the state at the first frame after the tare."""
+        rows_pC = np.zeros((len(INITIAL_PROPAGATION), output_pC.size))
+        film = Film.of(rule.creep, rule.thermoelastic, ScaleVariances(rule.known**2, rule.known**2, 0.0))
+        leak = Leak.start(output_pC)._replace(charge_pC=output_pC / film.step_response)
+        warmth_pC = rows_pC[WARMTH_ROWS]
+        return cls(film, leak, output_pC, rows_pC, warmth_pC, warmth_pC, warmth_pC)
 
 
 def undo_memory(
@@ -182,98 +215,143 @@ def undo_memory(
     *,
     contact: bool,
 ) -> Memory:
-    """The state after the next frame; the touch charge is `leak.charge_pC`.
+    """Return the state after the next frame. The touch charge is `leak.charge_pC`.
 
     Args:
-        rule: What the film does.
-        leak_rule: How the inflow is learned, how old what a touch begins with, and how long to pause after a release.
-        tau_s: Time constant of each amplifier, shape (electrodes,), s; None where charges do not leak.
-        memory: After the frame before.
-        output_pC: The amplifier's output above tare, shape (electrodes,), pC.
+        rule: How the film behaves.
+        leak_rule: How the inflow is estimated, how old the values are with which a touch begins, and how long the
+            estimates pause after a release.
+        tau_s: Time constant of each amplifier, shape (electrodes,), s; None if charges do not leak.
+        memory: State after the frame before.
+        output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
-        dt_s: Since the frame before, s.
+        dt_s: Time since the frame before, s.
         contact: Whether something touched in the frame before.
     """
-    film, leak, film_pC = memory.film, memory.leak, output_pC
-    surplus_pC = output_pC - leak.output_pC
-    if tau_s is not None:
+    film = memory.film
+    leak = memory.leak
+    if tau_s is None:
+        surplus_pC = output_pC - leak.output_pC
+        film_pC = output_pC
+    else:
         surplus_pC = output_pC - np.exp(-dt_s / tau_s) * leak.output_pC - leak.inflow_pC_per_s * dt_s
         film_pC = memory.film_pC + surplus_pC
-    passage = _passage(rule.warmth_s, dt_s)
-    rows_pC = passage.dot(memory.rows_pC)
-    apart_pC = film_pC - film.seen.dot(rows_pC)
-    charge_pC = apart_pC / film.at_once
+
+    propagation = _propagation(rule.warmth_s, dt_s)
+    rows_pC = propagation.dot(memory.rows_pC)
+    residual_pC = film_pC - film.response.dot(rows_pC)
+    charge_pC = residual_pC / film.step_response
     unseen_s = memory.unseen_s + dt_s
     if contact or memory.lingers:
-        trusted = leak.trusted_pC_per_s
-        leak = Leak(charge_pC, output_pC, trusted, trusted, trusted, 0.0, leak.learned_s, leak_rule.hold_off_s)
-        rows_pC[HELD], warmth_pC = charge_pC, rows_pC[WARMTH]
-        learn_s = LEARN_S + LINGER_S if contact else memory.learn_s - dt_s
-        return Memory(film, leak, film_pC, rows_pC, warmth_pC, warmth_pC, warmth_pC, 0.0, 0.0, unseen_s, learn_s)
+        rows_pC[CHARGE_ROW] = charge_pC
+        warmth_pC = rows_pC[WARMTH_ROWS]
+        return Memory(
+            film,
+            in_touch(leak, charge_pC, output_pC, leak_rule.hold_off_s),
+            film_pC,
+            rows_pC,
+            trusted_pC=warmth_pC,
+            candidate_pC=warmth_pC,
+            expected_pC=warmth_pC,
+            unseen_s=unseen_s,
+            learn_s=LEARN_S + LINGER_S if contact else memory.learn_s - dt_s,
+        )
+
     fading = math.exp(-dt_s / rule.settle_s)
-    rows_pC[WARM] += (1.0 - fading * fading) * apart_pC
-    leak = Leak(charge_pC, output_pC, *leak[2:])
+    rows_pC[WARMTH_ROW] += (1.0 - fading * fading) * residual_pC
+    leak = leak._replace(charge_pC=charge_pC, output_pC=output_pC)
     if leak.hold_s > 0.0:
         leak = leak._replace(hold_s=leak.hold_s - dt_s)
     else:
-        rows_pC[SLOPE] += ((1.0 - fading) ** 2 / max(dt_s, 1e-9)) * apart_pC
-        calm = leak.learned_s < leak_rule.settle_s or max(map(abs, rows_pC[SLOPE].tolist())) < CALM_PC_PER_S
-        if tau_s is not None and leak_rule.learn and calm:
+        rows_pC[SLOPE_ROW] += ((1.0 - fading) ** 2 / max(dt_s, MIN_STEP_S)) * residual_pC
+        steepest_pC_per_s = max(map(abs, rows_pC[SLOPE_ROW].tolist()))
+        is_calm = leak.learned_s < leak_rule.settle_s or steepest_pC_per_s < CALM_PC_PER_S
+        if tau_s is not None and leak_rule.learn and is_calm:
             change_pC = rows_pC - memory.rows_pC
-            recovery_pC = film.seen.dot(change_pC) - change_pC[WARM]
+            recovery_pC = film.response.dot(change_pC) - change_pC[WARMTH_ROW]
             leak = learn_inflow(leak_rule, leak, surplus_pC - recovery_pC, noise_pC, dt_s)
-    learn_s, expected_pC = memory.learn_s, memory.expected_pC
-    learns = learn_s > 0.0
-    if learns:
-        learn_s, expected_pC = learn_s - dt_s, passage[WARMTH, WARMTH].dot(expected_pC)
-    warmths_pC, ages_s = (memory.trusted_pC, memory.candidate_pC), (memory.trusted_s + dt_s, memory.candidate_s + dt_s)
-    after = Memory(film, leak, film_pC, rows_pC, *warmths_pC, expected_pC, *ages_s, unseen_s, learn_s)
-    if learns and leak.hold_s <= 0.0:
+
+    learn_s = memory.learn_s
+    expected_pC = memory.expected_pC
+    is_learning = learn_s > 0.0
+    if is_learning:
+        learn_s -= dt_s
+        expected_pC = propagation[WARMTH_ROWS, WARMTH_ROWS].dot(expected_pC)
+    after = Memory(
+        film,
+        leak,
+        film_pC,
+        rows_pC,
+        memory.trusted_pC,
+        memory.candidate_pC,
+        expected_pC,
+        memory.trusted_s + dt_s,
+        memory.candidate_s + dt_s,
+        unseen_s,
+        learn_s,
+    )
+    if is_learning and leak.hold_s <= 0.0:
         after = _learn_film(after, dt_s)
     if after.candidate_s >= leak_rule.look_back_s:
         after = after._replace(
             trusted_pC=after.candidate_pC,
             trusted_s=after.candidate_s,
-            candidate_pC=after.rows_pC[WARMTH],
+            candidate_pC=after.rows_pC[WARMTH_ROWS],
             candidate_s=0.0,
         )
     return after
 
 
 def _learn_film(memory: Memory, dt_s: float) -> Memory:
-    """Both scales by what is left on the film along the touch's charges; all frames after a release count as one."""
-    film, rows_pC = memory.film, memory.rows_pC.copy()
-    by_scales = OF_SCALES.dot(rows_pC)
-    crept_pC, cooled_pC = film.creep * by_scales[0], film.thermoelastic * by_scales[1]
-    along = crept_pC + cooled_pC
-    size = math.sqrt(float(along @ along))
-    if size < 1e-9:
+    """Update the scale factors of creep and step with the charge that remains after a release.
+
+    The remaining charge is projected onto the direction of the predicted creep and step. All frames after one release
+    together count as one measurement.
+    """
+    film = memory.film
+    rows_pC = memory.rows_pC.copy()
+    responses_pC = SCALE_RESPONSE.dot(rows_pC)
+    creep_pC = film.creep * responses_pC[0]
+    step_pC = film.thermoelastic * responses_pC[1]
+    direction_pC = creep_pC + step_pC
+    size_pC = math.sqrt(float(direction_pC @ direction_pC))
+    if size_pC < MIN_CREEP_PC:
         return memory
-    by_creep, by_step = float(crept_pC @ along) / size, float(cooled_pC @ along) / size
-    left_pC = float((rows_pC[WARM] - memory.expected_pC[0]) @ along) / size
-    of_creep, of_step, both = film.variances
-    to_creep, to_step = of_creep * by_creep + both * by_step, both * by_creep + of_step * by_step
-    known_pC2 = by_creep * to_creep + by_step * to_step
-    noise_pC2 = WANDER_PC**2 * len(along) * memory.unseen_s + (UNLIKE * size) ** 2
-    if left_pC * left_pC > OUTLIER**2 * (known_pC2 + noise_pC2):
+    creep_jacobian = float(creep_pC @ direction_pC) / size_pC
+    step_jacobian = float(step_pC @ direction_pC) / size_pC
+    innovation_pC = float((rows_pC[WARMTH_ROW] - memory.expected_pC[0]) @ direction_pC) / size_pC
+
+    variances = film.variances
+    creep_gain = variances.creep * creep_jacobian + variances.covariance * step_jacobian
+    step_gain = variances.covariance * creep_jacobian + variances.step * step_jacobian
+    prior_pC2 = creep_jacobian * creep_gain + step_jacobian * step_gain
+    noise_pC2 = WANDER_PC**2 * len(direction_pC) * memory.unseen_s + (UNLIKE * size_pC) ** 2
+    if innovation_pC * innovation_pC > OUTLIER**2 * (prior_pC2 + noise_pC2):
         return memory._replace(learn_s=0.0)
-    total_pC2 = known_pC2 + noise_pC2 * LEARN_S / max(dt_s, 1e-9)
-    creep, step = 1.0 + to_creep / total_pC2 * left_pC, 1.0 + to_step / total_pC2 * left_pC
-    variances = (
-        of_creep - to_creep**2 / total_pC2,
-        of_step - to_step**2 / total_pC2,
-        both - to_creep * to_step / total_pC2,
+
+    total_pC2 = prior_pC2 + noise_pC2 * LEARN_S / max(dt_s, MIN_STEP_S)
+    creep_scale = 1.0 + creep_gain / total_pC2 * innovation_pC
+    step_scale = 1.0 + step_gain / total_pC2 * innovation_pC
+    updated = ScaleVariances(
+        variances.creep - creep_gain**2 / total_pC2,
+        variances.step - step_gain**2 / total_pC2,
+        variances.covariance - creep_gain * step_gain / total_pC2,
     )
-    rows_pC[WARM] -= (creep - 1.0) * crept_pC + (step - 1.0) * cooled_pC
-    return memory._replace(film=Film.of(film.creep * creep, film.thermoelastic * step, variances), rows_pC=rows_pC)
+    rows_pC[WARMTH_ROW] -= (creep_scale - 1.0) * creep_pC + (step_scale - 1.0) * step_pC
+    learned = Film.of(film.creep * creep_scale, film.thermoelastic * step_scale, updated)
+    return memory._replace(film=learned, rows_pC=rows_pC)
 
 
 def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
-    """The state at the first frame of a touch: warmth as predicted from before it."""
-    film, rows_pC, age_s = memory.film, memory.rows_pC.copy(), memory.trusted_s
-    rows_pC[WARMTH] = _passage(rule.warmth_s, age_s)[WARMTH, WARMTH].dot(memory.trusted_pC)
-    rows_pC[HELD] = 0.0
-    charge_pC = rows_pC[HELD] = (memory.film_pC - film.seen.dot(rows_pC)) / film.at_once
+    """Return the state at the first frame of a touch, with the warmth as predicted from before the touch."""
+    film = memory.film
+    age_s = memory.trusted_s
+    rows_pC = memory.rows_pC.copy()
+    warmth_propagation = _propagation(rule.warmth_s, age_s)[WARMTH_ROWS, WARMTH_ROWS]
+    rows_pC[WARMTH_ROWS] = warmth_propagation.dot(memory.trusted_pC)
+    rows_pC[CHARGE_ROW] = 0.0
+    charge_pC = (memory.film_pC - film.response.dot(rows_pC)) / film.step_response
+    rows_pC[CHARGE_ROW] = charge_pC
     return memory._replace(
         leak=memory.leak._replace(charge_pC=charge_pC),
         rows_pC=rows_pC,
@@ -282,29 +360,47 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
     )
 
 
-def warmer(memory: Memory, change_pC: Array | float, rate_pC_per_s: Array | float, *, learns: bool = True) -> Memory:
-    """The state if so much more of the touch charge, shape (electrodes,), pC, and of its slope, pC/s, is warmth.
+def add_warmth(
+    memory: Memory, change_pC: Array | float, rate_pC_per_s: Array | float, *, is_learned: bool = True
+) -> Memory:
+    """Return the state in which a part of the touch charge counts as warmth.
 
-    With `learns` false, nothing is learned of the film after this touch: its warmth is not known well enough.
+    Args:
+        memory: The state.
+        change_pC: Part of the touch charge, shape (electrodes,), pC.
+        rate_pC_per_s: Change of the slope of the warmth, shape (electrodes,), pC/s.
+        is_learned: Whether the scale factors of the film are updated after this touch. They should not be if the
+            warmth is not known well.
     """
-    at_once, charge_pC, rows_pC = memory.film.at_once, memory.leak.charge_pC - change_pC, memory.rows_pC.copy()
-    rows_pC[WARM] += at_once * change_pC
-    rows_pC[SLOPE] += at_once * rate_pC_per_s
-    rows_pC[HELD] = charge_pC
+    step_response = memory.film.step_response
+    charge_pC = memory.leak.charge_pC - change_pC
+    rows_pC = memory.rows_pC.copy()
+    rows_pC[WARMTH_ROW] += step_response * change_pC
+    rows_pC[SLOPE_ROW] += step_response * rate_pC_per_s
+    rows_pC[CHARGE_ROW] = charge_pC
     return memory._replace(
         leak=memory.leak._replace(charge_pC=charge_pC),
         rows_pC=rows_pC,
-        unseen_s=memory.unseen_s if learns else math.inf,
+        unseen_s=memory.unseen_s if is_learned else math.inf,
     )
 
 
-def doubt(memory: Memory) -> float:
-    """Relative standard deviation of all touch charges together, because creep and step are not known better."""
-    rows_pC = memory.rows_pC.sum(axis=1)
-    total_pC = float(rows_pC[HELD])
-    if total_pC <= 0.0:
+def charge_scale_std(memory: Memory) -> float:
+    """Return the relative standard deviation that all touch charges have in common.
+
+    It follows from the variances of the scale factors of creep and step.
+    """
+    totals_pC = memory.rows_pC.sum(axis=1)
+    touch_pC = float(totals_pC[CHARGE_ROW])
+    if touch_pC <= 0.0:
         return 0.0
-    crept, cooled = OF_SCALES.dot(rows_pC).tolist()
-    crept, cooled = memory.film.creep * crept / total_pC, memory.film.thermoelastic * cooled / total_pC
-    of_creep, of_step, both = memory.film.variances
-    return math.sqrt(max(crept * crept * of_creep + cooled * cooled * of_step + 2.0 * crept * cooled * both, 0.0))
+    creep_response, step_response = SCALE_RESPONSE.dot(totals_pC).tolist()
+    creep_share = memory.film.creep * creep_response / touch_pC
+    step_share = memory.film.thermoelastic * step_response / touch_pC
+    variances = memory.film.variances
+    variance = (
+        creep_share * creep_share * variances.creep
+        + step_share * step_share * variances.step
+        + 2.0 * creep_share * step_share * variances.covariance
+    )
+    return math.sqrt(max(variance, 0.0))

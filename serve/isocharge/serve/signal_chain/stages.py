@@ -13,7 +13,14 @@ from isocharge.serve.flags import BLIND, NEGATIVE, SATURATED, TARE, THERMAL
 from isocharge.serve.signal_chain.contact import NO_TOUCH, Touch, TouchRule, update_contact
 from isocharge.serve.signal_chain.hum import Hum, HumRule, remove_hum
 from isocharge.serve.signal_chain.leak import Leak, LeakRule, undo_leak
-from isocharge.serve.signal_chain.memory import Memory, MemoryRule, begin_touch, doubt, undo_memory, warmer
+from isocharge.serve.signal_chain.memory import (
+    Memory,
+    MemoryRule,
+    add_warmth,
+    begin_touch,
+    charge_scale_std,
+    undo_memory,
+)
 from isocharge.serve.signal_chain.stage import ChainFrame, OffsetStage, Stage, WarmingChange
 from isocharge.serve.signal_chain.tare import Tare, TareRule, look_for_tare
 from isocharge.serve.signal_chain.thermal import NO_DRIFT, Misfit, ThermalRule, track_thermal_drift
@@ -218,13 +225,13 @@ class MemoryStage(OffsetStage):
     def add_warming(self, change: WarmingChange) -> None:
         """Add the warming to the predicted warmth."""
         assert self._memory is not None
-        self._memory = warmer(self._memory, change.charge_pC, change.rate_pC_per_s, learns=change.is_learned)
+        self._memory = add_warmth(self._memory, change.charge_pC, change.rate_pC_per_s, is_learned=change.is_learned)
 
     def _report(self, frame: ChainFrame) -> None:
         """Write the touch charge and its common standard deviation into a frame."""
         assert self._memory is not None
         frame.charge_pC = self._memory.leak.charge_pC
-        frame.charge_scale_std = doubt(self._memory)
+        frame.charge_scale_std = charge_scale_std(self._memory)
 
 
 class TouchStage(Stage):
