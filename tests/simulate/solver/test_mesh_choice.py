@@ -99,7 +99,7 @@ def test_press_on_two_meshes_starts_its_neighbour():
 def test_meshes_with_different_equilibria_are_an_error(monkeypatch):
     """Meshes that differ by a tenth are not two views of one film; by less, the difference is the estimate."""
     scene = FILM, *NEAR_THE_RIM
-    monkeypatch.setattr("isocharge.simulate.solver.press.MOST_ORDERS", 1)
+    monkeypatch.setattr("isocharge.simulate.solver.press.MAX_EXTRA_ORDERS", 1)
     monkeypatch.setattr("isocharge.simulate.solver.press.relative_difference", lambda *_: 0.09)
     assert estimated_error(press(*scene)) == pytest.approx(0.09)
     monkeypatch.setattr("isocharge.simulate.solver.press.relative_difference", lambda *_: 0.11)

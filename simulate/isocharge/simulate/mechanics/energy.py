@@ -1,16 +1,17 @@
-"""The film's energy under a load: stretching, bending where the press needs it, and the probe's work.
+"""Potential energy of the film under a load, with its first and second derivatives.
 
-    Pi = stretching + bending - load * mean of W over the footprint
+    Pi = stretching energy + bending energy - load * mean of W over the footprint
 
-as a function of the nodal field (U1, U2, W), shape (n_node, 3). Lengths are in units of the film's radius a, and with
-an amplitude A (see `isocharge.simulate.mechanics.scaling`)
+The energy is a function of the scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3). Lengths are in units
+of the film radius a. With the amplitude A of `isocharge.simulate.mechanics.scaling`, the displacements and the
+Green-Lagrange strain are
 
-    w = a A W,   u = a A^2 U,   E = A^2 [ sym grad U + grad W (x) grad W / 2 + A^2 (grad U)^T grad U / 2 ],
+    w = a A W,   u = a A^2 U,   E = A^2 [ sym grad U + grad W (x) grad W / 2 + A^2 (grad U)^T grad U / 2 ].
 
-so that the Green-Lagrange strain is A^2 times a number of order one whatever the force, and so is the stress: St.
-Venant-Kirchhoff, plane stress, S = E_young A^2 (C : E' + tau I). Energies are in units of E_young h a^2 A^4. A film
-that is not the same in all directions adds a matrix to C and a deviator to tau I (`scaling.Anisotropy`); its bending
-keeps the mean stiffness.
+The expression in brackets is the scaled strain E', which is of order one for every force. The stress is that of St.
+Venant-Kirchhoff elasticity in plane stress, S = E_young A^2 (C : E' + tau I). Energies are in units of
+E_young h a^2 A^4. An anisotropic film adds a matrix to C and a deviator to tau I (`scaling.Anisotropy`). Its bending
+stiffness is that of the isotropic film.
 """
 
 from dataclasses import replace
@@ -24,15 +25,22 @@ from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_str
 from isocharge.simulate.mechanics.stress import strain
 from isocharge.simulate.mesh.placed_mesh import Geometry
 
-PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Pairs of displacement components whose tangent blocks are different."""
+COMPONENT_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Pairs of displacement components whose blocks of the tangent are computed. The other blocks follow by symmetry."""
 
 SHIFT = 5.0
-"""Shift s of the linear solves with bending, dimensionless: between 0 and 11.56, twice the film's lowest eigenvalue."""
+"""Shift s of the linear solves with bending, between 0 and 11.56, twice the lowest eigenvalue of the film."""
 
 
 class ElasticFilm:
-    """The discrete film for one geometry and one set of groups."""
+    """The discrete film for one mesh and one set of dimensionless groups.
+
+    Attributes:
+        geometry: Elements of the mesh.
+        groups: Dimensionless groups of the press.
+        membrane: Stretching energy.
+        bending: Bending energy; None if the theory omits bending.
+    """
 
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
         self.geometry = geometry
@@ -42,18 +50,25 @@ class ElasticFilm:
 
     @property
     def components(self) -> int:
-        """Unknowns per node of the linear solves."""
+        """Number of unknowns per node of the linear solves."""
         return 3 if self.bending is None else 4
 
     def energy(self, field: Array) -> float:
-        """Pi of a nodal field."""
+        """Compute the potential energy Pi of a field, shape (n_node, 3)."""
         elastic = self.membrane.energy(field)
         if self.bending is not None:
             elastic += self.bending.energy(field[:, 2])
         return elastic - self.groups.load * float(self.geometry.load @ field[:, 2])
 
     def residual(self, field: Array) -> Array:
-        """Gradient of Pi: internal minus external force on every node, shape (n_node, 3)."""
+        """Compute the gradient of Pi: internal minus external forces at the nodes.
+
+        Args:
+            field: Scaled displacements, shape (n_node, 3).
+
+        Returns:
+            Shape (n_node, 3).
+        """
         forces = self.membrane.forces(field)
         if self.bending is not None:
             forces[..., 2] += self.bending.forces(field[:, 2])
@@ -62,25 +77,32 @@ class ElasticFilm:
         return residual
 
     def in_plane_scale(self, field: Array) -> float:
-        """Norm of the in-plane forces before they balance: what their residual is to be compared with."""
+        """Compute the norm of the in-plane forces of the elements, to which the in-plane residual is relative."""
         return float(np.linalg.norm(self.membrane.forces(field)[..., :2]))
 
     def tangent(self, field: Array, guard: float = 0.0) -> Array:
-        """Element matrices of the linear solve, with some more tension as a guard.
+        """Compute the element matrices of the linear solve.
 
-        Shape (n_element, n_local, components, n_local, components).
+        Args:
+            field: Scaled displacements, shape (n_node, 3).
+            guard: Additional tension, in units of E_young A^2.
+
+        Returns:
+            Shape (n_element, n_local, components, n_local, components).
         """
         tangent = Membrane(self.geometry, self.groups.stiffened(guard)).tangent(field)
-        return tangent if self.bending is None else self.bending.extend(tangent)
+        if self.bending is None:
+            return tangent
+        return self.bending.extend(tangent)
 
 
 class Membrane:
-    """Stretching for one geometry and one set of groups: the geometrically nonlinear membrane.
+    """Stretching energy of the geometrically nonlinear membrane.
 
-    Its energy is integral( E' : C : E' / 2 + tau (tr E' - div U) ). The integral of div U over a clamped film is zero;
-    left in, with a strong pretension its round-off would drown the others. F_ia = d_ia + A^2 U_i,a for i = 1, 2 and W,a
-    for i = 3, so that the variation of E' is sym(F_ia v_i,b) for all three components alike.
-    (Strain and stress: Bonet and Wood 2008, ch. 3 and 6; scaling: Schwerin 1929.)
+    The energy is integral( E' : C : E' / 2 + tau (tr E' - div U) ). The integral of div U over a clamped film is zero.
+    It is subtracted because its round-off would dominate the other terms if the pretension is large. With
+    F_ia = d_ia + A^2 U_i,a for i = 1, 2 and F_3a = W,a, the variation of E' is sym(F_ia v_i,b) for all three
+    components. (Strain and stress: Bonet and Wood 2008, ch. 3 and 6; scaling: Schwerin 1929.)
     """
 
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
@@ -90,31 +112,38 @@ class Membrane:
 
     @property
     def _deviator(self) -> Array | None:
-        """What the pretension adds to its mean, over E_young A^2, shape (2, 2)."""
+        """Difference between the pretension and its mean, over E_young A^2, shape (2, 2); None if isotropic."""
         return None if self.groups.anisotropy is None else _tensor(self.groups.anisotropy.tension)
 
     def _stress(self, elastic: Array) -> Array:
-        """C : E' of a strain at the quadrature points, shape (n_element, n_point, 3), that of a coat included."""
-        borne = scaled_stress(elastic, self.groups)
+        """Compute the stress C : E' of the film and its coat at the quadrature points.
+
+        Args:
+            elastic: Scaled strain (E11, E22, 2 E12), shape (n_element, n_point, 3).
+
+        Returns:
+            (S11, S22, S12), same shape.
+        """
+        total = scaled_stress(elastic, self.groups)
         if self.geometry.coat is not None:
-            stiffened, moduli = self.geometry.coat
-            borne[stiffened] += (moduli @ elastic[stiffened][..., None])[..., 0]
-        return borne
+            coated, moduli = self.geometry.coat
+            total[coated] += (moduli @ elastic[coated][..., None])[..., 0]
+        return total
 
     def _slope(self, field: Array) -> Array:
-        """d(U1, U2, W)/d(X1, X2) at the quadrature points, shape (n_element, n_point, 2, 3)."""
+        """Compute d(U1, U2, W)/d(X1, X2) at the quadrature points, shape (n_element, n_point, 2, 3)."""
         slope = self.geometry.stacked @ field[self.geometry.nodes]
         return slope.reshape(*self.geometry.gradient.shape[:3], 3)
 
     def _stretch(self, slope: Array) -> Array:
-        """F with index (..., derivative, component)."""
+        """Compute F with the indices (..., derivative, component) from the slopes, shape (..., 2, 3)."""
         stretch: Array = slope * self._scale
         stretch[..., 0, 0] += 1.0
         stretch[..., 1, 1] += 1.0
         return stretch
 
     def energy(self, field: Array) -> float:
-        """Stretching energy of a nodal field of shape (n_node, 3)."""
+        """Compute the stretching energy of a field, shape (n_node, 3)."""
         slope = self._slope(field)
         elastic = strain(slope, self.groups.amplitude2)
         density = 0.5 * np.sum(elastic * self._stress(elastic), axis=-1)
@@ -124,8 +153,16 @@ class Membrane:
         return float(np.sum(density * self.geometry.weights))
 
     def forces(self, field: Array) -> Array:
-        """Gradient of the energy, element by element: internal forces, shape (n_element, n_local, 3)."""
-        geometry, slope = self.geometry, self._slope(field)
+        """Compute the internal forces of the elements, which are the gradient of the stretching energy.
+
+        Args:
+            field: Scaled displacements, shape (n_node, 3).
+
+        Returns:
+            Shape (n_element, n_local, 3).
+        """
+        geometry = self.geometry
+        slope = self._slope(field)
         total = self._stress(strain(slope, self.groups.amplitude2))
         traction = _tensor(total) @ self._stretch(slope) + self.groups.tension * self._scale * slope
         if self._deviator is not None:
@@ -134,12 +171,17 @@ class Membrane:
         return np.asarray(geometry.stacked.transpose(0, 2, 1) @ traction.reshape(len(traction), -1, 3))
 
     def tangent(self, field: Array) -> Array:
-        """Second derivative of the energy, element by element.
+        """Compute the second derivatives of the stretching energy of the elements.
+
+        Args:
+            field: Scaled displacements, shape (n_node, 3).
 
         Returns:
-            Shape (n_element, n_local, 3, n_local, 3): symmetric under exchange of the two (node, component) pairs.
+            Shape (n_element, n_local, 3, n_local, 3), symmetric under exchange of the two pairs of node and component.
         """
-        geometry, gradient, slope = self.geometry, self.geometry.gradient, self._slope(field)
+        geometry = self.geometry
+        gradient = geometry.gradient
+        slope = self._slope(field)
         stretch = self._stretch(slope)
         total = self._stress(strain(slope, self.groups.amplitude2))
         total[..., :2] += self.groups.tension
@@ -149,7 +191,7 @@ class Membrane:
         n_element, _, _, n_local = gradient.shape
         left = np.ascontiguousarray(geometry.stacked.transpose(0, 2, 1))
         matrix = np.empty((n_element, 3, n_local, 3, n_local))
-        for i, j in PAIRS:
+        for i, j in COMPONENT_PAIRS:
             block = self._moduli(stretch, i, j) * geometry.weights[..., None, None]
             if i == j:
                 block += self._scale[i] * weighted
@@ -159,45 +201,59 @@ class Membrane:
         return matrix.transpose(0, 2, 1, 4, 3)
 
     def _moduli(self, stretch: Array, i: int, j: int) -> Array:
-        """Material part of d(traction_ia)/d(slope_jb) for one pair of components, shape (n_element, n_point, 2, 2)."""
+        """Compute the material part of d(traction_ia)/d(slope_jb) for a pair of components.
+
+        Args:
+            stretch: F, shape (n_element, n_point, 2, 3).
+            i: Component of the traction.
+            j: Component of the slope.
+
+        Returns:
+            Shape (n_element, n_point, 2, 2), with the indices a and b.
+        """
         poisson = self.groups.poisson
-        plane, shear = 1.0 / (1.0 - poisson**2), 0.5 / (1.0 + poisson)
-        a, b = stretch[..., 0, i], stretch[..., 1, i]
-        c, d = stretch[..., 0, j], stretch[..., 1, j]
+        plane = 1.0 / (1.0 - poisson**2)
+        shear = 0.5 / (1.0 + poisson)
+        a = stretch[..., 0, i]
+        b = stretch[..., 1, i]
+        c = stretch[..., 0, j]
+        d = stretch[..., 1, j]
         block = np.empty((*a.shape, 2, 2))
         block[..., 0, 0] = plane * a * c + shear * b * d
         block[..., 1, 1] = plane * b * d + shear * a * c
         block[..., 0, 1] = plane * poisson * a * d + shear * b * c
         block[..., 1, 0] = plane * poisson * b * c + shear * a * d
         if self.groups.anisotropy is not None:
-            block += _by_slope(a, b) @ self.groups.anisotropy.moduli @ _by_slope(c, d).swapaxes(-1, -2)
+            block += _strain_by_slope(a, b) @ self.groups.anisotropy.moduli @ _strain_by_slope(c, d).swapaxes(-1, -2)
         if self.geometry.coat is not None:
-            stiffened, moduli = self.geometry.coat
-            left, right = _by_slope(a[stiffened], b[stiffened]), _by_slope(c[stiffened], d[stiffened])
-            block[stiffened] += left @ moduli @ right.swapaxes(-1, -2)
+            coated, moduli = self.geometry.coat
+            strain_by_i = _strain_by_slope(a[coated], b[coated])
+            strain_by_j = _strain_by_slope(c[coated], d[coated])
+            block[coated] += strain_by_i @ moduli @ strain_by_j.swapaxes(-1, -2)
         return block
 
 
 class Bending:
-    """Bending for one geometry and one stiffness beta: beta / 2 * integral( (lap W)^2 ), since the film is clamped.
+    """Bending energy beta / 2 * integral( (lap W)^2 ) of a clamped film with the dimensionless stiffness beta.
 
-    Elements are continuous but not smooth, so the Laplacian is taken weakly: m = lap W means
+    The elements are continuous, but their slopes are not. The Laplacian m = lap W is therefore defined weakly by
 
-        integral( m phi ) = -integral( grad W . grad phi )   for every basis function phi, those on the rim included,
+        integral( m phi ) = -integral( grad W . grad phi )   for every basis function phi.
 
-    which also clamps the slope at the rim (Ciarlet and Raviart 1974). With the left integral lumped on the
-    Gauss-Lobatto nodes, m = -M^-1 L W with a diagonal M, and the energy is a plain function of W:
-    beta / 2 W L^T M^-1 L W.
+    Since this includes the basis functions on the rim, it also clamps the slope at the rim (Ciarlet and Raviart 1974).
+    The integral on the left is lumped on the Gauss-Lobatto nodes, so m = -M^-1 L W with a diagonal matrix M, and the
+    energy is beta / 2 W L^T M^-1 L W.
 
-    That matrix couples elements that do not touch, so the linear solves carry m along as an unknown of its own. With
-    any shift s, and mu = sqrt(beta) M^-1 (L - s M) W,
+    The matrix of this energy couples elements that do not touch. The linear solves therefore have an additional unknown
+    mu = sqrt(beta) M^-1 (L - s M) W, where s is a shift:
 
         [ K + beta (2 s L - s^2 M)    sqrt(beta) (L - s M)^T ] [W ]   [r]
         [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0]
 
-    is the same equation for W for every s: its Schur complement is K + beta L^T M^-1 L. A shift between 0 and twice the
-    film's lowest eigenvalue, 5.78, makes the first block positive definite even where K vanishes (a thick film without
-    tension), so the matrix is quasi-definite and needs no pivoting (Vanderbei 1995).
+    The solution W does not depend on s, because the Schur complement is K + beta L^T M^-1 L for every s. If s lies
+    between 0 and twice the lowest eigenvalue of the film (5.78), the first block is positive definite even if K
+    vanishes, as in a thick film without tension. The matrix is then quasi-definite and needs no pivoting (Vanderbei
+    1995).
     """
 
     def __init__(self, geometry: Geometry, stiffness: float) -> None:
@@ -209,29 +265,47 @@ class Bending:
         self._factor: SuperLU | None = None
 
     def laplacian(self, deflection: Array) -> Array:
-        """lap W at the nodes, shape (n_node,), from W at the nodes."""
+        """Compute the Laplacian of the deflection W.
+
+        Args:
+            deflection: W at the nodes, shape (n_node,).
+
+        Returns:
+            lap W at the nodes, shape (n_node,).
+        """
         weak = self.geometry.gather((self._laplace @ deflection[self.geometry.nodes][..., None])[..., 0])
-        follow = self.geometry.constraint
-        if follow is None:
+        constraint = self.geometry.constraint
+        if constraint is None:
             return np.asarray(-weak / self._mass)
-        if self._factor is None:  # the mass of nodes that others follow is not quite diagonal
-            hanging = diags_array((follow.diagonal() == 0.0).astype(float))
-            self._factor = splu((follow.T @ diags_array(self._mass) @ follow + hanging).tocsc())
-        return np.asarray(-(follow @ self._factor.solve(weak)))
+        if self._factor is None:  # the constraint makes the mass matrix non-diagonal
+            hanging = diags_array((constraint.diagonal() == 0.0).astype(float))
+            self._factor = splu((constraint.T @ diags_array(self._mass) @ constraint + hanging).tocsc())
+        return np.asarray(-(constraint @ self._factor.solve(weak)))
 
     def energy(self, deflection: Array) -> float:
-        """Bending energy of a nodal deflection, shape (n_node,)."""
+        """Compute the bending energy of a deflection W, shape (n_node,)."""
         return float(0.5 * self.stiffness * np.sum(self._mass * self.laplacian(deflection) ** 2))
 
     def forces(self, deflection: Array) -> Array:
-        """Gradient of the energy, element by element, shape (n_element, n_local)."""
+        """Compute the internal forces of the elements, which are the gradient of the bending energy.
+
+        Args:
+            deflection: W at the nodes, shape (n_node,).
+
+        Returns:
+            Shape (n_element, n_local).
+        """
         laplacian = self.laplacian(deflection)[self.geometry.nodes]
         return np.asarray(-self.stiffness * (self._laplace @ laplacian[..., None])[..., 0])
 
     def extend(self, tangent: Array) -> Array:
-        """Element matrices over (U1, U2, W, mu) from those over (U1, U2, W).
+        """Add bending to the element matrices of the membrane.
 
-        Shape (n_element, n_local, 4, n_local, 4).
+        Args:
+            tangent: Matrices for (U1, U2, W), shape (n_element, n_local, 3, n_local, 3).
+
+        Returns:
+            Matrices for (U1, U2, W, mu), shape (n_element, n_local, 4, n_local, 4).
         """
         n_element, n_local = self.geometry.nodes.shape
         matrix = np.zeros((n_element, 4, n_local, 4, n_local)).transpose(0, 2, 1, 4, 3)
@@ -245,14 +319,24 @@ class Bending:
         return matrix
 
 
-def _by_slope(one: Array, two: Array) -> Array:
-    """d(E11, E22, 2 E12) / d(slope) of a component with this column of F, shape (..., 2, 3)."""
-    by_slope = np.zeros((*one.shape, 2, 3))
-    by_slope[..., 0, 0] = by_slope[..., 1, 2] = one
-    by_slope[..., 1, 1] = by_slope[..., 0, 2] = two
-    return by_slope
+def _strain_by_slope(first: Array, second: Array) -> Array:
+    """Compute d(E11, E22, 2 E12) / d(slope) for one displacement component.
+
+    Args:
+        first: F_i1 of the component, shape (...).
+        second: F_i2 of the component, shape (...).
+
+    Returns:
+        Shape (..., 2, 3): the derivative of the component, then the strain.
+    """
+    derivative = np.zeros((*first.shape, 2, 3))
+    derivative[..., 0, 0] = first
+    derivative[..., 1, 2] = first
+    derivative[..., 1, 1] = second
+    derivative[..., 0, 2] = second
+    return derivative
 
 
 def _tensor(total: Array) -> Array:
-    """(S11, S22, S12) as matrices, shape (..., 2, 2)."""
+    """Convert stresses (S11, S22, S12), shape (..., 3), into symmetric matrices, shape (..., 2, 2)."""
     return total[..., [0, 2, 2, 1]].reshape(*total.shape[:-1], 2, 2)

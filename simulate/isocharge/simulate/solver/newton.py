@@ -1,9 +1,10 @@
-"""Newton's method for a film that may be flat and slack at the start, and the linear theories as its first step.
+"""Newton's method for the equilibrium of the film, and the direct solution of the linear theories.
 
-A flat film without pretension has no transverse stiffness, and plain Newton fails in many ways. What works: a start
-of Schwerin's shape, an energy line search, and some tension added to the tangent only, in proportion to the residual,
-so that the step stays a descent direction and the convergence near the equilibrium stays quadratic. It gives up after
-`MAX_ITERATIONS`, or where steps no longer shrink (`PATIENCE`); how small a residual has to be is in `settings`.
+A flat film without pretension has no transverse stiffness, so the plain Newton method fails. The following measures
+make it reliable: the first iterate has the shape of Schwerin's solution, the step length is found by a line search on
+the energy, and a tension proportional to the residual is added to the tangent matrix only. With this tension the step
+is a descent direction, and the convergence near the equilibrium remains quadratic. The iteration stops after
+`MAX_ITERATIONS` steps, or if the steps no longer become smaller (`PATIENCE`).
 """
 
 from dataclasses import dataclass
@@ -18,40 +19,56 @@ from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.solver.assembly import Assembly, Factor
 
 GUARD_TENSION = 0.4
-"""Tension added to the tangent at a relative residual of one, over a slack film's own (5 MPa at 25 um and 1 N)."""
+"""Tension that is added to the tangent at a relative residual of one, over the induced tension of a film without
+pretension."""
 
 GUARD_BELOW = 1e-2
-"""Relative residual, dimensionless, below which no tension is added to the tangent."""
+"""Relative residual below which no tension is added to the tangent, dimensionless."""
 
 MAX_ITERATIONS = 60
-"""Limit of Newton steps; ordinary presses take five to ten."""
+"""Largest number of Newton steps. Typical presses need five to ten."""
 
 PATIENCE = 8
-"""Number of steps. Newton stops as stalled if, after the first PATIENCE steps, the smallest step of the last PATIENCE
-is not below half of the smallest before."""
+"""Number of steps after which stagnation is detected.
 
-REFINEMENTS, REFINED = 5, 1e-5
-"""Largest number of corrections of a linear solve, and size of a correction in the energy norm that ends them."""
+The iteration stops if the smallest of the last PATIENCE steps is not below half of the smallest step before them."""
 
-CHORD_FROM, CHORD_KEEPS = 0.15, 0.3
-"""Reuse the factorised tangent if the last step reduced the residual below CHORD_FROM of its value, and as long as each
-reuse reduces it below CHORD_KEEPS."""
+MAX_REFINEMENTS = 5
+"""Largest number of corrections of a linear solve."""
+
+REFINEMENT_TOLERANCE = 1e-5
+"""Size of a correction of a linear solve, in the energy norm, at which the solve has converged."""
+
+CHORD_START = 0.15
+"""Ratio of the residuals after and before a Newton step below which the factorised tangent is used again."""
+
+CHORD_CONTINUE = 0.3
+"""Ratio of the residuals after and before a step with a reused tangent below which it is used once more."""
 
 ROUND_OFF = 1e-9
-"""Size of a Newton step in the energy norm, relative to the load's work, below which only round-off is left."""
+"""Size of a Newton step, in the energy norm relative to the work of the load, that is caused by round-off only."""
+
+MAX_HALVINGS = 30
+"""Largest number of step lengths that the line search tries."""
+
+ARMIJO_SHARE = 1e-4
+"""Smallest accepted decrease of the energy, as a share of the decrease that the slope predicts, dimensionless."""
+
+ENERGY_ROUND_OFF = 1e-12
+"""Relative change of the energy that is caused by round-off only."""
 
 
 @dataclass(frozen=True)
 class NewtonResult:
-    """Outcome of a solve.
+    """Result of a solve.
 
     Attributes:
-        field: Nodal (U1, U2, W), shape (n_node, 3).
-        converged: Whether the residual is below the tolerance or as low as round-off lets it.
-        iterations: Newton steps; of a linear theory, solves.
-        residual: Out-of-balance force: the larger of transverse over load and in-plane over in-plane force. Of a linear
-            theory the size of the correction that it asked for, in the energy norm.
-        message: One sentence for people.
+        field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
+        converged: Whether the residual is below the tolerance or at the level of round-off.
+        iterations: Number of Newton steps. For a linear theory, the number of linear solves.
+        residual: Relative residual: the larger one of the transverse residual over the load, and the in-plane residual
+            over the in-plane forces. For a linear theory, the size of the last correction in the energy norm.
+        message: Description of the outcome in one sentence.
     """
 
     field: Array
@@ -62,18 +79,19 @@ class NewtonResult:
 
 
 def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Array:
-    """The first field: Schwerin's point-load shape in the template's coordinate, no in-plane displacement.
+    """Compute the first iterate of Newton's method: Schwerin's deflection, and no in-plane displacement.
 
-    W = (3 / pi)^(1/3) (1 - r^(2/3)) solves a point load on a slack membrane exactly at Poisson 1/3 (Schwerin 1929).
-    Tension and bending lower it.
+    W = (3 / pi)^(1/3) (1 - r^(2/3)) is the exact deflection of a membrane without pretension under a point load if
+    Poisson's ratio is 1/3 (Schwerin 1929). The radius r is measured in the template plane. Pretension and bending
+    reduce the deflection.
 
     Args:
-        z: Template coordinates of the nodes, shape (n_node,).
-        rho: Footprint radius in the template.
+        z: Nodes in the template plane, shape (n_node,).
+        rho: Radius of the innermost circle in the template plane.
         groups: Dimensionless groups of the press.
 
     Returns:
-        Field of shape (n_node, 3).
+        Scaled displacements (U1, U2, W), shape (n_node, 3).
     """
     shape = np.cbrt(1.0 + rho**2) - np.cbrt(np.abs(z) ** 2 + rho**2)
     field = np.zeros((z.size, 3))
@@ -83,50 +101,60 @@ def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Ar
 
 
 def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
-    """The linear theories: W from load, tension and bending alone, then the in-plane displacement U that W causes.
+    """Solve a linear theory: the deflection W under the load, and the in-plane displacement U that W causes.
 
-    The stress that the deflection induces does not act back on it. The flat film's tangent does not couple W and U, so
-    one solve gives both U and a correction of W (iterative refinement: each squares the error, roughly). The size of
-    the correction in the energy norm shows how well W was solved.
+    The induced stress does not affect the deflection. The tangent of the flat film does not couple W and U, so one
+    solve computes both U and a correction of W (iterative refinement). The size of the correction in the energy norm
+    measures the error of W.
+
+    Args:
+        elastic: The discrete film.
+        assembly: Linear solver for its mesh.
     """
     flat = np.zeros((assembly.free.shape[0], 3))
     factor = assembly.factor(elastic.tangent(flat))
-    field, size = factor.solve(-elastic.residual(flat)), np.inf
-    for solves in range(2, 2 + REFINEMENTS):
+    field = factor.solve(-elastic.residual(flat))
+    size = np.inf
+    for solves in range(2, 2 + MAX_REFINEMENTS):
         balance = elastic.residual(field)
         balance[:, 2] = _linear_residual(elastic, field)[:, 2]
         step = factor.solve(-balance)
         size = _energy_norm(elastic, field, step[:, 2], balance[:, 2])
         field = field + step
-        if size <= REFINED:
+        if size <= REFINEMENT_TOLERANCE:
             return NewtonResult(
                 field, True, solves, size, f"linear theory, solved to round-off: corrected by {size:.0e}"
             )
     return NewtonResult(field, False, solves, size, "the linear system is too near to singular")
 
 
-def _linear_residual(elastic: ElasticFilm, deflection: Array) -> Array:
-    """The residual without the induced stress, whose force goes with W^3: two amplitudes separate it."""
-    flat, small = elastic.residual(np.zeros_like(deflection)), 0.01
-    once, twice = (elastic.residual(scale * small * deflection) - flat for scale in (1.0, 2.0))
-    return flat + (8.0 * once - twice) / (6.0 * small)
+def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
+    """Compute the residual without the forces of the induced stress, shape (n_node, 3).
+
+    These forces are cubic in the field, so the residuals at two amplitudes separate them from the linear forces.
+    """
+    amplitude = 0.01
+    flat = elastic.residual(np.zeros_like(field))
+    once = elastic.residual(amplitude * field) - flat
+    twice = elastic.residual(2.0 * amplitude * field) - flat
+    return flat + (8.0 * once - twice) / (6.0 * amplitude)
 
 
 def solve_newton(
     elastic: ElasticFilm, assembly: Assembly, start: Array, tolerance: float, local_below: float = GUARD_BELOW
 ) -> NewtonResult:
-    """Find the equilibrium from a start.
+    """Solve for the equilibrium with Newton's method.
 
     Args:
-        elastic: The discrete problem.
-        assembly: Solver for its template.
-        start: First field, shape (n_node, 3), zero where fixed.
-        tolerance: Relative residual to reach.
-        local_below: Relative residual below which a full Newton step that halves the residual is taken even if it
-            raises the energy.
+        elastic: The discrete film.
+        assembly: Linear solver for its mesh.
+        start: First iterate, shape (n_node, 3), zero where the film is fixed.
+        tolerance: Relative residual at which the solve has converged.
+        local_below: Relative residual below which a full Newton step that halves the residual is accepted even if it
+            increases the energy.
 
     Returns:
-        The result, converged or not; the caller decides what a failure means.
+        The result, which may not have converged.
     """
     iterate = _Iterate.at(elastic, assembly.free[:, :3], start)
     sizes: list[float] = []
@@ -154,13 +182,13 @@ def solve_newton(
 
 @dataclass(frozen=True)
 class _Iterate:
-    """A field on the way to the equilibrium.
+    """An iterate of Newton's method.
 
     Attributes:
-        elastic: The discrete problem.
-        free: Which components of the nodes are not fixed, shape (n_node, 3).
-        field: Nodal (U1, U2, W), shape (n_node, 3).
-        residual: Out-of-balance force at the nodes, shape (n_node, 3).
+        elastic: The discrete film.
+        free: Whether each component at each node is free, shape (n_node, 3).
+        field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
+        residual: Out-of-balance forces at the nodes, shape (n_node, 3).
     """
 
     elastic: ElasticFilm
@@ -170,50 +198,59 @@ class _Iterate:
 
     @classmethod
     def at(cls, elastic: ElasticFilm, free: Booleans, field: Array) -> Self:
-        """A field with its residual."""
+        """Return the iterate with a given field, shape (n_node, 3)."""
         return cls(elastic, free, field, elastic.residual(field))
 
     def moved(self, step: Array) -> Self:
-        """The field after a step."""
+        """Return the iterate after a step, shape (n_node, 3)."""
         return type(self).at(self.elastic, self.free, self.field + step)
 
     @cached_property
     def relative(self) -> float:
-        """Relative residual: the larger of transverse over load and in-plane over in-plane force."""
+        """Larger one of the relative transverse residual and the relative in-plane residual."""
         residual = self.residual * self.free
-        across = np.linalg.norm(residual[:, 2]) / (
-            self.elastic.groups.load * np.linalg.norm(self.elastic.geometry.load)
-        )
-        along = np.linalg.norm(residual[:, :2]) / max(self.elastic.in_plane_scale(self.field), 1e-300)
-        return float(max(across, along))
+        load = self.elastic.groups.load * np.linalg.norm(self.elastic.geometry.load)
+        in_plane_force = max(self.elastic.in_plane_scale(self.field), 1e-300)
+        transverse_residual = np.linalg.norm(residual[:, 2]) / load
+        in_plane_residual = np.linalg.norm(residual[:, :2]) / in_plane_force
+        return float(max(transverse_residual, in_plane_residual))
 
     def result(self, converged: bool, iterations: int, message: str) -> NewtonResult:
-        """This field as the outcome."""
+        """Return the result of a solve that ends with this iterate."""
         return NewtonResult(self.field, converged, iterations, self.relative, message)
 
 
 def _stalled(sizes: list[float]) -> bool:
-    """Whether the steps have stopped shrinking: the film runs away along a direction without stiffness."""
-    return len(sizes) > 2 * PATIENCE and min(sizes[-PATIENCE:]) > 0.5 * min(sizes[:-PATIENCE])
+    """Return whether the sizes of the steps no longer decrease, as along a direction without stiffness."""
+    if len(sizes) <= 2 * PATIENCE:
+        return False
+    recent = sizes[-PATIENCE:]
+    earlier = sizes[:-PATIENCE]
+    return min(recent) > 0.5 * min(earlier)
 
 
 def _energy_norm(elastic: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
-    """Square root of the energy a step would gain over the load's work."""
+    """Compute the size of a step: the square root of its energy over the work of the load."""
     work = elastic.groups.load * abs(float(elastic.geometry.load @ field[:, 2]))
     return float(np.sqrt(abs(float(np.sum(step * residual))) / max(work, 1e-300)))
 
 
 def _regularisation(elastic: ElasticFilm, relative: float) -> float:
-    """Tension to add to the tangent: in proportion to the residual, none near the equilibrium."""
-    slack = GUARD_TENSION * float(np.cbrt(elastic.groups.load)) ** 2
-    return slack * min(1.0, relative) if relative > GUARD_BELOW else 0.0
+    """Return the tension that is added to the tangent, in proportion to the relative residual.
+
+    It is zero below `GUARD_BELOW`.
+    """
+    if relative <= GUARD_BELOW:
+        return 0.0
+    induced_tension = float(np.cbrt(elastic.groups.load)) ** 2
+    return GUARD_TENSION * induced_tension * min(1.0, relative)
 
 
 def _local_step(iterate: _Iterate, step: Array) -> _Iterate | None:
-    """The full Newton step if it at least halves the residual.
+    """Return the iterate after the full Newton step if this step at least halves the residual, and None otherwise.
 
-    Accept a full Newton step that raises the energy: a compressed film may have an unwrinkled equilibrium whose energy
-    is slightly above the wrinkled one.
+    The step may increase the energy, because a compressed film can have a flat equilibrium with a slightly higher
+    energy than the wrinkled equilibrium.
     """
     if not np.isfinite(step).all():
         return None
@@ -222,22 +259,32 @@ def _local_step(iterate: _Iterate, step: Array) -> _Iterate | None:
 
 
 def _chord_steps(iterate: _Iterate, factor: Factor, before: float, tolerance: float) -> _Iterate:
-    """Further steps with the same tangent while they pay (chord method): each costs a seventh of a Newton step.
+    """Continue with the factorised tangent of the last step as long as it reduces the residual well (chord method).
 
-    A step that left the share s of the residual suggests that the next with its tangent leaves about 2 s (Kelley 1995).
+    Such a step costs a seventh of a Newton step. If the last step reduced the residual by the factor s, the next step
+    with the same tangent reduces it by about 2 s (Kelley 1995).
+
+    Args:
+        iterate: Iterate after the Newton step.
+        factor: Factorised tangent of this step.
+        before: Relative residual before this step.
+        tolerance: Relative residual at which the solve has converged.
     """
-    if iterate.relative > CHORD_FROM * before:
+    if iterate.relative > CHORD_START * before:
         return iterate
     while iterate.relative > tolerance:
         trial = iterate.moved(factor.solve(-iterate.residual))
-        if not trial.relative < CHORD_KEEPS * iterate.relative:
+        if not trial.relative < CHORD_CONTINUE * iterate.relative:
             break
         iterate = trial
     return iterate
 
 
 def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
-    """A step that lowers the energy: the given one, or one with more and more tension in the tangent."""
+    """Return a step that is a descent direction of the energy.
+
+    If the given step is not one, return the step with the smallest added tension in the tangent that makes it one.
+    """
     elastic = iterate.elastic
     tension = 0.05 * GUARD_TENSION * float(np.cbrt(elastic.groups.load)) ** 2
     for _ in range(12):
@@ -249,18 +296,25 @@ def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
 
 
 def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
-    """Halve the step until the energy falls enough (Armijo) or, where its digits end, until the residual falls."""
-    elastic, residual = iterate.elastic, iterate.residual
-    energy, slope = elastic.energy(iterate.field), float(np.sum(step * residual))
-    norm = np.linalg.norm(residual[iterate.free])
-    share = 1.0
-    for _ in range(30):
-        field = iterate.field + share * step
-        change = elastic.energy(field) - energy
-        lower = change <= 1e-4 * share * slope
-        if lower or abs(change) <= 1e-12 * abs(energy):
+    """Halve a step until it lowers the energy sufficiently (condition of Armijo).
+
+    If the change of the energy is within round-off, the step must lower the residual instead.
+
+    Returns:
+        The iterate after the step, or None if no step length is accepted.
+    """
+    elastic = iterate.elastic
+    energy = elastic.energy(iterate.field)
+    slope = float(np.sum(step * iterate.residual))
+    residual_norm = np.linalg.norm(iterate.residual[iterate.free])
+    length = 1.0
+    for _ in range(MAX_HALVINGS):
+        field = iterate.field + length * step
+        energy_change = elastic.energy(field) - energy
+        lowers_energy = energy_change <= ARMIJO_SHARE * length * slope
+        if lowers_energy or abs(energy_change) <= ENERGY_ROUND_OFF * abs(energy):
             trial = _Iterate.at(elastic, iterate.free, field)
-            if lower or np.linalg.norm(trial.residual[iterate.free]) < norm:
+            if lowers_energy or np.linalg.norm(trial.residual[iterate.free]) < residual_norm:
                 return trial
-        share *= 0.5
+        length *= 0.5
     return None

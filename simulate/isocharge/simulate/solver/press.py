@@ -1,4 +1,4 @@
-"""Solving the film under a press."""
+"""Solve the film under a press."""
 
 from dataclasses import replace
 from time import process_time
@@ -28,14 +28,17 @@ from isocharge.simulate.solver.load_case import (
 )
 from isocharge.simulate.solver.newton import GUARD_BELOW, NewtonResult, schwerin_start, solve_linear, solve_newton
 
-MOST_ORDERS = 3
-"""Largest number of orders that are tried beyond the first mesh."""
+MAX_EXTRA_ORDERS = 3
+"""Largest number of increases of the order after the first mesh."""
 
-ANOTHER = 0.1
-"""Relative difference above which two meshes have different equilibria: a film that wrinkles has many."""
+DIFFERENT_EQUILIBRIUM = 0.1
+"""Relative difference of the charges above which two meshes have different equilibria. A wrinkling film has many."""
 
-FIRST_LOAD, LOAD_STEPS = 0.0625, 12
-"""If the full load fails at once: share of the load to begin with, and how many loads to try at most."""
+FIRST_LOAD_SHARE = 0.0625
+"""Share of the load with which the load steps begin if the solve with the full load fails."""
+
+MAX_LOAD_STEPS = 12
+"""Largest number of load steps."""
 
 
 def press(
@@ -52,19 +55,19 @@ def press(
 
     Args:
         film: The clamped film.
-        probe: The footprint, pressing uniformly, dead load.
-        at: Centroid of the footprint (x, y), mm.
-        force: N, positive pushes.
+        probe: The probe. Its pressure is uniform over the footprint, and keeps its direction.
+        at: Centroid (x, y) of the footprint, mm.
+        force: Force, N, positive in the direction of the push.
         settings: Accuracy, theory and mesh.
-        start: A neighbouring equilibrium of the same mesh to start from: another force, another position.
-        throw: Whether a failure raises; if not, look at `status`.
+        start: Equilibrium of a similar press on the same mesh, whose field is the first iterate.
+        throw: Whether to raise an error if the solve fails. Otherwise `status` of the result is "failed".
 
     Returns:
         The equilibrium.
 
     Raises:
-        SceneError: If the press cannot exist, or not on this mesh.
-        SolveError: If no equilibrium is reached and `throw` is set.
+        SceneError: If the press cannot exist, or the mesh is too distorted.
+        SolveError: If the solve fails and `throw` is True.
     """
     case = LoadCase.of(film, probe, at, force, settings, start.mesh if start else None)
     with single_threaded_blas():
@@ -82,7 +85,14 @@ def press(
 def needed_resolution(
     film: Film, probe: Probe, at: tuple[float, float], force: float, settings: SolveSettings = SolveSettings()
 ) -> Resolution:
-    """The mesh that `press` would choose; the film is solved only where two meshes must be compared.
+    """Return the resolution that `press` would choose. The film is solved only if two meshes must be compared.
+
+    Args:
+        film: The clamped film.
+        probe: The probe.
+        at: Centroid (x, y) of the footprint, mm.
+        force: Force, N.
+        settings: Accuracy, theory and mesh.
 
     Raises:
         SceneError: If the press cannot exist, or every mesh for it is too distorted.
@@ -97,13 +107,14 @@ def needed_resolution(
 
 
 def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equilibrium:
-    """Solve on meshes of rising order until two agree to half of the accuracy, or `MOST_ORDERS` have been tried.
+    """Solve on meshes of increasing order until the charges of two meshes agree within half of the accuracy.
 
-    If a still finer mesh finds no equilibrium, the finer of the two before is the answer, with their difference as its
-    error. Two meshes with different equilibria give no answer: the status is "failed".
+    The order is increased at most `MAX_EXTRA_ORDERS` times. If a finer mesh has no equilibrium, return the equilibrium
+    of the finer one of the two previous meshes, with the difference of these meshes as its error. If two meshes have
+    different equilibria, the status of the result is "failed".
     """
     solved = _solve(case, choose_mesh(case), start)
-    for _ in range(MOST_ORDERS):
+    for _ in range(MAX_EXTRA_ORDERS):
         if solved.status != "converged":
             return solved
         resolution = solved.mesh.resolution
@@ -114,7 +125,7 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
         solved = replace(finer, iterations=solved.iterations + finer.iterations, proven_error=error)
         if error is not None and error <= 0.5 * case.accuracy:
             break
-    if solved.proven_error is not None and solved.proven_error > ANOTHER:
+    if solved.proven_error is not None and solved.proven_error > DIFFERENT_EQUILIBRIUM:
         order = solved.mesh.resolution.order
         return replace(
             solved,
@@ -126,7 +137,11 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
 
 
 def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equilibrium:
-    """Solve on one mesh."""
+    """Solve a press on one mesh.
+
+    Raises:
+        SceneError: If an element of the mesh is folded.
+    """
     if np.isinf(shape_error(mesh)):
         raise too_near_the_rim(case, mesh.resolution)
     solver = assembly(mesh.template, 4 if case.theory.bending else 3)
@@ -150,6 +165,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 
 
 def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
+    """Return the discrete film for the press with another force (N)."""
     angle = float(np.arctan2(case.at[1], case.at[0]))
     return ElasticFilm(geometry, DimensionlessGroups.of(case.film, force, bending=case.theory.bending, angle=angle))
 
@@ -157,63 +173,106 @@ def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
 def _newton(
     case: LoadCase, elastic: ElasticFilm, solver: Assembly, mesh: PlacedMesh, start: Equilibrium | None
 ) -> NewtonResult:
-    """Newton's method from the start if its mesh fits, else from Schwerin's field; by load steps if that fails."""
+    """Solve with Newton's method.
+
+    The first iterate is the field of the starting equilibrium if it has the same mesh, or else the field of Schwerin.
+    If Newton's method fails, the load is applied in steps.
+    """
     z = mesh.placement.to_template(from_oval(mesh.node_points, mesh.oval))
-    cold = schwerin_start(z, float(mesh.placement.rho), elastic.groups)
-    result = solve_newton(elastic, solver, _start_field(start, mesh.template, cold), case.tolerance)
-    return result if result.converged else _by_load_steps(case, result, mesh.geometry, solver, cold)
+    schwerin_field = schwerin_start(z, float(mesh.placement.rho), elastic.groups)
+    result = solve_newton(elastic, solver, _start_field(start, mesh.template, schwerin_field), case.tolerance)
+    if result.converged:
+        return result
+    return _solve_by_load_steps(case, result, mesh.geometry, solver, schwerin_field)
 
 
-def _by_load_steps(
-    case: LoadCase, failed: NewtonResult, geometry: Geometry, solver: Assembly, cold: Array
+def _solve_by_load_steps(
+    case: LoadCase, failed: NewtonResult, geometry: Geometry, solver: Assembly, first_field: Array
 ) -> NewtonResult:
-    """Follow the equilibrium up from a small force where at the full force the film runs away into wrinkles."""
-    reached, ratio, steps, field = 0.0, 2.0, failed.iterations, cold
-    force = FIRST_LOAD * case.force
-    for _ in range(LOAD_STEPS):
-        near = np.inf if reached else GUARD_BELOW
-        result = solve_newton(_elastic(case, geometry, force), solver, field, case.tolerance, near)
-        steps += result.iterations
+    """Solve with increasing forces, each from the field before, if the solve with the full force has failed.
+
+    Args:
+        case: The press.
+        failed: Result of the solve with the full force.
+        geometry: Elements of the mesh.
+        solver: Linear solver for the mesh.
+        first_field: First iterate of the smallest force, shape (n_node, 3).
+
+    Returns:
+        The result with the full force, or `failed` with the total number of iterations.
+    """
+    solved_force = 0.0
+    force_ratio = 2.0
+    iterations = failed.iterations
+    field = first_field
+    force = FIRST_LOAD_SHARE * case.force
+    for _ in range(MAX_LOAD_STEPS):
+        local_below = np.inf if solved_force else GUARD_BELOW
+        result = solve_newton(_elastic(case, geometry, force), solver, field, case.tolerance, local_below)
+        iterations += result.iterations
         if result.converged and force == case.force:
-            return replace(result, iterations=steps, message=f"converged in {steps} steps, the load in parts")
+            message = f"converged in {iterations} steps, the load in parts"
+            return replace(result, iterations=iterations, message=message)
         if result.converged:
-            reached, field = force, result.field
-        elif reached == 0.0:
+            solved_force = force
+            field = result.field
+        elif solved_force == 0.0:
             break
         else:
-            ratio = np.sqrt(ratio)
-        force = min(case.force, reached * ratio)
-    return replace(failed, iterations=steps)
+            force_ratio = np.sqrt(force_ratio)
+        force = min(case.force, solved_force * force_ratio)
+    return replace(failed, iterations=iterations)
 
 
-def _start_field(start: Equilibrium | None, template: Template, cold: Array) -> Array:
-    """The field of a neighbour on the same mesh, perhaps of another order; else the cold start."""
-    if start is None or (start.mesh.template.topology, start.mesh.template.half) != (template.topology, template.half):
-        return cold
-    before, order = start.mesh.template, template.resolution.order
-    is_other = replace(before.resolution, order=order) != template.resolution
-    if is_other or not np.array_equal(before.splits, template.splits):
-        return cold
-    return start.field if before.resolution == template.resolution else resampled(start.field, before, template)
+def _start_field(start: Equilibrium | None, template: Template, default: Array) -> Array:
+    """Return the first iterate of Newton's method, shape (n_node, 3).
+
+    Args:
+        start: Equilibrium of a similar press; None if there is none.
+        template: Template of the mesh.
+        default: Field that is returned if the mesh of `start` differs in more than the order of its elements.
+    """
+    if start is None:
+        return default
+    before = start.mesh.template
+    if (before.topology, before.half) != (template.topology, template.half):
+        return default
+    with_same_order = replace(before.resolution, order=template.resolution.order)
+    if with_same_order != template.resolution or not np.array_equal(before.splits, template.splits):
+        return default
+    if before.resolution == template.resolution:
+        return start.field
+    return resampled(start.field, before, template)
 
 
 def resampled(field: Array, before: Template, after: Template) -> Array:
-    """A nodal field on the nodes of the same mesh with elements of another order, shape (n_node, 3)."""
+    """Interpolate a nodal field to the same mesh with elements of another order.
+
+    Args:
+        field: Values at the nodes of `before`, shape (n_node_before, 3).
+        before: Template of the field.
+        after: Template with elements of another order.
+
+    Returns:
+        Values at the nodes of `after`, shape (n_node, 3).
+    """
     values = tensor_values(before.resolution.order, after.xi, after.eta)
-    other = np.empty((after.n_node, 3))
-    other[after.nodes] = values @ field[before.nodes]
-    return other
+    interpolated = np.empty((after.n_node, 3))
+    interpolated[after.nodes] = values @ field[before.nodes]
+    return interpolated
 
 
 def _failure_reason(solved: Equilibrium, tolerance: float) -> str:
-    """Why the solve failed, for the error message."""
-    (x, y), smallest = solved.at, principal_stress(solved)[0]
-    wrinkles = (
-        f"; the film is compressed to {smallest:.3g} MPa on the way: it wrinkles, which has many solutions; "
-        "press farther from the rim, with less force, or give the film a pretension"
-    )
-    return (
+    """Return the error message of a failed solve."""
+    x, y = solved.at
+    smallest_stress, _ = principal_stress(solved)
+    message = (
         f"no equilibrium at {solved.force:.4g} N, position ({x:.4g}, {y:.4g}) mm: {solved.message}; "
         f"residual {solved.residual:.2g} (expected {tolerance:.2g}) after {solved.iterations} steps"
-        + (wrinkles if smallest < 0.0 else "")
     )
+    if smallest_stress < 0.0:
+        message += (
+            f"; the film is compressed to {smallest_stress:.3g} MPa on the way: it wrinkles, which has many solutions; "
+            "press farther from the rim, with less force, or give the film a pretension"
+        )
+    return message
