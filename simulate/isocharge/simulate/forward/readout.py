@@ -1,13 +1,14 @@
 """Charge collected by an electrode on a stretched piezoelectric film.
 
-The electrodes are held at virtual ground by the charge amplifiers, so the field vanishes and an electrode of area A
-collects only what the in-plane stress polarises (Mirbagheri et al. 2007, eq. 2),
+The charge amplifiers hold the electrodes at virtual ground, so the electric field vanishes. An electrode of area A
+collects only the polarisation caused by the in-plane stress (Mirbagheri et al. 2007, eq. 2):
 
-    Q = A * mean(d31 * s11 + d32 * s22),
+    Q = A * mean(d31 * s11 + d32 * s22)
 
-with s the mid-surface stress in the film's axes, 1 = drawn direction = x. The area readout takes the mean over the
-electrode; the edge readout is the paper's eq. 3: s11 averaged over the left and right edges, s22 over the lower and
-upper. Touch charge is the reading under load minus the reading without: a uniform pretension cancels.
+where s is the mid-surface stress in the axes of the film and axis 1 is the drawn direction x. The area readout takes
+the mean over the electrode. The edge readout follows eq. 3 of the paper: it averages s11 over the left and right edges,
+and s22 over the lower and upper edges. The touch charge is the charge under load minus the charge without load, so a
+uniform pretension cancels.
 """
 
 from dataclasses import dataclass
@@ -23,28 +24,34 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import MAX_PART_SIDE, Electrode, Readout, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
 
-DIRECT, FINE, COARSE = 20, 12, 4
-"""Gauss points per side of an electrode: of one press; of many, near the probe and away from it.
+DIRECT = 20
+"""Number of Gauss points per side of an electrode for single presses.
 
-The stress has a kink on the footprint's edge; where that crosses an electrode 20 points leave 1e-5, 12 leave 8e-5.
+The stress has a kink at the edge of the footprint. If this edge crosses an electrode, the relative error is 1e-5.
 """
 
-ALONG = 8
-"""Gauss points along a line."""
+FINE = 12
+"""Number of Gauss points per side of an electrode near the probe, for many presses. The relative error is 8e-5."""
+
+COARSE = 4
+"""Number of Gauss points per side of an electrode away from the probe, for many presses."""
+
+LINE_POINTS = 8
+"""Number of Gauss points on a line."""
 
 NEAR = 1.0
-"""Distance from the probe's edge to an electrode below which the fine rule is used, mm; beyond it the coarse one leaves
-1e-4 of the charge at most, for squares of 1 to 6 mm."""
+"""Distance between the footprint and an electrode below which the fine rule is used, mm. At larger distances the
+relative error of the coarse rule is at most 1e-4 for squares of 1 to 6 mm."""
 
 
 @dataclass(frozen=True)
 class ReadoutPoints:
-    """How charges follow from the stress at points of the film.
+    """Integration points and weights that convert the stress of the film into charges.
 
     Attributes:
-        points: (x, y), shape (n_electrode, n_point, 2), mm.
+        points: Points (x, y) on the film, shape (n_electrode, n_point, 2), mm.
         weights: Charge per stress (s11, s22, s12), shape (n_electrode, n_point, 3), pC/MPa.
-        count: Points of each electrode, shape (n_electrode,); those beyond have no weight.
+        count: Number of points of each electrode, shape (n_electrode,). The remaining points have zero weight.
     """
 
     points: Array
@@ -53,7 +60,12 @@ class ReadoutPoints:
 
     @classmethod
     def of(cls, sensor: Sensor, per_side: int) -> "ReadoutPoints":
-        """Integration points for a sensor's electrodes and readout."""
+        """Return the integration points for the electrodes and the readout of a sensor.
+
+        Args:
+            sensor: The sensor.
+            per_side: Number of Gauss points per side of an electrode.
+        """
         layout = _on_layout(sensor.electrodes, sensor.readout, per_side)
         per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
         weights = sensor.gains[:, None, None] * layout.weights * per_stress
@@ -61,52 +73,66 @@ class ReadoutPoints:
 
     @classmethod
     def along(cls, sensor: Sensor, lines: Array) -> "ReadoutPoints":
-        """Points along straight lines of metal that belong to the electrodes, each read by itself.
+        """Return integration points on straight lines of metal that belong to the electrodes.
 
         Args:
-            sensor: Its coefficients and calibration are used.
-            lines: Ends on the layout, shape (n_electrode, n_line, 2, 2), mm.
+            sensor: Sensor whose coefficients and calibration are used.
+            lines: End points (x, y) of the lines in the layout, shape (n_electrode, n_line, 2, 2), mm.
 
         Returns:
-            For n_electrode * n_line lines, those of an electrode in turn; weights are per mm of width, pC/(MPa mm).
+            Points for n_electrode * n_line lines, ordered by electrode. The weights are per width of the line,
+            pC/(MPa mm).
         """
-        at, share = gauss_line(ALONG)
-        start, step = lines[:, :, :1], lines[:, :, 1:] - lines[:, :, :1]
-        points = start + at[:, None] * step
+        position, share = gauss_line(LINE_POINTS)
+        start = lines[:, :, :1]
+        step = lines[:, :, 1:] - start
+        points = start + position[:, None] * step
         weights = sensor.gains[:, None, None] * np.linalg.norm(step, axis=3) * share
         per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
-        placed = sensor.calibration.place(points.reshape(-1, ALONG, 2))
-        return cls(placed, weights.reshape(-1, ALONG, 1) * per_stress, np.full(len(placed), ALONG))
+        placed = sensor.calibration.place(points.reshape(-1, LINE_POINTS, 2))
+        return cls(placed, weights.reshape(-1, LINE_POINTS, 1) * per_stress, np.full(len(placed), LINE_POINTS))
 
     def charge(self, stress: Array) -> Array:
-        """Charges (..., n_electrode), pC, from stress at the points, shape (..., n_electrode, n_point, 3), MPa."""
+        """Compute charges from the stress at the points.
+
+        Args:
+            stress: Stress (s11, s22, s12), shape (..., n_electrode, n_point, 3), MPa.
+
+        Returns:
+            Charges, shape (..., n_electrode), pC.
+        """
         return np.asarray(np.einsum("...epc,epc->...e", stress, self.weights))
 
 
 @lru_cache(maxsize=32)
 def _on_layout(electrodes: tuple[Electrode, ...], readout: Readout, per_side: int) -> ReadoutPoints:
-    """Points where the electrodes are drawn; weights are areas, mm^2. Films of one layout share them."""
-    parts = [electrode_rule(electrode, readout, per_side) for electrode in electrodes]
-    count = np.array([len(share) for _, share in parts])
-    points, areas = np.zeros((2, len(parts), count.max(), 3))
-    for number, (electrode, (at, share)) in enumerate(zip(electrodes, parts, strict=True)):
-        points[number, : len(at), :2], areas[number, : len(at)] = at, electrode.area * share
-    return ReadoutPoints(points[..., :2], areas, count)
+    """Return the integration points in the layout, before the calibration. The weights are areas, mm^2.
+
+    The result is cached, because many films have the same layout.
+    """
+    rules = [electrode_rule(electrode, readout, per_side) for electrode in electrodes]
+    count = np.array([len(share) for _, share in rules])
+    points = np.zeros((len(rules), count.max(), 2))
+    areas = np.zeros((len(rules), count.max(), 3))
+    for number, (electrode, (electrode_points, share)) in enumerate(zip(electrodes, rules, strict=True)):
+        points[number, : len(electrode_points)] = electrode_points
+        areas[number, : len(electrode_points)] = electrode.area * share
+    return ReadoutPoints(points, areas, count)
 
 
 def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
-    """Touch charge of each electrode.
+    """Compute the touch charge of each electrode.
 
     Args:
-        sensor: Its electrodes, coefficients and readout are used; its `coated_film` must be the one that was solved.
+        sensor: Sensor whose `coated_film` was solved.
         equilibrium: The solved press.
 
     Returns:
-        Shape (n_electrode,), pC, in the order of `sensor.electrode_names`; positive for tension along a direction with
-        a positive coefficient.
+        Charges in the order of `sensor.electrode_names`, shape (n_electrode,), pC. Positive for tension along a
+        direction with a positive coefficient.
 
     Raises:
-        SensorError: If the film is another one, or the sensor reads a surface and bending was left out.
+        SensorError: If another film was solved, or if the readout is at an outer surface and the theory omits bending.
     """
     if sensor.coated_film != equilibrium.film:
         raise SensorError(
@@ -125,17 +151,26 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
-    """Charge of the contact pressure on the electrodes, d33 * mean(s33), shape (n_electrode,), pC.
+    """Compute the charge of the contact pressure on the electrodes, d33 * mean(s33) per area.
 
-    The film hangs free: through its thickness s33 goes from -pressure under the probe to 0 at the other face, so its
-    mean is -pressure / 2, by symmetry also where the film is sheared; -pressure would need a rigid back. Only the part
-    of an electrode under the footprint counts; a negative d33, as PVDF has, gives a positive charge.
+    The back of the film is free. Through the thickness, s33 changes from minus the pressure under the probe to zero at
+    the back, so its mean is minus half of the pressure. Only the part of an electrode under the footprint contributes.
+    The negative d33 of PVDF gives a positive charge.
+
+    Args:
+        sensor: The sensor.
+        probe: The probe.
+        at: Centroid (x, y) of the footprint, mm.
+        force: Force, N.
+
+    Returns:
+        Charges, shape (n_electrode,), pC.
     """
     if sensor.piezo.d33 == 0.0:
         return np.zeros(len(sensor.electrodes))
     covered = []
-    for electrode, (centre, reach) in zip(sensor.electrodes, sensor.part_circles, strict=True):
-        near = np.flatnonzero(np.abs(complex(*at) - centre) < reach + probe.reach)
+    for electrode, (centre, radius) in zip(sensor.electrodes, sensor.part_circles, strict=True):
+        near = np.flatnonzero(np.abs(complex(*at) - centre) < radius + probe.reach)
         covered.append(
             sum(probe.covered_area(sensor.calibration.place(electrode.parts[i]), complex(*at)) for i in near)
         )
@@ -143,42 +178,66 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:
-    """Pyroelectric charge of a uniform temperature step, shape (n_electrode,), pC: the same on equal electrodes.
+    """Compute the pyroelectric charge of a uniform change of the temperature.
 
-    `step` is in K, positive for warming, which takes charge from a PVDF film with d31 > 0. The clamp is taken to expand
-    as the film does: what a rim holds back is stress, and belongs to the pretension.
+    The clamp is assumed to expand as the film does. The stress from different expansions is part of the pretension.
+
+    Args:
+        sensor: The sensor.
+        step: Change of the temperature, K, positive for warming. Warming a PVDF film with d31 > 0 lowers the charge.
+
+    Returns:
+        Charges, shape (n_electrode,), pC, proportional to the areas of the electrodes.
     """
     areas = np.array([electrode.area for electrode in sensor.electrodes])
     return sensor.calibration.read(sensor.gains * areas * sensor.piezo.pyro * step)
 
 
 def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tuple[Array, Array]:
-    """Integration points, shape (n, 2), mm, and the share of each in the mean of (s11, s22, s12), shape (n, 3)."""
-    return _edge_rule(electrode, per_side) if readout == "edge" else _area_rule(electrode, per_side)
+    """Return the integration points of one electrode, and their shares of the mean stress.
+
+    Args:
+        electrode: The electrode.
+        readout: Mean over the area of the electrode, or over its edges.
+        per_side: Number of Gauss points per side.
+
+    Returns:
+        Points (x, y), shape (n, 2), mm, and their shares of the mean of (s11, s22, s12), shape (n, 3).
+    """
+    if readout == "edge":
+        return _edge_rule(electrode, per_side)
+    return _area_rule(electrode, per_side)
 
 
 def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
-    """Points (n, 2) and shares of the mean (n, 3) for a mean over the electrode."""
+    """Return the points and shares of a mean over the area of the electrode; see `electrode_rule`."""
     if electrode.square:
         unit, share = gauss_square(per_side)
-        low, high = np.array(electrode.corners[0]), np.array(electrode.corners[2])
-        points = low + unit * (high - low)
+        lower_left = np.array(electrode.corners[0])
+        upper_right = np.array(electrode.corners[2])
+        points = lower_left + unit * (upper_right - lower_left)
     elif len(electrode.parts) == 1:
         points, share = gauss_polygon(electrode.parts[0], per_side)
     else:
         rules = [gauss_quadrilateral(part, per_side, MAX_PART_SIDE) for part in electrode.parts]
-        points, weights = (np.concatenate(values) for values in zip(*rules, strict=True))
+        points = np.concatenate([part_points for part_points, _ in rules])
+        weights = np.concatenate([part_weights for _, part_weights in rules])
         share = weights / weights.sum()
     return points, np.repeat(share[:, None], 3, axis=1)
 
 
 def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
-    """Points and shares for s11 over the left and right edges and s22 over the lower and upper ones (eq. 3)."""
-    at, share = gauss_line(2 * per_side)
-    lower, right, upper, left = (
-        np.array(start) + at[:, None] * (np.array(end) - np.array(start))
-        for start, end in zip(electrode.corners, electrode.corners[1:] + electrode.corners[:1], strict=True)
-    )
-    half, zero = 0.5 * share, np.zeros_like(share)
-    first, second = np.stack([half, zero, zero], axis=1), np.stack([zero, half, zero], axis=1)
-    return np.concatenate([left, right, lower, upper]), np.concatenate([first, first, second, second])
+    """Return the points and shares of the edge readout (Mirbagheri et al. 2007, eq. 3); see `electrode_rule`.
+
+    The mean of s11 is over the left and right edges, that of s22 over the lower and upper edges.
+    """
+    position, share = gauss_line(2 * per_side)
+    corners = np.array(electrode.corners)
+    edges = np.roll(corners, -1, axis=0) - corners
+    lower, right, upper, left = corners[:, None] + position[:, None] * edges[:, None]
+    half = 0.5 * share
+    zero = np.zeros_like(share)
+    share_11 = np.stack([half, zero, zero], axis=1)
+    share_22 = np.stack([zero, half, zero], axis=1)
+    points = np.concatenate([left, right, lower, upper])
+    return points, np.concatenate([share_11, share_11, share_22, share_22])

@@ -1,36 +1,38 @@
-"""Parts of a film that a coat stiffens, and the mean of both along their edges, where elements are cut.
+"""Stiffness of a film with a coat on parts of it, whose edges do not follow the elements.
 
-Across an edge with the normal n the strain jumps by sym(a x n) = N a; displacement and traction go on. Within a band
-along an edge, film and coated film count as a laminate of that normal, of phases i with the stiffness C_i and the
-shares f_i (composite voxels: Kabel, Merkert and Schneider 2015). With the strain E of the mixture, that of a phase is
+The strain jumps by sym(a x n) = N a across an edge of the coat with the normal n. Displacement and traction are
+continuous. Within a band along the edge, the bare film and the coated film are treated as a laminate with this normal.
+The phases i of the laminate have the stiffness C_i and the volume share f_i (composite voxels: Kabel, Merkert and
+Schneider 2015). If E is the mean strain, the strain of a phase is
 
     E_i = E + N M_i^-1 (T E - N^T C_i E),   M_i = N^T C_i N,   T = (sum f_i M_i^-1)^-1 sum f_i M_i^-1 N^T C_i,
 
-and the stress sum f_i C_i E_i. So the jump is in the energy and in what is read, and elements need no edge there; what
-is left is of second order in the band's width over that of the coat, at its corners.
+and the mean stress is sum f_i C_i E_i. The energy and the charges therefore include the jump, although the elements
+have no edge there. The remaining error is of second order in the ratio of the width of the band to that of the coat.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.numerics.polygon import area_in_disk, spare
 
-DIFFERENCE = 0.1
-"""Step of the differences that give the normal, in widths of the band."""
+NORMAL_STEP = 0.1
+"""Step of the finite differences that determine the normal of an edge, in widths of the band."""
 
 
 @dataclass(frozen=True, eq=False)
 class Coating:
-    """What stiffens parts of a film, in units of the film's radius.
+    """A coat on parts of a film.
 
     Attributes:
-        layers: What is coated at least once, twice, ...: convex polygons without common area, corners x + iy,
-            anticlockwise.
-        band: Width of the band along the edges.
-        bare: C over E of the film, shape (3, 3).
-        added: What a coat adds to it, shape (3, 3).
+        layers: Areas with at least one layer of the coat, with at least two layers, and so on. Each area consists of
+            convex polygons that do not overlap, with anticlockwise corners x + iy, in film radii.
+        band: Width of the band along the edges, in film radii.
+        bare: Elasticity matrix C over E of the film, shape (3, 3).
+        added: Addition of one layer of the coat to this matrix, shape (3, 3).
     """
 
     layers: tuple[tuple[Complexes, ...], ...]
@@ -39,51 +41,110 @@ class Coating:
     added: Array
 
     def near(self, points: Complexes) -> Booleans:
-        """Which points a coat may reach, of the shape of `points`."""
-        return np.asarray(np.any([self._within(part, points) for part in self.layers[0]], axis=0))
+        """Return whether points lie on the coat or near it. Distant points are always excluded.
+
+        Args:
+            points: Film points x + iy, any shape, in film radii.
+        """
+        return np.asarray(np.any([self._is_near(part, points) for part in self.layers[0]], axis=0))
 
     def moduli(self, points: Complexes) -> Array:
-        """What is added to C over E at points, shape (..., 3, 3)."""
-        shares, stiffness, strains = self._phases(points)
-        return np.asarray(np.einsum("...i,iab,...ibc->...ac", shares, stiffness, strains) - self.bare)
+        """Compute the addition of the coat to the elasticity matrix C over E.
+
+        Args:
+            points: Film points x + iy, shape (...), in film radii.
+
+        Returns:
+            Shape (..., 3, 3).
+        """
+        laminate = self._laminate(points)
+        mixture = np.einsum("...i,iab,...ibc->...ac", laminate.shares, laminate.stiffness, laminate.strain)
+        return np.asarray(mixture - self.bare)
 
     def film_strain(self, points: Complexes, strained: Array) -> Array:
-        """Strain of the film at points, shape (n, 3), as coated as each is, from that of the mixture."""
-        strains = self._phases(points)[2]
-        return np.asarray(np.einsum("nab,nb->na", strains[np.arange(points.size), self._depth(points)], strained))
+        """Compute the strain of the phase in which each point lies, from the mean strain of the laminate.
 
-    def _within(self, part: Complexes, points: Complexes) -> Booleans:
+        Args:
+            points: Film points x + iy, shape (n,), in film radii.
+            strained: Mean strain (E11, E22, 2 E12), shape (n, 3).
+
+        Returns:
+            Strain of the phase, shape (n, 3).
+        """
+        strain_of_phase = self._laminate(points).strain[np.arange(points.size), self._layer_count(points)]
+        return np.asarray(np.einsum("nab,nb->na", strain_of_phase, strained))
+
+    def _is_near(self, part: Complexes, points: Complexes) -> Booleans:
+        """Return whether points lie in the circle round a polygon that is enlarged by the width of the band."""
         middle = part.mean()
         return np.asarray(np.abs(points - middle) < np.abs(part - middle).max() + self.band)
 
     def _shares(self, points: Complexes) -> Array:
-        """Shares of the band's disk about each point that each layer covers, shape (..., n_layer)."""
-        shares, radius = np.zeros((*points.shape, len(self.layers))), 0.5 * self.band
+        """Compute the share of a disk about each point that each layer covers.
+
+        The diameter of the disk is the width of the band.
+
+        Args:
+            points: Film points x + iy, shape (...), in film radii.
+
+        Returns:
+            Shape (..., n_layer).
+        """
+        shares = np.zeros((*points.shape, len(self.layers)))
+        radius = 0.5 * self.band
         for number, layer in enumerate(self.layers):
             for part in layer:
-                close = self._within(part, points)
+                close = self._is_near(part, points)
                 shares[close, number] += area_in_disk(part, points[close], radius) / (np.pi * radius**2)
         return np.minimum(shares, 1.0)
 
-    def _depth(self, points: Complexes) -> Integers:
-        """How often each point is coated, of the shape of `points`."""
+    def _layer_count(self, points: Complexes) -> Integers:
+        """Return the number of layers of the coat at each point, of the shape of `points`."""
         covered = [np.any([spare(part, points) >= 0.0 for part in layer], axis=0) for layer in self.layers]
         return np.asarray(np.sum(covered, axis=0))
 
-    def _phases(self, points: Complexes) -> tuple[Array, Array, Array]:
-        """Shares of the phases, shape (..., n_phase), their C over E, shape (n_phase, 3, 3), and the matrices to their
-        strains from that of the mixture, shape (..., n_phase, 3, 3)."""
-        covered, step = self._shares(points), DIFFERENCE * self.band
-        x, y = (self._shares(points + d).sum(-1) - self._shares(points - d).sum(-1) for d in (step, 1j * step))
-        size = np.hypot(x, y)
-        x, y = (np.divide(part, size, out=np.full_like(size, np.sqrt(0.5)), where=size > 0.0) for part in (x, y))
-        shares = -np.diff(covered, prepend=1.0, append=0.0)
-        across = np.zeros((*points.shape, 1, 3, 2))
-        across[..., 0, 0, 0] = across[..., 0, 2, 1] = x
-        across[..., 0, 1, 1] = across[..., 0, 2, 0] = y
+    def _normal(self, points: Complexes) -> tuple[Array, Array]:
+        """Compute the normal of the edge near each point from the gradient of the covered share.
+
+        Returns:
+            Components along x and y, each of the shape of `points`. Far from edges both are sqrt(1 / 2).
+        """
+        step = NORMAL_STEP * self.band
+        by_x = self._shares(points + step).sum(-1) - self._shares(points - step).sum(-1)
+        by_y = self._shares(points + 1j * step).sum(-1) - self._shares(points - 1j * step).sum(-1)
+        size = np.hypot(by_x, by_y)
+        has_normal = size > 0.0
+        x = np.divide(by_x, size, out=np.full_like(size, np.sqrt(0.5)), where=has_normal)
+        y = np.divide(by_y, size, out=np.full_like(size, np.sqrt(0.5)), where=has_normal)
+        return x, y
+
+    def _laminate(self, points: Complexes) -> "_Laminate":
+        """Compute the laminate at each point; see the module for the formulas."""
+        shares = -np.diff(self._shares(points), prepend=1.0, append=0.0)
+        x, y = self._normal(points)
+        jump = np.zeros((*points.shape, 1, 3, 2))  # N
+        jump[..., 0, 0, 0] = x
+        jump[..., 0, 2, 1] = x
+        jump[..., 0, 1, 1] = y
+        jump[..., 0, 2, 0] = y
         stiffness = self.bare + np.arange(len(self.layers) + 1)[:, None, None] * self.added
-        traction = across.swapaxes(-1, -2) @ stiffness
-        compliance = np.linalg.inv(traction @ across)
+        traction = jump.swapaxes(-1, -2) @ stiffness  # N^T C_i
+        compliance = np.linalg.inv(traction @ jump)  # M_i^-1
         weighted = shares[..., None, None] * compliance
-        common = np.linalg.solve(weighted.sum(axis=-3), (weighted @ traction).sum(axis=-3))
-        return shares, stiffness, np.eye(3) + across @ compliance @ (common[..., None, :, :] - traction)
+        common_traction = np.linalg.solve(weighted.sum(axis=-3), (weighted @ traction).sum(axis=-3))  # T
+        strain = np.eye(3) + jump @ compliance @ (common_traction[..., None, :, :] - traction)
+        return _Laminate(shares, stiffness, strain)
+
+
+class _Laminate(NamedTuple):
+    """Laminates of the bare film and the film with one, two, ... layers of the coat.
+
+    Attributes:
+        shares: Volume shares of the phases, shape (..., n_phase).
+        stiffness: Elasticity matrices C over E of the phases, shape (n_phase, 3, 3).
+        strain: Matrices that convert the mean strain into the strains of the phases, shape (..., n_phase, 3, 3).
+    """
+
+    shares: Array
+    stiffness: Array
+    strain: Array

@@ -1,7 +1,8 @@
-"""The mesh of one press: a template, where it lies on the film, and its elements there, ready for integration."""
+"""The mesh of one press: a template, its position on the film, and the integration rules of its elements."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -21,26 +22,28 @@ from isocharge.simulate.numerics.interpolation import (
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
 
-ROUND = 0.5
-"""Share of the film's radius within which the mesh of an oval film is that of a round one: probe and electrodes."""
+UNDEFORMED_RADIUS = 0.5
+"""Radius within which the mesh of an oval film equals that of a circular film, in film radii."""
 
 INVERSE_STEPS = 8
-"""Steps of Newton, with a slope that is right at the rim, to undo `to_oval`: to round-off up to e = 0.05."""
+"""Number of Newton steps of `from_oval`, which suffice for round-off up to e = 0.05. The slope is that at the rim."""
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """The elements of a template where it lies on the film, ready for integration.
+    """Integration rules for the elements of a mesh on the film.
 
     Attributes:
         nodes: Node numbers, shape (n_element, n_local).
-        gradient: d(basis)/d(X1, X2) at the quadrature points, shape (n_element, n_point, 2, n_local).
-        weights: Integration weights, shape (n_element, n_point); they add up to the meshed area.
-        load: Share of the load on each node's W, shape (n_node,); adds up to one over the number of copies.
-        mass: Lumped share of the area of each element's nodes, shape (n_element, n_local).
-        constraint: As `Template.constraint`.
-        coat: Elements that something stiffens, shape (n,), and what it adds there to C over E at the quadrature points,
-            shape (n, n_point, 3, 3).
+        gradient: Derivatives of the basis with respect to (X1, X2) at the quadrature points, shape
+            (n_element, n_point, 2, n_local).
+        weights: Integration weights, shape (n_element, n_point). Their sum is the meshed area.
+        load: Share of the load on the deflection W of each node, shape (n_node,). The sum is one over the number of
+            copies of the mesh.
+        mass: Lumped area of the nodes of each element, shape (n_element, n_local).
+        constraint: Matrix for hanging nodes; see `Template.constraint`.
+        coat: Indices of the coated elements, shape (n,), and the addition of the coat to the elasticity matrix C over E
+            at their quadrature points, shape (n, n_point, 3, 3). None if there is no coat.
     """
 
     nodes: Integers
@@ -53,43 +56,56 @@ class Geometry:
 
     @classmethod
     def build(cls, template: Template, points: Complexes) -> "Geometry":
-        """Integrate over elements whose nodes lie at film points; a footprint's load is spread uniformly over it."""
-        values, by_local, weights, at_nodes, node_weights = _quadrature(template.resolution.order)
-        gradient, jacobian = _film_gradient(by_local[:, None], points)
-        area = jacobian * weights
-        inner = template.footprint
-        share = area[inner] @ values
-        load = np.bincount(template.nodes[inner].ravel(), share.ravel(), template.n_node)
-        mass = _jacobian(at_nodes[:, None], points)[-1] * node_weights
-        load = load / (template.copies * area[inner].sum())
+        """Compute the integration rules of a mesh. The load is uniform over the footprint.
+
+        Args:
+            template: Template of the mesh.
+            points: Film points of the nodes of every element, shape (n_element, n_local), in film radii.
+        """
+        rule = _quadrature(template.resolution.order)
+        gradient, determinant = _film_gradient(rule.derivatives[:, None], points)
+        area = determinant * rule.weights
+        mass = _jacobian(rule.node_derivatives[:, None], points).determinant * rule.node_weights
+        footprint = template.footprint
+        node_area = area[footprint] @ rule.values
+        load = np.bincount(template.nodes[footprint].ravel(), node_area.ravel(), template.n_node)
+        load = load / (template.copies * area[footprint].sum())
         if template.constraint is not None:
             load = template.constraint.T @ load
         return cls(template.nodes, gradient, area, load, mass, template.constraint)
 
     @property
     def stacked(self) -> Array:
-        """The gradient with points and derivatives along one axis, shape (n_element, n_point * 2, n_local)."""
+        """The gradient with quadrature points and derivatives on one axis, shape (n_element, n_point * 2, n_local)."""
         return self.gradient.reshape(len(self.gradient), -1, self.gradient.shape[-1])
 
     def gather(self, local: Array) -> Array:
-        """Add up element contributions of shape (n_element, n_local) at the nodes, shape (n_node,).
+        """Sum the contributions of the elements at the nodes.
 
-        Those of a hanging node go to the nodes that it follows.
+        The contributions at a hanging node are distributed to the nodes that determine its value.
+
+        Args:
+            local: Contributions, shape (n_element, n_local).
+
+        Returns:
+            Sums, shape (n_node,).
         """
         total = np.asarray(np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64))
-        return total if self.constraint is None else np.asarray(self.constraint.T @ total)
+        if self.constraint is None:
+            return total
+        return np.asarray(self.constraint.T @ total)
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedMesh:
-    """A template where it lies under one press, the press rotated onto the positive x axis.
+    """The mesh of one press, which is rotated onto the positive x axis.
 
     Attributes:
-        template: The template.
-        placement: Where it lies.
-        layer: Width of the thin rings at the rim over the film's radius.
-        oval: e exp(2 i alpha) of a rim at 1 + e cos 2 (angle - alpha), in film radii.
-        coat: What stiffens parts of the film, in film radii, the press rotated onto the x axis.
+        template: Template of the mesh.
+        placement: Position of the template on a circular film.
+        layer: Width of the thin rings at the rim, in film radii.
+        oval: e exp(2 i alpha) of an oval clamp, whose rim lies at 1 + e cos 2 (angle - alpha), in film radii.
+        coat: Coat on parts of the film, in film radii and rotated with the press; None if there is no coat.
     """
 
     template: Template
@@ -100,12 +116,12 @@ class PlacedMesh:
 
     @property
     def resolution(self) -> Resolution:
-        """How fine it is."""
+        """Fineness of the mesh."""
         return self.template.resolution
 
     @cached_property
     def points(self) -> Complexes:
-        """Film points of every element's nodes, shape (n_element, n_local), in film radii."""
+        """Film points of the nodes of every element, shape (n_element, n_local), in film radii."""
         return self.template.from_base(to_oval(self.placement.element_points(self.template), self.oval))
 
     @property
@@ -115,34 +131,48 @@ class PlacedMesh:
 
     @cached_property
     def geometry(self) -> Geometry:
-        """The elements, ready for integration."""
+        """Integration rules of the elements."""
         geometry = Geometry.build(self.template, self.points)
         if self.coat is None:
             return geometry
         xi, eta, _ = gauss_reference_square(self.resolution.order + 1)
         points = self.points @ tensor_values(self.resolution.order, xi, eta).T
-        stiffened = np.flatnonzero(self.coat.near(points).any(axis=1))
-        return replace(geometry, coat=(stiffened, self.coat.moduli(points[stiffened])))
+        coated = np.flatnonzero(self.coat.near(points).any(axis=1))
+        return replace(geometry, coat=(coated, self.coat.moduli(points[coated])))
 
     def locate(self, points: Complexes) -> tuple[Integers, Array, Array, Booleans]:
-        """Element, xi and eta of film points, shape (n,), in film radii, the press rotated onto the x axis.
+        """Find the elements that contain film points.
 
-        And which points were mirrored into the half that is meshed.
+        Args:
+            points: Film points rotated with the press, shape (n,), in film radii.
+
+        Returns:
+            Index of the element, xi, eta, and whether the point was reflected into the meshed half, each of shape (n,).
         """
         position, mirrored = self.template.into_meshed_half(from_oval(points, self.oval))
         element, xi, eta = self.placement.batch().locate(self.template, position[None])
         return *self.template.within(element[0], xi[0], eta[0]), mirrored
 
     def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:
-        """d(basis)/d(X1, X2) at points of elements, shape (n, 2, n_local)."""
-        _, by_local = tensor_basis(self.resolution.order, xi, eta)
-        return _film_gradient(by_local[:, :, None, :], self.points[element])[0][:, 0]
-
-    def node_derivatives(self, values: Array) -> Array:
-        """Derivatives by (X1, X2) at the nodes of every element, of values at those nodes.
+        """Compute the derivatives of the basis with respect to (X1, X2) at points of elements.
 
         Args:
-            values: Shape (n_element, n_local, k).
+            element: Index of the element of each point, shape (n,).
+            xi: First local coordinate, shape (n,).
+            eta: Second local coordinate, shape (n,).
+
+        Returns:
+            Shape (n, 2, n_local).
+        """
+        _, derivatives = tensor_basis(self.resolution.order, xi, eta)
+        gradient, _ = _film_gradient(derivatives[:, :, None, :], self.points[element])
+        return gradient[:, 0]
+
+    def node_derivatives(self, values: Array) -> Array:
+        """Compute the derivatives of nodal values with respect to (X1, X2) at the nodes of every element.
+
+        Args:
+            values: Values at the nodes, shape (n_element, n_local, k).
 
         Returns:
             Shape (n_element, n_local, 2, k).
@@ -153,76 +183,122 @@ class PlacedMesh:
 
     @cached_property
     def _node_gradient(self) -> Array:
-        """d(basis)/d(X1, X2) at the nodes of every element, shape (n_element, n_local, 2, n_local)."""
-        _, by_local = tensor_basis(self.resolution.order, self.template.xi, self.template.eta)
-        return _film_gradient(by_local[:, None], self.points)[0]
+        """Derivatives of the basis with respect to (X1, X2) at the nodes, shape (n_element, n_local, 2, n_local)."""
+        _, derivatives = tensor_basis(self.resolution.order, self.template.xi, self.template.eta)
+        gradient, _ = _film_gradient(derivatives[:, None], self.points)
+        return gradient
 
 
 def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> PlacedMesh:
-    """Place the template of a probe under a press; `layer` is the width of the thin rings over the film's radius."""
-    template, angle = template_for(probe, resolution, not film.is_axisymmetric), float(np.arctan2(at[1], at[0]))
+    """Place the template of a probe under a press.
+
+    Args:
+        film: The film.
+        probe: The probe.
+        at: Centroid (x, y) of the footprint, mm.
+        resolution: Fineness of the mesh.
+        layer: Width of the thin rings at the rim, in film radii.
+    """
+    template = template_for(probe, resolution, whole=not film.is_axisymmetric)
+    angle = float(np.arctan2(at[1], at[0]))
     placement = Placement.of(template, probe.rotated(-angle), np.array(np.hypot(*at)), film.radius, layer)
     return PlacedMesh(template, placement, layer, film.oval * np.exp(2j * (film.oval_axis - angle)))
 
 
 def to_oval(points: Complexes, oval: complex) -> Complexes:
-    """Points of the round film (unit radius) where they lie on an oval one: the inner half of it stays."""
+    """Map points of a circular film to an oval film. Points within `UNDEFORMED_RADIUS` do not move.
+
+    Args:
+        points: Points x + iy, any shape, in film radii.
+        oval: e exp(2 i alpha) of the clamp; see `PlacedMesh`.
+    """
     if oval == 0.0:
         return points
-    radius = np.maximum(np.abs(points), ROUND)
-    return np.asarray(points * (1.0 + _swell(radius) * (np.conj(oval) * (points / radius) ** 2).real))
+    radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
+    return np.asarray(points * (1.0 + _displacement_share(radius) * (np.conj(oval) * (points / radius) ** 2).real))
 
 
 def from_oval(points: Complexes, oval: complex) -> Complexes:
-    """The inverse of `to_oval`."""
+    """Map points of an oval film to a circular film. This is the inverse of `to_oval`."""
     if oval == 0.0:
         return points
-    radius = start = np.maximum(np.abs(points), ROUND)
-    along = (np.conj(oval) * (points / start) ** 2).real
+    oval_radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
+    rim_displacement = (np.conj(oval) * (points / oval_radius) ** 2).real
+    radius = oval_radius
     for _ in range(INVERSE_STEPS):
-        radius = radius - (radius * (1.0 + _swell(radius) * along) - start) / (1.0 + 7.0 * along * _swell(radius))
-    return np.asarray(points * (radius / start))
+        share = _displacement_share(radius)
+        residual = radius * (1.0 + share * rim_displacement) - oval_radius
+        radius = radius - residual / (1.0 + 7.0 * rim_displacement * share)
+    return np.asarray(points * (radius / oval_radius))
 
 
-def _swell(radius: Array) -> Array:
-    """How much of the rim's displacement a radius takes part in: none up to `ROUND`, all at 1."""
-    return np.asarray(((radius - ROUND) / (1.0 - ROUND)) ** 3)
+def _displacement_share(radius: Array) -> Array:
+    """Return the displacement at a radius over that of the rim: 0 at `UNDEFORMED_RADIUS`, 1 at the rim."""
+    return np.asarray(((radius - UNDEFORMED_RADIUS) / (1.0 - UNDEFORMED_RADIUS)) ** 3)
+
+
+class _Quadrature(NamedTuple):
+    """Integration rules on the reference element.
+
+    Attributes:
+        values: Basis at the Gauss points, shape (n_point, n_local).
+        derivatives: Derivatives of the basis with respect to (xi, eta) at the Gauss points, shape (2, n_point,
+            n_local).
+        weights: Weights of the Gauss points, shape (n_point,).
+        node_derivatives: Derivatives of the basis with respect to (xi, eta) at the nodes, shape (2, n_local, n_local).
+        node_weights: Gauss-Lobatto weights of the nodes, shape (n_local,).
+    """
+
+    values: Array
+    derivatives: Array
+    weights: Array
+    node_derivatives: Array
+    node_weights: Array
+
+
+class _Jacobian(NamedTuple):
+    """Derivatives of the film coordinates (x, y) with respect to (xi, eta), each of shape (n_element, n_point)."""
+
+    x_xi: Array
+    x_eta: Array
+    y_xi: Array
+    y_eta: Array
+    determinant: Array
 
 
 @lru_cache(maxsize=16)
-def _quadrature(order: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Gauss points: basis (n_point, n_local), local derivatives (2, n_point, n_local), weights (n_point,).
-
-    And for the nodes themselves: local derivatives (2, n_local, n_local), Gauss-Lobatto weights (n_local,).
-    """
+def _quadrature(order: int) -> _Quadrature:
+    """Return the integration rules for elements of an order."""
     xi, eta, weights = gauss_reference_square(order + 1)
-    nodes, node_weight = lobatto_nodes(order), lobatto_quadrature(order)
+    values, derivatives = tensor_basis(order, xi, eta)
+    nodes = lobatto_nodes(order)
     node_xi, node_eta = np.meshgrid(nodes, nodes)
-    return (
-        *tensor_basis(order, xi, eta),
-        weights,
-        tensor_basis(order, node_xi.ravel(), node_eta.ravel())[1],
-        np.outer(node_weight, node_weight).ravel(),
-    )
+    _, node_derivatives = tensor_basis(order, node_xi.ravel(), node_eta.ravel())
+    node_weight = lobatto_quadrature(order)
+    return _Quadrature(values, derivatives, weights, node_derivatives, np.outer(node_weight, node_weight).ravel())
 
 
-def _film_gradient(by_local: Array, points: np.ndarray) -> tuple[Array, Array]:
-    """Gradients of the basis on the film.
+def _film_gradient(derivatives: Array, points: np.ndarray) -> tuple[Array, Array]:
+    """Compute the derivatives of the basis with respect to the film coordinates.
 
     Args:
-        by_local: d(basis)/d(xi, eta), shape (2, n_element or 1, n_point, n_local).
-        points: Film positions of the nodes as complex numbers, shape (n_element, n_local).
+        derivatives: Derivatives of the basis with respect to (xi, eta), shape (2, n_element or 1, n_point, n_local).
+        points: Film points of the nodes of every element, shape (n_element, n_local), in film radii.
 
     Returns:
-        d(basis)/d(X1, X2), shape (n_element, n_point, 2, n_local), and the Jacobian determinant (n_element, n_point).
+        Derivatives with respect to (X1, X2), shape (n_element, n_point, 2, n_local), and the determinant of the
+        Jacobian, shape (n_element, n_point).
     """
-    x_xi, x_eta, y_xi, y_eta, determinant = _jacobian(by_local, points)
-    inverse = np.stack([y_eta, -y_xi, -x_eta, x_xi], axis=-1) / determinant[..., None]
-    inverse = inverse.reshape(*determinant.shape, 2, 2)
-    return np.einsum("epab,bepn->epan", inverse, by_local), determinant
+    jacobian = _jacobian(derivatives, points)
+    determinant = jacobian.determinant
+    adjugate = np.stack([jacobian.y_eta, -jacobian.y_xi, -jacobian.x_eta, jacobian.x_xi], axis=-1)
+    inverse = (adjugate / determinant[..., None]).reshape(*determinant.shape, 2, 2)
+    return np.einsum("epab,bepn->epan", inverse, derivatives), determinant
 
 
-def _jacobian(by_local: Array, points: np.ndarray) -> tuple[Array, Array, Array, Array, Array]:
-    tangent = np.einsum("kepn,en->kep", by_local, points)
-    (x_xi, x_eta), (y_xi, y_eta) = tangent.real, tangent.imag
-    return x_xi, x_eta, y_xi, y_eta, x_xi * y_eta - x_eta * y_xi
+def _jacobian(derivatives: Array, points: np.ndarray) -> _Jacobian:
+    """Compute the Jacobian of the map from the reference element to the film; arguments as in `_film_gradient`."""
+    tangent = np.einsum("kepn,en->kep", derivatives, points)
+    x_xi, x_eta = tangent.real
+    y_xi, y_eta = tangent.imag
+    return _Jacobian(x_xi, x_eta, y_xi, y_eta, x_xi * y_eta - x_eta * y_xi)

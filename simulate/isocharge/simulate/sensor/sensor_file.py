@@ -1,4 +1,4 @@
-"""The sensor file: TOML with units in its keys, to and from `Sensor`. Unknown keys are errors, and missing ones too."""
+"""Reader and writer of sensor files: TOML with the units in the keys. Unknown and missing keys are errors."""
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
@@ -27,22 +27,25 @@ from isocharge.simulate.sensor.film import Film, Piezo, Surface
 from isocharge.simulate.sensor.sensor import Calibration, Corners, Electrode, Readout, Sensor
 from isocharge.simulate.sensor.size_check import tidy
 
-FARTHEST_MM = 1e6
-"""Largest coordinate of a point, mm."""
+MAX_COORDINATE_mm = 1e6
+"""Largest absolute value of a coordinate, mm."""
 
 log = logging.getLogger(__name__)
 
-SIDE, COATING = "side_mm", "coating_N_per_mm"
-"""Keys of the squares' side and of the stiffness of metal or ink, among the names of the electrodes."""
+SIDE = "side_mm"
+"""Key of the section `electrodes` for the side of all square electrodes."""
 
-Coordinate = Annotated[float, Meta(ge=-FARTHEST_MM, le=FARTHEST_MM)]
-Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm, each at most {FARTHEST_MM:g}")]
+COATING = "coating_N_per_mm"
+"""Key of the section `electrodes` for the stiffness of their metal or ink."""
+
+Coordinate = Annotated[float, Meta(ge=-MAX_COORDINATE_mm, le=MAX_COORDINATE_mm)]
+Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm, each at most {MAX_COORDINATE_mm:g}")]
 
 
 class FilmTable(Settings, frozen=True):
-    """The section `film`."""
+    """The section `film` of a sensor file."""
 
-    radius_mm: Annotated[float, Meta(gt=0.0, le=FARTHEST_MM)]
+    radius_mm: Annotated[float, Meta(gt=0.0, le=MAX_COORDINATE_mm)]
     thickness_um: Positive
     young_GPa: Positive | Annotated[list[Positive], Meta(min_length=2, max_length=2)]
     poisson: Finite
@@ -54,7 +57,7 @@ class FilmTable(Settings, frozen=True):
 
 
 class PiezoTable(Settings, frozen=True):
-    """The section `piezo`: coefficients in pC/N."""
+    """The section `piezo` of a sensor file. The piezoelectric coefficients are in pC/N."""
 
     d31: Finite
     d32: Finite
@@ -64,7 +67,10 @@ class PiezoTable(Settings, frozen=True):
 
 
 class PolygonTable(Settings, frozen=True):
-    """An electrode that is no square: its pad, further polygons and a trace on the front, polygons on the back."""
+    """Description of an electrode that is not a square.
+
+    It has a pad, further polygons and a trace on the front, and polygons on the back.
+    """
 
     polygon_mm: tuple[Point, ...]
     more_mm: tuple[tuple[Point, ...], ...] = ()
@@ -74,7 +80,7 @@ class PolygonTable(Settings, frozen=True):
 
 
 class CalibrationTable(Settings, frozen=True):
-    """The section `calibration`."""
+    """The section `calibration` of a sensor file."""
 
     gain: dict[str, Positive] = field(default_factory=dict)
     shift_mm: Point = (0.0, 0.0)
@@ -83,7 +89,11 @@ class CalibrationTable(Settings, frozen=True):
 
 
 class SensorTable(Settings, frozen=True):
-    """A sensor file; `electrodes` has places of squares and polygons by name, the squares' side and the coating."""
+    """A sensor file.
+
+    The section `electrodes` contains, by name, the centres of square electrodes and the tables of other electrodes. It
+    also contains the side of the squares and the stiffness of the coating.
+    """
 
     name: Text
     film: FilmTable
@@ -101,29 +111,29 @@ class SensorTable(Settings, frozen=True):
                 missing = "width_mm" if value.trace_mm else "trace_mm"
                 raise WrongKey(f"electrodes.{name}.{missing}", "trace_mm and a width_mm above 0 together")
         coating = self.electrodes.get(COATING, 0.0)
-        if not (isinstance(coating, float) and 0.0 <= coating <= FARTHEST_MM):
-            raise WrongKey(f"electrodes.{COATING}", f"a number from 0 to {FARTHEST_MM:g}", coating)
+        if not (isinstance(coating, float) and 0.0 <= coating <= MAX_COORDINATE_mm):
+            raise WrongKey(f"electrodes.{COATING}", f"a number from 0 to {MAX_COORDINATE_mm:g}", coating)
         side = self.electrodes.get(SIDE)
-        if side is not None and not (isinstance(side, float) and 0.0 < side <= FARTHEST_MM):
-            raise WrongKey(f"electrodes.{SIDE}", f"a number above 0 and at most {FARTHEST_MM:g}", side)
+        if side is not None and not (isinstance(side, float) and 0.0 < side <= MAX_COORDINATE_mm):
+            raise WrongKey(f"electrodes.{SIDE}", f"a number above 0 and at most {MAX_COORDINATE_mm:g}", side)
         if side is None and any(isinstance(value, tuple) for value in self.electrodes.values()):
             raise WrongKey(f"electrodes.{SIDE}")
 
 
 def built_in_sensors() -> tuple[str, ...]:
-    """Names of the sensors that come with the package."""
+    """Return the names of the sensors in the package."""
     folder = resources.files("isocharge.simulate") / "sensors"
     return tuple(sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml")))
 
 
 def load_sensor(sensor: str | Path) -> Sensor:
-    """Read a sensor; of one with a single electrode, a warning is logged.
+    """Read a sensor file. If the sensor has only one electrode, log a warning.
 
     Args:
         sensor: A built-in name such as "three-25um-biaxial", or the path of a TOML file.
 
     Raises:
-        SensorError: If there is no such sensor or its file is wrong; the message names file and key.
+        SensorError: If there is no such sensor, or its file is invalid. The message contains the file and the key.
     """
     if str(sensor) in built_in_sensors():
         text = (resources.files("isocharge.simulate") / "sensors" / f"{sensor}.toml").read_text("utf-8")
@@ -143,9 +153,19 @@ def load_sensor(sensor: str | Path) -> Sensor:
 
 
 def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
-    """Build a sensor from the tables of its file (units in the keys); `where` opens the error messages."""
+    """Create a sensor from the tables of its file.
+
+    Args:
+        table: Tables of the file, with the units in the keys.
+        where: Beginning of the error messages.
+
+    Raises:
+        SensorError: If a key or a value is invalid.
+    """
     file = convert(table, SensorTable, where, SensorError)
-    piezo, calibration, coating = file.piezo, file.calibration, file.electrodes.get(COATING)
+    piezo = file.piezo
+    calibration = file.calibration
+    coating = file.electrodes.get(COATING)
     with error_prefix(f"{where}: ", SensorError):
         return Sensor(
             name=file.name,
@@ -165,8 +185,15 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
 
 
 def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
-    """The tables of a sensor's file, ready for JSON: `sensor_from_dict` gives the sensor back to round-off."""
-    piezo, calibration = sensor.piezo, sensor.calibration
+    """Return the tables of the file of a sensor, which can be written as JSON or TOML.
+
+    `sensor_from_dict` returns the same sensor from these tables, except for round-off.
+
+    Raises:
+        SensorError: If no file can describe the sensor.
+    """
+    piezo = sensor.piezo
+    calibration = sensor.calibration
     return {
         "name": sensor.name,
         "readout": sensor.readout,
@@ -190,11 +217,13 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
 
 
 def film_to_dict(film: Film) -> dict[str, Any]:
-    """The table of a film in the sensor file."""
-    (difference, shear), ratio, mean = film.deviator, np.sqrt(film.young_ratio), film.pretension
+    """Return the section `film` of a sensor file."""
+    difference, shear = film.deviator
+    mean = film.pretension
     tension = [tidy(value) for value in (mean + difference, mean - difference, shear)]
-    both = [tidy(film.young * 1e-3 * ratio), tidy(film.young * 1e-3 / ratio)]
-    around = {
+    ratio = np.sqrt(film.young_ratio)
+    young_GPa = [tidy(film.young * 1e-3 * ratio), tidy(film.young * 1e-3 / ratio)]
+    asymmetries = {
         "shear_GPa": None if film.shear is None else tidy(film.shear * 1e-3),
         "axis_deg": tidy(float(np.rad2deg(film.axis))),
         "oval": tidy(film.oval),
@@ -203,22 +232,22 @@ def film_to_dict(film: Film) -> dict[str, Any]:
     return {
         "radius_mm": tidy(film.radius),
         "thickness_um": tidy(film.thickness * 1e3),
-        "young_GPa": tidy(film.young * 1e-3) if film.young_ratio == 1.0 else both,
+        "young_GPa": tidy(film.young * 1e-3) if film.young_ratio == 1.0 else young_GPa,
         "poisson": film.poisson,
         "pretension_MPa": tension if any(film.deviator) else tidy(mean),
-        **{name: value for name, value in around.items() if value},
+        **{name: value for name, value in asymmetries.items() if value},
     }
 
 
 def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
-    """The text of a sensor's file, from which `load_sensor` gives the sensor back to round-off.
+    """Return the text of the file of a sensor, from which `load_sensor` reads the same sensor except for round-off.
 
     Args:
         sensor: The sensor.
-        comment: Lines for the head of the file, without #.
+        comment: Comment lines at the beginning of the file, without "#".
 
     Raises:
-        SensorError: If no file can hold this sensor: squares of several sides with the edge readout, an empty name.
+        SensorError: If no file can describe the sensor, for example because its name is empty.
     """
     text = to_toml(sensor_to_dict(sensor), comment)
     try:
@@ -231,54 +260,77 @@ def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
 
 
 def write_sensor(sensor: Sensor, path: Path, comment: Iterable[str] = ()) -> None:
-    """Write a sensor's file, as `sensor_to_toml`; it appears whole or not at all.
+    """Write the file of a sensor. If an error occurs, no file is written.
+
+    Args:
+        sensor: The sensor.
+        path: Path of the new file.
+        comment: Comment lines at the beginning of the file, without "#".
 
     Raises:
-        SensorError: As `sensor_to_toml`.
-        OutputExists: If there is something at `path` already.
+        SensorError: If no file can describe the sensor.
+        OutputExists: If `path` exists.
     """
     refuse_existing(path)
     write_whole(path, sensor_to_toml(sensor, comment).encode())
 
 
 def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
-    """Squares share one side in the file; those of another side than the first are written as polygons."""
-    sides = {e.name: tidy(e.corners[1][0] - e.corners[0][0]) for e in sensor.electrodes if e.square}
+    """Return the section `electrodes` of a sensor file.
+
+    All squares of a file have the same side. Squares with another side than the first one become polygons.
+
+    Raises:
+        SensorError: If the readout needs squares, and their sides differ.
+    """
+    squares = [electrode for electrode in sensor.electrodes if electrode.square]
+    sides = {square.name: tidy(square.corners[1][0] - square.corners[0][0]) for square in squares}
     if sensor.readout == "edge" and len(set(sides.values())) > 1:
         raise SensorError(
             f"readout 'edge' needs squares, and in a sensor file all squares have one side: got {sides} mm"
         )
-    shared = next(iter(sides.values()), None)
-    tables: dict[str, Any] = {} if shared is None else {SIDE: shared}
+    shared_side = next(iter(sides.values()), None)
+    tables: dict[str, Any] = {}
+    if shared_side is not None:
+        tables[SIDE] = shared_side
     if sensor.coating:
         tables[COATING] = tidy(sensor.coating)
     for electrode in sensor.electrodes:
-        if sides.get(electrode.name) == shared is not None:
+        if electrode.square and sides[electrode.name] == shared_side:
             tables[electrode.name] = [tidy(value) for value in electrode.centre]
         else:
-            more = {"more_mm": electrode.more, "back_mm": electrode.back}
-            tables[electrode.name] = {
-                "polygon_mm": _corners(electrode.corners),
-                **{key: [_corners(polygon) for polygon in polygons] for key, polygons in more.items() if polygons},
-            }
+            tables[electrode.name] = _polygon_table(electrode)
     return tables
 
 
+def _polygon_table(electrode: Electrode) -> dict[str, Any]:
+    """Return the table of an electrode that is described by polygons."""
+    table: dict[str, Any] = {"polygon_mm": _corners(electrode.corners)}
+    if electrode.more:
+        table["more_mm"] = [_corners(polygon) for polygon in electrode.more]
+    if electrode.back:
+        table["back_mm"] = [_corners(polygon) for polygon in electrode.back]
+    return table
+
+
 def _corners(polygon: Corners) -> list[list[float]]:
+    """Return the corners of a polygon as lists of rounded numbers, mm."""
     return [[tidy(value) for value in corner] for corner in polygon]
 
 
 def _film(table: FilmTable) -> Film:
-    young, tension = table.young_GPa, table.pretension_MPa
+    """Create the film from the section `film`."""
+    young = table.young_GPa
+    tension = table.pretension_MPa
     first, second = young if isinstance(young, list) else (young, young)
-    along, across, shear = tension if isinstance(tension, list) else (tension, tension, 0.0)
+    tension_11, tension_22, tension_12 = tension if isinstance(tension, list) else (tension, tension, 0.0)
     return Film(
         radius=table.radius_mm,
         thickness=table.thickness_um * 1e-3,
         young=first * 1e3 if first == second else float(np.sqrt(first * second)) * 1e3,
         poisson=table.poisson,
-        pretension=along if along == across else 0.5 * (along + across),
-        deviator=(0.5 * (along - across), shear),
+        pretension=tension_11 if tension_11 == tension_22 else 0.5 * (tension_11 + tension_22),
+        deviator=(0.5 * (tension_11 - tension_22), tension_12),
         young_ratio=first / second,
         shear=None if table.shear_GPa is None else table.shear_GPa * 1e3,
         axis=float(np.deg2rad(table.axis_deg)),
@@ -288,10 +340,13 @@ def _film(table: FilmTable) -> Film:
 
 
 def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:
+    """Create the electrodes from the section `electrodes`."""
     side = table.get(SIDE)
     for name, value in table.items():
         if isinstance(value, PolygonTable):
             electrode = Electrode(name, value.polygon_mm, more=value.more_mm, back=value.back_mm)
-            yield electrode.with_trace(value.trace_mm, value.width_mm) if value.trace_mm else electrode
+            if value.trace_mm:
+                electrode = electrode.with_trace(value.trace_mm, value.width_mm)
+            yield electrode
         elif isinstance(value, tuple) and isinstance(side, float):
             yield Electrode.of_square(name, value, side)

@@ -1,13 +1,15 @@
-"""First-order change of an equilibrium by what a film has that is not isotropic and round.
+"""First-order change of an equilibrium by imperfections of the film, such as anisotropy and an oval clamp.
 
-With the equilibrium's residual R(u, m) = 0 and the tangent K = dR/du, an imperfection m moves the film by
+The residual of the equilibrium is R(u, m) = 0, and its tangent is K = dR/du. A small imperfection m changes the
+displacement by
 
     du/dm = -K^-1 dR/dm,
 
-one more back substitution. Seen from the press, an imperfection with two axes at an angle alpha to the direction of the
-press is cos(2 alpha) of one that is even about this direction and sin(2 alpha) of one that is odd. Both are solved on
-the half of the film that is meshed: even and odd fields differ in what the line of symmetry fixes. dR/dm and the stress
-that follows are central differences of the very residual and stress that a press is solved with.
+which costs one additional back substitution. An imperfection with two axes, at the angle alpha to the direction of the
+press, is the sum of cos(2 alpha) times a field that is even about this direction and sin(2 alpha) times a field that is
+odd. Both fields are solved on the meshed half of the film. They differ in the displacement components that are fixed on
+the line of symmetry. dR/dm and the change of the stress are central differences of the residual and the stress of a
+press.
 """
 
 from collections.abc import Callable
@@ -25,19 +27,19 @@ from isocharge.simulate.solver.assembly import assembly
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
 
 STEP = 1e-3
-"""Step of the differences by an imperfection, in its unit: strains of order one are quadratic in it or nearly so."""
+"""Step of the central differences, in units of the imperfection."""
 
 Change = Callable[[Equilibrium, float], Equilibrium]
-"""An equilibrium's film with some of an imperfection, its field as it was."""
+"""Function that adds a value of an imperfection to the film of an equilibrium, and keeps the displacements."""
 
 
 @dataclass(frozen=True)
 class StressField:
-    """One field of stress changes.
+    """A field of stress changes by one imperfection.
 
     Attributes:
-        change: The imperfection.
-        odd: Whether it is odd about the direction of the press.
+        change: Function that adds the imperfection.
+        odd: Whether the field is odd about the direction of the press.
     """
 
     change: Change
@@ -45,7 +47,11 @@ class StressField:
 
 
 def _tension(direction: tuple[float, float, float]) -> Change:
-    """Pretension over E A^2 (1 + mean pretension over E A^2)."""
+    """Return the function for an uneven pretension, in units of E A^2 (1 + mean pretension over E A^2).
+
+    Args:
+        direction: Components (T11, T22, T12) of one unit.
+    """
 
     def change(solved: Equilibrium, share: float) -> Equilibrium:
         tension = share * (1.0 + solved.groups.tension) * np.array(direction)
@@ -55,23 +61,28 @@ def _tension(direction: tuple[float, float, float]) -> Change:
 
 
 def _stiffness(angle: float) -> Change:
-    """ln(E1 / E2), axis 1 at an angle."""
+    """Return the function for ln(E1 / E2) of an orthotropic film whose axis 1 lies at an angle (rad)."""
 
     def change(solved: Equilibrium, share: float) -> Equilibrium:
-        turn, plane = stress_rotation(angle), 1.0 / (1.0 - solved.groups.poisson**2)
-        moduli = turn @ np.diag([0.5 * share * plane, -0.5 * share * plane, 0.0]) @ turn.T
+        rotation = stress_rotation(angle)
+        plane = 1.0 / (1.0 - solved.groups.poisson**2)
+        moduli = rotation @ np.diag([0.5 * share * plane, -0.5 * share * plane, 0.0]) @ rotation.T
         return replace(solved, groups=replace(solved.groups, anisotropy=Anisotropy(moduli, np.zeros(3))))
 
     return change
 
 
 def _poisson(solved: Equilibrium, share: float) -> Equilibrium:
-    before, after = solved.groups.poisson, solved.groups.poisson + share
+    """Add a value to Poisson's ratio."""
+    before = solved.groups.poisson
+    after = before + share
     bending = solved.groups.bending * (1.0 - before**2) / (1.0 - after**2)
     return replace(solved, groups=replace(solved.groups, poisson=after, bending=bending))
 
 
 def _oval(direction: complex) -> Change:
+    """Return the function for an oval clamp; `direction` is exp(2 i alpha) for a long axis at the angle alpha."""
+
     def change(solved: Equilibrium, share: float) -> Equilibrium:
         return replace(solved, mesh=replace(solved.mesh, oval=share * direction))
 
@@ -84,42 +95,51 @@ FIELDS = {
     "poisson": (StressField(_poisson, False),),
     "oval": (StressField(_oval(1.0), False), StressField(_oval(1j), True)),
 }
-"""Imperfections by name; of those with two axes the even field and the odd one."""
+"""Fields by the name of the imperfection. Imperfections with two axes have an even and an odd field, in this order."""
 
 IS_ODD = np.array([field.odd for fields in FIELDS.values() for field in fields])
-"""Which fields are odd, in the order of `stress_changes`."""
+"""Whether each field is odd, in the order of `stress_changes`, shape (n_field,)."""
 
 
 def stress_changes(solved: Equilibrium, surface: Surface = "middle") -> Array:
-    """Change of the scaled stress at the nodes by each field of `FIELDS`, the press rotated onto the x axis.
+    """Compute the change of the scaled stress at the nodes by each of `FIELDS`, with the press on the x axis.
+
+    The derivative is taken at fixed points of the film, although the mesh moves with an oval rim.
 
     Args:
-        solved: A press with a round probe on an isotropic round film, by a theory with stretching.
-        surface: Where in the thickness; see `touch_stress`.
+        solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
+        surface: Surface in the thickness; see `touch_stress`.
 
     Returns:
-        Shape (n_field, n_element, n_local, 3), as `nodal_stress`, per unit of the imperfection: at points of the film,
-        not of the mesh where that moves along with an oval rim.
+        Change of the stress of `nodal_stress`, per unit of the imperfection, shape (n_field, n_element, n_local, 3).
     """
     with single_threaded_blas():
         components = 3 if solved.groups.bending == 0.0 else 4
         tangent = ElasticFilm(solved.mesh.geometry, solved.groups).tangent(solved.field)
         factors = [assembly(solved.mesh.template, components, odd).factor(tangent) for odd in (False, True)]
-        fields = [field for fields in FIELDS.values() for field in fields]
-        return np.stack([_one(solved, field, factors[field.odd].solve, surface) for field in fields])
+        fields = [field for fields_of_kind in FIELDS.values() for field in fields_of_kind]
+        return np.stack([_stress_change(solved, field, factors[field.odd].solve, surface) for field in fields])
 
 
-def _one(solved: Equilibrium, field: StressField, solve: Callable[[Array], Array], surface: Surface) -> Array:
-    ends = [field.change(solved, sign * STEP) for sign in (1.0, -1.0)]
-    forces = [ElasticFilm(end.mesh.geometry, end.groups).residual(end.field) for end in ends]
-    moved = -0.5 * solve(forces[0] - forces[1])  # by one step
-    more, less = (
-        nodal_stress(replace(end, field=end.field + sign * moved), surface)
-        for end, sign in zip(ends, (1.0, -1.0), strict=True)
-    )
-    change = (more - less) / (2.0 * STEP)
-    if ends[0].mesh.oval != 0.0:
-        shift = (ends[0].mesh.points - ends[1].mesh.points) / (2.0 * STEP)
+def _stress_change(solved: Equilibrium, field: StressField, solve: Callable[[Array], Array], surface: Surface) -> Array:
+    """Compute the change of the scaled stress by one field, shape (n_element, n_local, 3).
+
+    Args:
+        solved: The solved press.
+        field: The field.
+        solve: Function that solves K x = b for a vector b at the nodes, shape (n_node, 3).
+        surface: Surface in the thickness.
+    """
+    above = field.change(solved, STEP)
+    below = field.change(solved, -STEP)
+    force_above = ElasticFilm(above.mesh.geometry, above.groups).residual(above.field)
+    force_below = ElasticFilm(below.mesh.geometry, below.groups).residual(below.field)
+    displacement = -0.5 * solve(force_above - force_below)  # for one step of the imperfection
+    stress_above = nodal_stress(replace(above, field=above.field + displacement), surface)
+    stress_below = nodal_stress(replace(below, field=below.field - displacement), surface)
+    change = (stress_above - stress_below) / (2.0 * STEP)
+    if above.mesh.oval != 0.0:
+        shift = (above.mesh.points - below.mesh.points) / (2.0 * STEP)
         slope = solved.mesh.node_derivatives(nodal_stress(solved, surface))
         change -= shift.real[..., None] * slope[..., 0, :] + shift.imag[..., None] * slope[..., 1, :]
     return np.asarray(change)
