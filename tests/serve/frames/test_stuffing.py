@@ -39,9 +39,17 @@ def test_documented_examples(name, data, stuffed):
     assert STUFFINGS[name].decode(bytes.fromhex(stuffed)) == bytes.fromhex(data)
 
 
-@pytest.mark.parametrize(("name", "stuffed"), [("slip", "DB"), ("slip", "DB 01"), ("hdlc", "31 7D"), ("cobs", "05 11")])
-def test_damaged_pieces(name, stuffed):
-    with pytest.raises(ValueError, match=r"."):
+@pytest.mark.parametrize(
+    ("name", "stuffed", "reason"),
+    [
+        ("slip", "DB", "expected DC or DD after the byte DB"),
+        ("slip", "DB 01", "expected DC or DD after the byte DB"),
+        ("hdlc", "31 7D", "expected a byte after 7D"),
+        ("cobs", "05 11", "byte 0 is 5, but 1 bytes or a zero follow"),
+    ],
+)
+def test_damaged_stuffing_is_refused_with_the_reason(name, stuffed, reason):
+    with pytest.raises(ValueError, match=reason):
         STUFFINGS[name].decode(bytes.fromhex(stuffed))
 
 

@@ -62,10 +62,22 @@ def test_lines_of_each_notation(text, names, values):
 
 
 @pytest.mark.parametrize(
-    "text", ["801.2,,803", "1_0,2", "A:1,A:2", "A:1:2,B", ">A", ">A:1:2:3", '{"A": "x"}', "{", "1,two,3", "\xff\xfe"]
+    ("text", "reason"),
+    [
+        ("801.2,,803", "could not convert string to float: ''"),
+        ("1_0,2", "expected a number, got '1_0'"),
+        ("A:1,A:2", "expected name:value, got 'A:2'"),
+        ("A:1:2,B", "expected name:value, got 'A:1:2,B'"),
+        (">A", "expected >name:value, got '>A'"),
+        (">A:1:2:3", "expected >name:time:value, got '>A:1:2:3'"),
+        ('{"A": "x"}', "expected numbers, got"),
+        ("{", "Expecting property name"),
+        ("1,two,3", "could not convert string to float: 'two'"),
+        ("\xff\xfe", "can't decode byte 0xff"),
+    ],
 )
-def test_lines_that_are_damaged(text):
-    with pytest.raises(ValueError, match=r"."):
+def test_damaged_line_of_text_is_refused_with_the_reason(text, reason):
+    with pytest.raises(ValueError, match=reason):
         parse_line(text.encode("latin-1"))
 
 
