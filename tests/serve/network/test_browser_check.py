@@ -215,7 +215,7 @@ def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_
     assert not any("unload" in route and status == "200" for _, route, status in requests)
     statistics = store.get("linear", "").statistics.snapshot()
     assert statistics.presses == 1  # the press of the server's own page
-    np.testing.assert_equal(len(store.all()), 2)
+    np.testing.assert_equal(len(store.loaded_versions()), 2)
 
 
 def test_a_page_on_another_port_of_an_allowed_host_is_refused():

@@ -13,7 +13,7 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.network.address import Token
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.traffic import LATENCY_NS, Statistics
+from isocharge.serve.network.traffic import LATENCY_BOUNDS_NS, Statistics
 from isocharge.serve.prediction.contact import Validity
 
 INFER = "/v2/models/linear/infer"
@@ -94,7 +94,7 @@ def test_the_histogram_is_that_of_the_durations():
     for row in stages.tolist():
         counters.succeeded(1, tuple(row))
     total = stages.sum(axis=1)
-    expected = [np.count_nonzero(total <= bound) for bound in (*LATENCY_NS, math.inf)]
+    expected = [np.count_nonzero(total <= bound) for bound in (*LATENCY_BOUNDS_NS, math.inf)]
     assert np.cumsum(counters.latency).tolist() == expected
 
 

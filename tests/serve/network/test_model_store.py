@@ -28,7 +28,7 @@ from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.page import page
 from isocharge.serve.network.protocol.routes import ROUTES
-from isocharge.serve.network.traffic import LONGEST_TEXT, RequestLog, Traffic
+from isocharge.serve.network.traffic import MAX_TEXT_CHARACTERS, RequestLog, Traffic
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def states(store):
 
 
 def labels(store):
-    return [loaded.metadata.label for loaded in store.all()]
+    return [loaded.metadata.label for loaded in store.loaded_versions()]
 
 
 def put_in_place(version, graph):
@@ -103,7 +103,10 @@ def test_a_broken_version_takes_no_other_with_it(film, store, folder, how):
         with pytest.raises(ModelError, match=said):
             store.load("linear")
         assert store.get("linear") is store.get("linear", "2") is before
-    assert [(row["state"], row["reason"] != "") for row in store.known()] == [("READY", False), ("READY", True)]
+    assert [(row["state"], row["reason"] != "") for row in store.version_states()] == [
+        ("READY", False),
+        ("READY", True),
+    ]
 
     store = open_model_store(folder.parent)
     assert states(store) == [("linear", "1", "READY"), ("linear", "2", "UNAVAILABLE"), ("other", "1", "READY")]
@@ -267,7 +270,7 @@ def test_messages_of_loggers_are_lines_too(lines):
     assert (failure["level"], failure["message"]) == ("error", "a request failed")
     assert "Traceback" in failure["traceback"]
     assert "ValueError" in failure["traceback"]
-    assert len(failure["traceback"]) < LONGEST_TEXT + 20
+    assert len(failure["traceback"]) < MAX_TEXT_CHARACTERS + 20
     assert not any("sesame" in line for line in lines)
 
 

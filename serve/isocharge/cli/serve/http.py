@@ -93,7 +93,7 @@ def http_command(
         handler = Handler(store, traffic=traffic, token=secret, browser_check=browser_check)
         server = HttpServer(handler, address, tls=tls)
         with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:
-            _tell(traffic, "info", "serving", ", ".join(served.metadata.label for served in store.all()))
+            _tell(traffic, "info", "serving", ", ".join(served.metadata.label for served in store.loaded_versions()))
             for url in filter(None, (server.url, grpc_url)):
                 announce(url)
             server.run()

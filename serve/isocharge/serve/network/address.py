@@ -1,6 +1,6 @@
-"""Where a server listens, whom it lets in and for how much: a TCP address or Unix socket, TLS, a token, bounds.
+"""Settings that the HTTP and the gRPC server share: address, TLS certificate, token, and limits.
 
-By default only this machine can connect. Token, TLS and bounds are the same over HTTP and gRPC.
+By default a server listens on the loopback address, so that only programs on the same machine can connect.
 """
 
 import contextlib
@@ -18,22 +18,22 @@ from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import InputError, ListenError, TokenError, TooLarge
 from isocharge.common.files import read_whole
 
-ADVICE = {
+LISTEN_ERRORS = {
     errno.EADDRINUSE: "another program listens there; stop it or choose another port",
     errno.EADDRNOTAVAIL: "this machine has no such address; choose one that it has",
     errno.EACCES: "this user may not listen there; choose another place, or a port above 1023",
 }
-"""Reason and advice for each error of the system."""
+"""Cause and advice for the error numbers of the operating system when a server cannot listen."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where to listen.
+    """Address on which a server listens.
 
     Attributes:
         host: Name or IP address.
-        port: TCP port; 0 takes a free one.
-        uds: Path of a Unix socket, which counts instead of host and port; only its owner may connect.
+        port: TCP port; 0 selects a free port.
+        uds: Path of a Unix socket, which is used instead of host and port. Only its owner can connect.
     """
 
     host: str = "127.0.0.1"
@@ -47,39 +47,50 @@ class Address:
         return self.uds is not None or self.host == "localhost" or (address is not None and address.is_loopback)
 
     def listen(self, backlog: int) -> socket.socket:
-        """A listening socket.
+        """Open a listening socket.
+
+        Args:
+            backlog: Largest number of connections that wait to be accepted.
 
         Raises:
-            ListenError: If the place is taken or impossible; the message says what to do.
+            ListenError: If the address is in use or cannot be used. The message states what to do.
         """
         try:
             if self.uds:
                 return _listen_unix(self.uds, backlog)
-            # A port whose last user was killed is free at once; a port on which a program listens stays refused.
+            # create_server sets SO_REUSEADDR, so that a port can be used again right after a server was killed.
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
             return socket.create_server((self.host, self.port), family=family, backlog=backlog)
         except ListenError:
             raise
         except (OSError, UnicodeError) as error:
-            why = ADVICE.get(getattr(error, "errno", None) or 0, str(error))
-            raise ListenError(f"cannot listen on {self.uds or f'{self.host}:{self.port}'}: {why}") from error
+            reason = LISTEN_ERRORS.get(getattr(error, "errno", None) or 0, str(error))
+            place = self.uds or f"{self.host}:{self.port}"
+            raise ListenError(f"cannot listen on {place}: {reason}") from error
 
     def release(self) -> None:
-        """Remove what a Unix socket leaves behind when it is closed; what listens in its place stays."""
+        """Remove the file of a closed Unix socket, unless another server listens on it."""
         if self.uds:
             with contextlib.suppress(ListenError):
                 _remove_stale(self.uds)
 
     def url(self, listening: socket.socket, *, secure: bool) -> str:
-        """The URL for clients; of a Unix socket its path, as curl's `--unix-socket` takes it."""
+        """Return the URL for clients, or `unix:PATH` for a Unix socket.
+
+        Args:
+            listening: The socket that `listen` returned.
+            secure: Whether the server uses TLS.
+        """
         if self.uds:
             return f"unix:{self.uds}"
+        scheme = "https" if secure else "http"
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{'https' if secure else 'http'}://{host}:{listening.getsockname()[1]}"
+        port = listening.getsockname()[1]
+        return f"{scheme}://{host}:{port}"
 
 
 def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """The IP address that a host is; None for a name."""
+    """Parse an IP address; return None if the text is a name."""
     try:
         return ipaddress.ip_address(host)
     except ValueError:
@@ -87,18 +98,19 @@ def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | Non
 
 
 def check_exposure(address: Address, *, has_token: bool) -> None:
-    """Refuse to serve others than this machine without a token.
+    """Check that a server without a token is not reachable from other machines.
 
     Raises:
-        InputError: If the address is open to others and there is no token.
+        InputError: If other machines can connect and there is no token.
     """
     if not (address.is_private or has_token):
         raise InputError(f"{address.host} lets other machines in: give --token TOKEN, which they then must send")
 
 
 def _listen_unix(path: Path, backlog: int) -> socket.socket:
+    """Open a Unix socket that only the owner can use."""
     _remove_stale(path)
-    before = os.umask(0o177)
+    previous_mask = os.umask(0o177)
     listening = socket.socket(socket.AF_UNIX)
     try:
         listening.bind(str(path))
@@ -107,15 +119,15 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
         listening.close()
         raise
     finally:
-        os.umask(before)
+        os.umask(previous_mask)
     return listening
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove the socket of a server that has ended.
+    """Remove the file of a Unix socket on which no server listens any more.
 
     Raises:
-        ListenError: If the path is something else, or a server listens there.
+        ListenError: If the path is another kind of file, or a server listens on the socket.
     """
     if not path.exists():
         return
@@ -129,82 +141,93 @@ def _remove_stale(path: Path) -> None:
 
 @dataclass(frozen=True)
 class Tls:
-    """Certificate chain and private key, PEM files; the key may be in the certificate's file."""
+    """Certificate chain and private key of a server, as PEM files.
+
+    Attributes:
+        certificate: File of the certificate chain.
+        key: File of the private key; None if the key is in the file of the certificate.
+    """
 
     certificate: Path
     key: Path | None = None
 
     def context(self) -> ssl.SSLContext:
-        """A server's TLS context.
+        """Create the TLS context of a server.
 
         Raises:
-            InputError: If a file cannot be read, or they do not belong together.
+            InputError: If a file cannot be read, or certificate and key do not belong together.
         """
+        paths = [self.certificate] if self.key is None else [self.certificate, self.key]
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         try:
-            for file in filter(None, (self.certificate, self.key)):
-                read_whole(file)  # a pipe would be waited for without end
+            for path in paths:
+                read_whole(path)  # refuses a pipe, for which load_cert_chain would wait without end
             context.load_cert_chain(self.certificate, self.key, password=lambda: "")
         except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
-            files = f"{self.certificate}" + (f" and {self.key}" if self.key else "")
+            names = " and ".join(map(str, paths))
             raise InputError(
-                f"{files}: not a certificate and its unencrypted private key in PEM files that can be read ({error})"
+                f"{names}: not a certificate and its unencrypted private key in PEM files that can be read ({error})"
             ) from error
         return context
 
-    def pair(self) -> tuple[bytes, bytes]:
-        """The key and the certificate, as gRPC takes them.
+    def key_and_certificate(self) -> tuple[bytes, bytes]:
+        """Read the files of the key and of the certificate, in the order in which gRPC takes them.
 
         Raises:
-            InputError: As `context`.
+            InputError: If a file cannot be read, or certificate and key do not belong together.
         """
         self.context()
         return read_whole(self.key or self.certificate), read_whole(self.certificate)
 
 
 class Token:
-    """A secret that clients must know; it is compared in a time that does not depend on how much of it is right."""
+    """A secret that clients must send. The time of the comparison does not depend on the number of right characters."""
 
     def __init__(self, token: str) -> None:
-        """Keep the token.
+        """Check and store the token.
 
         Raises:
-            InputError: If it is empty, or has characters that no header, or no page's address, can carry.
+            InputError: If the token is empty, or has characters that are not possible in a header or in a URL.
         """
         if not token or not token.isascii() or not token.isprintable() or token != token.strip() or "%" in token:
             raise InputError(
-                "token: expected printable ASCII characters without blanks at the ends, and no %, which means "
-                "something else in the address of a page; choose another one"
+                "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
+                "meaning in the address of a page; choose another one"
             )
         self._expected = b"Bearer " + token.encode()
 
     def check(self, authorization: bytes) -> None:
-        """Check the value of an Authorization header, empty if there was none.
+        """Check the value of an Authorization header.
 
-        The name of the scheme has no case (RFC 9110, 11.1).
+        Args:
+            authorization: Value of the header; empty if the request has none. The name of the scheme is compared
+                without regard to case (RFC 9110, 11.1).
 
         Raises:
-            TokenError: If it does not carry the token.
+            TokenError: If the header does not contain the token.
         """
         scheme, _, token = authorization.partition(b" ")
         given = b"Bearer " + token.lstrip(b" ") if scheme.lower() == b"bearer" else authorization
         if not hmac.compare_digest(given, self._expected):
-            sent = "a wrong one" if authorization else "none"
-            raise TokenError(f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {sent}")
+            received = "a wrong one" if authorization else "none"
+            raise TokenError(
+                f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {received}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServerLimits:
-    """Bounds of one server; the defaults fit the largest batch of four electrodes as JSON with all digits.
+    """Limits of one server. The defaults admit the largest batch of four electrodes as JSON with all digits.
 
     Attributes:
-        batch: Presses in one request.
-        body_bytes: Size of a request's body, compressed or not.
-        header_bytes: Size of request line and headers together.
-        header_seconds: Time from the first byte of a request, or from connecting, to the end of its headers.
-        body_seconds: Time from there to the end of the body; and again until the client has taken the answer.
-        idle_seconds: Time between requests.
-        connections: Connections that are open at a time.
+        batch: Largest number of presses in one request.
+        body_bytes: Largest size of the body of a request, compressed or not.
+        header_bytes: Largest size of the request line and the headers together.
+        header_seconds: Longest time from the first byte of a request, or from connecting, to the end of its headers.
+        body_seconds: Longest time from the end of the headers to the end of the body, and longest time until the
+            client has received the response.
+        idle_seconds: Longest time between two requests.
+        connections: Largest number of open connections.
     """
 
     batch: int = MAX_BATCH
@@ -216,10 +239,10 @@ class ServerLimits:
     connections: int = 1024
 
     def check_body(self, size: int) -> None:
-        """Check the size of a body, or of as much of it as has arrived.
+        """Check the size of a body, or of the part of a body that has arrived.
 
         Raises:
-            TooLarge: If it is above `body_bytes`.
+            TooLarge: If the size is above `body_bytes`.
         """
         if size > self.body_bytes:
             raise TooLarge(f"expected a body of at most {self.body_bytes} bytes, got more; send smaller batches")

@@ -1,11 +1,11 @@
-"""`/metrics`: the counters of models and traffic in the text format of Prometheus.
+"""Counters of models and traffic in the text format of Prometheus, for the path `/metrics`.
 
-Requests only add to plain counters; the families are built when somebody asks for them. So a request pays a fraction of
-a microsecond, where a histogram of the client library would cost it several.
+A request only increments plain integers, which takes a fraction of a microsecond; a histogram of the client library
+would take several. The metric families are built from the integers when Prometheus asks for them.
 """
 
 from collections.abc import Iterable
-from itertools import accumulate, chain
+from itertools import accumulate
 
 import onnxruntime as ort
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
@@ -19,91 +19,113 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 from isocharge.serve.network.model_store import ModelStore
-from isocharge.serve.network.traffic import LATENCY_NS, STAGES, Statistics, Traffic
+from isocharge.serve.network.traffic import LATENCY_BOUNDS_NS, STAGES, Statistics, Traffic
 
 CONTENT_TYPE = b"text/plain; version=0.0.4; charset=utf-8"
-"""The format that every Prometheus reads, whatever it asks for."""
+"""Content type of the text format, which every version of Prometheus reads."""
 
-VERSION = ("model", "version")
-"""Labels of what is counted for each version of a model."""
+VERSION_LABELS = ("model", "version")
+"""Labels of the metrics of one version of a model."""
 
-BOUNDS = (*(f"{ns / 1e9:g}" for ns in LATENCY_NS), "+Inf")
+BUCKET_BOUNDS = (*(f"{ns / 1e9:g}" for ns in LATENCY_BOUNDS_NS), "+Inf")
+"""Upper bounds of the latency histogram as texts, s."""
 
 _Counters = dict[tuple[str, str], Statistics]
 
 
 class Metrics(Collector):
-    """The metrics of one server; its families are built anew for each scrape."""
+    """Metrics of one server, computed for each scrape.
+
+    Args:
+        store: The models of the server.
+        traffic: Counters of requests and connections.
+        server_version: Version of isocharge.
+    """
 
     def __init__(self, store: ModelStore, traffic: Traffic, server_version: str) -> None:
-        """Report the models of a store and the traffic of their servers."""
-        self._store, self._traffic, self._version = store, traffic, server_version
+        self._store = store
+        self._traffic = traffic
+        self._version = server_version
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(self)
         ProcessCollector(registry=self._registry)
 
     def text(self) -> bytes:
-        """All metrics, in the format of CONTENT_TYPE."""
+        """Return all metrics in the format of `CONTENT_TYPE`."""
         return generate_latest(self._registry)
 
     def collect(self) -> Iterable[Metric]:
+        """Yield the metric families; the registry calls this method for each scrape."""
         counters = self._store.counters()
         versions = {"version": self._version, "onnxruntime": ort.__version__}
         yield InfoMetricFamily("isocharge", "Versions of the server.", versions)
-        yield from chain(_models(self._store), _traffic(self._traffic), _inferences(counters), _latencies(counters))
+        yield from _model_families(self._store)
+        yield from _traffic_families(self._traffic)
+        yield from _inference_families(counters)
+        yield from _latency_families(counters)
 
 
-def _models(store: ModelStore) -> Iterable[Metric]:
-    info = InfoMetricFamily("isocharge_model", "Versions of models that serve.", labels=VERSION)
-    for loaded in store.all():
-        facts = {"sensor": loaded.metadata.frame_id, "sha256": loaded.model.golden.sha256}
-        info.add_metric((loaded.metadata.name, loaded.version), facts)
-    ready = GaugeMetricFamily("isocharge_model_ready", "1 if the version serves, 0 if it was refused.", labels=VERSION)
-    for row in store.known():
+def _model_families(store: ModelStore) -> Iterable[Metric]:
+    """Return the loaded versions with their checksums, and the state of all versions."""
+    info = InfoMetricFamily("isocharge_model", "Loaded versions of the models.", labels=VERSION_LABELS)
+    for loaded in store.loaded_versions():
+        properties = {"sensor": loaded.metadata.frame_id, "sha256": loaded.model.golden.sha256}
+        info.add_metric((loaded.metadata.name, loaded.version), properties)
+    ready = GaugeMetricFamily(
+        "isocharge_model_ready", "1 if the version is loaded, 0 if it was refused.", labels=VERSION_LABELS
+    )
+    for row in store.version_states():
         ready.add_metric((row["name"], row["version"]), row["state"] == "READY")
     return info, ready
 
 
-def _traffic(traffic: Traffic) -> Iterable[Metric]:
+def _traffic_families(traffic: Traffic) -> Iterable[Metric]:
+    """Return the numbers of requests, open connections and lost log lines."""
     requests = CounterMetricFamily(
         "isocharge_requests", "Requests that were answered or refused.", labels=("transport", "route", "status")
     )
-    for kind, count in sorted(traffic.requests().items()):
-        requests.add_metric(kind, count)
-    opened = GaugeMetricFamily("isocharge_open", "Open connections of HTTP, open calls of gRPC.", labels=("transport",))
-    for transport, number in traffic.open.items():
-        opened.add_metric((transport,), number())
-    lost = CounterMetricFamily("isocharge_log_lines_lost", "Lines of the log that nobody took.")
-    lost.add_metric((), traffic.lost_lines() if traffic.lost_lines else 0)
-    return requests, opened, lost
+    for labels, count in sorted(traffic.requests().items()):
+        requests.add_metric(labels, count)
+    opened = GaugeMetricFamily(
+        "isocharge_open", "Open connections of HTTP and open calls of gRPC.", labels=("transport",)
+    )
+    for transport, count_open in traffic.open.items():
+        opened.add_metric((transport,), count_open())
+    lost_lines = CounterMetricFamily("isocharge_log_lines_lost", "Lines of the log that could not be written.")
+    lost_lines.add_metric((), traffic.lost_lines() if traffic.lost_lines else 0)
+    return requests, opened, lost_lines
 
 
-def _inferences(counters: _Counters) -> Iterable[Metric]:
-    plain = {
-        "presses": ("presses", "Presses that were answered."),
-        "misfit_checked": ("checked", "Presses whose misfit was computed."),
-        "misfit_alarms": ("alarms", "Presses whose misfit is above the limit of the model."),
-        "inferences_refused": ("refused", "Requests for an inference that were refused."),
+def _inference_families(counters: _Counters) -> Iterable[Metric]:
+    """Yield the numbers of presses and of refused requests for each version of a model."""
+    families = {
+        "presses": ("isocharge_presses", "Presses that were answered."),
+        "checked": ("isocharge_misfit_checked", "Presses whose misfit was computed."),
+        "alarms": ("isocharge_misfit_alarms", "Presses whose misfit is above the limit of the model."),
+        "refused": ("isocharge_inferences_refused", "Requests for an inference that were refused."),
     }
-    for name, (attribute, text) in plain.items():
-        family = CounterMetricFamily(f"isocharge_{name}", text, labels=VERSION)
-        for labels, of in counters.items():
-            family.add_metric(labels, getattr(of, attribute))
+    for attribute, (name, text) in families.items():
+        family = CounterMetricFamily(name, text, labels=VERSION_LABELS)
+        for labels, statistics in counters.items():
+            family.add_metric(labels, getattr(statistics, attribute))
         yield family
 
 
-def _latencies(counters: _Counters) -> Iterable[Metric]:
+def _latency_families(counters: _Counters) -> Iterable[Metric]:
+    """Return the latency histogram and the time of each stage for each version of a model."""
     latency = HistogramMetricFamily(
         "isocharge_inference_seconds",
         "Time to read, compute and write an inference, without the network.",
-        labels=VERSION,
+        labels=VERSION_LABELS,
     )
     stages = CounterMetricFamily(
-        "isocharge_inference_stage_seconds", "The same by stage, under the names of Triton.", labels=(*VERSION, "stage")
+        "isocharge_inference_stage_seconds",
+        "Time of each stage of an inference, under the names of Triton.",
+        labels=(*VERSION_LABELS, "stage"),
     )
-    for labels, of in counters.items():
-        buckets = list(zip(BOUNDS, accumulate(of.latency), strict=True))
-        latency.add_metric(labels, buckets, sum(of.stages_ns) / 1e9)
-        for stage, ns in zip(STAGES, of.stages_ns, strict=True):
+    for labels, statistics in counters.items():
+        buckets = list(zip(BUCKET_BOUNDS, accumulate(statistics.latency), strict=True))
+        latency.add_metric(labels, buckets, sum(statistics.stages_ns) / 1e9)
+        for stage, ns in zip(STAGES, statistics.stages_ns, strict=True):
             stages.add_metric((*labels, stage), ns / 1e9)
     return latency, stages

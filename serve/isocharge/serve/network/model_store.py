@@ -1,9 +1,11 @@
-"""The models that a server serves: every version of every model of its folders, loaded, checked, replaced whole.
+"""Store of the models that a server uses: all versions of all models in its folders.
 
-A version is checked before it answers: checksum, metadata, shapes, and the golden vectors, which are computed again. A
-version that fails is refused with the reason, and the others go on serving. To load a model again reads its files into
-new sessions and then changes one reference: a request that has begun finishes with its version, and a version whose new
-files are refused goes on with the old ones.
+Each version is checked when it is loaded: checksum, metadata, shapes, and the golden vectors, which are computed again.
+A version that fails a check is refused with the reason, and all other versions stay available.
+
+When a model is loaded again, its files are read into new sessions, and one assignment then replaces the old sessions. A
+request that has begun finishes with its session. If the new files of a version are refused, the old version stays
+available.
 """
 
 import logging
@@ -31,147 +33,181 @@ from isocharge.serve.prediction.contact import Validity
 log = logging.getLogger(__name__)
 
 UNLOADED = "unloaded"
-"""The reason that the index gives for a model that a client unloaded."""
+"""Reason in the index for a model that a client unloaded."""
 
 
 @dataclass(frozen=True)
 class LoadedVersion:
-    """One version of a model that answers requests."""
+    """One version of a model that is available for requests.
+
+    Attributes:
+        model: The model with its session.
+        metadata: Metadata of the model.
+        version: Version as a text.
+        statistics: Counters of the requests to this version.
+    """
 
     model: Model
     metadata: ModelMetadata
     version: str
     statistics: Statistics = field(default_factory=Statistics)
-    _of_thread: threading.local = field(default_factory=threading.local, repr=False)
+    _thread_local: threading.local = field(default_factory=threading.local, repr=False)
 
     @cached_property
     def validity(self) -> Validity:
-        """Where it may be trusted."""
+        """Domain in which the model is valid."""
         return Validity.of(self.metadata)
 
     @cached_property
     def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs that the model has."""
+        """Names of the outputs of the model."""
         return tuple(output_widths(self.model.session))
 
     def press(self) -> BoundPress:
-        """Bound memory for one press; each thread has its own."""
-        bound: BoundPress | None = getattr(self._of_thread, "press", None)
+        """Return the bound memory for one press. Each thread has its own."""
+        bound: BoundPress | None = getattr(self._thread_local, "press", None)
         if bound is None:
-            bound = self._of_thread.press = BoundPress(self.model.session, len(self.metadata.electrodes))
+            bound = BoundPress(self.model.session, len(self.metadata.electrodes))
+            self._thread_local.press = bound
         return bound
 
 
 class ModelStore:
-    """Models by name and version. Any thread may read; loads and unloads run one after another."""
+    """Models by name and version.
+
+    All methods may be called from any thread. Loading and unloading are serialised by a lock.
+    """
 
     def __init__(self, folders: Callable[[], Mapping[str, Path]]) -> None:
-        """Load everything.
+        """Load all versions of all models.
 
         Args:
-            folders: Gives model name to model folder; called for each load and index.
+            folders: Function that returns the folder of each model by its name. It is called for each load and index.
 
         Raises:
             ModelError: If there is no model, or no version passes its checks.
         """
-        self._folders, self._turn = folders, threading.Lock()
+        self._folders = folders
+        self._change_lock = threading.Lock()
         self._statistics: dict[tuple[str, int], Statistics] = {}
-        self._serving: dict[tuple[str, str], LoadedVersion] = {}  # by name and version; without version, the highest
+        # Versions by name and version. The key with an empty version holds the highest version.
+        self._loaded: dict[tuple[str, str], LoadedVersion] = {}
         self._refused: dict[tuple[str, int], str] = {}
         for name, folder in folders().items():
             self._load(name, folder)
-        if not self._serving:
+        if not self._loaded:
             raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'no model was found'}")
 
     def get(self, name: str, version: str = "") -> LoadedVersion:
-        """The model to answer with; the highest version if none is given.
+        """Return a loaded version of a model.
+
+        Args:
+            name: Name of the model.
+            version: Version; empty for the highest loaded version.
 
         Raises:
-            ModelNotFound: If it does not serve; the message says what does, and why not this one.
+            ModelNotFound: If the version is not loaded. The message lists the loaded versions and the reason why this
+                version was refused.
         """
-        loaded = self._serving.get((name, version))
+        loaded = self._loaded.get((name, version))
         if loaded is None:
-            label = f"{name}/{version}" if version else name
-            serving = ", ".join(sorted(loaded.metadata.label for loaded in self.all())) or "no model"
-            reasons = [why for (of, v), why in sorted(self._refused.items()) if of == name and version in ("", str(v))]
-            said = [f"model {label!r:.200} is not found", f"serving: {serving}", *dict.fromkeys(reasons)]
-            raise ModelNotFound("; ".join(said))
+            raise ModelNotFound(self._not_found_message(name, version))
         return loaded
 
+    def _not_found_message(self, name: str, version: str) -> str:
+        label = f"{name}/{version}" if version else name
+        available = ", ".join(sorted(loaded.metadata.label for loaded in self.loaded_versions())) or "no model"
+        reasons = [
+            reason
+            for (refused_name, refused_version), reason in sorted(self._refused.items())
+            if refused_name == name and version in ("", str(refused_version))
+        ]
+        parts = [f"model {label!r:.200} is not found", f"serving: {available}", *dict.fromkeys(reasons)]
+        return "; ".join(parts)
+
     def label(self, name: str, version: str = "") -> str | None:
-        """`name/version` of the model that would answer, None if none does."""
-        loaded = self._serving.get((name, version))
+        """Return the label `name/version` of a version; None if it is not loaded.
+
+        Args:
+            name: Name of the model.
+            version: Version; empty for the highest loaded version.
+        """
+        loaded = self._loaded.get((name, version))
         return None if loaded is None else loaded.metadata.label
 
-    def all(self) -> list[LoadedVersion]:
-        """Every version that serves, by name and version."""
-        serving = [loaded for (_, version), loaded in self._serving.items() if version]
-        return sorted(serving, key=lambda loaded: (loaded.metadata.name, loaded.metadata.version))
+    def loaded_versions(self) -> list[LoadedVersion]:
+        """Return all loaded versions, sorted by name and version."""
+        versions = [loaded for (_, version), loaded in self._loaded.items() if version]
+        return sorted(versions, key=lambda loaded: (loaded.metadata.name, loaded.metadata.version))
 
-    def named(self, name: str) -> list[LoadedVersion]:
-        """Every version of one model that serves, ascending.
+    def versions_of(self, name: str) -> list[LoadedVersion]:
+        """Return the loaded versions of one model in ascending order.
 
         Raises:
-            ModelNotFound: If none does.
+            ModelNotFound: If no version of the model is loaded.
         """
         self.get(name)
-        return [loaded for loaded in self.all() if loaded.metadata.name == name]
+        return [loaded for loaded in self.loaded_versions() if loaded.metadata.name == name]
 
     def refusals(self) -> list[str]:
-        """Why files were refused, a sentence for each version."""
+        """Return the reason for each version that was refused."""
         return [reason for _, reason in sorted(self._refused.items())]
 
     def check_ready(self) -> None:
-        """Check that a model serves; the message is for everybody, and names no file.
+        """Check that at least one version is loaded. The error message is sent to any client and names no files.
 
         Raises:
-            ModelError: If none does.
+            ModelError: If no version is loaded.
         """
-        if not self._serving:
-            unloaded = list(self._refused.values()).count(UNLOADED)
-            raise ModelError(
-                f"not ready: no model is loaded (versions refused: {len(self._refused) - unloaded}, unloaded: "
-                f"{unloaded}); the repository's index has the reasons"
-            )
+        if self._loaded:
+            return
+        unloaded_count = list(self._refused.values()).count(UNLOADED)
+        refused_count = len(self._refused) - unloaded_count
+        raise ModelError(
+            f"not ready: no model is loaded (versions refused: {refused_count}, unloaded: {unloaded_count}); "
+            "the repository's index has the reasons"
+        )
 
-    def known(self) -> list[dict[str, str]]:
-        """Name, version, state and reason of every version that serves or was refused."""
-        refused, serving = self._refused, self._serving
-        versions = sorted({(loaded.metadata.name, loaded.metadata.version) for loaded in self.all()} | set(refused))
+    def version_states(self) -> list[dict[str, str]]:
+        """Return the name, version, state and reason of every version that is loaded or was refused."""
+        refused = self._refused
+        loaded = {(version.metadata.name, version.metadata.version) for version in self.loaded_versions()}
         return [
             {
                 "name": name,
                 "version": str(version),
-                "state": "READY" if (name, str(version)) in serving else "UNAVAILABLE",
+                "state": "READY" if (name, version) in loaded else "UNAVAILABLE",
                 "reason": refused.get((name, version), ""),
             }
-            for name, version in versions
+            for name, version in sorted(loaded | set(refused))
         ]
 
     def index(self) -> list[dict[str, str]]:
-        """Every version that serves or was refused, and models that nobody has loaded."""
-        known = self.known()
-        names = {row["name"] for row in known}
-        nothing = {"version": "", "state": "UNAVAILABLE", "reason": ""}
-        return known + [{"name": name} | nothing for name in self._folders() if name not in names]
+        """Return the rows of `version_states`, and one row for each model that has not been loaded."""
+        rows = self.version_states()
+        names = {row["name"] for row in rows}
+        for name in self._folders():
+            if name not in names:
+                rows.append({"name": name, "version": "", "state": "UNAVAILABLE", "reason": ""})
+        return rows
 
     def counters(self) -> dict[tuple[str, str], Statistics]:
-        """Counters of every version that has ever served, by name and version, as they are now."""
+        """Return the present counters, by name and version, of every version that has ever been loaded."""
         counters = sorted(dict(self._statistics).items())
         return {(name, str(version)): statistics.snapshot() for (name, version), statistics in counters}
 
     def load(self, name: str) -> None:
         """Read a model's files again and replace its versions.
 
-        A version that served before is removed only if its folder is gone and every version that was found is valid. So
-        no model disappears while its folders are being copied or moved.
+        A loaded version is removed only if its folder has disappeared and every version that was found is valid. A
+        model therefore stays available while its folders are being copied or moved.
 
         Raises:
-            ModelNotFound: If the folders hold no such model.
-            ModelError: If a version is refused, or no version is found. Every version that served before goes on
-                serving, with its new files if these are valid.
+            ModelNotFound: If the folders contain no such model.
+            ModelError: If a version is refused, or no version is found. Versions that were loaded before stay loaded,
+                with their new files if these are valid.
         """
-        with self._turn:
+        with self._change_lock:
             folder = self._folders().get(name)
             if folder is None:
                 raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
@@ -180,18 +216,19 @@ class ModelStore:
             raise ModelError("; ".join(refused.values()))
         if not version_folders(folder):
             raise ModelError(
-                f"{folder}: expected folders of versions, found none; what served before goes on serving, and unload "
-                "stops it"
+                f"{folder}: expected folders of versions, found none; versions that were loaded before stay loaded, "
+                "and unload removes them"
             )
 
     def unload(self, name: str) -> None:
-        """Stop serving a model; requests that have begun finish.
+        """Remove all versions of a model. Requests that have begun still finish.
 
         Raises:
-            ModelNotFound: If it does not serve.
+            ModelNotFound: If no version of the model is loaded.
         """
-        with self._turn:
-            self._put(name, [], {(name, loaded.metadata.version): UNLOADED for loaded in self.named(name)})
+        with self._change_lock:
+            reasons = {(name, loaded.metadata.version): UNLOADED for loaded in self.versions_of(name)}
+            self._replace(name, [], reasons)
 
     def _load(self, name: str, folder: Path) -> dict[tuple[str, int], str]:
         """Load every version of a model.
@@ -202,46 +239,60 @@ class ModelStore:
         loaded: dict[int, LoadedVersion] = {}
         refused: dict[tuple[str, int], str] = {}
         for version, path in version_folders(folder).items():
-            # The counters continue when files are loaded again, because a counter must never fall.
+            # The counters continue when files are loaded again, because a Prometheus counter must never decrease.
             statistics = self._statistics.setdefault((name, version), Statistics())
             try:
                 loaded[version] = _load_version(name, version, path, statistics)
             except Exception as error:  # A folder may be broken in any way, and must not affect other models.
-                refused[name, version] = _reason(path, error)
+                refused[name, version] = _refusal_reason(path, error)
         if refused or not loaded:
-            loaded = self._versions_of(name) | loaded
-        self._put(name, [loaded[version] for version in sorted(loaded)], refused)
+            loaded = self._loaded_by_version(name) | loaded
+        self._replace(name, [loaded[version] for version in sorted(loaded)], refused)
         return refused
 
-    def _versions_of(self, name: str) -> dict[int, LoadedVersion]:
-        """Return the versions of a model that serve now; empty if there are none."""
-        return {int(version): loaded for (of, version), loaded in self._serving.items() if of == name and version != ""}
+    def _loaded_by_version(self, name: str) -> dict[int, LoadedVersion]:
+        """Return the loaded versions of a model by version; empty if there are none."""
+        return {loaded.metadata.version: loaded for loaded in self.loaded_versions() if loaded.metadata.name == name}
 
-    def _put(self, name: str, versions: list[LoadedVersion], refused: dict[tuple[str, int], str]) -> None:
-        """Change what serves in one assignment, so that a reader sees each change whole."""
-        serving = {key: loaded for key, loaded in self._serving.items() if key[0] != name}
-        serving |= {(name, loaded.version): loaded for loaded in versions}
+    def _replace(self, name: str, versions: list[LoadedVersion], refused: dict[tuple[str, int], str]) -> None:
+        """Replace the versions of a model, in ascending order, by one assignment, so that readers need no lock."""
+        loaded = {key: version for key, version in self._loaded.items() if key[0] != name}
+        loaded |= {(name, version.version): version for version in versions}
         if versions:
-            serving[name, ""] = versions[-1]
+            loaded[name, ""] = versions[-1]
         self._refused = {key: reason for key, reason in self._refused.items() if key[0] != name} | refused
-        self._serving = serving
+        self._loaded = loaded
 
 
 def open_model_store(models: Path | None = None) -> ModelStore:
-    """The models of one folder; without it, of every place where `find_model` looks, the first place winning.
+    """Load all models of one repository, or of all repositories that `find_model` searches.
+
+    Args:
+        models: The only repository. By default all repositories are searched; if a model is in several repositories,
+            the first one is used.
 
     Raises:
-        ModelError: If `models` is not a folder, holds no model, or none passes its checks.
+        ModelError: If `models` is not a folder or contains no model, or no version passes its checks.
     """
-    roots = [models] if models is not None else repositories()
-    if models is not None and not model_names(models):
-        repositories(models)  # raises if the folder itself is missing
-        raise ModelError(f"{models}: expected models, <name>/<version>/model.onnx, found none; correct --models")
-    return ModelStore(lambda: MappingProxyType({n: root / n for root in reversed(roots) for n in model_names(root)}))
+    if models is None:
+        roots = repositories()
+    else:
+        roots = [models]
+        if not model_names(models):
+            repositories(models)  # raises an error if the folder itself is missing
+            raise ModelError(f"{models}: expected models, <name>/<version>/model.onnx, found none; correct --models")
+
+    def folders() -> Mapping[str, Path]:
+        by_name: dict[str, Path] = {}
+        for root in reversed(roots):
+            by_name |= {name: root / name for name in model_names(root)}
+        return MappingProxyType(by_name)
+
+    return ModelStore(folders)
 
 
-def _reason(folder: Path, error: Exception) -> str:
-    """Why a version is refused; an error that isocharge did not raise on purpose goes into the log, too."""
+def _refusal_reason(folder: Path, error: Exception) -> str:
+    """Return why a version is refused. An error that is no ModelError is also written to the log."""
     if isinstance(error, ModelError):
         return str(error)
     log.error("%s: the model cannot be checked", folder, exc_info=error)
@@ -249,6 +300,7 @@ def _reason(folder: Path, error: Exception) -> str:
 
 
 def _load_version(name: str, version: int, folder: Path, statistics: Statistics) -> LoadedVersion:
+    """Load and check one version; raise ModelError if its metadata name another model or version than its folders."""
     model = load_model(folder)
     if (model.metadata.name, model.metadata.version) != (name, version):
         raise ModelError(

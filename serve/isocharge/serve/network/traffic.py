@@ -1,11 +1,12 @@
-"""What passes through the servers: requests by route and status, what is open, counters of each model, the log.
+"""Counters and log of the servers.
 
-The log is lines of JSON. `Statistics` counts the requests to a model, their time and its misfit alarms, for Triton's
-statistics and for `/metrics`.
+`Traffic` counts requests by route and status, and open connections. `Statistics` counts the requests to a model, their
+time and its misfit alarms, for Triton's statistics and for `/metrics`. `RequestLog` writes one line of JSON for each
+request.
 
-Of what a client sends, only its address is written: routes, models, statuses and kinds of errors are words of this
-server. So no client can forge a line, fill the disk with a long one, put a secret into it, or invent counters. JSON
-has no line feed inside a line.
+A line of the log contains no text that a client has sent: routes, models, statuses and types of errors are names of
+this server, and the address of the client comes from the operating system. A client therefore cannot forge a line,
+fill the disk with long lines, write a secret into the log, or create counters.
 """
 
 import logging
@@ -20,25 +21,26 @@ from typing import Any, NamedTuple
 
 import orjson
 
-LONGEST_TEXT = 4000
-"""Characters of a message or traceback that a line has; of longer ones the beginning and the end."""
+MAX_TEXT_CHARACTERS = 4000
+"""Largest number of characters of a message or traceback in a line. Of longer texts, the middle is left out."""
 
 Client = tuple[str, int] | None
 """Address and port of a client; None on a Unix socket."""
 
 
 class Exchange(NamedTuple):
-    """One request and its answer.
+    """One request and its response.
 
     Attributes:
         transport: "http" or "grpc".
-        route: Name of what was asked for; "none" for what could not be read.
+        route: Name of the route; "none" if the request could not be read.
         status: HTTP status, or name of the gRPC status.
-        model: `name/version` of the model that was asked, None if there is none.
-        error: Kind of the error, None without.
-        ns: Time from the complete request to the complete answer, ns; 0 if it is not known.
-        bytes_in, bytes_out: Sizes of the bodies.
-        client: Who asked.
+        model: Label `name/version` of the requested model; None if the request names no model.
+        error: Type of the error; None if there was no error.
+        ns: Time from the complete request to the complete response, ns; 0 if unknown.
+        bytes_in: Size of the body of the request, bytes.
+        bytes_out: Size of the body of the response, bytes.
+        client: Address of the client.
     """
 
     transport: str
@@ -53,20 +55,20 @@ class Exchange(NamedTuple):
 
 
 class RequestLog(logging.Handler):
-    """Writes lines of JSON; as a handler, the messages of Python's loggers too."""
+    """Log in lines of JSON, for requests and for the messages of Python's loggers.
+
+    Args:
+        write: Function that takes a line without a line feed. It is called from any thread and must not block.
+        secret: Text that is replaced by `[secret]` in all messages.
+    """
 
     def __init__(self, write: Callable[[str], object], *, secret: str | None = None) -> None:
-        """Set up the log.
-
-        Args:
-            write: Takes a line, without a line feed; called from any thread, and must not wait.
-            secret: What no message may say; `[secret]` stands in its place.
-        """
         super().__init__()
-        self._write, self._secret = write, secret
+        self._write = write
+        self._secret = secret
 
     def exchange(self, exchange: Exchange) -> None:
-        """Write the line of a request."""
+        """Write a line about a request."""
         transport, route, status, model, error, ns, bytes_in, bytes_out, client = exchange
         line = {
             "time": datetime.now(UTC),
@@ -80,43 +82,45 @@ class RequestLog(logging.Handler):
             "duration_us": ns / 1000,
             "bytes_in": bytes_in,
             "bytes_out": bytes_out,
-            "client": "%s:%d" % client if isinstance(client, tuple) else client,  # noqa: UP031 - half the time
+            "client": "%s:%d" % client if isinstance(client, tuple) else client,  # noqa: UP031 - twice as fast
         }
         self._write(orjson.dumps(line).decode())
 
     def message(self, level: str, event: str, message: str) -> None:
         """Write a line about the server itself."""
-        self._line(level, event=event, message=self._cut(message))
+        self._write_line(level, event=event, message=self._clean(message))
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write the message of a logger, its traceback too."""
-        fields = {"event": "message", "logger": record.name, "message": self._cut(record.getMessage())}
+        """Write the message of a logger with its traceback."""
+        fields = {"event": "message", "logger": record.name, "message": self._clean(record.getMessage())}
         if record.exc_info and record.exc_info[0] is not None:
-            fields["traceback"] = self._cut("".join(traceback.format_exception(*record.exc_info)))
-        self._line(record.levelname.lower(), **fields)
+            fields["traceback"] = self._clean("".join(traceback.format_exception(*record.exc_info)))
+        self._write_line(record.levelname.lower(), **fields)
 
-    def _line(self, level: str, **fields: str) -> None:
+    def _write_line(self, level: str, **fields: str) -> None:
         self._write(orjson.dumps({"time": datetime.now(UTC), "level": level} | fields).decode())
 
-    def _cut(self, text: str) -> str:
+    def _clean(self, text: str) -> str:
+        """Return a text as valid UTF-8, without the secret, and shortened to the largest number of characters."""
         text = text.encode("utf-8", "replace").decode()
         if self._secret:
             text = text.replace(self._secret, "[secret]")
-        half = LONGEST_TEXT // 2
-        return text if len(text) <= LONGEST_TEXT else f"{text[:half]} [...] {text[-half:]}"
+        if len(text) <= MAX_TEXT_CHARACTERS:
+            return text
+        half = MAX_TEXT_CHARACTERS // 2
+        return f"{text[:half]} [...] {text[-half:]}"
 
 
 class Traffic:
-    """Counters of the servers of one process; any thread may add to them.
+    """Counters of the servers of one process. All methods may be called from any thread.
 
     Attributes:
-        log: Where each request is written; None for nowhere.
-        open: For each transport, what gives the number of its open connections or calls.
-        lost_lines: What gives the number of log lines that nobody took.
+        log: Log to which each request is written; None if there is no log.
+        open: Function for each transport that returns the number of its open connections or calls.
+        lost_lines: Function that returns the number of log lines that could not be written; None if there is no log.
     """
 
     def __init__(self, log: RequestLog | None = None) -> None:
-        """Nothing has passed yet."""
         self.log = log
         self.open: dict[str, Callable[[], int]] = {}
         self.lost_lines: Callable[[], int] | None = None
@@ -124,44 +128,57 @@ class Traffic:
         self._lock = threading.Lock()
 
     def count(self, transport: str, route: str, status: int | str) -> None:
-        """Count an answered request, an error being an answer too."""
+        """Count a request that was answered, also by an error."""
         key = transport, route, status
         with self._lock:
             self._requests[key] = self._requests.get(key, 0) + 1
 
     def note(self, exchange: Exchange) -> None:
-        """Count an answered request, and write it into the log."""
+        """Count a request that was answered, and write it to the log."""
         self.count(exchange.transport, exchange.route, exchange.status)
         if self.log is not None:
             self.log.exchange(exchange)
 
     def requests(self) -> dict[tuple[str, str, str], int]:
-        """Requests so far, by transport, route and status."""
+        """Return the numbers of requests by transport, route and status."""
         with self._lock:
             counts = dict(self._requests)
         return {(transport, route, str(status)): count for (transport, route, status), count in counts.items()}
 
 
 STAGES = ("compute_input", "compute_infer", "compute_output")
-"""Triton's names for reading the request, running the model, writing the answer."""
+"""Triton's names of the three stages of an inference: reading the request, running the model, writing the response."""
 
-LATENCY_NS = (10_000, 20_000, 30_000, 50_000, 100_000, 200_000, 500_000, 1_000_000, 2_000_000, 5_000_000, 20_000_000)
-"""Upper bounds of the latency histogram: from half the time of one press to three times that of the largest batch."""
+LATENCY_BOUNDS_NS = (
+    10_000,
+    20_000,
+    30_000,
+    50_000,
+    100_000,
+    200_000,
+    500_000,
+    1_000_000,
+    2_000_000,
+    5_000_000,
+    20_000_000,
+)
+"""Upper bounds of the latency histogram, ns: from half the time of one press to three times that of a full batch."""
 
 
 @dataclass
 class Statistics:
-    """Counters of one version of a model, from the start of the server; any thread may add to them.
+    """Counters of one version of a model since the start of the server. All methods may be called from any thread.
 
     Attributes:
-        presses: Rows that were answered.
-        unchecked: Those of them whose misfit was not computed.
-        alarms: Those of them whose misfit is above the limit of the model.
-        answered, refused: Numbers of requests.
-        latency: Answered requests by their time, those beyond the last of LATENCY_NS at the end.
-        stages_ns: Time spent on the answered ones in each of STAGES.
-        refused_ns: Time spent on the others.
-        last_ms: Time of the last answer, unix time, ms.
+        presses: Number of presses that were answered.
+        unchecked: Number of these presses whose misfit was not computed.
+        alarms: Number of these presses whose misfit is above the limit of the model.
+        answered: Number of requests that were answered.
+        refused: Number of requests that were refused.
+        latency: Number of answered requests in each bucket of the histogram. The last bucket has no upper bound.
+        stages_ns: Total time of the answered requests in each of `STAGES`, ns.
+        refused_ns: Total time of the refused requests, ns.
+        last_ms: Time of the last response, Unix time, ms.
     """
 
     presses: int = 0
@@ -169,58 +186,63 @@ class Statistics:
     alarms: int = 0
     answered: int = 0
     refused: int = 0
-    latency: list[int] = field(default_factory=lambda: [0] * (len(LATENCY_NS) + 1))
+    latency: list[int] = field(default_factory=lambda: [0] * (len(LATENCY_BOUNDS_NS) + 1))
     stages_ns: list[int] = field(default_factory=lambda: [0] * len(STAGES))
     refused_ns: int = 0
     last_ms: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock, compare=False)
 
     def succeeded(self, presses: int, stages_ns: tuple[int, int, int], unchecked: int = 0, alarms: int = 0) -> None:
-        """Count an answered request.
+        """Count a request that was answered.
 
         Args:
-            presses: Rows of it.
-            stages_ns: Its time in each of STAGES.
-            unchecked: Rows whose misfit was not computed.
-            alarms: Rows whose misfit is above the limit.
+            presses: Number of its presses.
+            stages_ns: Its time in each of `STAGES`, ns.
+            unchecked: Number of presses whose misfit was not computed.
+            alarms: Number of presses whose misfit is above the limit.
         """
-        (read, ran, written), spent = stages_ns, self.stages_ns  # one by one: half a microsecond less than a loop
+        read_ns, run_ns, write_ns = stages_ns
+        totals_ns = self.stages_ns
         with self._lock:
             self.presses += presses
             self.unchecked += unchecked
             self.alarms += alarms
             self.answered += 1
-            self.latency[bisect_left(LATENCY_NS, read + ran + written)] += 1
-            spent[0] += read
-            spent[1] += ran
-            spent[2] += written
+            self.latency[bisect_left(LATENCY_BOUNDS_NS, read_ns + run_ns + write_ns)] += 1
+            # Three statements take half a microsecond less than a loop.
+            totals_ns[0] += read_ns
+            totals_ns[1] += run_ns
+            totals_ns[2] += write_ns
             self.last_ms = time.time_ns() // 1_000_000
 
     def failed(self, ns: int) -> None:
-        """Count a refused request and the time that it took."""
+        """Count a request that was refused, and add the time that it took, ns."""
         with self._lock:
             self.refused += 1
             self.refused_ns += ns
 
     @property
     def checked(self) -> int:
-        """Presses whose misfit was computed."""
+        """Number of presses whose misfit was computed."""
         return self.presses - self.unchecked
 
     def snapshot(self) -> "Statistics":
-        """A copy, all of whose counters belong to the same moment."""
+        """Return a copy whose counters all belong to the same moment."""
         with self._lock:
             return replace(self, latency=[*self.latency], stages_ns=[*self.stages_ns], _lock=threading.Lock())
 
     def to_json(self) -> dict[str, Any]:
-        """The counters under Triton's names; no request waits in a queue."""
-        now = self.snapshot()
-        spent = dict(zip(STAGES, now.stages_ns, strict=True)) | {"queue": 0, "success": sum(now.stages_ns)}
-        durations = {name: {"count": now.answered, "ns": ns} for name, ns in spent.items()}
+        """Return the counters under Triton's names. The time in the queue is 0, because no request waits in a queue."""
+        counters = self.snapshot()
+        totals_ns = dict(zip(STAGES, counters.stages_ns, strict=True))
+        totals_ns["queue"] = 0
+        totals_ns["success"] = sum(counters.stages_ns)
+        inference_stats = {name: {"count": counters.answered, "ns": ns} for name, ns in totals_ns.items()}
+        inference_stats["fail"] = {"count": counters.refused, "ns": counters.refused_ns}
         return {
-            "last_inference": now.last_ms,
-            "inference_count": now.presses,
-            "execution_count": now.answered,
-            "inference_stats": {**durations, "fail": {"count": now.refused, "ns": now.refused_ns}},
+            "last_inference": counters.last_ms,
+            "inference_count": counters.presses,
+            "execution_count": counters.answered,
+            "inference_stats": inference_stats,
             "batch_stats": [],
         }

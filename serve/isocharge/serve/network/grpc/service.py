@@ -144,7 +144,7 @@ class Service:
         self._traffic.open["grpc"] = lambda: self._open
         self._answers: dict[str, Callable[[Any], Any]] = {
             "ServerLive": lambda _: {"live": True},
-            "ServerReady": lambda _: {"ready": bool(store.all())},
+            "ServerReady": lambda _: {"ready": bool(store.loaded_versions())},
             "ModelReady": lambda request: {"ready": store.label(request.name, request.version) is not None},
             "ServerMetadata": lambda _: describe.server_metadata(),
             "ModelMetadata": lambda request: describe.model_metadata(store.get(request.name, request.version), store),
@@ -359,7 +359,7 @@ def _listen(server: grpc.aio.Server, place: str, tls: Tls | None) -> int:
     try:
         if tls is None:
             return int(server.add_insecure_port(place))
-        return int(server.add_secure_port(place, grpc.ssl_server_credentials([tls.pair()])))
+        return int(server.add_secure_port(place, grpc.ssl_server_credentials([tls.key_and_certificate()])))
     except RuntimeError as error:
         raise ListenError(
             f"cannot listen on {place} for gRPC: {error}; choose another --grpc-port or --host"

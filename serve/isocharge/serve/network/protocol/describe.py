@@ -32,7 +32,7 @@ def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:
     metadata = loaded.metadata
     return {
         "name": metadata.name,
-        "versions": [other.version for other in store.named(metadata.name)],
+        "versions": [other.version for other in store.versions_of(metadata.name)],
         "platform": PLATFORM,
         "inputs": [_tensor(INPUT, len(metadata.electrodes))],
         "outputs": [_tensor(name, OUTPUTS[name]) for name in loaded.outputs],
@@ -71,9 +71,9 @@ def statistics_of(store: ModelStore, name: str = "", version: str = "") -> dict[
     if version:
         models = [store.get(name, version)]
     elif name:
-        models = store.named(name)
+        models = store.versions_of(name)
     else:
-        models = store.all()
+        models = store.loaded_versions()
     return {
         "model_stats": [
             {"name": loaded.metadata.name, "version": loaded.version, **loaded.statistics.to_json()}

@@ -25,8 +25,8 @@ REFERENCE = "#/components/schemas/{name}"
 def openapi_document(routes: Iterable[Route], store: ModelStore) -> Json:
     """Return the document, OpenAPI 3.1, for the routes that have a summary and the models that are loaded."""
     listed = [route for route in routes if route.summary]
-    models = {loaded.metadata.name for loaded in store.all()}
-    versions = {loaded.version for loaded in store.all()}
+    models = {loaded.metadata.name for loaded in store.loaded_versions()}
+    versions = {loaded.version for loaded in store.loaded_versions()}
     return {
         "openapi": "3.1.0",
         "info": {"title": "isocharge", "version": server_metadata()["version"], "description": DESCRIPTION},

@@ -56,7 +56,7 @@ def page(store: ModelStore) -> str:
     It begins with an example of a request, because this is what most visitors look for.
     """
     refused = "".join(f'<p class="refused">Refused: {escape(reason)}</p>' for reason in store.refusals())
-    served = store.all()
+    served = store.loaded_versions()
     articles = "".join(map(_article, served)) or "<p>No model is loaded.</p>"
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
