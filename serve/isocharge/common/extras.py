@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 from isocharge.common.errors import MissingExtra
 
-SIMULATE = frozenset({"scipy", "threadpoolctl", "matplotlib", "contourpy"})
+SIMULATE = frozenset({"scipy", "threadpoolctl", "matplotlib", "contourpy", "shapely"})
 HTTP = frozenset({"uvloop", "httptools", "orjson", "prometheus_client", "websockets"})
 PACKAGES = {
     "simulate": SIMULATE,

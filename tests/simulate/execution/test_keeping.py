@@ -1,4 +1,7 @@
-"""An executor that keeps results: errors and cancelled tasks; tests/simulate/dataset goes on with what is kept."""
+"""Executor that saves results in a resumable run: errors, cancelled tasks and a pool that is shut down.
+
+Tests in tests/simulate/dataset resume runs from the saved results.
+"""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +14,7 @@ from isocharge.common.resumable_run import resume_parts
 from isocharge.simulate.execution.workers import in_order
 
 
-def test_an_error_of_a_task_is_raised_and_not_kept(tmp_path):
+def test_error_of_a_task_is_raised_and_not_saved(tmp_path):
     def refuse(number: int) -> np.ndarray:
         raise ZeroDivisionError(number)
 
@@ -22,14 +25,21 @@ def test_an_error_of_a_task_is_raised_and_not_kept(tmp_path):
         assert run.is_empty()
 
 
-def test_cancelling_what_is_kept_cancels_the_task_and_a_pool_that_is_shut_down_is_lost(tmp_path):
+def test_cancel_of_a_saving_future_cancels_the_task_and_shutdown_of_the_pool_raises_workers_lost(tmp_path):
     with resume_parts(tmp_path / "out", {}) as run:
-        pool, gate = ThreadPoolExecutor(1), threading.Event()
+        pool = ThreadPoolExecutor(1)
+        gate = threading.Event()
         pool.submit(gate.wait)
-        keeping, calls = run.keeping("solve", pool), []
-        assert keeping.submit(calls.append, 1).cancel()
-        results = in_order(keeping, calls.append, [2, 3], ahead=2)
-        threading.Timer(0.05, lambda: (pool.shutdown(wait=False, cancel_futures=True), gate.set())).start()
+        saving_executor = run.keeping("solve", pool)
+        calls = []
+        assert saving_executor.submit(calls.append, 1).cancel()
+
+        def shut_down() -> None:
+            pool.shutdown(wait=False, cancel_futures=True)
+            gate.set()
+
+        results = in_order(saving_executor, calls.append, [2, 3], max_pending=2)
+        threading.Timer(0.05, shut_down).start()
         with pytest.raises(WorkersLost, match="before the work was done"):
             next(results)
         assert calls == []

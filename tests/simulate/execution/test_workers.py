@@ -1,4 +1,4 @@
-"""The same bytes whoever does the work, a worker that dies included; and workers that do not outlive their sweep."""
+"""Workers: equal bytes from any executor, killed workers, Dask clusters, and the end of all worker processes."""
 
 import os
 import signal
@@ -29,19 +29,19 @@ def sweep_with(executor: Executor | None, target: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory) -> dict[str, bytes]:
-    """What one process writes."""
+    """Files that a sweep in one process writes."""
     with local_workers(1) as executor:
         assert executor is None
         return sweep_with(executor, tmp_path_factory.mktemp("one") / "presses")
 
 
-@pytest.mark.parametrize("pool", [local_workers, ThreadPoolExecutor], ids=["processes", "a pool of one's own"])
-def test_bytes_from_two_workers_are_the_same(tmp_path, expected, pool):
+@pytest.mark.parametrize("pool", [local_workers, ThreadPoolExecutor], ids=["processes", "thread pool"])
+def test_bytes_from_two_workers_are_equal_to_those_from_one_process(tmp_path, expected, pool):
     with pool(2) as executor:
         assert sweep_with(executor, tmp_path / "presses") == expected
 
 
-def test_worker_process_that_dies_is_an_error_and_the_run_can_go_on(tmp_path, expected):
+def test_killed_worker_process_raises_workers_lost_and_the_run_can_be_resumed(tmp_path, expected):
     killed = []
 
     def kill(title: str, *_) -> None:
@@ -50,7 +50,7 @@ def test_worker_process_that_dies_is_an_error_and_the_run_can_go_on(tmp_path, ex
             os.kill(killed[0], signal.SIGKILL)
 
     with (
-        pytest.raises(WorkersLost, match="a worker process ended by itself"),
+        pytest.raises(WorkersLost, match="a worker process ended unexpectedly"),
         local_workers(2) as executor,
         listening(kill),
     ):
@@ -59,7 +59,7 @@ def test_worker_process_that_dies_is_an_error_and_the_run_can_go_on(tmp_path, ex
     assert sweep_with(None, tmp_path / "presses") == expected
 
 
-def test_results_come_in_order_and_tasks_are_drawn_as_they_are_needed():
+def test_in_order_returns_results_in_order_and_consumes_jobs_as_needed():
     drawn = []
 
     def jobs() -> Iterator[float]:
@@ -68,13 +68,13 @@ def test_results_come_in_order_and_tasks_are_drawn_as_they_are_needed():
             yield 0.002 * (number % 3)
 
     with ThreadPoolExecutor(4) as pool:
-        results = in_order(pool, waited, jobs(), ahead=5)
+        results = in_order(pool, waited, jobs(), max_pending=5)
         assert next(results) == 0.0
         assert len(drawn) <= 5
         assert [0.0, *results] == [0.002 * (number % 3) for number in range(20)]
 
 
-def test_tasks_run_beside_each_other():
+def test_in_order_runs_jobs_in_parallel():
     both = Barrier(2)
     with ThreadPoolExecutor(2) as pool:
         assert sorted(in_order(pool, lambda _: both.wait(timeout=5.0), range(4))) == [0, 0, 1, 1]
@@ -85,8 +85,8 @@ def waited(seconds: float) -> float:
     return seconds
 
 
-def test_worker_with_another_isocharge_is_refused(monkeypatch):
-    """Its bytes might differ."""
+def test_worker_with_a_different_code_fingerprint_is_refused(monkeypatch):
+    """Results of a different version could differ."""
     fingerprint = module.code_fingerprint()
     monkeypatch.setattr(module, "code_fingerprint", lambda: "isocharge 9.9")
     with pytest.raises(WorkersLost, match=r"a worker runs isocharge 9\.9, expected isocharge 0\.1\.0 \([0-9a-f]{12}\)"):
@@ -106,7 +106,7 @@ def cluster():
             n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
         ) as cluster,
     ):
-        patch.setattr(module, "CONNECT_S", 120.0)  # a busy machine is no fault
+        patch.setattr(module, "CONNECT_TIMEOUT_s", 120.0)  # a busy machine needs more time
         yield cluster
 
 
@@ -114,8 +114,8 @@ def pids(cluster) -> list[int]:
     return [nanny.pid for nanny in cluster.workers.values() if nanny.pid]
 
 
-def test_bytes_from_dask_are_the_same_though_a_worker_is_killed(cluster, tmp_path, expected):
-    """In the middle of the solves; another takes its place."""
+def test_bytes_from_dask_are_equal_although_a_worker_is_killed(cluster, tmp_path, expected):
+    """The worker is killed during the solves, and Dask starts a new one."""
     killed = []
 
     def kill(title: str, done: int, *_) -> None:
@@ -129,8 +129,8 @@ def test_bytes_from_dask_are_the_same_though_a_worker_is_killed(cluster, tmp_pat
     assert killed[0] not in pids(cluster)
 
 
-def test_cluster_that_does_not_answer_is_an_error(monkeypatch):
-    monkeypatch.setattr(module, "CONNECT_S", 0.3)
+def test_dask_scheduler_that_does_not_answer_raises_workers_lost(monkeypatch):
+    monkeypatch.setattr(module, "CONNECT_TIMEOUT_s", 0.3)
     with pytest.raises(WorkersLost, match="no Dask scheduler answers at tcp://127"):
         dask_workers("tcp://127.0.0.1:9").__enter__()
     with pytest.raises(InputError, match="cluster 'carrier-pigeon://1': expected an address like"):

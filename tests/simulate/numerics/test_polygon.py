@@ -1,4 +1,4 @@
-"""Areas shared by polygons and disks against closed forms, Monte Carlo and what areas must obey."""
+"""Areas and centroids of polygons, and their overlaps, compared with closed forms and with properties of areas."""
 
 import numpy as np
 import pytest
@@ -75,7 +75,15 @@ def test_area_in_a_disk_is_bounded_and_additive_and_a_polygons_limit(a, x, y, ra
 
 @pytest.mark.parametrize(
     ("shift", "expected"),
-    [(0.0, 1.0), (0.5, 0.5), (0.5 + 0.25j, 0.375), (1.0, 0.0), (2.0, 0.0), (-0.25 - 0.25j, 0.5625)],
+    [
+        pytest.param(0.0, 1.0, id="identical"),
+        pytest.param(0.5, 0.5, id="shifted along x"),
+        pytest.param(0.5 + 0.25j, 0.375, id="shifted along both axes"),
+        pytest.param(1.0, 0.0, id="common edge"),
+        pytest.param(1.0 + 1.0j, 0.0, id="common corner"),
+        pytest.param(2.0, 0.0, id="separate"),
+        pytest.param(-0.25 - 0.25j, 0.5625, id="shifted back"),
+    ],
 )
 def test_shared_area_of_two_squares(shift, expected):
     assert shared_area(SQUARE, SQUARE + shift) == pytest.approx(expected, abs=1e-15)
@@ -84,14 +92,41 @@ def test_shared_area_of_two_squares(shift, expected):
 @pytest.mark.parametrize(
     ("centre", "radius", "expected"),
     [
-        (0.5 + 0.5j, 0.3, np.pi * 0.09),  # disk inside
-        (0.5 + 0.5j, 5.0, 1.0),  # square inside
-        (0.0, 0.5, np.pi / 16),  # about a corner
-        (0.5, 0.4, np.pi * 0.08),  # about the middle of an edge
-        (3.0, 1.0, 0.0),  # apart
-        (2.0 + 0.5j, 1.0, 0.0),  # touching
-        (0.5 + 0.5j, 0.6, 0.36 * (np.pi - 4 * (np.arccos(5 / 6) - 5 / 6 * np.sqrt(11) / 6))),  # four segments cut off
+        pytest.param(0.5 + 0.5j, 0.3, np.pi * 0.09, id="disk inside"),
+        pytest.param(0.5 + 0.5j, 5.0, 1.0, id="square inside"),
+        pytest.param(0.0, 0.5, np.pi / 16, id="disk about a corner"),
+        pytest.param(0.5, 0.4, np.pi * 0.08, id="disk about the middle of an edge"),
+        pytest.param(3.0, 1.0, 0.0, id="separate"),
+        pytest.param(2.0 + 0.5j, 1.0, 0.0, id="touching"),
+        pytest.param(
+            0.5 + 0.5j,
+            0.6,
+            0.36 * (np.pi - 4 * (np.arccos(5 / 6) - 5 / 6 * np.sqrt(11) / 6)),
+            id="disk without four segments",
+        ),
     ],
 )
 def test_area_in_disk_of_a_square(centre, radius, expected):
     assert area_in_disk(SQUARE, centre, radius) == pytest.approx(expected, abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("shift", "within", "expected"),
+    [
+        pytest.param(0.5, 0.0, True, id="common area"),
+        pytest.param(1.0, 0.0, False, id="common edge"),
+        pytest.param(1.0 + 1.0j, 0.0, False, id="common corner"),
+        pytest.param(1.0, 1e-3, True, id="common edge within a distance"),
+        pytest.param(1.5, 0.4, False, id="farther than the distance"),
+        pytest.param(1.5, 0.6, True, id="nearer than the distance"),
+        pytest.param(1.5 + 1.5j, 0.7, False, id="corners farther than the distance"),
+        pytest.param(1.5 + 1.5j, 0.8, True, id="corners nearer than the distance"),
+    ],
+)
+def test_overlap_of_two_squares(shift, within, expected):
+    assert overlap(corners_of(SQUARE), corners_of(SQUARE + shift), within) is expected
+
+
+def test_centroid_of_a_triangle_is_the_mean_of_its_corners():
+    corners = np.array([[0.0, 0.0], [6.0, 0.0], [0.0, 3.0]])
+    np.testing.assert_allclose(centroid_of(corners), [2.0, 1.0], atol=1e-15)

@@ -1,1 +1,1 @@
-"""Where long work is done: this process, worker processes, a Dask cluster; and the fingerprint of the code."""
+"""Execution of long computations in this process, in worker processes or on a Dask cluster; code fingerprint."""

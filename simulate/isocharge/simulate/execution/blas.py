@@ -1,13 +1,17 @@
-"""BLAS on one thread."""
+"""Restriction of BLAS to one thread."""
 
 from contextlib import AbstractContextManager
 
 from threadpoolctl import ThreadpoolController
 
-_THREADS = ThreadpoolController()
+_CONTROLLER = ThreadpoolController()
 
 
 def single_threaded_blas() -> AbstractContextManager[object]:
-    """For many small matrices: BLAS threads would spin at barriers, many times slower when the other cores are busy."""
-    limiter: AbstractContextManager[object] = _THREADS.limit(limits=1, user_api="blas")
+    """Return a context manager within which BLAS uses one thread.
+
+    Operations on many small matrices are faster with one thread. Several threads wait for each other in busy loops,
+    which takes many times longer if other processes occupy the remaining cores.
+    """
+    limiter: AbstractContextManager[object] = _CONTROLLER.limit(limits=1, user_api="blas")
     return limiter

@@ -1,4 +1,4 @@
-"""Fingerprint of the code that results depend on."""
+"""Fingerprint of the code on which the results depend."""
 
 import hashlib
 import importlib.metadata
@@ -6,22 +6,27 @@ from functools import lru_cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
-"""The folder of isocharge.simulate."""
+"""Folder of the package isocharge.simulate."""
+
+LIBRARIES = ("numpy", "scipy", "shapely")
+"""Libraries on whose version the results depend."""
 
 
 @lru_cache(maxsize=1)
 def code_fingerprint() -> str:
-    """Version of the package, checksum of the simulator's sources, versions of the libraries it computes with.
+    """Return a text that changes whenever the code or a numerical library changes.
 
-    The sources are every module of isocharge.simulate, with its packages, and the built-in sensors.
+    The text contains the version of isocharge, a checksum of the sources of isocharge.simulate and of the built-in
+    sensors, and the versions of NumPy, SciPy and shapely.
     """
     source = hashlib.sha256()
     for path in sources():
         source.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
-    versions = [f"{name} {importlib.metadata.version(name)}" for name in ("isocharge", "numpy", "scipy")]
-    return f"{versions[0]} ({source.hexdigest()[:12]}), {versions[1]}, {versions[2]}"
+    isocharge_version = importlib.metadata.version("isocharge")
+    libraries = [f"{name} {importlib.metadata.version(name)}" for name in LIBRARIES]
+    return ", ".join([f"isocharge {isocharge_version} ({source.hexdigest()[:12]})", *libraries])
 
 
 def sources() -> list[Path]:
-    """The files whose change is another fingerprint, in one order on every machine."""
+    """Return the files that enter the checksum, in an order that is the same on every machine."""
     return sorted([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.toml")], key=lambda path: path.as_posix())

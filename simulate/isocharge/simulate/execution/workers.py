@@ -1,7 +1,7 @@
-"""Where long work is done: any `concurrent.futures.Executor`, such as processes on this machine or a Dask cluster.
+"""Execution of long computations with a `concurrent.futures.Executor`, such as a process pool or a Dask cluster.
 
-The results do not depend on the executor, on the number of workers, or on which of them finishes first: tasks are cut
-beforehand and their results are taken in order.
+The results do not depend on the executor, on the number of workers, or on the order in which the workers finish,
+because the work is divided into jobs beforehand and the results are returned in the order of the jobs.
 """
 
 import multiprocessing
@@ -25,27 +25,30 @@ Job = TypeVar("Job")
 
 Result = TypeVar("Result")
 
-AHEAD = 64
-"""Most tasks handed out whose results were not taken yet: enough for some thirty workers, few enough for memory."""
+MAX_PENDING = 64
+"""Default of the largest number of submitted jobs whose results have not been returned yet. It is enough for about
+thirty workers and limits the memory that finished results occupy."""
 
-CONNECT_S = 10.0
-"""Longest wait for a cluster to answer, s."""
+CONNECT_TIMEOUT_s = 10.0
+"""Longest time to wait for a connection to a Dask cluster, s."""
 
 
 def in_order(
-    executor: Executor | None, function: Callable[[Job], Result], jobs: Iterable[Job], *, ahead: int = AHEAD
+    executor: Executor | None, function: Callable[[Job], Result], jobs: Iterable[Job], *, max_pending: int = MAX_PENDING
 ) -> Iterator[Result]:
-    """The results of all jobs, in their order; jobs are drawn as they are needed.
+    """Call a function with every job and yield the results in the order of the jobs.
+
+    The iterable of jobs is consumed only as far as jobs can be submitted.
 
     Args:
-        executor: Runs the tasks: a process pool with any start method, `Client.get_executor()` of Dask, threads. None
-            runs them in this process, one when its result is asked for.
-        function: Called with each job; processes must be able to import it.
-        jobs: What it is called with.
-        ahead: Most tasks handed out whose results were not taken yet.
+        executor: Executor that runs the jobs, such as a process pool with any start method, a thread pool, or
+            `Client.get_executor()` of Dask. If it is None, each job runs in this process when its result is requested.
+        function: Function that is called with each job. Worker processes must be able to import it.
+        jobs: Arguments of the calls.
+        max_pending: Largest number of submitted jobs whose results have not been returned yet.
 
     Raises:
-        WorkersLost: If workers end by themselves, or run another version of isocharge.
+        WorkersLost: If a worker process ends unexpectedly, or runs a different version of isocharge.
     """
     if executor is None:
         yield from map(function, jobs)
@@ -54,9 +57,9 @@ def in_order(
     pending: deque[Future[Result]] = deque()
     try:
         for job in jobs:
-            with _loss_of_workers():
+            with _executor_errors():
                 pending.append(executor.submit(task, job))
-            while pending and (len(pending) >= ahead or all(future.done() for future in pending)):
+            while pending and (len(pending) >= max_pending or all(future.done() for future in pending)):
                 yield _result(pending.popleft())
         while pending:
             yield _result(pending.popleft())
@@ -66,94 +69,110 @@ def in_order(
 
 
 def _result(future: Future[Result]) -> Result:
-    with _loss_of_workers():
+    """Wait for a future and return its result."""
+    with _executor_errors():
         return future.result()
 
 
 @contextmanager
-def _loss_of_workers() -> Iterator[None]:
-    """Turn what executors raise when their workers are gone into WorkersLost."""
+def _executor_errors() -> Iterator[None]:
+    """Convert the exceptions that executors raise when they lose workers into WorkersLost."""
     try:
         yield
     except BrokenExecutor as error:
-        raise WorkersLost("a worker process ended by itself: out of memory, or killed from outside") from error
+        raise WorkersLost("a worker process ended unexpectedly: out of memory, or killed by another program") from error
     except CancelledError as error:
         raise WorkersLost("the executor was shut down, or lost its workers, before the work was done") from error
     except Exception as error:
         if not type(error).__module__.startswith("distributed."):  # KilledWorker, CommClosedError
             raise
-        raise WorkersLost(f"the Dask cluster gave up: {error}") from error
+        raise WorkersLost(f"the Dask cluster stopped the computation: {error}") from error
 
 
 def run_same_code(fingerprint: str, function: Callable[[Job], Result], job: Job) -> Result:
-    """Run a job where isocharge is the same as the sender's: else its bytes would differ.
+    """Run a job in a worker after checking that the worker runs the same code as the sender.
+
+    Args:
+        fingerprint: Result of `code_fingerprint` in the sending process.
+        function: Function to call.
+        job: Argument of the call.
 
     Raises:
-        WorkersLost: If it is another.
+        WorkersLost: If the code of the worker differs, because its results would then differ as well.
     """
     if code_fingerprint() != fingerprint:
         raise WorkersLost(
-            f"a worker runs {code_fingerprint()}, expected {fingerprint}; install the same on all of them"
+            f"a worker runs {code_fingerprint()}, expected {fingerprint}; install the same versions on all workers"
         )
     with single_threaded_blas():
         return function(job)
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else multiprocessing.cpu_count()
 
 
 @contextmanager
 def local_workers(count: int) -> Iterator[Executor | None]:
-    """Processes on this machine, None for one worker. They end with the block, and if this process is killed."""
+    """Start worker processes on this machine.
+
+    The workers end when the `with` block ends, and also if this process is killed.
+
+    Args:
+        count: Number of worker processes. For 1, no process is started and the executor is None.
+    """
     if count == 1:
         yield None
         return
-    context = multiprocessing.get_context("spawn")  # a fork copies locks that other threads hold
-    watched, held = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(watched,))
+    context = multiprocessing.get_context("spawn")  # a fork would copy locks that other threads hold
+    worker_end, parent_end = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_initialise_worker, initargs=(worker_end,))
     try:
         yield pool
     except BaseException:
-        held.close()  # workers in the middle of a task end, too
+        parent_end.close()  # this also ends workers that are still computing
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-        held.close()
-        watched.close()
+        parent_end.close()
+        worker_end.close()
 
 
-def _begin(watched: Connection) -> None:
-    """Interrupts are the parent's to handle; the worker ends when the parent lets go of its end of the pipe."""
+def _initialise_worker(worker_end: Connection) -> None:
+    """Leave interrupts to the parent process, and end this worker when the parent closes its end of the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    threading.Thread(target=_end_with_parent, args=(watched,), daemon=True).start()
+    threading.Thread(target=_end_with_parent, args=(worker_end,), daemon=True).start()
 
 
-def _end_with_parent(watched: Connection) -> None:
-    watched.poll(None)
+def _end_with_parent(worker_end: Connection) -> None:
+    """Wait until the parent closes its end of the pipe, and then end this process."""
+    worker_end.poll(None)
     os._exit(1)
 
 
 @contextmanager
 def dask_workers(address: str) -> Iterator[Executor]:
-    """The workers of a Dask cluster, such as "tcp://10.0.0.1:8786"; they need the same isocharge as this process.
+    """Connect to the workers of a Dask cluster, which must run the same version of isocharge as this process.
 
-    If a worker is killed, Dask gives its tasks to the others.
+    If a worker is killed, Dask runs its tasks on the other workers.
+
+    Args:
+        address: Address of the scheduler, such as "tcp://10.0.0.1:8786".
 
     Raises:
-        InputError: If this is no address.
-        WorkersLost: If the cluster does not answer.
+        InputError: If the address is not valid.
+        WorkersLost: If the scheduler does not answer.
         MissingExtra: If the extra `cluster` is not installed.
     """
     with require("cluster"):
         import dask
         from distributed import Client
 
-    with dask.config.set({"distributed.admin.large-graph-warning-threshold": "100MiB"}):  # a task carries its map
+    with dask.config.set({"distributed.admin.large-graph-warning-threshold": "100MiB"}):  # tasks contain a map
         try:
-            client = Client(address, timeout=CONNECT_S, set_as_default=False)
+            client = Client(address, timeout=CONNECT_TIMEOUT_s, set_as_default=False)
         except ValueError as error:
             raise InputError(f"cluster {address!r}: expected an address like 'tcp://10.0.0.1:8786': {error}") from error
         except OSError as error:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
-from isocharge.simulate.numerics.polygon import area_in_disk, spare
+from isocharge.simulate.numerics.polygon import area_in_disk, min_edge_cross_product
 
 NORMAL_STEP = 0.1
 """Step of the finite differences that determine the normal of an edge, in widths of the band."""
@@ -100,7 +100,9 @@ class Coating:
 
     def _layer_count(self, points: Complexes) -> Integers:
         """Return the number of layers of the coat at each point, of the shape of `points`."""
-        covered = [np.any([spare(part, points) >= 0.0 for part in layer], axis=0) for layer in self.layers]
+        covered = [
+            np.any([min_edge_cross_product(part, points) >= 0.0 for part in layer], axis=0) for layer in self.layers
+        ]
         return np.asarray(np.sum(covered, axis=0))
 
     def _normal(self, points: Complexes) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from isocharge.simulate.mesh.coating import Coating
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.template import Template, sample_points
 from isocharge.simulate.numerics.interpolation import lagrange_values, lobatto_nodes, lobatto_weights, tensor_values
-from isocharge.simulate.numerics.polygon import area_of, spare, to_corners
+from isocharge.simulate.numerics.polygon import area_of, min_edge_cross_product, to_corners
 
 GRADING = 1.0
 """An element is split if a line lies nearer to its middle than this multiple of its longest side."""
@@ -185,5 +185,5 @@ def _edges(parts: tuple[Complexes, ...], finest: float) -> Complexes:
             points.append(start + along * (end - start))
             outside.append(points[-1] - 1e-3j * finest * (end - start) / abs(end - start))
     beyond = np.concatenate(outside)
-    inner = [spare(part, beyond) > 0.0 for part in parts]
+    inner = [min_edge_cross_product(part, beyond) > 0.0 for part in parts]
     return np.asarray(np.concatenate(points)[~np.any(inner, axis=0)])

@@ -1,78 +1,143 @@
-"""Unions of polygons in parts without common area; corners are x + iy, anticlockwise."""
+"""Unions of polygons, divided into trapezoids for integration. Polygons are arrays of corners x + iy, anticlockwise.
+
+Unions, intersections and validity come from shapely (GEOS). Two functions are written here, because shapely has no
+equivalent: the division into trapezoids, and the outline of a trace. The `buffer` of shapely cuts a sharp bend off
+without notice and joins a trace that crosses itself into a ring, while `trace_outline` makes both detectable.
+"""
 
 from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+import shapely
 
 from isocharge.common.arrays import Array, Complexes
-from isocharge.simulate.numerics.polygon import area_of, bilinear, to_corners
+from isocharge.simulate.numerics.polygon import area_of, bilinear, to_complex, to_corners
 
-NARROW = 1e-9
-"""Distance below which corners, and heights of corners, are one, mm."""
+MERGE_DISTANCE = 1e-9
+"""Distance below which two corners, or the y coordinates of two corners, are merged, mm."""
 
-SHARPEST = 0.1
-"""Smallest 1 + cos of the angle by which a trace may turn, which is 154 degrees: a mitre grows with 1 / (1 + cos)."""
+MIN_BEND = 0.1
+"""Smallest 1 + cos(angle) for the angle by which a trace bends, dimensionless. It corresponds to a bend of 154 degrees.
+The length of a mitre grows with 1 / (1 + cos(angle))."""
 
 
-def is_simple(z: Complexes) -> bool:
-    """Whether a polygon is anticlockwise and does not cross itself: it then covers its signed area, nothing twice."""
-    area, around = area_of(to_corners(z)), np.abs(z - np.roll(z, 1)).sum()
-    covered = sum(area_of(to_corners(part)) for part in union_parts([z]))
-    return area > 0.0 and bool(abs(covered - area) < NARROW * around)
+def is_simple(corners: Complexes) -> bool:
+    """Return whether a polygon is anticlockwise and does not cross itself.
+
+    The signed area of a polygon equals the area that it covers only if it covers no point twice or with the opposite
+    orientation. A polygon that touches itself in a point or along an edge is simple in this sense.
+
+    Args:
+        corners: Corners x + iy, shape (n,), mm.
+    """
+    signed_area = area_of(to_corners(corners))
+    perimeter = np.abs(corners - np.roll(corners, 1)).sum()
+    difference = _region([corners]).area - signed_area
+    return signed_area > 0.0 and bool(abs(difference) < MERGE_DISTANCE * perimeter)
 
 
 def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> list[Complexes]:
-    """The union of simple polygons, or what it has in common with the union of others, as trapezoids.
+    """Divide the union of simple polygons into trapezoids without common area.
 
-    Between two heights at which no corner lies and no edges cross, edges follow each other from left to right. What an
-    edge downwards opens, one upwards closes.
+    The plane is cut into horizontal strips at every corner and at every crossing of two edges. Within a strip the union
+    consists of trapezoids (or triangles, as trapezoids with two equal corners).
+
+    Args:
+        front: Simple polygons, each of shape (n,), mm.
+        back: Further simple polygons. If there are any, the intersection of both unions is divided.
+
+    Returns:
+        Trapezoids, each of shape (4,), mm: lower left, lower right, upper right and upper left corner. They are ordered
+        from bottom to top, and from left to right within a strip.
     """
-    polygons, parts = [*front, *back], []
-    start, end = np.concatenate(polygons), np.concatenate([np.roll(z, -1) for z in polygons])
-    behind = np.repeat(np.arange(len(polygons)) >= len(front), [z.size for z in polygons])
-    opens = np.where(end.imag < start.imag, 1, -1)
-    for low, high in pairwise(_heights(start, end)):
-        between = np.flatnonzero((start.imag < 0.5 * (low + high)) != (end.imag < 0.5 * (low + high)))
-        begin, step = start[between], (end - start)[between]
-        at_low, at_high = (begin + (height - begin.imag) / step.imag * step for height in (low, high))
-        order = np.argsort((at_low + at_high).real)
-        edges = between[order]
-        inside = np.cumsum(opens[edges] * ~behind[edges]) > 0
-        if back:
-            inside &= np.cumsum(opens[edges] * behind[edges]) > 0
-        for left, right in order[np.flatnonzero(np.diff(inside, prepend=False))].reshape(-1, 2):
-            parts.append(np.array([at_low[left], at_low[right], at_high[right], at_high[left]]))
-    return parts
+    region = _region(front)
+    if back:
+        region = shapely.intersection(region, _region(back))
+    if region.area == 0.0:
+        return []
+
+    start, end = _edges(region)
+    slope = np.divide((end - start).real, (end - start).imag, out=np.zeros(start.size), where=start.imag != end.imag)
+    trapezoids = []
+    for low, high in pairwise(_strip_ends([*front, *back])):
+        middle = 0.5 * (low + high)
+        edges = np.flatnonzero((start.imag < middle) != (end.imag < middle))
+        x_middle = start[edges].real + slope[edges] * (middle - start[edges].imag)
+        from_left = edges[np.argsort(x_middle)]
+        low_corners = start[from_left].real + slope[from_left] * (low - start[from_left].imag) + 1j * low
+        high_corners = start[from_left].real + slope[from_left] * (high - start[from_left].imag) + 1j * high
+        for left in range(0, edges.size, 2):  # the region lies between each edge with an even number and the next one
+            right = left + 1
+            corners = [low_corners[left], low_corners[right], high_corners[right], high_corners[left]]
+            trapezoids.append(np.array(corners))
+    return trapezoids
 
 
-def _heights(start: Complexes, end: Complexes) -> Array:
-    """Heights of corners and crossings of edges, rising."""
-    step, offset = end - start, start - start[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):  # parallel edges do not cross
-        turn = (np.conj(step[:, None]) * step).imag
-        along, other = (np.conj(offset) * step).imag / turn, (np.conj(offset) * step[:, None]).imag / turn
-        crosses = (along >= 0.0) & (along <= 1.0) & (other >= 0.0) & (other <= 1.0)
-    crossing = (start[:, None] + np.where(crosses, along, 0.0) * step[:, None]).imag
-    heights = np.unique(crossing)
-    return np.asarray(heights[np.diff(heights, prepend=-np.inf) > NARROW])
+def _region(polygons: Sequence[Complexes]) -> shapely.Geometry:
+    """Return the union of polygons. Polygons that touch or cross themselves are made valid first."""
+    valid = shapely.make_valid([shapely.Polygon(to_corners(corners)) for corners in polygons])
+    return shapely.union_all(valid)
 
 
-def pieces(part: Complexes, longest: float) -> list[Complexes]:
-    """A quadrilateral cut into some, or triangles, with sides no longer than `longest`."""
-    sides = np.abs(np.roll(part, -1) - part)
-    s, t = (np.linspace(0.0, 1.0, int(np.ceil(max(sides[k], sides[k + 2]) / longest)) + 1) for k in (0, 1))
+def _strip_ends(polygons: Sequence[Complexes]) -> Array:
+    """Return the y coordinates of all corners and of all crossings of edges, ascending and without repetition, mm."""
+    outlines = [shapely.LinearRing(to_corners(corners)) for corners in polygons]
+    noded = shapely.union_all(outlines)
+    y = np.unique(shapely.get_coordinates(noded)[:, 1])
+    return np.asarray(y[np.diff(y, prepend=-np.inf) > MERGE_DISTANCE])
+
+
+def _edges(region: shapely.Geometry) -> tuple[Complexes, Complexes]:
+    """Return the start and end points x + iy of all edges of a region, including the edges of its holes."""
+    parts = shapely.get_parts(region)
+    polygons = parts[shapely.get_dimensions(parts) == 2]
+    rings = [to_complex(shapely.get_coordinates(ring)) for ring in shapely.get_rings(polygons)]
+    start = np.concatenate([ring[:-1] for ring in rings])
+    end = np.concatenate([ring[1:] for ring in rings])
+    return start, end
+
+
+def subdivide(part: Complexes, max_side: float) -> list[Complexes]:
+    """Cut a quadrilateral into smaller quadrilaterals, or triangles where two of their corners coincide.
+
+    Args:
+        part: Corners of the quadrilateral, shape (4,), mm.
+        max_side: Largest length of a side of the returned polygons, mm.
+
+    Returns:
+        Polygons of shape (4,) or (3,), mm.
+    """
+    side_length = np.abs(np.roll(part, -1) - part)
+    s = np.linspace(0.0, 1.0, int(np.ceil(max(side_length[0], side_length[2]) / max_side)) + 1)
+    t = np.linspace(0.0, 1.0, int(np.ceil(max(side_length[1], side_length[3]) / max_side)) + 1)
     grid = bilinear(part, s[:, None], t)
-    cells = [grid[[i, i + 1, i + 1, i], [j, j, j + 1, j + 1]] for i, j in np.ndindex(s.size - 1, t.size - 1)]
-    distinct = [cell[np.abs(cell - np.roll(cell, 1)) > NARROW] for cell in cells]
-    return [cell for cell in distinct if cell.size > 2]
+    cells = []
+    for i, j in np.ndindex(s.size - 1, t.size - 1):
+        cell = np.array([grid[i, j], grid[i + 1, j], grid[i + 1, j + 1], grid[i, j + 1]])
+        distinct = cell[np.abs(cell - np.roll(cell, 1)) > MERGE_DISTANCE]
+        if distinct.size > 2:
+            cells.append(distinct)
+    return cells
 
 
 def trace_outline(path: Complexes, width: float) -> Complexes:
-    """Corners of a line of a width along a path: straight ends, mitred bends; NaN where it turns back sharply."""
+    """Compute the outline of a trace of constant width along a path, with straight ends and mitred bends.
+
+    Args:
+        path: Points of the path, shape (n,), mm.
+        width: Width of the trace, mm.
+
+    Returns:
+        Corners, anticlockwise, shape (2 n,), mm. Corners of a bend sharper than `MIN_BEND` allows are NaN.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         normal = 1j * np.diff(path) / np.abs(np.diff(path))
-        first, last = np.append(normal[:1], normal), np.append(normal, normal[-1:])
-        turn = 1.0 + (first * np.conj(last)).real
-        mitre = 0.5 * width * (first + last) / np.where(turn < SHARPEST, np.nan, turn)
-    return np.append(path - mitre, (path + mitre)[::-1])
+        normal_before = np.append(normal[:1], normal)
+        normal_after = np.append(normal, normal[-1:])
+        bend = 1.0 + (normal_before * np.conj(normal_after)).real
+        bend = np.where(bend < MIN_BEND, np.nan, bend)
+        mitre = 0.5 * width * (normal_before + normal_after) / bend
+    right_side = path - mitre
+    left_side = path + mitre
+    return np.append(right_side, left_side[::-1])

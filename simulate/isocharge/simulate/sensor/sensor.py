@@ -16,7 +16,7 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SensorError, cut, shown
 from isocharge.common.printable_text import is_printable
 from isocharge.simulate.numerics.polygon import area_of, is_convex, overlap, to_complex, to_corners
-from isocharge.simulate.numerics.polygon_union import is_simple, pieces, trace_outline, union_parts
+from isocharge.simulate.numerics.polygon_union import is_simple, subdivide, trace_outline, union_parts
 from isocharge.simulate.sensor.film import Coat, Film, Piezo, Surface
 from isocharge.simulate.sensor.size_check import check_length
 
@@ -150,7 +150,7 @@ class Electrode:
         return tuple(
             to_corners(piece)
             for polygon in self.collecting_polygons
-            for piece in pieces(to_complex(polygon), MAX_PART_SIDE)
+            for piece in subdivide(to_complex(polygon), MAX_PART_SIDE)
         )
 
     @property

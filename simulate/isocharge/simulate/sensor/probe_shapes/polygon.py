@@ -7,7 +7,14 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes
 from isocharge.common.errors import SceneError
-from isocharge.simulate.numerics.polygon import area_of, centroid_of, is_convex, shared_area, spare, to_complex
+from isocharge.simulate.numerics.polygon import (
+    area_of,
+    centroid_of,
+    is_convex,
+    min_edge_cross_product,
+    shared_area,
+    to_complex,
+)
 from isocharge.simulate.sensor.probe_shapes.base import (
     NUMBER,
     FootprintTopology,
@@ -166,7 +173,7 @@ class Polygon(Probe):
 
     def contains(self, points: Complexes) -> Booleans:
         """Return whether points lie in the polygon."""
-        return np.asarray(spare(self.outline, points) >= 0.0)
+        return np.asarray(min_edge_cross_product(self.outline, points) >= 0.0)
 
     def farthest_distance(self, at: tuple[float, float]) -> float:
         """Return the distance of the farthest corner from the centre of the film, mm."""
