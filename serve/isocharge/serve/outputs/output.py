@@ -1,6 +1,6 @@
 """The interface of an output, and the description of a kind of output.
 
-Another package adds a kind of output through the entry-point group `isocharge.outputs`. The entry point refers to an
+Another package adds a kind of output through an entry point of the group "isocharge.outputs", which refers to an
 `OutputKind`:
 
     # pyproject.toml
