@@ -37,14 +37,17 @@ misfit_charges = 1000
 EXAMPLE_PAGES = [page for page in PAGES if not page.startswith(("serve/", "CONTRIBUTING", "CHANGELOG"))]
 """Those of serve use ports (tests/serve), and CONTRIBUTING.md has recipes (tests/test_contributing.py)."""
 
+RESEARCH_TUTORIAL = "simulate/docs/tutorial.md"
+"""Tutorial that goes from a press to records of a virtual sensor."""
+
 
 SLOW = ("simulate identify", "train report", "make paper", "fit presses --config quick.toml")
 """What takes an example of a README more than a few seconds, or stands in that of another."""
 
 
 def is_slow(example):
-    """Examples of the READMEs run in `make test`, those of other pages in `make test-all`."""
-    return not example.page.endswith("README.md") or any(key in example.text for key in SLOW)
+    """Examples of the READMEs and of the tutorial run in `make test`, those of other pages in `make test-all`."""
+    return not example.page.endswith(("README.md", RESEARCH_TUTORIAL)) or any(key in example.text for key in SLOW)
 
 
 @pytest.fixture(scope="module")
@@ -88,15 +91,35 @@ def test_an_example_does_what_it_says(page_example, desk, installed, run_example
         run_example(text, desk, environment)
         return
     printed = run_commands(text, desk, environment, timeout=3600)
-    if page_example.page == "README.md" and "simulate point" in text:
+    if page_example.page == RESEARCH_TUTORIAL and "simulate point" in text:
         assert '"charge_pC"' in printed
         assert printed.count('"frame_id": "three-25um-biaxial"') == 1000
 
 
+def anchors(text):
+    """Return the anchors of the headings of a page, as GitHub and the site make them."""
+    without_code = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ (.+)$", without_code, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
 @pytest.mark.parametrize("page", PAGES)
-def test_links_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)#]+)\)", PAGES[page]):
-        assert target.startswith("http") or (ROOT / page).parent.joinpath(target).exists(), target
+def test_links_lead_to_a_file_and_to_a_heading(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", PAGES[page]):
+        if target.startswith("http"):
+            continue
+        name, _, anchor = target.partition("#")
+        path = (ROOT / page).parent / name if name else ROOT / page
+        assert path.exists(), target
+        assert not anchor or anchor in anchors(path.read_text("utf-8")), target
+
+
+SITE_CONTENTS = (ROOT / ".ci" / "docs" / "contents.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_page_is_in_the_contents_of_the_site(page):
+    assert page == "README.md" or page.removesuffix(".md") in SITE_CONTENTS.split()
 
 
 def test_figures_of_the_released_models_are_their_cards():

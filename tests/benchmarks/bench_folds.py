@@ -1,4 +1,4 @@
-"""Slides across the folds of a film, followed by their charges: the table of serve/docs/tracking.md.
+"""Slides across the folds of a film, followed by their charges: the table of serve/docs/tracking_results.md.
 
     isocharge simulate sweep three-25um-uniaxial --radius 6.5 -o presses
     isocharge train fit presses -o three-25um-uniaxial

@@ -13,9 +13,6 @@ PAGES = [*ROOT.glob("*.md"), *(ROOT / "models").glob("*.md")]
 for stage in ("simulate", "train", "serve"):
     PAGES += [ROOT / stage / "README.md", *(ROOT / stage / "docs").glob("*.md")]
 
-OLD_COMMANDS = ("CHANGELOG.md", "UPGRADING.md")
-"""Pages that name commands of earlier versions."""
-
 GROUPS = ("simulate", "train", "serve")
 SHELL_BLOCK = re.compile(r"^```(?:sh|text|console)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 INLINE_CODE = re.compile(r"`(isocharge [^`]+)`")
@@ -41,8 +38,6 @@ def shell_commands(text):
 
 def documented_commands():
     for page in sorted(PAGES):
-        if page.name in OLD_COMMANDS:
-            continue
         text = page.read_text("utf-8")
         name = page.relative_to(ROOT).as_posix()
         for block in SHELL_BLOCK.finditer(text):

@@ -29,7 +29,7 @@ SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
 
 SLOW = {"mcap.md", "recordings.md", "virtual_sensor.md", "live_page.md"}
-"""Pages whose commands simulate a film each time; those of the README, which do the same, run always."""
+"""Pages whose commands simulate a film each time; those of the tutorial, which do the same, run always."""
 
 
 EXAMPLE_PAGES = ["serve/README.md", *(f"serve/docs/{name}" for name in PAGES if name != "README.md")]
@@ -51,7 +51,6 @@ def test_frame_example():
 def desks(tmp_path_factory):
     """A folder for each page, with the presses that its reader has already."""
     folders = {page: tmp_path_factory.mktemp("desk") for page in EXAMPLE_PAGES}
-    (folders["serve/README.md"] / "presses.csv").write_text("A,B,C\n850,840,846\n")
     return folders
 
 
@@ -96,9 +95,12 @@ def on_free_ports(example):
 
 
 def test_every_flag_is_explained():
+    """Each flag has one row with its meaning and its remedy."""
     words = {value for name, value in vars(flags).items() if name.isupper() and isinstance(value, str)}
     assert words == set(flags.MEANINGS)
-    assert words <= set(re.findall(r"`(\w+)`", PAGES["predictions.md"].partition("| flag |")[2]))
+    rows = re.findall(r"^\| `(\w+)` \| (.+) \| (.+) \|$", PAGES["flags.md"], re.MULTILINE)
+    assert sorted(flag for flag, _, _ in rows) == sorted(words)
+    assert all(meaning.endswith((".", ")")) and remedy.endswith(".") for _, meaning, remedy in rows)
 
 
 REQUIRED = {
