@@ -1,4 +1,4 @@
-"""Contacts followed in time, and what others make of the same frames: tables and picture of serve/docs/tracking_results.md.
+"""Contacts followed in time, by isocharge and by other filters: tables and picture of serve/docs/tracking_results.md.
 
     python tests/benchmarks/bench_track.py [--model NAME|PATH] [--paths 40] [--rate-hz 1000] [--noise reference]
         [--force 1] [--plot FILE] [--json]

@@ -49,9 +49,8 @@ def test_frame_example():
 
 @pytest.fixture(scope="module")
 def desks(tmp_path_factory):
-    """A folder for each page, with the presses that its reader has already."""
-    folders = {page: tmp_path_factory.mktemp("desk") for page in EXAMPLE_PAGES}
-    return folders
+    """An empty folder for each page, in which its examples run."""
+    return {page: tmp_path_factory.mktemp("desk") for page in EXAMPLE_PAGES}
 
 
 def test_an_example_does_what_it_says(page_example, desks, installed, start_http, run_example, run_commands):
