@@ -1,12 +1,13 @@
-"""From element matrices to a linear solve: condensation of the elements' interiors, then a sparse direct solver.
+"""Solution of the linear system of a mesh: static condensation of the elements, then a sparse direct solver.
 
-A node inside an element touches no other element, so its unknowns are eliminated element by element in dense algebra,
-and only the skeleton is factorised: 2.3 times fewer unknowns at order 4. Everything that depends on the template alone
-(numbering, sparsity, where each entry goes) is done once.
+A node in the interior of an element belongs to no other element. Its unknowns are eliminated element by element with
+dense matrices, so only the unknowns of the skeleton (the sides of the elements) are factorised together. At order 4
+this reduces the number of unknowns by a factor of 2.3. The numbering and the sparsity pattern depend on the template
+only and are computed once.
 
-Unknowns per node are U1, U2, W and, with bending, the carried Laplacian (see `mechanics.energy`). On the rim
-the first three are fixed; on the line of symmetry of a half template U2 is, or, for fields that are odd about it, all
-but U2.
+The unknowns of a node are U1, U2, W and, with bending, the auxiliary unknown of `mechanics.energy`. The first three are
+zero on the rim. On the line of symmetry of a half template, U2 is zero for even fields, and all other unknowns are zero
+for odd fields.
 """
 
 from functools import lru_cache
@@ -20,15 +21,15 @@ from isocharge.simulate.mesh.template import Template
 
 
 class Assembly:
-    """Factorises K for one template and number of unknowns per node.
+    """Linear solver for one template and number of unknowns per node.
 
     Attributes:
-        components: Unknowns per node.
-        free: Which are not fixed, shape (n_node, components).
-        inner_global: Numbers of the elements' interior unknowns, shape (n_element, n_inner).
-        outer_global: Numbers of those on the elements' edges, shape (n_element, n_outer).
-        skeleton: Numbers of those that are left to factorise.
-        follow: Their values from those that do not hang; None if none hangs.
+        components: Number of unknowns per node.
+        free: Whether each unknown is free, shape (n_node, components).
+        inner_global: Numbers of the interior unknowns of each element, shape (n_element, n_inner).
+        outer_global: Numbers of the unknowns on the sides of each element, shape (n_element, n_outer).
+        skeleton: Numbers of the free unknowns on sides, in the order of elimination, shape (n_skeleton,).
+        follow: Matrix from the skeleton unknowns that do not hang to all skeleton unknowns; None if no node hangs.
     """
 
     def __init__(self, mesh: Template, components: int, odd: bool = False) -> None:
@@ -55,9 +56,17 @@ class Assembly:
         self._reorder()
 
     def _pattern(self, number: Integers) -> None:
-        """Compressed columns of the skeleton matrix and where each element entry goes; fixed ones go past the end."""
-        shape, size = (*number.shape, number.shape[1]), self.skeleton.size
-        row, column = np.broadcast_to(number[:, :, None], shape), np.broadcast_to(number[:, None, :], shape)
+        """Compute the sparsity pattern of the skeleton matrix, and the position of each entry of the element matrices.
+
+        Entries of fixed unknowns get a position after the last entry.
+
+        Args:
+            number: Number of each outer unknown in the skeleton, -1 if it is fixed, shape (n_element, n_outer).
+        """
+        shape = (*number.shape, number.shape[1])
+        size = self.skeleton.size
+        row = np.broadcast_to(number[:, :, None], shape)
+        column = np.broadcast_to(number[:, None, :], shape)
         free = (row >= 0) & (column >= 0)
         key, place = np.unique(column[free] * size + row[free], return_inverse=True)
         self._place = np.full(shape, key.size, dtype=np.intp)
@@ -67,7 +76,7 @@ class Assembly:
         self._indptr = np.concatenate([[0], np.cumsum(np.bincount(key // size, minlength=size))]).astype(np.int32)
 
     def _reorder(self) -> None:
-        """Number the unknowns so that elimination in turn fills in little: the pattern alone decides, so once."""
+        """Renumber the skeleton unknowns so that the factorisation has little fill-in (minimum degree)."""
         pattern = self._skeleton(np.ones(self._indices.size))
         dominant = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
         order = np.argsort(_factorise(dominant, "MMD_AT_PLUS_A").perm_c)
@@ -78,16 +87,18 @@ class Assembly:
         numbered = pattern[:, order][order]
         numbered.sort_indices()
         self._place = np.append(np.argsort(numbered.data), numbered.nnz)[self._place]
-        self._indices, self._indptr, self.skeleton = numbered.indices, numbered.indptr, self.skeleton[order]
+        self._indices = numbered.indices
+        self._indptr = numbered.indptr
+        self.skeleton = self.skeleton[order]
 
     def factor(self, matrix: Array) -> "Factor":
-        """Factorise K.
+        """Factorise the matrix K of the mesh.
 
         Args:
             matrix: Element matrices, shape (n_element, n_local, components, n_local, components), symmetric.
 
         Returns:
-            What solves K x = b for any b.
+            Factorisation that solves K x = b for any b.
         """
         inner, outer = self._inner, self._outer
         size = matrix.shape[1] * self.components
@@ -100,58 +111,83 @@ class Assembly:
         return Factor(self, inverse, coupling, reduced, _factorise(self._skeleton(data), "NATURAL"))
 
     def _skeleton(self, data: np.ndarray) -> csc_matrix:
-        """The skeleton matrix of the unknowns that do not hang."""
+        """Return the matrix of the skeleton unknowns that do not hang, from the entries of its sparsity pattern."""
         matrix = csc_matrix((data, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
-        return matrix if self.follow is None else csc_matrix(self.follow.T @ matrix @ self.follow)
+        if self.follow is None:
+            return matrix
+        return csc_matrix(self.follow.T @ matrix @ self.follow)
 
 
 class Factor:
-    """A factorised K."""
+    """Factorisation of the matrix K of a mesh."""
 
     def __init__(self, assembly: Assembly, inverse: Array, coupling: Array, reduced: Array, skeleton: SuperLU) -> None:
         self._assembly = assembly
-        self._inverse, self._coupling, self._reduced, self._skeleton = inverse, coupling, reduced, skeleton
+        self._inverse = inverse
+        self._coupling = coupling
+        self._reduced = reduced
+        self._skeleton = skeleton
 
     def solve(self, right: Array) -> Array:
-        """Solve for the free unknowns.
+        """Solve K x = b for the free unknowns.
 
         Args:
-            right: Right-hand side for (U1, U2, W) on every node, shape (n_node, 3); fixed values are ignored.
+            right: Right-hand side b for (U1, U2, W) at the nodes, shape (n_node, 3). Values of fixed unknowns are
+                ignored.
 
         Returns:
-            (U1, U2, W), shape (n_node, 3), zero where fixed.
+            (U1, U2, W) at the nodes, shape (n_node, 3). Fixed unknowns are zero.
         """
-        parts = self._assembly
-        padded = np.zeros(parts.free.shape)
+        assembly = self._assembly
+        padded = np.zeros(assembly.free.shape)
         padded[:, :3] = right
         flat = padded.ravel()
-        inside = self._inverse @ flat[parts.inner_global][..., None]
-        carried = self._coupling.transpose(0, 2, 1) @ inside
-        shifted = flat - np.bincount(parts.outer_global.ravel(), carried.ravel(), flat.size)
+        inner_solution = self._inverse @ flat[assembly.inner_global][..., None]
+        condensed = self._coupling.transpose(0, 2, 1) @ inner_solution
+        reduced_right = flat - np.bincount(assembly.outer_global.ravel(), condensed.ravel(), flat.size)
+        skeleton_right = reduced_right[assembly.skeleton]
+        if assembly.follow is None:
+            skeleton_solution = self._skeleton.solve(skeleton_right)
+        else:
+            skeleton_solution = assembly.follow @ self._skeleton.solve(assembly.follow.T @ skeleton_right)
         solution = np.zeros(flat.size)
-        skeleton = shifted[parts.skeleton]
-        if parts.follow is not None:
-            skeleton = parts.follow.T @ skeleton
-        found = self._skeleton.solve(skeleton)
-        solution[parts.skeleton] = found if parts.follow is None else parts.follow @ found
-        back = self._reduced @ solution[parts.outer_global][..., None]
-        solution[parts.inner_global] = (inside - back)[..., 0]
-        return solution.reshape(parts.free.shape)[:, :3]
+        solution[assembly.skeleton] = skeleton_solution
+        correction = self._reduced @ solution[assembly.outer_global][..., None]
+        solution[assembly.inner_global] = (inner_solution - correction)[..., 0]
+        return solution.reshape(assembly.free.shape)[:, :3]
 
 
 def _factorise(matrix: csc_matrix, order: str) -> SuperLU:
+    """Factorise a symmetric matrix without pivoting, with a column ordering of SuperLU."""
     return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
-    """Which unknowns are not fixed by clamping or symmetry, shape (n_node, components)."""
+    """Return whether each unknown is free, which is not fixed by the clamp or by symmetry.
+
+    Args:
+        mesh: Template of the mesh.
+        components: Number of unknowns per node.
+        odd: Whether the fields are odd about the line of symmetry.
+
+    Returns:
+        Shape (n_node, components).
+    """
     free = np.ones((mesh.n_node, components), dtype=bool)
     free[mesh.on_rim, :3] = False
-    free[np.ix_(mesh.on_axis, (np.arange(components) == 1) != odd)] = False
+    is_displacement_2 = np.arange(components) == 1
+    fixed_on_axis = ~is_displacement_2 if odd else is_displacement_2
+    free[np.ix_(mesh.on_axis, fixed_on_axis)] = False
     return free
 
 
 @lru_cache(maxsize=16)
 def assembly(mesh: Template, components: int, odd: bool = False) -> Assembly:
-    """The assembly of a template, built once."""
+    """Return the linear solver of a template, which is cached.
+
+    Args:
+        mesh: Template of the mesh.
+        components: Number of unknowns per node: 3 without bending, 4 with bending.
+        odd: Whether the fields are odd about the line of symmetry.
+    """
     return Assembly(mesh, components, odd)

@@ -1,10 +1,10 @@
-"""How wrong a charge is: from one mesh, from a second one, and from what the theory leaves out; and what to warn of.
+"""Estimates of the error of a charge by the mesh and by the theory, and warnings about effects that are not modelled.
 
-In the inner part of the film the elements' shapes and the decay of their modes predict the error of a charge. Near the
-rim, and around polygons that are large on the film, they do not: the coarse elements may be far from the stressed ones.
-There, and for accuracies below the default, a press is solved again one order higher, from its own field, until two
-meshes agree. Each order divides the error by three to ten, so the difference of two meshes bounds the error of the
-finer one.
+In the inner part of the film, the error of the mesh is estimated from the shapes of the elements and the decay of their
+polynomial modes. This estimate is not reliable near the rim and for large footprints that are not circular, because the
+coarse elements can be far from the stressed ones. In these cases, and for accuracies below the default, the press is
+solved on meshes of increasing order until two meshes agree. Each order reduces the error by a factor of three to ten,
+so the difference of two meshes is an upper bound of the error of the finer one.
 """
 
 from typing import Any
@@ -26,35 +26,42 @@ from isocharge.simulate.solver.equilibrium import (
 )
 
 SAFETY = 2.0
-"""Safety factor on the error predicted from element shape and modal decay, dimensionless.
+"""Safety factor of the error that is predicted from element shapes and modal decay, dimensionless.
 
-Valid within 0.6 film radii; near the rim it is too small.
+It is too small at distances above 0.6 film radii.
 """
 
-LEAST_ERROR = 5e-5
-"""Smallest relative error of a charge that is claimed: thin rings and the electrodes' integration points leave it."""
+MIN_ERROR = 5e-5
+"""Smallest reported relative error of a charge, which the thin rings and the integration over electrodes cause."""
 
 DECAY_WEIGHT = 0.1
-"""Relative error of a charge per share of the slopes that the elements' highest modes carry, dimensionless."""
+"""Relative error of a charge, per share of the slopes in the highest modes of the elements, dimensionless."""
 
-RINGS, AROUND = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8), 12
-"""Radii of rings about the film's centre, in film radii, and number of patches on each, where charges are compared."""
+PATCH_RINGS = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8)
+"""Radii of the rings of square patches on which the charges of two meshes are compared, in film radii."""
 
-PATCH = 1.0 / 15.0
-"""Side of the patches, in film radii: 3 mm of 45."""
+PATCHES_PER_RING = 12
+"""Number of patches on each ring."""
 
-PER_SIDE = 6
-"""Gauss points along a patch's side."""
+PATCH_SIDE = 1.0 / 15.0
+"""Side of the patches, in film radii."""
+
+PATCH_POINTS = 6
+"""Number of Gauss points along the side of a patch."""
 
 WRINKLE_SHARE = 1e-3
-"""Compression over the largest stress, dimensionless, above which a warning is given."""
+"""Ratio of the compression to the largest stress above which a warning is given, dimensionless."""
 
 
 def shape_error(mesh: PlacedMesh) -> float:
-    """Relative error of a charge as predicted from the elements' shapes, infinite where an element is inside out.
+    """Predict the relative error of a charge from the shapes of the elements.
 
-    The elements carry the conformal map as a polynomial. How well they do shows in the film's own area: the worst
-    charge's error is about a third of the square root of the area's (`tests/benchmarks/bench_hard_cases.py`).
+    The elements approximate the conformal map by polynomials. The error of this approximation is measured by the error
+    of the film's area. The largest error of a charge is about a third of the square root of the relative error of the
+    area (`tests/benchmarks/bench_hard_cases.py`).
+
+    Returns:
+        The error, which is infinite if an element is folded.
     """
     geometry = mesh.geometry
     if geometry.weights.min() <= 0.0 or geometry.mass.min() <= 0.0:
@@ -64,14 +71,14 @@ def shape_error(mesh: PlacedMesh) -> float:
 
 
 def decay(mesh: PlacedMesh, slope: Array) -> float:
-    """Share of the deflection's slopes that the highest polynomial modes of the elements carry.
+    """Compute the share of the slopes of the deflection that is in the highest polynomial modes of the elements.
 
     Args:
-        mesh: The mesh of the press.
-        slope: grad W at the nodes of every element, shape (n_element, n_local, 2).
+        mesh: Mesh of the press.
+        slope: Gradient of W at the nodes of every element, shape (n_element, n_local, 2).
 
     Returns:
-        Mean over the elements, weighted with the slopes' squares.
+        Mean share over the elements, weighted with the squares of the slopes.
     """
     size = mesh.resolution.order + 1
     modal = modal_matrix(mesh.resolution.order)
@@ -85,48 +92,69 @@ def decay(mesh: PlacedMesh, slope: Array) -> float:
 
 
 def mesh_error(equilibrium: Equilibrium) -> float:
-    """Expected relative error of a charge from the mesh: proven by a second one, or by shapes and modes."""
+    """Estimate the relative error of a charge by the mesh, from a second mesh or from element shapes and modes."""
     if equilibrium.proven_error is not None:
-        return max(LEAST_ERROR, equilibrium.proven_error)
+        return max(MIN_ERROR, equilibrium.proven_error)
     mesh = equilibrium.mesh
     modes = DECAY_WEIGHT * decay(mesh, node_slope(equilibrium)[..., 2])
-    return max(LEAST_ERROR, SAFETY * shape_error(mesh), SAFETY * modes)
+    return max(MIN_ERROR, SAFETY * shape_error(mesh), SAFETY * modes)
 
 
 def estimated_error(equilibrium: Equilibrium) -> float:
-    """Expected relative error of a charge, from the terms that the theory leaves out and from the mesh.
+    """Estimate the relative error of a charge by the mesh and by the terms that the theory omits.
 
-    Infinite where the theory has no meaning for this film.
+    Returns:
+        The error, which is infinite if the theory cannot describe the film.
     """
     film, probe, force = equilibrium.film, equilibrium.probe, equilibrium.force
     return mesh_error(equilibrium) + modelling_error(film, probe, force, equilibrium.theory)
 
 
 def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
-    """Largest relative difference between two equilibria of a press, of patches' charges and of the deflection.
+    """Compute the largest relative difference between two equilibria of the same press.
 
-    A patch counts relative to the largest charge on its ring.
+    The charges of square patches, for biaxial and uniaxial films, and the deflection are compared. The patches lie on
+    rings about the centre of the film and round the footprint. The difference of the charges of a patch is relative to
+    the largest charge on its ring.
     """
-    around = np.exp(2j * np.pi * np.arange(AROUND) / AROUND)
-    rings = one.film.radius * np.array(RINGS)[:, None] * around
-    centres = np.concatenate([rings, (complex(*one.at) + one.probe.reach * around)[None]])
-    xi, eta, weight = gauss_reference_square(PER_SIDE)
-    points = (centres[:, :, None] + 0.5 * PATCH * one.film.radius * (xi + 1j * eta)).ravel()
-    inside = np.abs(points) < one.film.radius
-    position = np.stack([points.real, points.imag], axis=1)[inside]
-    read = []
-    for solved in (one, other):
-        stress = np.zeros((points.size, 3))
-        stress[inside] = touch_stress(solved, position)
-        mean = np.einsum("rapc,p->rac", stress.reshape(*centres.shape, -1, 3), 0.25 * weight)
-        read.append(np.stack([mean[..., 0] + mean[..., 1], 10.0 * mean[..., 0] + mean[..., 1]], axis=-1))
-    largest = np.maximum(np.abs(read[1]).max(axis=1, keepdims=True), 1e-300)
-    first, second = (deflection(solved, np.array([one.at]))[0] for solved in (one, other))
-    return max(float((np.abs(read[0] - read[1]) / largest).max()), abs(float(first / second) - 1.0))
+    film_radius = one.film.radius
+    circle = np.exp(2j * np.pi * np.arange(PATCHES_PER_RING) / PATCHES_PER_RING)
+    rings = film_radius * np.array(PATCH_RINGS)[:, None] * circle
+    round_footprint = complex(*one.at) + one.probe.reach * circle
+    centres = np.concatenate([rings, round_footprint[None]])
+    one_charge = _patch_charges(one, centres)
+    other_charge = _patch_charges(other, centres)
+    largest = np.maximum(np.abs(other_charge).max(axis=1, keepdims=True), 1e-300)
+    charge_difference = float((np.abs(one_charge - other_charge) / largest).max())
+    (one_depth,) = deflection(one, np.array([one.at]))
+    (other_depth,) = deflection(other, np.array([one.at]))
+    return max(charge_difference, abs(float(one_depth / other_depth) - 1.0))
+
+
+def _patch_charges(solved: Equilibrium, centres: Array) -> Array:
+    """Compute the charges per area of square patches, for a biaxial and a uniaxial film.
+
+    Args:
+        solved: The solved press.
+        centres: Centres x + iy of the patches, shape (n_ring, n_patch), mm.
+
+    Returns:
+        Charges in arbitrary units, shape (n_ring, n_patch, 2). Points outside the film do not contribute.
+    """
+    film_radius = solved.film.radius
+    xi, eta, weight = gauss_reference_square(PATCH_POINTS)
+    points = (centres[:, :, None] + 0.5 * PATCH_SIDE * film_radius * (xi + 1j * eta)).ravel()
+    inside = np.abs(points) < film_radius
+    stress = np.zeros((points.size, 3))
+    stress[inside] = touch_stress(solved, np.stack([points.real, points.imag], axis=1)[inside])
+    mean = np.einsum("rapc,p->rac", stress.reshape(*centres.shape, -1, 3), 0.25 * weight)
+    biaxial = mean[..., 0] + mean[..., 1]
+    uniaxial = 10.0 * mean[..., 0] + mean[..., 1]
+    return np.stack([biaxial, uniaxial], axis=-1)
 
 
 def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
-    """Effects in a real film that the theory does not model, one sentence each."""
+    """Return warnings about effects in a real film that the theory does not model, one sentence for each."""
     smallest, largest = principal_stress(equilibrium)
     sentences = []
     if largest > DEFAULT_STRESS_LIMIT:
@@ -137,7 +165,7 @@ def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
 
 
 def summary(equilibrium: Equilibrium) -> dict[str, Any]:
-    """For JSON: deflection under the probe, theory, estimated error, and how the solve went."""
+    """Return the deflection, the theory, the estimated error and the outcome of the solve, for JSON output."""
     return {
         "deflection_mm": float(deflection(equilibrium, np.array([equilibrium.at]))[0]),
         "theory": equilibrium.theory.name,
