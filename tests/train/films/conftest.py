@@ -31,7 +31,7 @@ def random_films(films):
             FilmScaling(prior, domain), draw_film_presses(prior, films.family, domain, 8, 16, seed=3)
         )
         torch.manual_seed(5)
-        n_electrode, n_context = inputs.mean.size, inputs.scaling.standard[0].size
+        n_electrode, n_context = inputs.mean.size, inputs.scaling.statistics.mean.size
         parts = [ConditionalPerceptron(n_electrode, (12, 10), outputs, n_context) for outputs in (6, n_electrode)]
         for part in parts:
             for parameter in part.parameters():

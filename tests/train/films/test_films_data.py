@@ -55,9 +55,9 @@ def source(films):
 
 def test_misfit_examples_are_those_of_their_film(source, monkeypatch):
     """The residual is at a contact of the film: charge less noise times residual lies on its map, hence has none."""
-    monkeypatch.setattr(films_data, "CANDIDATES", 64)
+    monkeypatch.setattr(films_data, "N_CANDIDATES", 64)
     drawn = draw_misfit_films(source, 2, 12, seed=1)
-    for parameters, charge, residual in zip(drawn.parameters, drawn.charge, drawn.aim, strict=True):
+    for parameters, charge, residual in zip(drawn.parameters, drawn.charge, drawn.target, strict=True):
         charge_map = source.charge_map(parameters)
         near = np.linalg.norm(residual, axis=1) < 5.0
         nearest = charge[near] - source.noise.sigma(charge[near]) * residual[near]
@@ -69,7 +69,7 @@ def test_misfit_examples_are_those_of_their_film(source, monkeypatch):
 
 def test_what_no_contact_explains_is_perpendicular_to_the_derivatives(source):
     drawn = draw_near_films(source, 2, 5, seed=1)
-    for parameters, charge, across in zip(drawn.parameters, drawn.charge, drawn.aim, strict=True):
+    for parameters, charge, across in zip(drawn.parameters, drawn.charge, drawn.target, strict=True):
         charge_map = source.charge_map(parameters)
         contact, left = search(charge_map, charge, source.noise.sigma(charge), candidates=256)
         assert np.linalg.norm(left, axis=1).max() < 0.05
@@ -87,7 +87,7 @@ def test_good_presses_are_off_by_up_to_eight_times_the_noise_and_count_ten_times
     """
     clean, off = np.full((50, 8, 4), 400.0), []
     examples = DrawnFilms(np.zeros((50, 1)), clean, 0.0 * clean)
-    near = replace(examples, aim=np.broadcast_to(np.eye(4), (50, 8, 4, 4)))
+    near = replace(examples, target=np.broadcast_to(np.eye(4), (50, 8, 4, 4)))
     inputs = SimpleNamespace(values=lambda charge, _: (charge - 400.0) / 5.0, context=torch.tensor)
 
     def wrong_by_one(deviation, _):

@@ -108,7 +108,7 @@ def test_folded_is_the_conditional_network(random_films, sensor):
 )
 def test_its_intervals_hold(films, drawn, factor):
     """The 95 % intervals hold 92 to 98 % of the coordinates, and the misfit is that of noise."""
-    errors = [evaluate(films.film(parameters, correlation=False, factor=factor)) for parameters in drawn]
+    errors = [evaluate(films.film(parameters, correlation=False, charge_factor=factor)) for parameters in drawn]
     assert 0.92 < np.mean([error["coverage_95"] for error in errors]) < 0.98
     assert np.median([error["misfit_p99"] for error in errors]) < 5.0
 

@@ -129,8 +129,8 @@ def solved(films, monkeypatch):
 
     monkeypatch.setattr(films_fit, "FilmFamily", Solved)
     monkeypatch.setattr(films_fit.FilmModes, "build", lambda *_: films.family.imperfections)
-    monkeypatch.setattr(films_release, "FILMS", 4)
-    monkeypatch.setattr(films_data, "CANDIDATES", 64)
+    monkeypatch.setattr(films_release, "N_FILMS", 4)
+    monkeypatch.setattr(films_data, "N_CANDIDATES", 64)
     monkeypatch.setattr(correlation, "N_EXAMPLES", 1_000)
 
 

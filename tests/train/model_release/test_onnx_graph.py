@@ -8,6 +8,7 @@ import onnxruntime
 import pytest
 import torch
 from onnx import numpy_helper
+from onnx.reference import ReferenceEvaluator
 from tests.train.random_networks import random_network
 
 from isocharge.common.errors import ModelError, TrainingError
@@ -20,35 +21,49 @@ from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.network import fold_network
 
 REFERENCE = noise_model("reference")
-ABSURD = {
+
+EXTREME_CHARGES = {
     "negative": lambda charge: -charge,
     "zero": lambda charge: 0.0 * charge,
     "tiny": lambda charge: 1e-30 * charge,
     "huge": lambda charge: 1e30 * charge,
 }
-ODD = {
+"""Charges that no film gives, from the charges of presses."""
+
+UNUSUAL_CHARGES = {
     "clean": lambda charge: charge,
     "ten times": lambda charge: 10.0 * charge,
     "a tenth": lambda charge: 0.1 * charge,
     "dead electrode": lambda charge: charge * [0.0, 1.0, 1.0],
     "wrong gain": lambda charge: charge * [1.0, 1.2, 1.0],
-    **ABSURD,
+    **EXTREME_CHARGES,
 }
+
+OUTPUTS = ["contact", "contact_std", "misfit"]
+
+FLOORS = ([1.0, 1.0, 0.1], [1.0, 1.0, 0.1], [1.0])
+"""Values of the outputs, mm, N and standard deviations, below which differences count as absolute differences."""
+
+TOLERANCE = 1e-5
+"""Largest relative difference of contact and standard deviations that float32 causes on the charges of a film."""
+
+MISFIT_TOLERANCE = 1e-4
+"""Largest relative difference of the misfit."""
 
 
 @pytest.fixture(scope="module")
-def held(trained):
+def held_out(trained):
     return trained.split.test
 
 
 @pytest.fixture(scope="module")
-def graph(trained):
-    return write_graph(turned(trained.network, trained), {"note": "kept"})
+def exact(trained):
+    return fold_with_correlation(trained.network, trained.split.train)
 
 
-def turned(network, trained):
-    """The network, folded, with correlations."""
-    return with_correlation(fold_network(network), trained.split.train, REFERENCE, 0)
+@pytest.fixture(scope="module")
+def graph(exact):
+    return write_graph(exact, {"note": "kept"})
 
 
 @pytest.fixture(scope="module")
@@ -56,98 +71,97 @@ def session(graph):
     return onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
 
 
-def answers(session, charge):
-    return session.run(["contact", "contact_std", "misfit"], {"charge_pC": charge.astype(np.float32)})
+def fold_with_correlation(network, presses):
+    return with_correlation(fold_network(network), presses, REFERENCE, 0)
 
 
-FLOORS = ([1.0, 1.0, 0.1], [1.0, 1.0, 0.1], [1.0])
-"""Below these, mm, mm, N and standard deviations, differences count absolutely."""
-
-CLOSE, CLOSE_MISFIT = 1e-5, 1e-4
-"""Relative differences that float32 may make on charges that a film gives."""
+def graph_outputs(session, charge):
+    return session.run(OUTPUTS, {"charge_pC": charge.astype(np.float32)})
 
 
-def apart(answers, expected):
-    """Largest relative difference of each output."""
+def torch_outputs(trained, charge):
+    """Evaluate the trained network with PyTorch in double precision, on the charges that the graph gets."""
+    network = copy.deepcopy(trained.network).double()
+    with torch.no_grad():
+        outputs = network(torch.tensor(charge.astype(np.float32)).double())
+    return [tensor.numpy() for tensor in outputs]
+
+
+def largest_differences(given, expected):
+    """Return the largest relative difference of each output."""
     return [
-        float(np.max(np.abs(a - b) / np.maximum(np.abs(b), floor)))
-        for a, b, floor in zip(answers, expected, FLOORS, strict=False)
+        float(np.max(np.abs(given_output - output) / np.maximum(np.abs(output), floor)))
+        for given_output, output, floor in zip(given, expected, FLOORS, strict=False)
     ]
 
 
-def by_torch(trained, charge):
-    """In double precision, from the charges that the graph gets."""
-    with torch.no_grad():
-        double = copy.deepcopy(trained.network).double()
-        return [tensor.numpy() for tensor in double(torch.tensor(charge.astype(np.float32)).double())]
+def test_the_graph_answers_as_the_network_does_on_ten_thousand_presses(trained, held_out, session):
+    rows = np.arange(10_000) % len(held_out)
+    charge = held_out[rows].noisy(REFERENCE, seed=0)
+    differences = largest_differences(graph_outputs(session, charge), torch_outputs(trained, charge))
+    contact, std, misfit = differences
+    assert contact < TOLERANCE
+    assert std < TOLERANCE
+    assert misfit < MISFIT_TOLERANCE
 
 
-def test_the_graph_answers_as_the_network_does_on_ten_thousand_presses(trained, held, session):
-    charge = held[np.arange(10_000) % len(held)].noisy(REFERENCE, seed=0)
-    contact, std, misfit = apart(answers(session, charge), by_torch(trained, charge))
-    assert contact < CLOSE
-    assert std < CLOSE
-    assert misfit < CLOSE_MISFIT
+@pytest.mark.parametrize("case", UNUSUAL_CHARGES)
+def test_the_graph_answers_as_the_network_does_on_unusual_charges(trained, held_out, session, case):
+    charge = UNUSUAL_CHARGES[case](held_out.charge)
+    outputs = graph_outputs(session, charge)
+    assert max(largest_differences(outputs, torch_outputs(trained, charge))) < 10.0 * TOLERANCE
+    assert all(np.isfinite(output).all() for output in outputs)
+    if case in EXTREME_CHARGES:
+        _, _, misfit = outputs
+        assert misfit.min() > 50.0
 
 
-@pytest.mark.parametrize("case", ODD)
-def test_the_graph_answers_as_the_network_does_on_odd_charges(trained, held, session, case):
-    charge = ODD[case](held.charge)
-    found = answers(session, charge)
-    assert max(apart(found, by_torch(trained, charge))) < 10.0 * CLOSE
-    assert all(np.isfinite(output).all() for output in found)
-    assert case not in ABSURD or found[2].min() > 50.0
-
-
-def test_a_network_that_runs_off_the_numbers_is_not_released(trained, held, monkeypatch):
-    monkeypatch.setattr(correlation, "N_EXAMPLES", 1_000)  # errors that are nonsense have no correlations to find
+def test_a_network_with_infinite_answers_is_not_released(trained, held_out, monkeypatch):
+    monkeypatch.setattr(correlation, "N_EXAMPLES", 1_000)  # the errors of this network have no correlations
     network = copy.deepcopy(trained.network)
     with torch.no_grad():
         network.contact.skip.weight *= 1e3
-    exact = turned(network, trained)
+    diverging = fold_with_correlation(network, trained.split.train)
     with pytest.raises(TrainingError, match=r"answers contact = .* expected finite numbers for any charges"):
-        check_graph(write_graph(exact, {}), exact.outputs, held, REFERENCE)
+        check_graph(write_graph(diverging, {}), diverging.outputs, held_out, REFERENCE)
 
 
-def test_file_and_network_may_differ_by_a_thousandth_of_what_charges_tell(trained, held, graph):
-    exact = turned(trained.network, trained)
+def test_graph_and_network_may_differ_by_a_thousandth_of_a_standard_deviation(exact, held_out, graph):
+    def shifted(n_std):
+        """Return the outputs of the network with the contact shifted by a number of standard deviations."""
 
-    def beside(deviations):
         def outputs(charge):
             contact, std, *others = exact.outputs(charge)
-            return contact + deviations * std, std, *others
+            return contact + n_std * std, std, *others
 
         return outputs
 
-    check_graph(graph, beside(8e-4), held, REFERENCE)
-    with pytest.raises(
-        TrainingError, match=r"on contact: expected at most 1e-05 for 99\.9% of the charges and 0\.0001 for all"
-    ):
-        check_graph(graph, beside(2e-3), held, REFERENCE)
+    check_graph(graph, shifted(8e-4), held_out, REFERENCE)
+    message = r"on contact: expected at most 1e-05 for 99\.9% of the charges and 0\.0001 for all"
+    with pytest.raises(TrainingError, match=message):
+        check_graph(graph, shifted(2e-3), held_out, REFERENCE)
 
 
-def test_the_file_is_plain_onnx_that_another_runtime_computes(held, graph, session):
-    """onnx's own reference implementation, in plain NumPy."""
-    from onnx.reference import ReferenceEvaluator
-
+def test_the_file_is_plain_onnx_that_another_runtime_computes(held_out, graph, session):
+    """The other runtime is the reference implementation of onnx in NumPy."""
     model = onnx.load_from_string(graph)
     onnx.checker.check_model(model, full_check=True)
     assert {entry.key: entry.value for entry in model.metadata_props} == {"note": "kept"}
     assert {entry.domain for entry in model.opset_import} == {""}
-    charge = held.charge[:50].astype(np.float32)
-    reference = ReferenceEvaluator(model).run(["contact", "contact_std", "misfit"], {"charge_pC": charge})
-    contact, std, misfit = answers(session, charge)
-    assert max(apart((contact, std), reference[:2])) < CLOSE
-    assert np.all(np.abs(misfit - reference[2]) <= CLOSE_MISFIT * np.maximum(misfit, 1.0))
+    charge = held_out.charge[:50].astype(np.float32)
+    reference = ReferenceEvaluator(model).run(OUTPUTS, {"charge_pC": charge})
+    contact, std, misfit = largest_differences(graph_outputs(session, charge), reference)
+    assert contact < TOLERANCE
+    assert std < TOLERANCE
+    assert misfit < MISFIT_TOLERANCE
 
 
 @pytest.mark.parametrize("name", ["three-25um-biaxial", "four-25um-uniaxial-films", "four-25um-biaxial-student"])
 def test_the_definition_read_from_a_released_model_writes_the_same_constants(name):
-    released = (find_model(name) / "model.onnx").read_bytes()
-    written = write_graph(read_graph(released, name), {})
-    for before, after in zip(
-        *(onnx.load_from_string(data).graph.initializer for data in (released, written)), strict=True
-    ):
+    released = onnx.load(find_model(name) / "model.onnx").graph
+    network = read_graph((find_model(name) / "model.onnx").read_bytes(), name)
+    written = onnx.load_from_string(write_graph(network, {})).graph
+    for before, after in zip(released.initializer, written.initializer, strict=True):
         np.testing.assert_array_equal(numpy_helper.to_array(before), numpy_helper.to_array(after))
 
 

@@ -1,8 +1,9 @@
-"""The head for correlations: its angles against Cholesky factors, its loss against SciPy, a planted covariance."""
+"""Correlations of a network: against Cholesky factors, against SciPy, and against a known covariance."""
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.optimize import approx_fprime
 from scipy.stats import multivariate_normal
 
@@ -12,56 +13,85 @@ from isocharge.train.training.correlation import ANGLE_SUMS, correlation_loss, w
 from isocharge.train.training.folded_network import COSINES_TO_CORRELATIONS
 from isocharge.train.training.network import fold_network
 
-RNG = np.random.default_rng(0)
-ANGLES = RNG.uniform(-4.0, 4.0, (50, 3))
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
 
 
-def matrices(correlation):
-    """Correlations xy, xF, yF, shape (n, 3), as matrices."""
-    whole = np.tile(np.eye(3), (len(correlation), 1, 1))
-    for value, (row, column) in zip(correlation.T, ((0, 1), (0, 2), (1, 2)), strict=True):
-        whole[:, row, column] = whole[:, column, row] = value
-    return whole
+@pytest.fixture
+def angles(rng):
+    """Random angles a, b and c, shape (50, 3), rad."""
+    return rng.uniform(-4.0, 4.0, (50, 3))
 
 
-def test_any_angles_give_the_gram_matrix_of_unit_vectors():
-    (a, b, c), one, zero = ANGLES.T, np.ones(len(ANGLES)), np.zeros(len(ANGLES))
-    rows = [[one, zero, zero], [np.cos(a), np.sin(a), zero]]
-    rows.append([np.cos(b), np.sin(b) * np.cos(c), np.sin(b) * np.sin(c)])
+def correlation_matrices(correlations):
+    """Return matrices, shape (n, 3, 3), from the correlations xy, xF and yF, shape (n, 3)."""
+    matrices = np.tile(np.eye(3), (len(correlations), 1, 1))
+    for values, (row, column) in zip(correlations.T, ((0, 1), (0, 2), (1, 2)), strict=True):
+        matrices[:, row, column] = values
+        matrices[:, column, row] = values
+    return matrices
+
+
+def matrices_of_angles(angles):
+    return correlation_matrices(np.cos(angles @ ANGLE_SUMS) @ COSINES_TO_CORRELATIONS)
+
+
+def test_any_angles_give_the_gram_matrix_of_unit_vectors(angles):
+    a, b, c = angles.T
+    one = np.ones(len(angles))
+    zero = np.zeros(len(angles))
+    rows = [
+        [one, zero, zero],
+        [np.cos(a), np.sin(a), zero],
+        [np.cos(b), np.sin(b) * np.cos(c), np.sin(b) * np.sin(c)],
+    ]
     factor = np.moveaxis(np.array(rows), 2, 0)
-    gram = factor @ factor.transpose(0, 2, 1)
-    np.testing.assert_allclose(matrices(np.cos(ANGLES @ ANGLE_SUMS) @ COSINES_TO_CORRELATIONS), gram, atol=1e-14)
+    gram_matrices = factor @ factor.transpose(0, 2, 1)
+    np.testing.assert_allclose(matrices_of_angles(angles), gram_matrices, atol=1e-14)
 
 
-def test_the_loss_is_the_likelihood_of_a_gaussian():
-    deviation, correlation = (
-        RNG.standard_normal((50, 3)),
-        matrices(np.cos(ANGLES @ ANGLE_SUMS) @ COSINES_TO_CORRELATIONS),
-    )
-    pairs = zip(deviation, correlation, strict=True)
-    expected = -np.mean([multivariate_normal(cov=cov).logpdf(row) for row, cov in pairs])
+def test_the_loss_is_the_likelihood_of_a_gaussian(angles, rng):
+    deviation = rng.standard_normal((50, 3))
+    log_densities = [
+        multivariate_normal(cov=covariance).logpdf(row)
+        for row, covariance in zip(deviation, matrices_of_angles(angles), strict=True)
+    ]
     constant = 1.5 * np.log(2.0 * np.pi) + 0.5 * np.mean(deviation[:, 0] ** 2)
-    np.testing.assert_allclose(correlation_loss(ANGLES.T, deviation.T)[0] + constant, expected, rtol=1e-7)
+    loss, _ = correlation_loss(angles.T, deviation.T)
+    np.testing.assert_allclose(loss + constant, -np.mean(log_densities), rtol=1e-7)
 
 
-def test_the_derivatives_of_the_loss_are_its_differences():
-    angles, deviation = RNG.uniform(0.5, 2.5, 15), RNG.standard_normal((3, 5))
-    found, by_angle = (lambda at, part=part: correlation_loss(at.reshape(3, 5), deviation)[part] for part in (0, 1))
-    np.testing.assert_allclose(by_angle(angles).ravel(), approx_fprime(angles, found), atol=1e-6)
+def test_the_gradient_of_the_loss_is_its_finite_difference(rng):
+    angles = rng.uniform(0.5, 2.5, 15)
+    deviation = rng.standard_normal((3, 5))
+
+    def loss(flat_angles):
+        value, _ = correlation_loss(flat_angles.reshape(3, 5), deviation)
+        return value
+
+    _, gradient = correlation_loss(angles.reshape(3, 5), deviation)
+    np.testing.assert_allclose(gradient.ravel(), approx_fprime(angles, loss), atol=1e-6)
 
 
-def test_planted_correlations_are_found_and_other_answers_stay(trained, caplog):
-    """Truths drawn about the network's own answers, with correlations that depend on the charges."""
-    network, charge = fold_network(trained.network), trained.split.train.charge
-    still = replace(noise_model("reference"), white=0.0, gain=0.0)
+def test_known_correlations_are_found_and_the_other_answers_stay(trained, rng, caplog):
+    """The true contacts are drawn about the network's answers, with correlations that depend on the charges."""
+    network = fold_network(trained.network)
+    charge = trained.split.train.charge
+    no_noise = replace(noise_model("reference"), white=0.0, gain=0.0)
     contact, std, _ = network.predict(charge)
-    turn = np.tanh(np.log(charge[:, 0] / charge[:, 1]))
-    planted = np.stack([0.9 * turn, 0.5 * np.ones_like(turn), 0.4 * turn], axis=1)
-    drawn = (np.linalg.cholesky(matrices(planted)) @ RNG.standard_normal((len(charge), 3, 1)))[..., 0] * std
-    truth = np.column_stack([contact[:, :2] + drawn[:, :2], contact[:, 2] * np.exp(drawn[:, 2] / contact[:, 2])])
-    turned = with_correlation(network, LabelledPresses(truth, charge), still, seed=0)
-    *same, found, misfit = turned.outputs(charge)
-    assert caplog.messages == []  # the search has ended
-    assert np.sqrt(np.mean((found - planted) ** 2)) < 0.2 * np.sqrt(np.mean(planted**2))
-    for mine, theirs in zip((*same, misfit), network.outputs(charge), strict=True):
-        np.testing.assert_array_equal(mine, theirs)
+    ratio = np.tanh(np.log(charge[:, 0] / charge[:, 1]))
+    true_correlations = np.stack([0.9 * ratio, np.full_like(ratio, 0.5), 0.4 * ratio], axis=1)
+    factor = np.linalg.cholesky(correlation_matrices(true_correlations))
+    error = (factor @ rng.standard_normal((len(charge), 3, 1)))[..., 0] * std
+    true_force = contact[:, 2] * np.exp(error[:, 2] / contact[:, 2])
+    truth = np.column_stack([contact[:, :2] + error[:, :2], true_force])
+
+    correlated = with_correlation(network, LabelledPresses(truth, charge), no_noise, seed=0)
+    new_contact, new_std, correlations, new_misfit = correlated.outputs(charge)
+    assert caplog.messages == []  # no warning that the minimisation has not converged
+    rms_error = np.sqrt(np.mean((correlations - true_correlations) ** 2))
+    assert rms_error < 0.2 * np.sqrt(np.mean(true_correlations**2))
+    for new, old in zip((new_contact, new_std, new_misfit), network.outputs(charge), strict=True):
+        np.testing.assert_array_equal(new, old)

@@ -21,6 +21,7 @@ from isocharge.train.calibration.nuisances import NUISANCES, NuisanceEstimate
 from isocharge.train.calibration.press_data import PressData, temperatures
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity, quantities, summarise
+from isocharge.train.films.films_model import AddedVariance
 from isocharge.train.training.fitted import Fitted
 
 UNEXPLAINED_PROBABILITY = 1e-6
@@ -124,7 +125,8 @@ class CalibrationResult:
         """
         contact_covariance = self.sensitivity.contact_covariance(self.posterior.joint)
         variance = np.einsum("nii->ni", contact_covariance)
-        return self.problem.fitted(parameters, (self.sensitivity.contact, variance), self._factor, release=release)
+        added_variance = AddedVariance(self.sensitivity.contact, variance)
+        return self.problem.fitted(parameters, added_variance, self._factor, release=release)
 
     @cached_property
     def _factor(self) -> Callable[[Array], Array]:

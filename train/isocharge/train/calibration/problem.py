@@ -18,7 +18,7 @@ from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.hypotheses import Hypothesis
 from isocharge.train.calibration.nuisances import PRETENSION_PER_KELVIN
 from isocharge.train.films.films_file import FILE, read_films
-from isocharge.train.films.films_model import FilmsModel
+from isocharge.train.films.films_model import AddedVariance, FilmsModel
 from isocharge.train.training.fitted import Fitted
 
 DRIFT = {"pretension": 0.4, "d31": 0.05, "d32": 0.05, "gain": 0.1}
@@ -210,7 +210,7 @@ class CalibrationProblem:
     def fitted(
         self,
         parameters: Array,
-        left: tuple[Array, Array],
+        added_variance: AddedVariance,
         factor: Callable[[Array], Array],
         *,
         release: bool = True,
@@ -220,7 +220,7 @@ class CalibrationProblem:
         The network is changed for its factor and for what only the described electrodes have. Only one for `release`
         learns correlations and is judged.
         """
-        about: dict[str, Any] = {} if release else {"correlation": False, "fresh": 0}
+        about: dict[str, Any] = {} if release else {"correlation": False, "n_test": 0}
         described, own = self.charges.forward_map(parameters), self.films.forward_map(parameters)
 
         def over_own(contact: Array) -> Array:
@@ -228,7 +228,8 @@ class CalibrationProblem:
                 return factor(contact)
             return np.asarray(factor(contact) * described.charges(contact) / own.charges(contact))
 
-        return replace(self.films.film(parameters, left=left, factor=over_own, **about), sensor=described.sensor)
+        fitted = self.films.film(parameters, added_variance=added_variance, charge_factor=over_own, **about)
+        return replace(fitted, sensor=described.sensor)
 
     @property
     def domain(self) -> Domain:

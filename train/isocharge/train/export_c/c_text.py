@@ -1,4 +1,4 @@
-"""Numbers, arrays and texts as C99."""
+"""Numbers, arrays and texts in the syntax of C99."""
 
 from collections.abc import Iterable
 from importlib import resources
@@ -9,48 +9,61 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-LINE = 109
-"""Columns of a line of numbers."""
+LINE_WIDTH = 109
+"""Largest number of characters of a line of numbers."""
 
 
 def source_text(name: str, **values: object) -> str:
-    """A file of `sources/` with values for its `$names`."""
+    """Return the text of a file in `sources/` with values in the place of its `$names`."""
     return Template((resources.files(__package__) / "sources" / name).read_text("utf-8")).substitute(values)
 
 
 def c_float(value: float) -> str:
-    """A finite float32 as the shortest literal that gives it back, bit by bit."""
+    """Return the shortest C literal that gives exactly this finite float32 number."""
     return _with_point(str(np.float32(value))) + "f"
 
 
 def c_double(value: float) -> str:
-    """A finite double as a literal."""
+    """Return the C literal of a finite double."""
     return _with_point(repr(float(value)))
 
 
 def _with_point(digits: str) -> str:
-    return digits if any(mark in digits for mark in ".e") else digits + ".0"
+    """Append a decimal point to the digits of an integer, so that C reads a floating-point number."""
+    has_point = "." in digits or "e" in digits
+    return digits if has_point else f"{digits}.0"
 
 
 def c_doubles(values: Iterable[float]) -> str:
-    """An initialiser of doubles in one line: `{1.0, 2.0}`."""
+    """Return the initialiser of an array of doubles in one line, for example `{1.0, 2.0}`."""
     return "{" + ", ".join(map(c_double, values)) + "}"
 
 
 def c_array(name: str, values: NDArray[Any]) -> str:
-    """A constant array of one dimension, of float or signed char, from values of any shape, in the order of rows."""
-    whole = values.dtype == np.int8
-    words = ", ".join(map(str if whole else c_float, values.ravel()))
-    numbers = "\n    ".join(wrap(f"{words},", LINE, break_on_hyphens=False)).rstrip(",")
-    return f"static const {'signed char' if whole else 'float'} {name}[{values.size}] = {{\n    {numbers}\n}};\n"
+    """Return the definition of a constant array with one dimension.
+
+    Args:
+        name: Name of the array.
+        values: Array of any shape, written row by row; int8 numbers become `signed char`, all others `float`.
+    """
+    is_int8 = values.dtype == np.int8
+    number_type = "signed char" if is_int8 else "float"
+    words = ", ".join(map(str if is_int8 else c_float, values.ravel()))
+    numbers = "\n    ".join(wrap(f"{words},", LINE_WIDTH, break_on_hyphens=False)).rstrip(",")
+    return f"static const {number_type} {name}[{values.size}] = {{\n    {numbers}\n}};\n"
 
 
 def c_string(text: str) -> str:
-    """A text as a C string; all but letters, digits and blanks by their octal codes, so no compiler reads them."""
-    plain = (chr(byte) if chr(byte).isalnum() and byte < 128 else f"\\{byte:03o}" for byte in text.encode())
-    return '"' + "".join(plain).replace("\\040", " ") + '"'
+    """Return a C string literal. All characters except ASCII letters, digits and blanks are written as octal codes."""
+
+    def escape(byte: int) -> str:
+        character = chr(byte)
+        is_plain = character == " " or (character.isascii() and character.isalnum())
+        return character if is_plain else f"\\{byte:03o}"
+
+    return '"' + "".join(map(escape, text.encode())) + '"'
 
 
 def c_comment(text: str) -> str:
-    """A text that may stand in a comment: what could end it, or begin another, is left out."""
+    """Return a text for a C comment. Characters that could end the comment or begin another are replaced by `_`."""
     return "".join(sign if sign.isascii() and (sign.isalnum() or sign in " ._-,:()=/") else "_" for sign in text)

@@ -1,4 +1,7 @@
-"""The folder of an export: C for the model, the board's signal chain, examples, and a README; whole or not at all."""
+"""The folder of a C export: the model, the signal chain of a board, examples and a README.
+
+The folder is written completely or not at all.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -15,33 +18,38 @@ from isocharge.train.export_c.c_text import c_comment, c_double, c_doubles, sour
 from isocharge.train.export_c.model_source import model_header, model_source, self_test
 from isocharge.train.model_release.onnx_graph import read_graph
 
-MOST_TARE_FRAMES = 10_000
-"""Frames of a tare that a state in C may hold: 320 kB with four electrodes."""
+MAX_TARE_FRAMES = 10_000
+"""Largest number of frames of a tare in C. The frames take 320 kB with four electrodes."""
 
 SWITCHES = {"HUM": "HUM", "TARE": "TARE_ON", "LEAK": "LEAK", "TOUCH": "TOUCH", "THERMAL": "THERMAL_ON"}
-"""Prefix of a stage's numbers in C to the name that says whether it runs."""
+"""Name of the C constant that switches a stage on, by the prefix of the stage's other constants."""
 
-NAMES = {"frequency_Hz": "HZ"}
-"""Settings that C calls otherwise."""
+C_NAMES = {"frequency_Hz": "HZ"}
+"""C names of settings whose name in C is not their name in capital letters."""
 
 
 def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
-    """The text of `isocharge_device.h`.
+    """Return the text of `isocharge_device.h`.
+
+    Args:
+        device: The board.
+        electrodes: Names of the electrodes in the order of the model.
 
     Raises:
-        DeviceError: If the device file is for other electrodes, has a tare that is too long for a state in C, or what a
-            chain in C cannot do.
+        DeviceError: If the device file is for other electrodes, has a tare that is too long for C, or uses a stage
+            that does not exist in C.
     """
     chain = device.chain(electrodes)
-    if chain.tare is not None and not 1 <= chain.tare.frames <= MOST_TARE_FRAMES:
+    if chain.tare is not None and not 1 <= chain.tare.frames <= MAX_TARE_FRAMES:
         raise DeviceError(
-            f"{device.where}: tare.frames: expected a whole number from 1 to {MOST_TARE_FRAMES} for a signal chain in "
+            f"{device.where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES} for a signal chain in "
             f"C, which holds them all, got {chain.tare.frames}"
         )
-    pyro = isinstance(chain.pyro, np.ndarray)
-    if chain.memory is not None or pyro:
+    has_pyroelectric_charges = isinstance(chain.pyro, np.ndarray)
+    if chain.memory is not None or has_pyroelectric_charges:
+        key = "common_mode.pC_per_K" if has_pyroelectric_charges else "memory"
         raise DeviceError(
-            f"{device.where}: {'common_mode.pC_per_K' if pyro else 'memory'}: a signal chain in C does not know it; "
+            f"{device.where}: {key}: a signal chain in C does not know it; "
             "remove it from the device file, or run `isocharge serve stream` on a host"
         )
     numbers = {
@@ -60,45 +68,49 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
         settings.pop("pC_per_K", None)
         numbers[SWITCHES[prefix]] = str(int(settings.pop("on", False)))
         if rule is leak and leak is not None:
-            settings = {"tau_s": None} | settings | {"tau_s": chain.tau_s}  # first, and one for each electrode
+            settings = {"tau_s": None} | settings | {"tau_s": chain.tau_s}  # keeps tau_s first; one for each electrode
         for name, value in settings.items():
-            numbers[f"{prefix}_{NAMES.get(name, name.upper())}"] = _number(value)
+            numbers[f"{prefix}_{C_NAMES.get(name, name.upper())}"] = _number(value)
     lines = "\n".join(f"#define ISOCHARGE_{name} {text}" for name, text in numbers.items())
     return source_text("isocharge_device.h", board=c_comment(device.name), lines=lines)
 
 
 def _number(value: Any) -> str:
+    """Return a number, a truth value or an array as a C literal."""
     if isinstance(value, np.ndarray):
         return c_doubles(value)
-    return str(int(value)) if isinstance(value, int) else c_double(value)
+    if isinstance(value, int):
+        return str(int(value))
+    return c_double(value)
 
 
 SKETCH = "isocharge_sketch"
-"""Name of the Arduino sketch: of its folder and of the file in it."""
+"""Name of the Arduino sketch, of its folder and of the file in the folder."""
 
-FOR_BOARDS = ("isocharge_chain.h", "isocharge_chain.c", "isocharge_frames.h", "isocharge_frames.c")
-"""Copied as they are, to the sketch as well."""
+BOARD_SOURCES = ("isocharge_chain.h", "isocharge_chain.c", "isocharge_frames.h", "isocharge_frames.c")
+"""Files that are the same for every model; the sketch gets copies of them."""
 
-SINGLE = "/* This board computes the chain in single precision. */\n#define ISOCHARGE_CHAIN_FLOAT\n\n"
+SINGLE_PRECISION = "/* This board computes the chain in single precision. */\n#define ISOCHARGE_CHAIN_FLOAT\n\n"
+"""Text that switches the signal chain of the sketch to single precision."""
 
 
 def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: str = "") -> Path:
     """Write a model and the signal chain beside it as C99.
 
     Args:
-        model: The version folder, as `find_model` gives it.
-        output: The folder to create.
-        device: The board, for the numbers of its signal chain.
-        command: How to make this folder again, for its README.
+        model: Version folder of the model, as `find_model` returns it.
+        output: Folder to create.
+        device: Board, for the settings of its signal chain.
+        command: Command that makes this folder again, for the README.
 
     Returns:
         The folder.
 
     Raises:
-        ModelError: If the model is missing or damaged, or its graph is not one of ours.
+        ModelError: If the model is missing or damaged, or its graph was not written by isocharge.
         DeviceError: If the device file is for other electrodes.
         OutputExists: If the folder exists.
-        OutputError: If the file system refuses; nothing is left then.
+        OutputError: If the file system refuses to write. No files remain then.
     """
     refuse_existing(output)
     files = c_files(model, device, command)
@@ -110,15 +122,26 @@ def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: 
 
 
 def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[str, str]:
-    """The texts of an export by their paths in its folder; the errors are those of `export_c`."""
+    """Return the texts of an export by their paths in its folder.
+
+    Args:
+        model: Version folder of the model.
+        device: Board, for the settings of its signal chain.
+        command: Command that makes this folder again, for the README.
+
+    Raises:
+        ModelError: If the model is missing or damaged, or its graph was not written by isocharge.
+        DeviceError: If the device file is for other electrodes.
+    """
     loaded = load_model(model)
-    path, metadata = loaded.folder / "model.onnx", loaded.metadata
+    path = loaded.folder / "model.onnx"
+    metadata = loaded.metadata
     network = read_graph(path.read_bytes(), str(path))
     files = {
         "isocharge_model.h": model_header(metadata, network),
         "isocharge_model.c": model_source(metadata, network),
         "isocharge_device.h": device_header(device, metadata.electrodes),
-        **{name: source_text(name) for name in (*FOR_BOARDS, "host_example.c")},
+        **{name: source_text(name) for name in (*BOARD_SOURCES, "host_example.c")},
         "self_test.c": self_test(loaded.golden),
         "README.md": source_text(
             "README.md",
@@ -129,8 +152,8 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
             board=c_comment(device.name),
         ),
     }
-    sketch = {name: files[name] for name in ("isocharge_model.h", "isocharge_model.c", *FOR_BOARDS)}
-    sketch["isocharge_device.h"] = SINGLE + files["isocharge_device.h"]
+    sketch = {name: files[name] for name in ("isocharge_model.h", "isocharge_model.c", *BOARD_SOURCES)}
+    sketch["isocharge_device.h"] = SINGLE_PRECISION + files["isocharge_device.h"]
     pins = ", ".join(f"A{number}" for number in range(len(metadata.electrodes)))
     sketch[f"{SKETCH}.ino"] = source_text("sketch.ino", pins=pins)
     return files | {f"arduino/{SKETCH}/{name}": text for name, text in sketch.items()}

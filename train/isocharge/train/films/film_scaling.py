@@ -1,16 +1,18 @@
-"""What a film's parameters do to its charges exactly, and the context by which a network knows the rest.
+"""Exact scales of the charges of films, and the context that describes the rest of a film to a network.
 
-With E h the stretching stiffness, d the geometric mean of d31 and d32, and g the gain of an electrode,
+With the stretching stiffness E h, the geometric mean d of d31 and d32, and the gain g of an electrode,
 
-    Q / (g d E)  =  function of F / (E h), of the place in the frame of the electrodes, and of the context:
+    Q / (g d E)  =  function of F / (E h), of the position in the frame of the electrodes, and of the context.
 
-the softened pretension over E, ln d31/d32, h, where the film's centre lies in that frame, its rotation, and the
-probe's radius. The noise and the ends of the domain do not scale along, so the context also has the scales that were
-divided out: of all charges, of the force, and each gain about their mean.
+The context contains the softened pretension over E, ln(d31 / d32), h, the position of the film's centre in the frame of
+the electrodes, the rotation of the film, and the radius of the probe. The noise and the limits of the domain do not
+scale with the film. The context therefore also contains the scales that are divided out: that of all charges, that of
+the force, and the gain of each electrode relative to the mean.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,89 +21,147 @@ from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.film_grid import SOFTENING
 from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 
-DRAWS = 4096
-"""Films drawn to standardise the context."""
+N_FILMS = 4096
+"""Number of films from which mean and standard deviation of the context are computed."""
+
+
+class ContextStatistics(NamedTuple):
+    """Mean and standard deviation of the context over the films, shape (n_context,) each."""
+
+    mean: Array
+    std: Array
 
 
 @dataclass(frozen=True)
 class FilmScaling:
-    """The exact scales of films, and their context, for parameters of any leading shape.
+    """Exact scales and contexts of films. Parameters can have any leading dimensions.
 
     Attributes:
-        prior: The films.
-        domain: The contacts; unit coordinates refer to it.
+        prior: Distribution of the films.
+        domain: Contacts, to which the unit coordinates refer.
     """
 
     prior: FilmPrior
     domain: Domain
 
     def log_charge_scale(self, parameters: Array) -> Array:
-        """ln of the charges' exact factors, 1 for the described film: (..., n_parameter) to (..., n_electrode)."""
-        common = _of(parameters, "young") + 0.5 * (_of(parameters, "d31") + _of(parameters, "d32"))
-        return np.asarray(parameters[..., len(SHARED) :] + common[..., None])
+        """Compute the logarithms of the exact factors of the charges, which are 1 for the described film.
+
+        Args:
+            parameters: Shape (..., n_parameter).
+
+        Returns:
+            Shape (..., n_electrode).
+        """
+        mean_piezo = 0.5 * (_shared(parameters, "d31") + _shared(parameters, "d32"))
+        common = _shared(parameters, "young") + mean_piezo
+        return np.asarray(_gains(parameters) + common[..., None])
 
     def rotation(self, parameters: Array) -> Array:
-        """Matrix T of `to_film`, (..., n_parameter) to (..., 3, 3): the rotation of the electrodes."""
+        """Compute the matrix T of `to_film`, the rotation of the electrodes.
+
+        Args:
+            parameters: Shape (..., n_parameter).
+
+        Returns:
+            Shape (..., 3, 3).
+        """
         rotation = np.zeros((*parameters.shape[:-1], 3, 3))
-        rotation[..., :2, :2] = _rotation(_of(parameters, "rotation"))
+        rotation[..., :2, :2] = _rotation(_shared(parameters, "rotation"))
         rotation[..., 2, 2] = 1.0
         return rotation
 
     def offset(self, parameters: Array) -> Array:
-        """Offset o of `to_film`, (..., n_parameter) to (..., 3)."""
-        described = np.array(self.prior.sensor.calibration.shift)
-        moved = described + _shift(parameters) - _rotation(_of(parameters, "rotation")) @ described
-        stiffness = _of(parameters, "young") + _of(parameters, "thickness")
-        return np.asarray(np.concatenate([moved, stiffness[..., None]], axis=-1) / self.domain.scale)
+        """Compute the vector o of `to_film`.
+
+        Args:
+            parameters: Shape (..., n_parameter).
+
+        Returns:
+            Shape (..., 3).
+        """
+        described_shift = np.array(self.prior.sensor.calibration.shift)
+        rotated_shift = _rotation(_shared(parameters, "rotation")) @ described_shift
+        shift = described_shift + _shift(parameters) - rotated_shift
+        log_stiffness = _shared(parameters, "young") + _shared(parameters, "thickness")
+        return np.asarray(np.concatenate([shift, log_stiffness[..., None]], axis=-1) / self.domain.scale)
 
     def to_film(self, parameters: Array, unit: Array) -> Array:
-        """Unit coordinates on the described film with the scales divided out, (..., 3), to those on the film: T u + o.
+        """Transform unit coordinates on the described film to those on another film: T u + o.
 
-        The place is carried along by the electrodes; the force grows with the stiffness.
+        The position moves with the electrodes, and the force is proportional to the stiffness.
+
+        Args:
+            parameters: Shape (..., n_parameter).
+            unit: Unit coordinates u with the scales divided out, shape (..., 3).
+
+        Returns:
+            Shape (..., 3).
         """
-        return np.asarray((self.rotation(parameters) @ unit[..., None])[..., 0] + self.offset(parameters))
+        rotated = (self.rotation(parameters) @ unit[..., None])[..., 0]
+        return np.asarray(rotated + self.offset(parameters))
 
     def context(self, parameters: Array) -> Array:
-        """What a network knows of a film, standardised over the films: (..., n_parameter) to (..., 9 + n_electrode)."""
-        centre, spread = self.standard
-        return np.asarray((self._raw_context(parameters) - centre) / spread)
+        """Compute the context of films, standardised over the prior.
+
+        Args:
+            parameters: Shape (..., n_parameter).
+
+        Returns:
+            Shape (..., n_context), where n_context is 9 + n_electrode.
+        """
+        return np.asarray((self._raw_context(parameters) - self.statistics.mean) / self.statistics.std)
 
     @cached_property
-    def standard(self) -> tuple[Array, Array]:
-        """Means and standard deviations of the context over the films, each of shape (9 + n_electrode,)."""
-        raw = self._raw_context(self.prior.draw(np.random.default_rng(0), DRAWS))
-        return raw.mean(axis=0), raw.std(axis=0)
+    def statistics(self) -> ContextStatistics:
+        """Mean and standard deviation of the context over films drawn from the prior."""
+        raw = self._raw_context(self.prior.draw(np.random.default_rng(0), N_FILMS))
+        return ContextStatistics(raw.mean(axis=0), raw.std(axis=0))
 
     def _raw_context(self, parameters: Array) -> Array:
-        film, described = self.prior.sensor.film, np.array(self.prior.sensor.calibration.shift)
-        strain = _of(parameters, "pretension") / (film.young * np.exp(_of(parameters, "young")))
-        back = _rotation(-_of(parameters, "rotation"))
-        centre = described - (back @ (described + _shift(parameters))[..., None])[..., 0]
-        gains = parameters[..., len(SHARED) :]
-        columns = [
+        """Compute the context before it is standardised."""
+        film = self.prior.sensor.film
+        described_shift = np.array(self.prior.sensor.calibration.shift)
+        young = film.young * np.exp(_shared(parameters, "young"))
+        strain = _shared(parameters, "pretension") / young
+        to_electrodes = _rotation(-_shared(parameters, "rotation"))
+        shift = described_shift + _shift(parameters)
+        centre = described_shift - (to_electrodes @ shift[..., None])[..., 0]
+        gains = _gains(parameters)
+        shared_columns = [
             np.log(strain + SOFTENING),
-            _of(parameters, "d31") - _of(parameters, "d32"),
-            _of(parameters, "thickness"),
+            _shared(parameters, "d31") - _shared(parameters, "d32"),
+            _shared(parameters, "thickness"),
             centre[..., 0],
             centre[..., 1],
-            _of(parameters, "rotation"),
-            _of(parameters, "probe_radius"),
+            _shared(parameters, "rotation"),
+            _shared(parameters, "probe_radius"),
             self.log_charge_scale(parameters).mean(axis=-1),
-            _of(parameters, "young") + _of(parameters, "thickness"),
+            _shared(parameters, "young") + _shared(parameters, "thickness"),
         ]
-        return np.concatenate([np.stack(columns, axis=-1), gains - gains.mean(axis=-1, keepdims=True)], axis=-1)
+        relative_gains = gains - gains.mean(axis=-1, keepdims=True)
+        return np.concatenate([np.stack(shared_columns, axis=-1), relative_gains], axis=-1)
 
 
-def _of(parameters: Array, name: str) -> Array:
-    """One of the parameters that all films share, shape (...)."""
+def _shared(parameters: Array, name: str) -> Array:
+    """Return one of the parameters that do not belong to an electrode, shape (...)."""
     return np.asarray(parameters[..., SHARED.index(name)])
 
 
+def _gains(parameters: Array) -> Array:
+    """Return the logarithms of the gains, shape (..., n_electrode)."""
+    return parameters[..., len(SHARED) :]
+
+
 def _shift(parameters: Array) -> Array:
-    return np.stack([_of(parameters, "shift_x"), _of(parameters, "shift_y")], axis=-1)
+    """Return the shift of the electrodes, shape (..., 2), mm."""
+    return np.stack([_shared(parameters, "shift_x"), _shared(parameters, "shift_y")], axis=-1)
 
 
 def _rotation(angle: Array) -> Array:
-    """Matrices of shape (..., 2, 2) for rotations by angles (...), rad, anticlockwise."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    """Return matrices, shape (..., 2, 2), of rotations by angles of shape (...), rad, anticlockwise."""
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    first_row = np.stack([cosine, -sine], axis=-1)
+    second_row = np.stack([sine, cosine], axis=-1)
+    return np.stack([first_row, second_row], axis=-2)

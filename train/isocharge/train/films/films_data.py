@@ -1,10 +1,10 @@
-"""What the networks for all films learn from.
+"""Training data of the networks for all films.
 
-The contact network: presses on many films, with the charges that d31 and d32 give kept apart. Gains and piezoelectric
-coefficients act on the charges exactly, so that training draws them anew in every step: the presses are stored for the
-described coefficients, one part of the charge for each.
+The contact network is trained on presses on many films. Gains and piezoelectric coefficients are exact factors of the
+charges, so training draws them again in every step. The charges are therefore stored for the described coefficients, in
+separate parts for d31, d32 and d33.
 
-The misfit network: charges of all kinds with their nearest contacts, and good presses.
+The misfit network is trained on charges of many kinds with their nearest contacts, and on good presses.
 """
 
 from concurrent.futures import Executor
@@ -25,18 +25,24 @@ from isocharge.train.data.misfit_charges import draw_misfit_examples
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses, draw_contacts
 
 CHUNK = 16
-"""Films that one job computes."""
+"""Number of films that one task computes."""
 
-MOST_NEGATIVE = 0.2
-"""Share of the presses that may give some electrode no positive charge: light ones on taut uniaxial films do. What is
-below 1 pC counts as 1 pC, and the other electrodes have to say it."""
+MAX_NEGATIVE_FRACTION = 0.2
+"""Largest fraction of presses with a charge that is not positive, as light presses on taut uniaxial films have. Charges
+below 1 pC are clipped to 1 pC, and only the other electrodes then carry information."""
 
-CANDIDATES = 512
-"""Contacts among which the search for the nearest starts; fewer than for one film alone, where a candidate costs less.
-"""
+N_CANDIDATES = 512
+"""Number of contacts among which the search for the nearest contact starts. A candidate costs more here than for a
+single film, so there are fewer."""
 
-D31, D32 = SHARED.index("d31"), SHARED.index("d32")
-"""Places of the coefficients among the parameters."""
+D31 = SHARED.index("d31")
+"""Position of ln d31 among the parameters."""
+
+D32 = SHARED.index("d32")
+"""Position of ln d32 among the parameters."""
+
+GAINS = slice(len(SHARED), None)
+"""Positions of the logarithms of the gains among the parameters."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +50,10 @@ class FilmPresses:
     """Presses on films.
 
     Attributes:
-        parameters: Of the films, shape (n_film, n_parameter).
-        contact: (x, y, F), shape (n_film, n_press, 3), mm and N, float32.
-        response: Charges with the described gains, by d31, d32 and d33 alone as described, shape (n_film, n_press,
-            n_electrode, 3), pC, float32.
+        parameters: Parameters of the films, shape (n_film, n_parameter).
+        contact: Contacts (x, y, F), shape (n_film, n_press, 3), mm and N, float32.
+        response: Charges for the described gains, in parts for d31, d32 and d33 alone with their described values,
+            shape (n_film, n_press, n_electrode, 3), pC, float32.
     """
 
     parameters: Array
@@ -58,10 +64,13 @@ class FilmPresses:
         return len(self.parameters)
 
     def charge(self) -> Array:
-        """Clean charges of the films as they are, shape (n_film, n_press, n_electrode), pC."""
-        d31, d32, gains = (np.exp(self.parameters[:, which]) for which in (D31, D32, slice(len(SHARED), None)))
-        parts = np.stack([d31, d32, np.ones(len(self))], axis=1)
-        return np.asarray(np.einsum("fpec,fc,fe->fpe", self.response.astype(float), parts, gains))
+        """Compute the charges of the films without noise, shape (n_film, n_press, n_electrode), pC."""
+        d31_factor = np.exp(self.parameters[:, D31])
+        d32_factor = np.exp(self.parameters[:, D32])
+        d33_factor = np.ones(len(self))
+        part_factors = np.stack([d31_factor, d32_factor, d33_factor], axis=1)
+        gain_factors = np.exp(self.parameters[:, GAINS])
+        return np.asarray(np.einsum("fpec,fc,fe->fpe", self.response.astype(float), part_factors, gain_factors))
 
 
 def draw_film_presses(
@@ -73,59 +82,95 @@ def draw_film_presses(
     seed: int,
     executor: Executor | None = None,
 ) -> FilmPresses:
-    """Draw films from the prior, and presses on each: uniform over the disk, forces log-uniform.
+    """Draw films from the prior and presses on each film, uniform over the disk and log-uniform in force.
+
+    Args:
+        prior: Distribution of the films.
+        family: Forward maps of the films.
+        domain: Contacts.
+        films: Number of films.
+        presses: Number of presses on each film.
+        seed: Seed of films and presses.
+        executor: Executor of the tasks; None for this process.
 
     Raises:
         DatasetError: If too many charges are not positive.
     """
     parameters = prior.draw(np.random.default_rng([seed, 0]), films)
     jobs = [(start, parameters[start : start + CHUNK]) for start in range(0, films, CHUNK)]
-    work = partial(_some_films, prior, family, domain, presses, seed)
-    drawn = np.concatenate(list(track(in_order(executor, work, jobs), "pressing films", len(jobs))))
-    of_films = FilmPresses(parameters, drawn[:, :, 0], drawn[:, :, 1:])
-    _check_positive(of_films)
-    return of_films
+    work = partial(_press_films, prior, family, domain, presses, seed)
+    chunks = list(track(in_order(executor, work, jobs), "pressing films", len(jobs)))
+    contact, response = np.split(np.concatenate(chunks), [1], axis=2)
+    drawn = FilmPresses(parameters, contact[:, :, 0], response)
+    _check_positive(drawn)
+    return drawn
 
 
-def _some_films(
+def _press_films(
     prior: FilmPrior, family: FilmFamily, domain: Domain, presses: int, seed: int, job: tuple[int, Array]
 ) -> Singles:
-    """Contacts and responses side by side, shape (n_film, presses, 1 + n_electrode, 3)."""
+    """Compute presses on some films.
+
+    Args:
+        prior: Distribution of the films.
+        family: Forward maps of the films.
+        domain: Contacts.
+        presses: Number of presses on each film.
+        seed: Seed of the presses.
+        job: Number of the first film, and parameters of the films.
+
+    Returns:
+        Contacts and then responses of the electrodes, shape (n_film, presses, 1 + n_electrode, 3).
+    """
     start, parameters = job
     rng = np.random.default_rng([seed, 1, start])
     contacts = np.stack([draw_contacts(rng, domain, presses) for _ in parameters])
-    response = np.stack([_response(prior, family, *film) for film in zip(parameters, contacts, strict=True)])
-    return np.concatenate([contacts[:, :, None], response], axis=2).astype(np.float32)
+    responses = [_response(prior, family, *film) for film in zip(parameters, contacts, strict=True)]
+    return np.concatenate([contacts[:, :, None], np.stack(responses)], axis=2).astype(np.float32)
 
 
 def _response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: Array) -> Array:
-    """Charges by part for the described coefficients and gains, shape (n_press, n_electrode, 3), pC."""
-    plain = parameters.copy()
-    plain[[D31, D32]] = plain[len(SHARED) :] = 0.0
-    forward_map, piezo = family.forward_map(*prior.film(plain)), prior.sensor.piezo
-    none = np.zeros((len(contact), len(prior.sensor.electrodes)))
+    """Compute the charges of one film in parts, for the described coefficients and gains.
+
+    Args:
+        prior: Distribution of the films.
+        family: Forward maps of the films.
+        parameters: Parameters of the film, shape (n_parameter,).
+        contact: Contacts, shape (n_press, 3), mm and N.
+
+    Returns:
+        Parts for d31, d32 and d33, shape (n_press, n_electrode, 3), pC.
+    """
+    described = parameters.copy()
+    described[[D31, D32]] = 0.0
+    described[GAINS] = 0.0
+    forward_map = family.forward_map(*prior.film(described))
+    piezo = prior.sensor.piezo
+    no_charge = np.zeros((len(contact), len(prior.sensor.electrodes)))
 
     def charges(d31: float, d32: float, d33: float = 0.0) -> Array:
-        """Zero without coefficients."""
-        if d31 == d32 == 0.0:
-            return none
+        if d31 == 0.0 and d32 == 0.0:
+            return no_charge
         sensor = replace(forward_map.sensor, piezo=Piezo(d31, d32, d33))
         return replace(forward_map, sensor=sensor).charges(contact)
 
-    parts = [charges(piezo.d31, 0.0), charges(0.0, piezo.d32), none]
+    d31_part = charges(piezo.d31, 0.0)
+    d32_part = charges(0.0, piezo.d32)
+    d33_part = no_charge
     if piezo.d33 != 0.0:
-        parts[2] = charges(piezo.d31, piezo.d32, piezo.d33) - parts[0] - parts[1]
-    return np.stack(parts, axis=-1)
+        d33_part = charges(piezo.d31, piezo.d32, piezo.d33) - d31_part - d32_part
+    return np.stack([d31_part, d32_part, d33_part], axis=-1)
 
 
 def _check_positive(drawn: FilmPresses) -> None:
+    """Raise a DatasetError if too many presses have a charge that is not positive."""
     charge = drawn.charge()
-    useless = (charge <= 0.0).any(axis=-1)
-    if useless.mean() > MOST_NEGATIVE:
-        film, row = (int(index) for index in np.argwhere(useless)[0])
+    has_negative = (charge <= 0.0).any(axis=-1)
+    if has_negative.mean() > MAX_NEGATIVE_FRACTION:
+        film, row = (int(index) for index in np.argwhere(has_negative)[0])
         raise DatasetError(
-            f"{useless.mean():.0%} of the presses give an electrode no positive charge, expected at most "
-            f"{MOST_NEGATIVE:.0%} (the features are logarithms); the first: film {film}, "
+            f"{has_negative.mean():.0%} of the presses give an electrode no positive charge, expected at most "
+            f"{MAX_NEGATIVE_FRACTION:.0%} (the features are logarithms); the first: film {film}, "
             f"{drawn.contact[film, row].tolist()} (mm, mm, N), {charge[film, row].tolist()} pC; check d31 "
             "and d32, or ask for a smaller radius"
         )
@@ -133,12 +178,12 @@ def _check_positive(drawn: FilmPresses) -> None:
 
 @dataclass(frozen=True)
 class FilmsSource:
-    """Where examples come from.
+    """Films and contacts from which the training data of the misfit network are drawn.
 
     Attributes:
-        prior: The films.
-        family: Their forward maps.
-        domain: The contacts.
+        prior: Distribution of the films.
+        family: Forward maps of the films.
+        domain: Contacts.
         noise: Noise of good presses.
     """
 
@@ -148,7 +193,7 @@ class FilmsSource:
     noise: NoiseModel
 
     def charge_map(self, parameters: Array) -> FunctionMap:
-        """The charges of one film as the model sees them, clipped."""
+        """Return the map of one film from contacts to charges, clipped as the input features clip them."""
         forward_map = self.family.forward_map(*self.prior.film(parameters))
 
         def charges(contact: Array) -> Array:
@@ -159,56 +204,87 @@ class FilmsSource:
 
 @dataclass(frozen=True)
 class DrawnFilms:
-    """Charges on films.
+    """Training data of the misfit network.
 
     Attributes:
-        parameters: Of the films, shape (n_film, n_parameter).
-        charge: Shape (n_film, n, n_electrode), pC.
-        aim: What the misfit network learns about them; shape (n_film, n, n_electrode, ...).
+        parameters: Parameters of the films, shape (n_film, n_parameter).
+        charge: Charges, shape (n_film, n, n_electrode), pC.
+        target: Residuals or projections from which the targets are computed, shape (n_film, n, n_electrode, ...).
     """
 
     parameters: Array
     charge: Array
-    aim: Array
+    target: Array
 
 
 def draw_misfit_films(
     source: FilmsSource, films: int, charges: int, seed: int, executor: Executor | None = None
 ) -> DrawnFilms:
-    """Draw films, and charges of every kind on each; `aim` is (Q - Q(c)) / sigma at the nearest contact c."""
+    """Draw films and charges of every kind on each film.
+
+    Args:
+        source: Films and contacts.
+        films: Number of films.
+        charges: Number of charges on each film.
+        seed: Seed of films and charges.
+        executor: Executor of the tasks; None for this process.
+
+    Returns:
+        Films and charges. The target is (Q - Q(c)) / sigma at the nearest contact c, in standard deviations of the
+        noise, shape (films, charges, n_electrode).
+    """
     parameters = source.prior.draw(np.random.default_rng([seed, 2]), films)
-    jobs = in_order(executor, partial(_of_every_kind, source, charges, seed), enumerate(parameters))
-    return DrawnFilms(parameters, *np.stack(list(track(jobs, "searching nearest contacts", films)), axis=1))
+    jobs = in_order(executor, partial(_charges_of_every_kind, source, charges, seed), enumerate(parameters))
+    charge, residual = np.stack(list(track(jobs, "searching nearest contacts", films)), axis=1)
+    return DrawnFilms(parameters, charge, residual)
 
 
-def _of_every_kind(source: FilmsSource, charges: int, seed: int, job: tuple[int, Array]) -> Array:
-    """Charges and residuals, shape (2, charges, n_electrode)."""
+def _charges_of_every_kind(source: FilmsSource, charges: int, seed: int, job: tuple[int, Array]) -> Array:
+    """Draw charges on one film, given by its number and parameters.
+
+    Returns:
+        Charges, pC, and residuals, shape (2, charges, n_electrode).
+    """
     number, parameters = job
     charge_map = source.charge_map(parameters)
     contact = draw_contacts(np.random.default_rng([seed, 3, number]), source.domain, charges)
     presses = LabelledPresses(contact, charge_map.charges(contact))
-    return draw_misfit_examples(presses, charge_map, source.noise, charges, seed + number, candidates=CANDIDATES)
+    return draw_misfit_examples(presses, charge_map, source.noise, charges, seed + number, candidates=N_CANDIDATES)
 
 
 def draw_near_films(
     source: FilmsSource, films: int, presses: int, seed: int, executor: Executor | None = None
 ) -> DrawnFilms:
-    """Draw films, and clean presses on each, about which the nearest contact follows without a search.
+    """Draw films and good presses on each film, for which the nearest contact follows without a search.
 
-    `aim` is a matrix, shape (n_film, n, n_electrode, n_electrode): of a deviation in units of the noise it leaves the
-    part that no contact explains, to first order. Noise of many seeds is free then.
+    Args:
+        source: Films and contacts.
+        films: Number of films.
+        presses: Number of presses on each film.
+        seed: Seed of films and presses.
+        executor: Executor of the tasks; None for this process.
+
+    Returns:
+        Films and charges without noise. The target is a projection matrix, shape (films, presses, n_electrode,
+        n_electrode). To first order, it maps a deviation in standard deviations of the noise to the residual at the
+        nearest contact, so new noise costs nothing.
     """
     parameters = source.prior.draw(np.random.default_rng([seed, 4]), films)
     jobs = in_order(executor, partial(_good_presses, source, presses, seed), enumerate(parameters))
     drawn = np.stack(list(track(jobs, "drawing good presses", films)))
-    return DrawnFilms(parameters, drawn[..., 0], drawn[..., 1:])
+    charge, projection = np.split(drawn, [1], axis=-1)
+    return DrawnFilms(parameters, charge[..., 0], projection)
 
 
 def _good_presses(source: FilmsSource, presses: int, seed: int, job: tuple[int, Array]) -> Array:
-    """Charges and matrices side by side, shape (presses, n_electrode, 1 + n_electrode)."""
+    """Draw good presses on one film, given by its number and parameters.
+
+    Returns:
+        Charges, pC, and then projection matrices, shape (presses, n_electrode, 1 + n_electrode).
+    """
     number, parameters = job
     contact = draw_contacts(np.random.default_rng([seed, 5, number]), source.domain, presses)
     charge, slopes = linearised(source.charge_map(parameters), contact)
-    basis = np.linalg.qr(slopes / source.noise.sigma(charge)[:, :, None])[0]
-    across = np.eye(charge.shape[1]) - basis @ basis.transpose(0, 2, 1)
-    return np.concatenate([charge[:, :, None], across], axis=2)
+    basis, _ = np.linalg.qr(slopes / source.noise.sigma(charge)[:, :, None])
+    projection = np.eye(charge.shape[1]) - basis @ basis.transpose(0, 2, 1)
+    return np.concatenate([charge[:, :, None], projection], axis=2)

@@ -1,13 +1,13 @@
-"""The films file, `films.npz` beside a model: all that is needed for a model of another film. Its writer and reader.
+"""Writer and reader of the films file, `films.npz` beside a model, from which a model of another film is computed.
 
-    about              JSON: format, sensor, probe, spread, domain, noise
+    about              JSON: format, sensor, probe, spread, domain, activation, noise
     family.*           the forward maps of the films (`FilmFamily.to_arrays`)
     contact.*          weights of the contact network, integers of `BITS` bits, with their scales
     misfit.*           weights of the misfit network
-    mean, whitening    of the inputs
-    sha256             checksum of all the above
+    mean, whitening    mean and whitening matrix of the inputs
+    sha256             checksum of all arrays above
 
-The last bits of the integers are nearly noise, so that fewer bits make a smaller compressed file.
+The weights are rounded to few bits, because their last bits are nearly random and cannot be compressed.
 """
 
 import hashlib
@@ -41,22 +41,26 @@ FORMAT = 1
 """Version of the file's format."""
 
 BITS = 12
-"""Bits of a weight, its sign included: relative to the largest of its row."""
+"""Number of bits of a weight, including its sign. The largest weight of a row has the largest integer."""
 
 FILE_UNITS = {"pretension": 1e6, "shift": 1e-3, "probe_radius": 1e-3}
-"""Factors to the spread in the file, which is in Pa and m."""
+"""Factors from the units of the program to those of the file, Pa and m, by name of the quantity."""
 
 FILE_PC = 1e-12
-"""Factor to white noise in the file, which is in C."""
+"""Factor from the white noise in pC to that in the file, C."""
 
 MAX_LAYER_WIDTH = 2048
 """Largest number of nodes of a layer."""
 
-AGAIN = "copy the model's folder again, or train it again (isocharge train fit --films)"
+MIN_LARGEST_WEIGHT = 1e-30
+"""Largest weight that is assumed for a row of zeros, so that its scale is positive."""
+
+ADVICE = "copy the model's folder again, or train it again (isocharge train fit --films)"
+"""What a user can do about a damaged file, for error messages."""
 
 
 def films_bytes(films: FilmsModel) -> bytes:
-    """The file of a model."""
+    """Return the content of the file."""
     arrays = {
         "about": np.array(json.dumps(_about(films), allow_nan=False)),
         "mean": films.mean,
@@ -83,10 +87,14 @@ def read_films(version_folder: Path) -> FilmsModel:
 
 
 def films_from_bytes(data: bytes, where: str) -> FilmsModel:
-    """The model in a file's bytes; `where` is for messages.
+    """Read a model from the content of a file.
+
+    Args:
+        data: Content of the file.
+        where: Name of the file, for error messages.
 
     Raises:
-        ModelError: If they are damaged or of another format.
+        ModelError: If the file is damaged or has another format.
     """
     try:
         arrays = _arrays(data)
@@ -97,11 +105,11 @@ def films_from_bytes(data: bytes, where: str) -> FilmsModel:
     except ModelError:
         raise
     except DAMAGED as error:
-        raise ModelError(f"{where}: damaged ({type(error).__name__}: {error}); {AGAIN}") from error
+        raise ModelError(f"{where}: damaged ({type(error).__name__}: {error}); {ADVICE}") from error
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """What `numpy.load` reads, as `numpy.savez_compressed` writes it but with LZMA: a tenth smaller."""
+    """Return an npz file that is compressed with LZMA, which is a tenth smaller than `numpy.savez_compressed`."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_LZMA) as file:
         for name, array in arrays.items():
@@ -111,10 +119,11 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def _arrays(data: bytes) -> dict[str, np.ndarray]:
-    """All arrays but the checksum, which must be theirs."""
+    """Return all arrays except the checksum, after a check of checksum and numbers."""
     arrays = npz_arrays(data)
     expected = str(arrays.pop("sha256"))
-    if (actual := _checksum(arrays)) != expected:
+    actual = _checksum(arrays)
+    if actual != expected:
         raise ValueError(f"expected the checksum {expected:.12}..., got {actual:.12}...")
     for name, array in arrays.items():
         is_text = array.dtype.kind == "U" and array.ndim == 0
@@ -125,6 +134,7 @@ def _arrays(data: bytes) -> dict[str, np.ndarray]:
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return the SHA-256 checksum of names, types, shapes and numbers of arrays."""
     total = hashlib.sha256()
     for name in sorted(arrays):
         array = arrays[name]
@@ -152,9 +162,20 @@ def _about(films: FilmsModel) -> dict[str, Any]:
 
 
 def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str) -> FilmsModel:
+    """Return the model of a file.
+
+    Args:
+        about: The JSON object of the file.
+        arrays: Arrays of the file by name.
+        sha256: Checksum of the file.
+
+    Raises:
+        InputError: If the parts of the file do not fit together.
+    """
     spread = {name: _converted(value, 1.0 / FILE_UNITS.get(name, 1.0)) for name, value in about["spread"].items()}
     probe = Circle(_converted(about["probe_radius"], 1.0 / FILE_UNITS["probe_radius"]))
-    prior, noise = FilmPrior(sensor_from_dict(about["sensor"]), probe, FilmSpread(**spread)), about["noise"]
+    prior = FilmPrior(sensor_from_dict(about["sensor"]), probe, FilmSpread(**spread))
+    noise = about["noise"]
     low, high = about["force_range_N"]
     activation = ACTIVATIONS[about.get("activation", TANH.name)]
     model = FilmsModel(
@@ -170,32 +191,43 @@ def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str)
     n_electrode = len(prior.sensor.electrodes)
     if model.mean.shape != (n_electrode,) or model.whitening.shape != (n_electrode, n_electrode):
         raise InputError(f"inputs of {model.mean.size} electrodes, a sensor with {n_electrode}")
-    model.fold(prior.mean)  # what does not fit together is an error now
+    model.fold(prior.mean)  # raises if the weights do not fit together
     return model
 
 
 def _converted(value: float, factor: float) -> float:
-    """A number in another unit, without the rounding of the conversion."""
+    """Convert a number to another unit, and round it to the 15 digits that a conversion keeps."""
     return value if factor == 1.0 else float(f"{factor * value:.15g}")
 
 
 def _within(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray]:
-    """The arrays of one part, by their names in it."""
+    """Return the arrays of one part of the file, by their names in this part."""
     prefix = f"{part}."
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def _packed(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarray]:
-    """Weights as integers; matrices with a scale for each row."""
+    """Round weights to integers with a scale for each row.
+
+    Args:
+        part: Name of the part of the file.
+        weights: Arrays by name.
+
+    Returns:
+        Integers and scales by their names in the file.
+    """
+    largest_integer = 2 ** (BITS - 1) - 1
     packed: dict[str, np.ndarray] = {}
     for name, values in weights.items():
-        largest = np.maximum(np.abs(values).max(axis=-1, keepdims=True), 1e-30)
-        scale = (largest / (2 ** (BITS - 1) - 1)).astype(np.float32)
-        packed |= {f"{part}.{name}": np.round(values / scale).astype(np.int16), f"{part}.{name}.scale": scale}
+        largest = np.maximum(np.abs(values).max(axis=-1, keepdims=True), MIN_LARGEST_WEIGHT)
+        scale = (largest / largest_integer).astype(np.float32)
+        packed[f"{part}.{name}"] = np.round(values / scale).astype(np.int16)
+        packed[f"{part}.{name}.scale"] = scale
     return packed
 
 
 def _unpacked(packed: Mapping[str, np.ndarray], activation: Activation) -> ConditionalWeights:
+    """Return the weights of a network from integers and scales by their names in its part of the file."""
     names = [name for name in packed if not name.endswith(".scale")]
     for name in names:
         if max(packed[name].shape, default=1) > MAX_LAYER_WIDTH:

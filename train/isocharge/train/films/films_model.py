@@ -1,8 +1,8 @@
-"""A network for all films as it is used: folded to the plain network of one film."""
+"""A trained network for all films, from which the network of each film is computed."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,15 +21,20 @@ from isocharge.train.training.folded_network import FoldedNetwork
 from isocharge.train.training.folding import answer_units, fold
 from isocharge.train.training.output_regression import adapt_to_charges, add_variance
 
-TAUGHT, COPIES = 750, 4
-"""Presses by which layers are changed, each with noise drawn so often; twice as many change errors by 0.5 %."""
+N_REGRESSION_PRESSES = 750
+"""Number of presses from which the last layer is fitted to another film. Twice as many change the errors by 0.5 %."""
 
-CORRELATED = 1500
-"""Presses from which correlations are learned, those among them."""
+N_COPIES = 4
+"""Number of copies of these presses with different noise."""
 
-PRESSES, SEED = 1000, 11
-"""Fresh presses on which a film's network is judged, and their seed."""
+N_CORRELATION_PRESSES = 1500
+"""Number of presses from which the correlations are fitted; the presses above are among them."""
 
+N_TEST_PRESSES = 1000
+"""Number of presses on which the errors of a film's network are measured."""
+
+SEED = 11
+"""Seed of the presses and the noise."""
 
 CONTEXT_LAYERS = ("0", "2")
 """Names of the layers of the context network in the films file."""
@@ -74,20 +79,32 @@ class ConditionalWeights:
         return np.asarray(self.arrays[constant] + np.tensordot(phi, self.arrays[bases], axes=1))
 
 
+class AddedVariance(NamedTuple):
+    """Variances that are added to those of a network.
+
+    Attributes:
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        variance: Variances of (x, y, ln F) to add at these contacts, shape (n, 3), mm^2, mm^2 and 1.
+    """
+
+    contact: Array
+    variance: Array
+
+
 @dataclass(frozen=True)
 class FilmsModel:
-    """What is needed for the network of any film of a prior.
+    """A network for all films of a prior.
 
     Attributes:
         family: Forward maps of the films.
-        scaling: Exact scales and context of films; holds prior and domain.
-        mean: Of the logarithms of the charges (pC) with the exact scales divided out, shape (n_electrode,).
-        whitening: Shape (n_electrode, n_electrode).
+        scaling: Exact scales and contexts of films, with prior and domain.
+        mean: Mean of the logarithms of the charges (pC) with the exact scales divided out, shape (n_electrode,).
+        whitening: Whitening matrix, shape (n_electrode, n_electrode).
         contact: Weights of the contact network.
         misfit: Weights of the misfit network.
         noise: Noise of the training.
-        sha256: Checksum of the file that it was read from, or "".
-        made_with: Of a fit, for the metadata; not in the file.
+        sha256: Checksum of the file from which the model was read, or "".
+        made_with: Settings of the training, for the metadata; they are not in the file.
     """
 
     family: FilmFamily
@@ -102,16 +119,19 @@ class FilmsModel:
 
     @property
     def prior(self) -> FilmPrior:
-        """The films: the sensor as described, the probe, and how far films spread."""
+        """Distribution of the films."""
         return self.scaling.prior
 
     @property
     def domain(self) -> Domain:
-        """The contacts that the network knows."""
+        """Contacts for which the network was trained."""
         return self.scaling.domain
 
     def forward_map(self, parameters: Array) -> ForwardMap:
-        """The charges of one film, parameters as in `FilmPrior`, shape (n_parameter,).
+        """Return the map from contacts to charges of one film.
+
+        Args:
+            parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
 
         Raises:
             SceneError: If the film is outside the family.
@@ -122,63 +142,72 @@ class FilmsModel:
         self,
         parameters: Array,
         *,
-        left: tuple[Array, Array] | None = None,
         provenance: Provenance | None = None,
-        factor: Callable[[Array], Array] | None = None,
+        charge_factor: Callable[[Array], Array] | None = None,
+        added_variance: AddedVariance | None = None,
         correlation: bool = True,
-        fresh: int = PRESSES,
+        n_test: int = N_TEST_PRESSES,
     ) -> Fitted:
-        """The network of one film, as `fit` gives it for one: to predict, to evaluate on fresh presses, to release.
+        """Compute the network of one film, with everything that a release needs.
 
         Args:
-            parameters: Of the film, as in `FilmPrior`, shape (n_parameter,).
-            left: Contacts (x, y, F), shape (n, 3), mm and N, and the variances of (x, y, ln F) there by what is not
-                known of the film, shape (n, 3): the deviations are larger by them.
-            provenance: For the release, if there is something to say.
-            factor: Contacts (x, y, F), shape (n, 3), mm and N, to factors on the charges, shape (n, n_electrode), if
-                they differ from those of the parameters: the network's first and last layers are changed accordingly,
-                and its deviations are those of the errors that this leaves.
-            correlation: Whether it learns how errors go together; that takes a second or two.
-            fresh: How many presses it has to be judged on.
+            parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
+            provenance: Additional information for the release.
+            charge_factor: Function from contacts (x, y, F), shape (n, 3), mm and N, to factors of the charges, shape
+                (n, n_electrode), by which the film differs from the simulated film. The first and the last layer of the
+                network are then changed, and its standard deviations are fitted to the remaining errors.
+            added_variance: Variances that are added to those of the network, for example because the parameters of the
+                film are uncertain.
+            correlation: Whether to fit the correlations, which takes one or two seconds.
+            n_test: Number of test presses, at most `N_TEST_PRESSES`.
 
         Raises:
             InputError: If there are not as many finite parameters as the prior names.
             SceneError: If the film is outside the family.
         """
-        network, (sensor, probe) = self.fold(parameters), self.prior.film(parameters)
-        rng, (known, variance) = np.random.default_rng(SEED), left or (np.empty((0, 3)), np.empty((0, 3)))
-        drawn, learned = draw_contacts(rng, self.domain, PRESSES + CORRELATED), CORRELATED if correlation else TAUGHT
-        contact = np.concatenate([drawn[PRESSES - fresh : PRESSES + learned], known])
-        ratio = np.ones((len(contact), self.mean.size)) if factor is None else factor(contact)
-        charge = self.forward_map(parameters).charges(contact)
-        presses = LabelledPresses(contact[:fresh], (charge * ratio)[:fresh])
-        if factor is not None:
-            taught = np.arange(fresh, fresh + TAUGHT).repeat(COPIES)
-            noisy = self.noise.add((charge * ratio)[taught], rng)
-            network = adapt_to_charges(network, noisy, noisy / ratio[taught], contact[taught])
+        network = self.fold(parameters)
+        sensor, probe = self.prior.film(parameters)
+        rng = np.random.default_rng(SEED)
+        n_train = N_CORRELATION_PRESSES if correlation else N_REGRESSION_PRESSES
+        drawn = draw_contacts(rng, self.domain, N_TEST_PRESSES + N_CORRELATION_PRESSES)
+        contacts = [
+            drawn[N_TEST_PRESSES - n_test : N_TEST_PRESSES],
+            drawn[N_TEST_PRESSES : N_TEST_PRESSES + n_train],
+            np.empty((0, 3)) if added_variance is None else added_variance.contact,
+        ]
+        contact = np.concatenate(contacts)
+        simulated_charge = self.forward_map(parameters).charges(contact)
+        factor = np.ones(simulated_charge.shape) if charge_factor is None else charge_factor(contact)
+        presses = LabelledPresses(contact, simulated_charge * factor)
+        test, train, uncertain = np.split(np.arange(len(contact)), [n_test, n_test + n_train])
+
+        if charge_factor is not None:
+            rows = train[:N_REGRESSION_PRESSES].repeat(N_COPIES)
+            noisy = self.noise.add(presses.charge[rows], rng)
+            network = adapt_to_charges(network, noisy, noisy / factor[rows], contact[rows])
         if correlation:
-            of = slice(fresh, fresh + learned)
-            examples = LabelledPresses(contact[of], (charge * ratio)[of])
-            network = with_correlation(network, examples, self.noise, SEED)
-        if left is not None:
-            taught = np.arange(fresh + learned, len(contact)).repeat(COPIES)
-            noisy = self.noise.add((charge * ratio)[taught], rng)
-            network = add_variance(network, noisy, variance.repeat(COPIES, axis=0))
+            network = with_correlation(network, presses[train], self.noise, SEED)
+        if added_variance is not None:
+            noisy = self.noise.add(presses.charge[uncertain.repeat(N_COPIES)], rng)
+            network = add_variance(network, noisy, added_variance.variance.repeat(N_COPIES, axis=0))
         return Fitted(
             network=network,
             sensor=sensor,
             probes=(probe.notation,),
             domain=self.domain,
             noise=self.noise,
-            test=presses,
-            good=presses,
+            test=presses[test],
+            good=presses[test],
             sha256=self.sha256,
             provenance=provenance or Provenance(),
             requested_domain=self.domain,
         )
 
     def fold(self, parameters: Array) -> FoldedNetwork:
-        """The plain network of one film, parameters as in `FilmPrior`, shape (n_parameter,); some milliseconds.
+        """Compute the network of one film without corrections, which takes a few milliseconds.
+
+        Args:
+            parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
 
         Raises:
             InputError: If there are not as many finite parameters as the prior names.

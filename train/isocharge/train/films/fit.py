@@ -1,9 +1,9 @@
-"""Fit one network to all the films that a sensor may be."""
+"""Training of one network for all films of a prior."""
 
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -34,7 +34,7 @@ from isocharge.train.films.films_data import (
 from isocharge.train.films.films_model import ConditionalWeights, FilmsModel
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fit import WARM_UP_FRACTION, threads_and_seed
-from isocharge.train.training.folded_network import N_CONTACT_ANSWERS
+from isocharge.train.training.folded_network import LOG_STD, MEAN, N_CONTACT_ANSWERS
 from isocharge.train.training.losses import (
     likelihood_loss,
     mean_squared_distance,
@@ -44,48 +44,53 @@ from isocharge.train.training.losses import (
 )
 from isocharge.train.training.network import as_tensor, compress_length
 
-BEYOND = 1.5
-"""How far the family reaches beyond the domain, mm: a calibration moves presses whose place is not exactly known."""
+RADIUS_MARGIN = 1.5
+"""Distance by which the forward maps reach beyond the domain, mm. A calibration moves presses whose position is
+uncertain."""
 
-FORCES_BEYOND = (0.8, 1.2)
-"""The same for forces: factors of the smallest and the largest."""
+FORCE_MARGINS = (0.8, 1.2)
+"""Factors of the smallest and the largest force of the domain up to which the forward maps reach."""
 
 LARGEST_GRADIENT = 5.0
-"""Norm to which gradients are cut: films whose map nearly folds pull hard."""
+"""Norm to which larger gradients are clipped. Films whose map nearly folds have large gradients."""
 
-WIDEST = 8.0
-"""Largest deviation of a good press, over that of the noise."""
+MAX_NOISE_FACTOR = 8.0
+"""Largest factor on the noise of good presses in the training of the misfit network."""
 
-NEAR_WEIGHT = 10.0
-"""Weight of good presses in the loss of the misfit: they decide when an alarm is false, and their misfits are small."""
+GOOD_PRESS_WEIGHT = 10.0
+"""Weight of good presses in the loss of the misfit network. They determine the rate of false alarms, and their misfits
+are small."""
 
-WATCHED = 0.06
-"""Share of the films that are watched while the misfit network trains."""
+MISFIT_VALIDATION_FRACTION = 0.06
+"""Fraction of the films that are used for validation in the training of the misfit network."""
+
+N_VALIDATION_PRESSES = 8
+"""Number of good presses of each film in the validation of the misfit network."""
 
 
 @dataclass(frozen=True)
 class FilmsConfig:
-    """Everything that fixes a fit, given the films.
+    """Settings of the training of a network for all films.
 
     Attributes:
         radius: Largest distance of a press from the film's centre, mm.
         force_range: Smallest and largest force, N.
         hidden: Widths of the hidden layers of the contact network.
-        misfit_hidden: Widths of the one that gives the misfit; as many layers.
+        misfit_hidden: Widths of the hidden layers of the misfit network, which has as many.
         activation: Name of the activation of the hidden layers (`isocharge.common.activations`).
-        films: Films that the contact network learns from; `watched` of them are only watched.
-        presses: Presses on each.
-        watched: Films that are watched while it trains.
-        steps: Optimiser steps of the contact network.
-        misfit_films: Films that the misfit network learns from.
-        misfit_charges: Charges of each.
-        near_films: Films whose good presses it learns from, as many presses on each as above.
-        misfit_steps: Optimiser steps of the misfit network.
-        batch_films: Films in a step.
-        batch_presses: Presses of each.
-        learning_rate: Largest rate of the schedule (Adam's; Muon's is a multiple).
-        noise: Level of the noise model that is added afresh in every step.
-        seed: Of films, presses, weights, batches and noise.
+        films: Number of films for the contact network, including those for validation.
+        presses: Number of presses on each of these films.
+        watched: Number of films for the validation of the contact network.
+        steps: Number of optimiser steps of the contact network.
+        misfit_films: Number of films for the misfit network.
+        misfit_charges: Number of charges on each of these films.
+        near_films: Number of films with good presses for the misfit network; each has as many presses as above.
+        misfit_steps: Number of optimiser steps of the misfit network.
+        batch_films: Number of films in a batch.
+        batch_presses: Number of presses on each film of a batch.
+        learning_rate: Largest learning rate of Adam; that of Muon is a multiple of it.
+        noise: Name of the noise model. The noise is drawn again in every step.
+        seed: Seed of films, presses, weights, batches and noise.
     """
 
     radius: float = DEFAULT_RADIUS
@@ -108,7 +113,7 @@ class FilmsConfig:
     seed: int = 0
 
     def to_dict(self) -> dict[str, Any]:
-        """Ready for JSON."""
+        """Return the settings for JSON, with units in the names."""
         table = asdict(self)
         return {"radius_mm": table.pop("radius"), "force_range_N": table.pop("force_range"), **table}
 
@@ -120,56 +125,57 @@ def fit_films(
     executor: Executor | None = None,
     run: ResumableRun | None = None,
 ) -> FilmsModel:
-    """Fit a network to films drawn from a prior.
+    """Train a network for films drawn from a prior.
 
     Args:
-        prior: The films: the sensor as described, the probe, and how far films spread.
-        config: Radius, sizes, steps, seed.
-        executor: Runs solves, presses and searches; None for this process.
-        run: Keeps the state, so that a killed fit goes on.
+        prior: Distribution of the films: the described sensor, the probe and the standard deviations of the parameters.
+        config: Radius, sizes, steps and seed.
+        executor: Executor for solves, presses and searches; None for this process.
+        run: Saves the state, so that an interrupted training can be continued.
 
     Raises:
-        InputError: If the noise level is unknown.
-        SceneError, SolveError: If some presses cannot exist or be solved.
+        InputError: If the noise model is unknown.
+        SceneError, SolveError: If some presses cannot exist or cannot be solved.
         DatasetError: If too many charges are not positive.
         TrainingError: If the loss is not finite.
     """
-    noise = noise_model(config.noise)  # an unknown level is an error before the work
+    noise = noise_model(config.noise)  # an unknown name raises before the long computation
 
-    def kept(name: str) -> Executor | None:
-        return run.keeping(name, executor) if run else executor
+    def saving_executor(name: str) -> Executor | None:
+        return executor if run is None else run.keeping(name, executor)
 
     with threads_and_seed(1, config.seed):
         domain = Domain(config.radius, config.force_range)
-        family = _family(prior, config, kept("family"))
-        source = FilmsSource(prior, family, domain, misfit_noise(noise))
-        sizes = config.films, config.presses, config.seed
-        presses = draw_film_presses(prior, family, domain, *sizes, kept("presses"))
+        family = _build_family(prior, config, saving_executor("family"))
+        presses = draw_film_presses(
+            prior, family, domain, config.films, config.presses, config.seed, saving_executor("presses")
+        )
         inputs = FilmInputs.fit(FilmScaling(prior, domain), presses)
-
         activation = ACTIVATIONS[config.activation]
-        part = _network(inputs, config.hidden, N_CONTACT_ANSWERS, activation)
-        _descend(contact_stage(part, inputs, presses, noise, config), config, run)
+        contact = _new_perceptron(inputs, config.hidden, N_CONTACT_ANSWERS, activation)
+        _train(contact_stage(contact, inputs, presses, noise, config), config, run)
 
-        sizes = config.misfit_films, config.misfit_charges, config.seed
-        examples = draw_misfit_films(source, *sizes, kept("nearest-contacts"))
-        near = draw_near_films(source, config.near_films, config.presses, config.seed, kept("good-presses"))
-        vector = _network(inputs, config.misfit_hidden, inputs.mean.size, activation)
-        _descend(misfit_stage(vector, inputs, examples, near, source.noise, config), config, run)
+        source = FilmsSource(prior, family, domain, misfit_noise(noise))
+        examples = draw_misfit_films(
+            source, config.misfit_films, config.misfit_charges, config.seed, saving_executor("nearest-contacts")
+        )
+        good = draw_near_films(source, config.near_films, config.presses, config.seed, saving_executor("good-presses"))
+        misfit = _new_perceptron(inputs, config.misfit_hidden, inputs.mean.size, activation)
+        _train(misfit_stage(misfit, inputs, examples, good, source.noise, config), config, run)
     return FilmsModel(
         family=family,
         scaling=inputs.scaling,
         mean=inputs.mean,
         whitening=inputs.whitening,
-        contact=ConditionalWeights(part.to_arrays(), activation),
-        misfit=ConditionalWeights(vector.to_arrays(), activation),
+        contact=ConditionalWeights(contact.to_arrays(), activation),
+        misfit=ConditionalWeights(misfit.to_arrays(), activation),
         noise=noise,
         made_with={"config": config.to_dict(), "torch": torch.__version__},
     )
 
 
 def films_identity(prior: FilmPrior, config: FilmsConfig) -> dict[str, Any]:
-    """All that decides about the weights: the identity of a resumable run."""
+    """Return everything that determines the weights, as the identity of a resumable run."""
     return {
         "sensor": sensor_to_dict(prior.sensor),
         "probe": prior.probe.notation,
@@ -181,120 +187,153 @@ def films_identity(prior: FilmPrior, config: FilmsConfig) -> dict[str, Any]:
     }
 
 
-def _family(prior: FilmPrior, config: FilmsConfig, executor: Executor | None) -> FilmFamily:
-    """Forward maps of the films, to the resolution of the file."""
-    low, high = config.force_range
-    forces = (low * FORCES_BEYOND[0], high * FORCES_BEYOND[1])
-    family = FilmFamily.build(prior, config.radius + BEYOND, forces, executor=executor)
+def _build_family(prior: FilmPrior, config: FilmsConfig, executor: Executor | None) -> FilmFamily:
+    """Simulate the forward maps of the films, with the resolution of the films file."""
+    smallest, largest = config.force_range
+    smallest_factor, largest_factor = FORCE_MARGINS
+    forces = (smallest * smallest_factor, largest * largest_factor)
+    family = FilmFamily.build(prior, config.radius + RADIUS_MARGIN, forces, executor=executor)
     modes = FilmModes.build(family, prior.sensor.film, executor)
     return FilmFamily.from_arrays(replace(family, imperfections=modes).to_arrays())
 
 
-def _network(
+def _new_perceptron(
     inputs: FilmInputs, hidden: tuple[int, ...], n_output: int, activation: Activation
 ) -> ConditionalPerceptron:
     """Return an untrained perceptron for all films."""
-    context_mean, _ = inputs.scaling.standard
-    return ConditionalPerceptron(inputs.mean.size, hidden, n_output, context_mean.size, activation)
+    n_context = inputs.scaling.statistics.mean.size
+    return ConditionalPerceptron(inputs.mean.size, hidden, n_output, n_context, activation)
 
 
-def _descend(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | None) -> None:
-    """Train to the end: the schedule's last steps are the best."""
+def _train(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | None) -> None:
+    """Train without early stopping, because the last steps of the schedule have the smallest loss."""
     Descent(stage, config.learning_rate, stage.steps, config.seed).run(run)
 
 
-def contact_stage(
-    part: ConditionalPerceptron, inputs: FilmInputs, presses: FilmPresses, noise: NoiseModel, config: FilmsConfig
-) -> TrainingStage:
-    """The contact network's losses; the last films of the presses are only watched."""
-    scaling, warm_up, trained = inputs.scaling, round(WARM_UP_FRACTION * config.steps), len(presses) - config.watched
+class _Batch(NamedTuple):
+    """Estimated and true contacts of a batch in unit coordinates, shape (n, 3) each."""
 
-    def posterior(
-        of: np.ndarray, rows: np.ndarray, parameters: Array, random: torch.Generator
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, log standard deviation and truth in unit coordinates, each (n, 3), of noisy charges."""
-        drawn = FilmPresses(parameters, presses.contact[of[:, None], rows], presses.response[of[:, None], rows])
-        noisy = with_fresh_noise(as_tensor(drawn.charge()), noise, random)
-        out = part(inputs.values(noisy, parameters), inputs.context(parameters))
-        rotation, offset = as_tensor(scaling.rotation(parameters)), as_tensor(scaling.offset(parameters))
-        mean = torch.baddbmm(offset[:, None], out[..., :3], rotation.transpose(1, 2))
-        unit = as_tensor(scaling.domain.to_unit(drawn.contact.reshape(-1, 3).astype(float)))
-        return mean.reshape(-1, 3), out[..., 3:].reshape(-1, 3), unit
+    mean: Tensor
+    log_std: Tensor
+    target: Tensor
+
+
+def contact_stage(
+    network: ConditionalPerceptron, inputs: FilmInputs, presses: FilmPresses, noise: NoiseModel, config: FilmsConfig
+) -> TrainingStage:
+    """Return the training of the contact network.
+
+    Args:
+        network: The network.
+        inputs: Inputs of the network.
+        presses: Presses on films; the last films are used for validation.
+        noise: Noise that is added to the charges in every step.
+        config: Numbers of steps and films, and sizes of the batches.
+    """
+    scaling = inputs.scaling
+    warm_up_steps = round(WARM_UP_FRACTION * config.steps)
+    n_train = len(presses) - config.watched
+    n_press = presses.contact.shape[1]
+
+    def evaluate_batch(films: np.ndarray, rows: np.ndarray, parameters: Array, random: torch.Generator) -> _Batch:
+        """Evaluate the network on charges with noise.
+
+        Args:
+            films: Numbers of the films, shape (n_film,).
+            rows: Numbers of the presses on each film, shape (n_film, n_row).
+            parameters: Parameters of these films, shape (n_film, n_parameter).
+            random: Generator of the noise.
+        """
+        films = films[:, None]
+        batch = FilmPresses(parameters, presses.contact[films, rows], presses.response[films, rows])
+        noisy = with_fresh_noise(as_tensor(batch.charge()), noise, random)
+        outputs = network(inputs.values(noisy, parameters), inputs.context(parameters))
+        rotation = as_tensor(scaling.rotation(parameters))
+        offset = as_tensor(scaling.offset(parameters))
+        mean = torch.baddbmm(offset[:, None], outputs[..., MEAN], rotation.transpose(1, 2))
+        target = as_tensor(scaling.domain.to_unit(batch.contact.reshape(-1, 3).astype(float)))
+        return _Batch(mean.reshape(-1, 3), outputs[..., LOG_STD].reshape(-1, 3), target)
 
     def loss(step: int, random: torch.Generator) -> Tensor:
-        of = torch.randint(trained, (config.batch_films,), generator=random)
-        rows = torch.randint(presses.contact.shape[1], (config.batch_films, config.batch_presses), generator=random)
-        parameters = _with_fresh_factors(scaling.prior, presses.parameters[of.numpy()], random)
-        answers = posterior(of.numpy(), rows.numpy(), parameters, random)
-        return (warm_up_loss if step < warm_up else likelihood_loss)(*answers)
+        films = torch.randint(n_train, (config.batch_films,), generator=random).numpy()
+        rows = torch.randint(n_press, (config.batch_films, config.batch_presses), generator=random).numpy()
+        parameters = _with_fresh_factors(scaling.prior, presses.parameters[films], random)
+        loss_function = warm_up_loss if step < warm_up_steps else likelihood_loss
+        return loss_function(*evaluate_batch(films, rows, parameters, random))
 
     def score() -> tuple[float, str]:
-        of = np.arange(trained, len(presses))
-        rows = np.tile(np.arange(presses.contact.shape[1]), (config.watched, 1))
+        films = np.arange(n_train, len(presses))
+        rows = np.tile(np.arange(n_press), (config.watched, 1))
         random = torch.Generator().manual_seed(config.seed)
-        return validation_score(*posterior(of, rows, presses.parameters[of], random), scaling.domain, "films")
+        batch = evaluate_batch(films, rows, presses.parameters[films], random)
+        return validation_score(*batch, scaling.domain, "films")
 
-    return TrainingStage("contact", part, loss, score, config.steps, warm_up, LARGEST_GRADIENT)
+    return TrainingStage("contact", network, loss, score, config.steps, warm_up_steps, LARGEST_GRADIENT)
 
 
 def _with_fresh_factors(prior: FilmPrior, parameters: Array, random: torch.Generator) -> Array:
-    """The films with d31, d32 and gains drawn anew."""
-    fresh, columns = parameters.copy(), [D31, D32, *range(len(SHARED), parameters.shape[1])]
-    drawn = (
-        torch.randn((len(parameters), len(columns)), generator=random)
-        .clamp(-MAX_DEVIATION, MAX_DEVIATION)
-        .double()
-        .numpy()
-    )
-    fresh[:, columns] = prior.mean[columns] + prior.std[columns] * drawn
+    """Return films, shape (n_film, n_parameter), with d31, d32 and the gains drawn again."""
+    columns = [D31, D32, *range(len(SHARED), parameters.shape[1])]
+    deviation = torch.randn((len(parameters), len(columns)), generator=random).clamp(-MAX_DEVIATION, MAX_DEVIATION)
+    fresh = parameters.copy()
+    fresh[:, columns] = prior.mean[columns] + prior.std[columns] * deviation.double().numpy()
     return fresh
 
 
 def misfit_stage(
-    part: ConditionalPerceptron,
+    network: ConditionalPerceptron,
     inputs: FilmInputs,
     examples: DrawnFilms,
-    near: DrawnFilms,
+    good: DrawnFilms,
     noise: NoiseModel,
     config: FilmsConfig,
 ) -> TrainingStage:
-    """The misfit network's losses, half of every batch from good presses; the last films of the examples are watched.
+    """Return the training of the misfit network. Half of the films of each batch have good presses.
 
     Args:
-        part: The network.
-        inputs: What it sees.
-        examples: What `draw_misfit_films` gives.
-        near: What `draw_near_films` gives; their deviations, up to `WIDEST` times the noise, are new in every step.
-        noise: Of good presses.
-        config: Batches and steps.
+        network: The network.
+        inputs: Inputs of the network.
+        examples: Charges of every kind (`draw_misfit_films`); the last films are used for validation.
+        good: Good presses (`draw_near_films`). In every step they get new noise, of up to `MAX_NOISE_FACTOR` times
+            their standard deviation.
+        noise: Noise of good presses.
+        config: Number of steps and sizes of the batches.
     """
     values = inputs.values(as_tensor(examples.charge), examples.parameters)
-    context, targets = inputs.context(examples.parameters), compress_length(torch.tensor(examples.aim)).float()
-    trained = len(values) - max(1, round(WATCHED * len(values)))
-    near_charge, across = as_tensor(near.charge), as_tensor(near.aim)
+    context = inputs.context(examples.parameters)
+    targets = compress_length(torch.tensor(examples.target)).float()
+    n_train = len(values) - max(1, round(MISFIT_VALIDATION_FRACTION * len(values)))
+    n_charge = values.shape[1]
+    good_charge = as_tensor(good.charge)
+    projection = as_tensor(good.target)
+    n_good_film, n_good_press = good_charge.shape[:2]
 
-    def near_squares(films: int, presses: int, random: torch.Generator) -> Tensor:
-        of = torch.randint(len(near_charge), (films,), generator=random)
-        rows = torch.randint(near_charge.shape[1], (films, presses), generator=random)
-        clean = near_charge[of[:, None], rows]
-        widest = 1.0 + (WIDEST - 1.0) * torch.rand((films, presses, 1), generator=random) ** 3
-        deviation = widest * torch.randn(clean.shape, generator=random)
+    def good_press_loss(n_film: int, n_press: int, random: torch.Generator) -> Tensor:
+        films = torch.randint(n_good_film, (n_film,), generator=random)
+        rows = torch.randint(n_good_press, (n_film, n_press), generator=random)
+        clean = good_charge[films[:, None], rows]
+        noise_factor = 1.0 + (MAX_NOISE_FACTOR - 1.0) * torch.rand((n_film, n_press, 1), generator=random) ** 3
+        deviation = noise_factor * torch.randn(clean.shape, generator=random)
         noisy = clean + torch.hypot(torch.tensor(noise.white), noise.gain * clean) * deviation
-        residual = (across[of[:, None], rows] @ deviation[..., None])[..., 0]
-        parameters = near.parameters[of.numpy()]
-        vector = part(inputs.values(noisy, parameters), inputs.context(parameters))
+        residual = (projection[films[:, None], rows] @ deviation[..., None])[..., 0]
+        parameters = good.parameters[films.numpy()]
+        vector = network(inputs.values(noisy, parameters), inputs.context(parameters))
         return mean_squared_distance(vector, compress_length(residual))
 
     def loss(_: int, random: torch.Generator) -> Tensor:
-        films = config.batch_films // 2
-        of = torch.randint(trained, (films,), generator=random)
-        rows = torch.randint(values.shape[1], (films, config.batch_presses), generator=random)
-        all_kinds = mean_squared_distance(part(values[of[:, None], rows], context[of]), targets[of[:, None], rows])
-        return NEAR_WEIGHT * near_squares(films, config.batch_presses, random) + all_kinds
+        n_film = config.batch_films // 2
+        films = torch.randint(n_train, (n_film,), generator=random)
+        rows = torch.randint(n_charge, (n_film, config.batch_presses), generator=random)
+        vector = network(values[films[:, None], rows], context[films])
+        example_loss = mean_squared_distance(vector, targets[films[:, None], rows])
+        return GOOD_PRESS_WEIGHT * good_press_loss(n_film, config.batch_presses, random) + example_loss
 
     def score() -> tuple[float, str]:
-        all_kinds = mean_squared_distance(part(values[trained:], context[trained:]), targets[trained:]).item()
-        good = near_squares(len(near_charge), 8, torch.Generator().manual_seed(0)).item()
-        return NEAR_WEIGHT * good + all_kinds, f"{all_kinds:.4f} on watched films, {good:.5f} on good presses"
+        vector = network(values[n_train:], context[n_train:])
+        example_loss = mean_squared_distance(vector, targets[n_train:]).item()
+        random = torch.Generator().manual_seed(0)
+        good_loss = good_press_loss(n_good_film, N_VALIDATION_PRESSES, random).item()
+        text = f"{example_loss:.4f} on watched films, {good_loss:.5f} on good presses"
+        return GOOD_PRESS_WEIGHT * good_loss + example_loss, text
 
-    return TrainingStage("misfit", part, loss, score, config.misfit_steps, largest_gradient=LARGEST_GRADIENT)
+    return TrainingStage("misfit", network, loss, score, config.misfit_steps, largest_gradient=LARGEST_GRADIENT)

@@ -1,4 +1,4 @@
-"""The network for all films as a model: its errors, its card, its folder."""
+"""Release of a network for all films as a model: its measured errors, its card and its folder."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,11 +16,14 @@ from isocharge.train.model_release.evaluate import ONLY_SIMULATED, contact_error
 from isocharge.train.model_release.release import Release, release, yield_text
 from isocharge.train.training.fitted import Fitted, Provenance
 
-FILMS, PRESSES = 64, 256
-"""Fresh films that errors are measured on, and presses of each."""
+N_FILMS = 64
+"""Number of new films on which the errors are measured."""
+
+N_PRESSES = 256
+"""Number of presses on each of these films."""
 
 SEED = 90_001
-"""Of the fresh films: no training draws with it."""
+"""Seed of these films, which no training uses."""
 
 ROWS = (
     ("position, median", "position_median_mm", "mm"),
@@ -31,18 +34,18 @@ ROWS = (
     ("force, median", "force_median_percent", "%"),
     ("force, rms", "force_rms_percent", "%"),
 )
-"""Lines of the table of errors: text, key, unit."""
+"""Rows of the table of errors: text, name of the error, unit."""
 
 
 @dataclass(frozen=True)
 class FilmsErrors:
-    """Errors on fresh films of a prior, and the film that a model assumes before anything is calibrated.
+    """Errors on new films of a prior, and the film that a model assumes before a calibration.
 
     Attributes:
-        known: Errors if the network knows each film.
-        unknown: Errors on the same films if it takes all of them for the assumed one.
-        parameters: Of the assumed film, shape (n_parameter,): that with the lower error of the described one and the
-            mean of the prior.
+        known: Errors if the parameters of each film are known.
+        unknown: Errors on the same films if each of them is taken for the assumed film.
+        parameters: Parameters of the assumed film, shape (n_parameter,). It is the described film or the mean of the
+            prior, whichever gives the lower errors.
         description: The assumed film in words, with the errors of both.
     """
 
@@ -52,82 +55,93 @@ class FilmsErrors:
     description: str
 
 
-def evaluate_films(films: FilmsModel, count: int = FILMS, presses: int = PRESSES, seed: int = SEED) -> FilmsErrors:
-    """Errors over films drawn from the prior, with presses that no training saw.
+def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PRESSES, seed: int = SEED) -> FilmsErrors:
+    """Measure the errors on films drawn from the prior and presses that were not in the training.
 
-    Position errors in mm and relative force errors in percent over all presses, the rms of the median film and of the
-    worst, and the coverage of the 68 and 95 % intervals (share of coordinates, 0 to 1).
+    The errors are position errors in mm and relative force errors in percent over all presses, the rms of the median
+    film and of the worst film, and the coverage of the 68 and 95 % intervals (fraction of the coordinates, 0 to 1).
 
     Args:
         films: The network.
-        count: Number of films.
-        presses: Presses on each.
-        seed: Of films, presses and noise.
+        n_film: Number of films.
+        n_press: Number of presses on each film.
+        seed: Seed of films, presses and noise.
     """
     rng = np.random.default_rng(seed)
-    parameters = films.prior.draw(rng, count)
-    contacts, noisy = [], []
+    parameters = films.prior.draw(rng, n_film)
+    contacts = []
+    charges = []
     for film in parameters:
-        contacts.append(draw_contacts(rng, films.domain, presses))
-        noisy.append(films.noise.add(films.forward_map(film).charges(contacts[-1]), rng))
+        contact = draw_contacts(rng, films.domain, n_press)
+        contacts.append(contact)
+        charges.append(films.noise.add(films.forward_map(film).charges(contact), rng))
     truth = np.stack(contacts)
 
-    def errors(assumed: Array) -> Mapping[str, float]:
-        answers = [films.fold(film).predict(charge) for film, charge in zip(assumed, noisy, strict=True)]
-        return _errors(np.stack([answer[0] for answer in answers]), np.stack([answer[1] for answer in answers]), truth)
+    def errors_with(assumed_films: Array) -> Mapping[str, float]:
+        answers = [films.fold(film).predict(charge) for film, charge in zip(assumed_films, charges, strict=True)]
+        contact = np.stack([contact for contact, _, _ in answers])
+        std = np.stack([std for _, std, _ in answers])
+        return _errors(contact, std, truth)
 
     choices = {"as described": films.prior.described, "in the middle of all": films.prior.mean}
-    tried = {name: errors(np.tile(film, (count, 1))) for name, film in choices.items()}
-    name, other = sorted(tried, key=lambda name: tried[name]["position_rms_mm"])
+    choice_errors = {name: errors_with(np.tile(film, (n_film, 1))) for name, film in choices.items()}
+    rms_mm = {name: errors["position_rms_mm"] for name, errors in choice_errors.items()}
+    best, other = sorted(rms_mm, key=lambda name: rms_mm[name])
+    pretension_MPa = choices[best][films.prior.index("pretension")]
     description = (
-        f"the film {name}, with a pretension of {choices[name][0]:g} MPa.\nThat film errs least over all films "
-        f"({tried[name]['position_rms_mm']:g} mm rms; {other}: {tried[other]['position_rms_mm']:g} mm)"
+        f"the film {best}, with a pretension of {pretension_MPa:g} MPa.\nThat film errs least over all films "
+        f"({rms_mm[best]:g} mm rms; {other}: {rms_mm[other]:g} mm)"
     )
-    return FilmsErrors(errors(parameters), tried[name], choices[name], description)
+    return FilmsErrors(errors_with(parameters), choice_errors[best], choices[best], description)
 
 
 def _errors(contact: Array, std: Array, truth: Array) -> Mapping[str, float]:
-    """Errors of contacts, all of shape (n_film, n_press, 3)."""
-    flat = contact.reshape(-1, 3), std.reshape(-1, 3), truth.reshape(-1, 3)
-    position = position_error(flat[0], flat[2]).reshape(truth.shape[:2])
-    by_film = np.sqrt((position**2).mean(axis=1))
-    every = contact_errors(*flat)
+    """Compute the errors of contacts; all arrays have the shape (n_film, n_press, 3), mm and N."""
+    all_contacts = contact.reshape(-1, 3)
+    all_truth = truth.reshape(-1, 3)
+    errors = contact_errors(all_contacts, std.reshape(-1, 3), all_truth)
+    position = position_error(all_contacts, all_truth).reshape(truth.shape[:2])
+    film_rms = np.sqrt((position**2).mean(axis=1))
     return {
-        **{name: error for name, error in every.items() if name not in ONLY_SIMULATED},
-        "position_rms_median_film_mm": rounded(np.median(by_film)),
-        "position_rms_worst_film_mm": rounded(by_film.max()),
+        **{name: error for name, error in errors.items() if name not in ONLY_SIMULATED},
+        "position_rms_median_film_mm": rounded(np.median(film_rms)),
+        "position_rms_worst_film_mm": rounded(film_rms.max()),
     }
 
 
 def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command: str = "") -> Release:
-    """Write a network for all films as a model: `films.npz`, and the plain model of the film that errs least over all.
+    """Write a network for all films as a model: `films.npz`, and the model of the assumed film.
 
     Args:
-        films: What `fit_films` gives.
-        folder: The model's folder, `models/NAME`; the name is the model's.
+        films: The trained network.
+        folder: Folder of the model, `models/NAME`. Its name is the name of the model.
         version: Number of the version folder.
-        command: How to make this model again, for the card.
+        command: Command that makes this model again, for the card.
 
     Returns:
-        Where it is; the errors of its metadata are those on the film that it assumes.
+        The version folder and the metadata, with the errors on the assumed film.
 
     Raises:
         OutputExists: If the version exists.
-        TrainingError: If an exported file and the network disagree.
+        TrainingError: If an exported graph and the network disagree.
     """
     data = films_bytes(films)
     as_written = films_from_bytes(data, FILE)
-    errors = evaluate_films(as_written)
+    errors = evaluate_films(as_written, N_FILMS)
     provenance = Provenance(made_with={**films.made_with, "films": dict(errors.known)}, files={FILE: data})
     fitted = as_written.film(errors.parameters, provenance=provenance)
     return release(fitted, folder, version=version, command=command, card=partial(films_card, as_written, errors))
 
 
 def films_card(films: FilmsModel, errors: FilmsErrors, about: ModelMetadata, fitted: Fitted) -> str:
-    """The text of `card.md`."""
-    (low, high), spread = fitted.domain.force_range, films.prior.spread
-    known, unknown, exact = errors.known, errors.unknown, about.errors
-    electrodes, correlated = ", ".join(about.electrodes), ", `contact_correlation` (xy, xF, yF)"
+    """Return the text of `card.md`."""
+    low, high = fitted.domain.force_range
+    spread = films.prior.spread
+    known = errors.known
+    unknown = errors.unknown
+    exact = about.errors
+    electrodes = ", ".join(about.electrodes)
+    correlated = ", `contact_correlation` (xy, xF, yF)"
     lines = [f"| {text} | {known[key]:g} {unit} | {unknown[key]:g} {unit} |" for text, key, unit in ROWS]
     lines += [
         f"| coverage of the {level} % intervals | {100 * known[f'coverage_{level}']:.3g} % | "

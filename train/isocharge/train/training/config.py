@@ -1,4 +1,4 @@
-"""Training configuration: a TOML file with two tables, or the defaults below."""
+"""Settings of a training, which a TOML file with the tables `network` and `training` can change."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,24 +10,24 @@ from isocharge.common.errors import ConfigError
 from isocharge.common.structs import Settings, WrongKey, convert, read_toml
 from isocharge.simulate import NoiseModel, noise_model
 
+MAX_ELECTRODES = 64
+"""Largest number of electrodes that a configuration can require."""
+
 Width = Annotated[int, Meta(ge=1, le=4096)]
 Widths = Annotated[tuple[Width, ...], Meta(min_length=1, description="widths from 1 to 4096")]
 Count = Annotated[int, Meta(ge=1, le=10_000_000)]
 
-MOST_ELECTRODES = 64
-"""Largest number of electrodes that a configuration may ask for."""
-
 
 class NetworkConfig(Settings, frozen=True):
-    """Sizes of the two perceptrons.
+    """Sizes of the contact perceptron and of the misfit perceptron.
 
     Attributes:
         hidden: Widths of the hidden layers of the contact network.
-        misfit_hidden: Widths of the one that gives the misfit; as many layers.
-        electrodes: How many electrodes the dataset has to have; 0 takes what it has.
+        misfit_hidden: Widths of the hidden layers of the misfit network, which has as many.
+        electrodes: Number of electrodes that the dataset must have; 0 for any number.
         activation: Name of the activation of the hidden layers (`isocharge.common.activations`).
-        weights: "int8" rounds the weights between hidden layers to 8 bits and trains the others on; in C they then
-            take a quarter of the memory.
+        weights: "int8" rounds the weights between hidden layers to 8 bits and then trains the other weights further.
+            In C the rounded weights take a quarter of the memory.
     """
 
     hidden: Widths = (96, 96, 96)
@@ -42,25 +42,27 @@ class NetworkConfig(Settings, frozen=True):
             raise WrongKey("misfit_hidden", layers, list(self.misfit_hidden))
         if self.activation not in ACTIVATIONS:
             raise WrongKey("activation", f"one of {', '.join(ACTIVATIONS)}", self.activation)
-        if not (self.electrodes == 0 or 3 <= self.electrodes <= MOST_ELECTRODES):
-            raise WrongKey("electrodes", f"0 (as the dataset) or 3 to {MOST_ELECTRODES}", self.electrodes)
+        if not (self.electrodes == 0 or 3 <= self.electrodes <= MAX_ELECTRODES):
+            raise WrongKey("electrodes", f"0 (as the dataset) or 3 to {MAX_ELECTRODES}", self.electrodes)
 
 
 class TrainingConfig(Settings, frozen=True):
-    """How to train.
+    """Settings of the optimisation.
 
     Attributes:
-        steps: Optimiser steps of the contact network.
-        misfit_steps: Optimiser steps of the misfit network.
-        misfit_charges: Charges that it learns from.
-        batch: Samples per step.
-        learning_rate: Largest rate of the schedule (Adam's; Muon's is a multiple).
-        patience: Steps without a better network after which a stage ends early with the best one.
-        hold_out: Share of the positions held out for measuring errors; half as many are watched while it trains. Of
-            measured presses a fifth is held out always, the same for every command.
-        noise: Added afresh in every step: a `NoiseModel`, or what `noise_model` takes.
-        seed: Of weights, batches, noise and split.
-        threads: CPU threads; one is nearly as fast as two at this size and does not suffer when the cores are busy.
+        steps: Number of optimiser steps of the contact network.
+        misfit_steps: Number of optimiser steps of the misfit network.
+        misfit_charges: Number of charges from which the misfit network learns.
+        batch: Number of samples in a batch.
+        learning_rate: Largest learning rate of Adam; that of Muon is a multiple of it.
+        patience: Number of steps without a better validation score after which the training stops. The network then
+            gets the best weights.
+        hold_out: Fraction of the positions that are used for testing; half as many are used for validation. Of measured
+            presses, every command uses the same fifth for testing.
+        noise: Noise that is drawn again in every step: a `NoiseModel`, or a name that `noise_model` takes.
+        seed: Seed of weights, batches, noise and split.
+        threads: Number of CPU threads. One thread is nearly as fast as two for these sizes, and it is not delayed by
+            other programs on the second core.
     """
 
     steps: Count = 8_000
@@ -76,35 +78,35 @@ class TrainingConfig(Settings, frozen=True):
 
     @property
     def noise_model(self) -> NoiseModel:
-        """The noise itself.
+        """Noise model of the setting `noise`.
 
         Raises:
-            InputError: If the level is unknown.
+            InputError: If its name is unknown.
         """
         return noise_model(self.noise) if isinstance(self.noise, str) else self.noise
 
 
 class FitConfig(Settings, frozen=True):
-    """Everything that fixes a fit, given what it is fitted to."""
+    """All settings of a training."""
 
     network: NetworkConfig = NetworkConfig()
     training: TrainingConfig = TrainingConfig()
 
     def to_dict(self) -> dict[str, Any]:
-        """As the tables of the file, ready for JSON."""
+        """Return the settings as tables for JSON."""
         return json.decode(json.encode(self), type=dict[str, Any])
 
     def checked(self) -> "FitConfig":
-        """The same, once every value is found to be in its range, as it is when a file is read.
+        """Check the ranges of all settings, as for a file, and return the settings.
 
         Raises:
-            ConfigError: If one is not.
+            ConfigError: If a setting is out of its range.
         """
         return convert(self.to_dict(), FitConfig, "", ConfigError)
 
 
 def load_config(path: Path) -> FitConfig:
-    """Read a configuration; keys that are not given keep their defaults.
+    """Read the settings of a training from a TOML file; missing keys have their default values.
 
     Raises:
         ConfigError: If the file cannot be read, a key is unknown, or a value has the wrong type or range.
