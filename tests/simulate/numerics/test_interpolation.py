@@ -1,4 +1,4 @@
-"""Lobatto basis against what numpy and scipy know of Legendre polynomials, and against polynomials themselves."""
+"""Lagrange and cubic interpolation, compared with exact polynomials and with SciPy."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,8 @@ ORDERS = (1, 2, 3, 4, 7, 16)
 @pytest.mark.parametrize("order", ORDERS)
 def test_basis_reproduces_a_polynomial_and_its_derivative(order):
     rng = np.random.default_rng(order)
-    polynomial, at = Polynomial(rng.standard_normal(order + 1)), rng.uniform(-1.0, 1.0, 50)
+    polynomial = Polynomial(rng.standard_normal(order + 1))
+    at = rng.uniform(-1.0, 1.0, 50)
     values, derivatives = basis(order, at)
     nodal = polynomial(lobatto_nodes(order))
     np.testing.assert_allclose(values @ nodal, polynomial(at), atol=1e-12)
@@ -28,8 +29,9 @@ def test_basis_reproduces_a_polynomial_and_its_derivative(order):
 
 
 @pytest.mark.parametrize("count", [2, 8, 15, 40])
-def test_interpolation_on_chebyshev_nodes_is_scipys(count):
-    nodes, at = chebyshev_nodes(count, 0.0, 8.0), np.linspace(0.0, 8.0, 33)
+def test_interpolation_on_chebyshev_nodes_agrees_with_scipy(count):
+    nodes = chebyshev_nodes(count, 0.0, 8.0)
+    at = np.linspace(0.0, 8.0, 33)
     values = np.random.default_rng(count).standard_normal(count)
     ours = lagrange_values(nodes, barycentric_weights(nodes), at) @ values
     np.testing.assert_allclose(ours, BarycentricInterpolator(nodes, values)(at), rtol=1e-9, atol=1e-9)
@@ -38,7 +40,7 @@ def test_interpolation_on_chebyshev_nodes_is_scipys(count):
 # Local cubics
 
 
-def test_cubics_are_exact_everywhere():
+def test_cubic_weights_reproduce_cubic_polynomials():
     polynomial = np.polynomial.Polynomial([1.0, -2.0, 0.3, 0.05])
     at = np.array([-0.5, 0.0, 0.2, 1.7, 3.0, 5.9, 7.0, 7.4])
     number, weights = cubic_weights(at, 8)

@@ -10,7 +10,7 @@ import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap
-from isocharge.simulate.numerics.disk import INSIDE, onto_disk
+from isocharge.simulate.numerics.disk import INNER_RADIUS, onto_disk
 
 NODE_SPACING = 0.6
 """Distance of the grid's nodes, mm: contours bend little on this scale."""
@@ -100,7 +100,7 @@ class SeedGrid:
         line = np.linspace(-radius, radius, side)
         grid = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
         place = np.flatnonzero(np.hypot(*grid.T) <= radius * (1.0 + 1.0 / side))
-        at = onto_disk(grid[place], INSIDE * radius)
+        at = onto_disk(grid[place], INNER_RADIUS * radius)
         logs = np.linspace(np.log(low), np.log(high), FORCES if high > low else 1)
         forces = np.clip(np.exp(logs), low, high)
         nodal = np.stack([charge_map.charges(np.column_stack([at, np.full(len(at), force)])) for force in forces])

@@ -20,7 +20,7 @@ from isocharge.simulate.contours.candidates import FLAT, Candidates, SeedGrid
 from isocharge.simulate.contours.fix import AMBIGUOUS, APART, RESOLVED, TOLERANCE, Fix, Meeting, check_triangulation
 from isocharge.simulate.forward.charge_map import ChargeMap, as_charges, check_forces, linearised
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
-from isocharge.simulate.numerics.disk import INSIDE, onto_disk
+from isocharge.simulate.numerics.disk import INNER_RADIUS, onto_disk
 
 SECOND_SEARCH = 2.0
 """Distance from a meeting at which the search for a second one starts, in tolerances."""
@@ -208,7 +208,7 @@ class Triangulation:
     def _moved(self, contact: Array, step: Array) -> Array:
         """Contacts after a step by x, y and, if it has a third component, ln F times the radius; within the domain."""
         domain = self.charge_map.domain
-        at, force = onto_disk(contact[:, :2] + step[:, :2], INSIDE * domain.radius), contact[:, 2]
+        at, force = onto_disk(contact[:, :2] + step[:, :2], INNER_RADIUS * domain.radius), contact[:, 2]
         if step.shape[1] == 3:
             force = np.clip(force * np.exp(step[:, 2] / domain.radius), *domain.force_range)
         return np.column_stack([at, force])

@@ -15,7 +15,7 @@ from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.force_profile import ForceProfile
 from isocharge.simulate.identifiability.nearest_contact import nearest_contact
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.numerics.disk import INSIDE, lattice
+from isocharge.simulate.numerics.disk import INNER_RADIUS, lattice
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 INDISTINGUISHABLE_SIGMAS = 3.0
@@ -91,7 +91,7 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
         places: Number of positions of the lattice: 1,000 take some 3 s with splines.
     """
     unit = lattice(places)
-    position = INSIDE * charge_map.domain.radius * np.stack([unit.real, unit.imag], axis=1)
+    position = INNER_RADIUS * charge_map.domain.radius * np.stack([unit.real, unit.imag], axis=1)
     first = np.column_stack([position, np.full(len(position), force)])
     charge = charge_map.charges(first)
     apart = np.maximum(APART, WIDTHS * limits_at(charge_map, first, noise).position)

@@ -25,7 +25,7 @@ import scipy  # loads a part when it is used
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.numerics.disk import INSIDE, Rings, onto_disk
+from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, onto_disk
 
 FINEST = 0.02
 """Distance within which a map turns over at a fold, mm. Beside an electrode it may turn over within 0.1 mm and yet lose
@@ -103,7 +103,7 @@ class _FoldSearch:
 
     def __init__(self, charge_map: ChargeMap, noise: NoiseModel, force: float) -> None:
         self.charge_map, self.noise, self.force = charge_map, noise, force
-        self.radius = INSIDE * charge_map.domain.radius
+        self.radius = INNER_RADIUS * charge_map.domain.radius
 
     def scaled(self, position: Array) -> Array:
         """J / sigma, shape (n, n_electrode, 3)."""

@@ -11,8 +11,8 @@ import scipy  # loads a part when it is used
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.measuring_chain.noise import NoiseModel
-from isocharge.simulate.numerics.disk import INSIDE
-from isocharge.simulate.numerics.disk_least_squares import MOST_STEPS, minimise
+from isocharge.simulate.numerics.disk import INNER_RADIUS
+from isocharge.simulate.numerics.disk_least_squares import MAX_STEPS, minimise
 
 STEPS = 8
 """Steps from a start that is near: most charges need five."""
@@ -53,14 +53,14 @@ def explain(charge_map: ChargeMap, charge: Array, sigma: Array, start: Array) ->
     Returns:
         Contacts within the map's domain, shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
-    return _descent(charge_map, charge, lambda rows, _: sigma[rows], start, MOST_STEPS)
+    return _descent(charge_map, charge, lambda rows, _: sigma[rows], start, MAX_STEPS)
 
 
 def _descent(
     charge_map: ChargeMap, charge: Array, sigma_of: Callable[[Integers, Array], Array], start: Array, steps: int
 ) -> tuple[Array, Array]:
     """As `explain`; the unit of distance is a function of the rows of charges and of the charges that explain them."""
-    radius, force_range = INSIDE * charge_map.domain.radius, charge_map.domain.force_range
+    radius, force_range = INNER_RADIUS * charge_map.domain.radius, charge_map.domain.force_range
     low, high = np.log(force_range)
     centre, scale = charge_map.domain.centre, np.array([radius, radius, 0.5 * (high - low)])  # one force: no width
 
@@ -82,7 +82,7 @@ def search(
     charge_map: ChargeMap, charge: Array, sigma: Array, *, starts: int = 2, candidates: int = CANDIDATES
 ) -> tuple[Array, Array]:
     """The nearest contacts from the best few of many starts; other arguments and result as `explain`."""
-    spread = charge_map.domain.to_contact(INSIDE * _spread(candidates))
+    spread = charge_map.domain.to_contact(INNER_RADIUS * _spread(candidates))
     known = charge_map.charges(spread)
     chunks = range(0, max(len(charge), 1), CHUNK)
     nearest = [_nearest_rows(charge[k : k + CHUNK], sigma[k : k + CHUNK], known, starts) for k in chunks]

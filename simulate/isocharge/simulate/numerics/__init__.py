@@ -1,1 +1,1 @@
-"""Numerics without physics: interpolation, points of a disk, convex polygons, Gauss rules."""
+"""Numerical methods without physics: interpolation, points on a disk, polygons, least squares, Gauss rules."""

@@ -1,4 +1,4 @@
-"""Points on a disk: lattice, square grid, sunflower, rings, and the projection back onto it."""
+"""Points on a disk: square lattices, a sunflower pattern, rings, and the projection of points onto the disk."""
 
 from dataclasses import dataclass
 
@@ -6,22 +6,35 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 
-INSIDE = 1.0 - 1e-9
-"""Radius that is searched, relative to a map's: rounding must not leave the disk."""
+INNER_RADIUS = 1.0 - 1e-9
+"""Radius within which contacts are searched, in units of the radius of the charge map, dimensionless. It is smaller
+than one so that rounding errors do not move a contact out of the disk."""
+
+ROUNDING = 1e-9
+"""Relative tolerance for points on the edge of a disk, dimensionless."""
 
 
 def onto_disk(position: Array, radius: float) -> Array:
-    """Positions (x, y), shape (n, 2), those outside the disk moved onto its edge, in the unit of the radius."""
-    return np.asarray(position / np.maximum(1.0, np.hypot(*position.T) / radius)[:, None])
+    """Move positions outside a disk to the nearest point of its edge.
+
+    Args:
+        position: Positions (x, y), shape (n, 2), in the unit of the radius.
+        radius: Radius of the disk, whose centre is the origin.
+
+    Returns:
+        Positions within the disk, shape (n, 2).
+    """
+    relative_distance = np.hypot(*position.T) / radius
+    return np.asarray(position / np.maximum(1.0, relative_distance)[:, None])
 
 
 @dataclass(frozen=True)
 class Rings:
-    """Positions on rings about the centre.
+    """Positions on concentric rings.
 
     Attributes:
-        distance: From the centre, shape (n_ring,).
-        position: x and y, shape (n_ring, n_angle, 2), in the same unit.
+        distance: Radius of each ring, shape (n_ring,).
+        position: Positions (x, y), shape (n_ring, n_angle, 2), in the unit of the radii.
     """
 
     distance: Array
@@ -29,44 +42,79 @@ class Rings:
 
     @classmethod
     def spread(cls, radius: float, rings: int = 100, angles: int = 180) -> "Rings":
-        """Evenly up to the radius, without the centre."""
+        """Create rings at equal distances, of which the last has the given radius. The centre is not included.
+
+        Args:
+            radius: Radius of the outermost ring.
+            rings: Number of rings.
+            angles: Number of positions on each ring.
+        """
         distance = radius * np.arange(1, rings + 1) / rings
-        at = np.outer(distance, np.exp(2j * np.pi * np.arange(angles) / angles))
-        return cls(distance, np.stack([at.real, at.imag], axis=-1))
+        z = np.outer(distance, np.exp(2j * np.pi * np.arange(angles) / angles))
+        return cls(distance, np.stack([z.real, z.imag], axis=-1))
 
     def contacts(self, force: float) -> Array:
-        """(x, y, F) of every position, shape (n_ring * n_angle, 3)."""
+        """Return the contact (x, y, F) at every position, shape (n_ring * n_angle, 3).
+
+        Args:
+            force: Force of all contacts, N.
+        """
         flat = self.position.reshape(-1, 2)
         return np.concatenate([flat, np.full((len(flat), 1), force)], axis=1)
 
     def per_ring(self, values: Array) -> Array:
-        """Values of all contacts as (n_ring, n_angle, ...)."""
+        """Reshape values of all contacts, shape (n_ring * n_angle, ...), to shape (n_ring, n_angle, ...)."""
         return values.reshape(*self.position.shape[:2], *values.shape[1:])
 
 
-def lattice(most: int) -> Complexes:
-    """Points x + iy of the largest square lattice with at most `most` points in the unit disk.
+def lattice(max_count: int) -> Complexes:
+    """Return the points x + iy of a square lattice in the unit disk.
 
-    The centre is one of them and the outermost lie on the circle; from the inside out, shape (n,).
+    The lattice is the largest one with at most `max_count` points. The centre of the disk is one of the points, and
+    the outermost points lie on the unit circle.
+
+    Args:
+        max_count: Largest number of points.
+
+    Returns:
+        Points in the order of their distance from the centre, shape (n,).
     """
-    reach = int(np.sqrt(max(most, 1) / np.pi)) + 2
-    i, j = (axis.ravel() for axis in np.meshgrid(*[np.arange(-reach, reach + 1)] * 2))
-    squared = i**2 + j**2
-    rings, counts = np.unique(squared, return_counts=True)
-    ring = rings[np.searchsorted(np.cumsum(counts), max(most, 1), side="right") - 1]
-    inside = np.flatnonzero(squared <= ring)
-    inside = inside[np.lexsort((j[inside], i[inside], squared[inside]))]
-    return np.asarray((i[inside] + 1j * j[inside]) / max(np.sqrt(ring), 1.0) * (1.0 - 1e-15))
+    max_count = max(max_count, 1)
+    half_side = int(np.sqrt(max_count / np.pi)) + 2
+    line = np.arange(-half_side, half_side + 1)
+    i, j = (index.ravel() for index in np.meshgrid(line, line))
+    squared_distance = i**2 + j**2
+    squared_radii, counts = np.unique(squared_distance, return_counts=True)
+    number_of_rings = np.searchsorted(np.cumsum(counts), max_count, side="right")
+    squared_radius = squared_radii[number_of_rings - 1]
+    inside = np.flatnonzero(squared_distance <= squared_radius)
+    inside = inside[np.lexsort((j[inside], i[inside], squared_distance[inside]))]
+    radius = max(np.sqrt(squared_radius), 1.0)
+    return np.asarray((i[inside] + 1j * j[inside]) / radius * (1.0 - 1e-15))
 
 
 def square_grid(radius: float, spacing: float) -> Array:
-    """Places of a square grid through the centre of a disk, shape (n, 2), in the unit of the radius."""
-    count = int(radius / spacing * (1.0 + 1e-9))
-    x, y = (axis.ravel() for axis in np.meshgrid(*[spacing * np.arange(-count, count + 1)] * 2))
-    return np.asarray(np.stack([x, y], axis=1)[np.hypot(x, y) <= radius * (1.0 + 1e-9)])
+    """Return the points of a square grid in a disk. The centre of the disk is one of the points.
+
+    Args:
+        radius: Radius of the disk.
+        spacing: Distance between neighbouring points, in the unit of the radius.
+
+    Returns:
+        Points (x, y), shape (n, 2).
+    """
+    count = int(radius / spacing * (1.0 + ROUNDING))
+    line = spacing * np.arange(-count, count + 1)
+    x, y = (coordinate.ravel() for coordinate in np.meshgrid(line, line))
+    inside = np.hypot(x, y) <= radius * (1.0 + ROUNDING)
+    return np.asarray(np.stack([x, y], axis=1)[inside])
 
 
 def sunflower(count: int) -> Complexes:
-    """`count` points x + iy spread evenly over the unit disk, from the inside out (Vogel 1979)."""
+    """Return `count` points x + iy that are spread evenly over the unit disk, ordered by distance from the centre.
+
+    The pattern is that of the seeds of a sunflower (Vogel 1979).
+    """
     number = np.arange(count)
-    return np.asarray(np.sqrt((number + 0.5) / count) * np.exp(1j * np.pi * (3.0 - np.sqrt(5.0)) * number))
+    golden_angle = np.pi * (3.0 - np.sqrt(5.0))
+    return np.asarray(np.sqrt((number + 0.5) / count) * np.exp(1j * golden_angle * number))

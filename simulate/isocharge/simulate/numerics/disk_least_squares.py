@@ -1,11 +1,14 @@
-"""Least squares over a disk and an interval: damped Gauss-Newton steps for many small problems at once.
+"""Nonlinear least squares over the product of a disk and an interval, for many small problems at once.
+
+Each problem is
 
     min |r(u)|^2   over   u in D = unit disk x [-1, 1],
 
-r with a few components and derivatives J. A step solves (J'J + damping trace(J'J) / 3) du = -J'r (Levenberg 1944). D is
-held by an active set: where u lies on an edge and the gradient leads out, u moves along the edge only. On the circle
-the edge's own curvature joins the second derivatives, so the nearest point of the circle takes a few steps as well,
-however far the minimum without bounds lies outside.
+where r has a few components and the derivatives J. A damped Gauss-Newton step solves
+(J'J + damping trace(J'J) / 3) du = -J'r (Levenberg 1944). The bounds of D are treated by an active set: if u lies on an
+edge and the negative gradient points out of D, the step follows the edge. On the circle, the curvature of the circle is
+added to the second derivatives, so that the search along the circle also converges within a few steps, regardless of
+how far outside D the unbounded minimum lies.
 """
 
 from collections.abc import Callable
@@ -15,118 +18,160 @@ import numpy as np
 from isocharge.common.arrays import Array, Integers
 
 Residuals = Callable[[Integers, Array], tuple[Array, Array]]
-"""From numbers of problems (m,) and their points u (m, 3) to r, shape (m, k), and dr/du, shape (m, 3, k)."""
+"""Function from indices of problems, shape (m,), and their points u, shape (m, 3), to the residuals r, shape (m, k),
+and the derivatives dr/du, shape (m, 3, k)."""
 
-MOST_STEPS = 30
-"""Steps at most; most problems need five."""
+MAX_STEPS = 30
+"""Default of the largest number of steps. Most problems converge in five."""
 
-CHANGE = 1e-7
-"""Least change of |r|^2 that is worth another step, relative to 1 + |r|^2."""
+MIN_CHANGE = 1e-7
+"""Default of the change of |r|^2 below which the iteration ends, relative to 1 + |r|^2."""
 
-ROUNDING = 1e-12
-"""A step that raises |r|^2 by no more than this, relative to 1 + |r|^2, is taken: it may be the last to the minimum."""
+MAX_INCREASE = 1e-12
+"""Largest increase of |r|^2 that an accepted step may cause, relative to 1 + |r|^2. Near the minimum, rounding errors
+cause such increases."""
 
-FIRST, LEAST, MOST = 1e-4, 1e-9, 1e4
-"""Damping at the start and its bounds, relative to the mean diagonal of J'J; above the last, no step helps any more."""
+INITIAL_DAMPING = 1e-4
+"""Damping of the first step, relative to the mean of the diagonal of J'J."""
 
-EASIER, HARDER = 0.2, 8.0
-"""Factors of the damping after a step that lowered |r|^2 and one that did not."""
+MIN_DAMPING = 1e-9
+"""Smallest damping, relative to the mean of the diagonal of J'J."""
 
-WALL = 1e6
-"""Stiffness against leaving an active edge, relative to the trace of J'J."""
+MAX_DAMPING = 1e4
+"""Damping above which the iteration ends without convergence, relative to the mean of the diagonal of J'J."""
 
-ON_EDGE = 1e-9
-"""Distance from an edge up to which a point counts as on it: rounding."""
+DAMPING_DECREASE = 0.2
+"""Factor of the damping after a step that lowers |r|^2, dimensionless."""
+
+DAMPING_INCREASE = 8.0
+"""Factor of the damping after a rejected step, dimensionless."""
+
+EDGE_STIFFNESS = 1e6
+"""Stiffness that keeps a point on an active edge, relative to the trace of J'J."""
+
+EDGE_TOLERANCE = 1e-9
+"""Distance from an edge of D below which a point counts as lying on the edge."""
+
+MEAN_OF_DIAGONAL = np.eye(3) / 3.0
+"""Matrix that, multiplied by the trace of a 3 x 3 matrix, has the mean of the diagonal of that matrix as its diagonal
+elements."""
 
 
-def minimise(residuals: Residuals, start: Array, steps: int = MOST_STEPS, least: float = CHANGE) -> tuple[Array, Array]:
-    """The minimum that descent from a start leads to, for every problem.
+def minimise(
+    residuals: Residuals, start: Array, steps: int = MAX_STEPS, min_change: float = MIN_CHANGE
+) -> tuple[Array, Array]:
+    """Find the local minimum that is reached from the starting point of every problem.
 
     Args:
-        residuals: The problems.
-        start: Shape (n, 3); points outside D start from its nearest point.
+        residuals: Function that evaluates the residuals of some of the problems.
+        start: Starting points, shape (n, 3). Points outside D are replaced by the nearest point of D.
         steps: Largest number of steps.
-        least: Least change of |r|^2 that is worth another step, relative to 1 + |r|^2.
+        min_change: Change of |r|^2 below which the iteration ends, relative to 1 + |r|^2.
 
     Returns:
         Points in D, shape (n, 3), and their residuals, shape (n, k).
     """
-    unit, active = into_domain(start).copy(), np.arange(len(start))
-    residual, slopes = (np.array(part) for part in residuals(active, unit))
-    square, damping = (residual**2).sum(axis=1), np.full(len(unit), FIRST)
+    point = into_domain(start).copy()
+    active = np.arange(len(start))
+    residual, slopes = (np.array(values) for values in residuals(active, point))
+    square = (residual**2).sum(axis=1)
+    damping = np.full(len(point), INITIAL_DAMPING)
     for _ in range(steps):
         if not active.size:
             break
-        trial = bounded_step(unit[active], residual[active], slopes[active], damping[active])
-        new_residual, new_slopes = residuals(active, trial)
-        new_square = (new_residual**2).sum(axis=1)
-        change = (new_square - square[active]) / (1.0 + new_square)
-        lower = change <= ROUNDING
-        better = active[lower]
-        unit[better], residual[better], slopes[better] = trial[lower], new_residual[lower], new_slopes[lower]
-        square[better] = new_square[lower]
-        damping[active] = np.where(lower, np.maximum(damping[active] * EASIER, LEAST), damping[active] * HARDER)
-        active = active[(np.abs(change) >= least) & (damping[active] <= MOST)]
-    return unit, residual
+        trial = bounded_step(point[active], residual[active], slopes[active], damping[active])
+        trial_residual, trial_slopes = residuals(active, trial)
+        trial_square = (trial_residual**2).sum(axis=1)
+        change = (trial_square - square[active]) / (1.0 + trial_square)
+        is_accepted = change <= MAX_INCREASE
+
+        accepted = active[is_accepted]
+        point[accepted] = trial[is_accepted]
+        residual[accepted] = trial_residual[is_accepted]
+        slopes[accepted] = trial_slopes[is_accepted]
+        square[accepted] = trial_square[is_accepted]
+
+        lower_damping = np.maximum(damping[active] * DAMPING_DECREASE, MIN_DAMPING)
+        damping[active] = np.where(is_accepted, lower_damping, damping[active] * DAMPING_INCREASE)
+        active = active[(np.abs(change) >= min_change) & (damping[active] <= MAX_DAMPING)]
+    return point, residual
 
 
 def bounded_step(unit: Array, residual: Array, slopes: Array, damping: Array | float) -> Array:
-    """Where a damped step ends, within D.
+    """Take one damped Gauss-Newton step that stays within D.
 
     Args:
         unit: Points of D, shape (..., 3).
-        residual: r there, shape (..., k).
-        slopes: dr/du there, shape (..., 3, k).
-        damping: Relative to the mean diagonal of J'J, shape (...).
+        residual: Residuals r at the points, shape (..., k).
+        slopes: Derivatives dr/du at the points, shape (..., 3, k).
+        damping: Damping relative to the mean of the diagonal of J'J, shape (...).
 
     Returns:
-        Shape (..., 3).
+        Points after the step, shape (..., 3).
     """
     normal: Array = slopes @ slopes.swapaxes(-1, -2)
     gradient: Array = (slopes @ residual[..., None])[..., 0]
     trace = normal[..., 0, 0] + normal[..., 1, 1] + normal[..., 2, 2] + 1e-12
-    normal = normal + (damping * trace)[..., None, None] * MEAN_DIAGONAL
-    on_rim, at_end = _beyond(unit, 1.0 - ON_EDGE)
-    if np.count_nonzero(on_rim | at_end):
-        normal, gradient = _along_edges(unit, normal, gradient, trace, on_rim, at_end)
+    normal = normal + (damping * trace)[..., None, None] * MEAN_OF_DIAGONAL
+    on_circle, at_end = _is_beyond(unit, 1.0 - EDGE_TOLERANCE)
+    if np.count_nonzero(on_circle | at_end):
+        normal, gradient = _restrict_to_edges(unit, normal, gradient, trace, on_circle, at_end)
     trial: Array = unit - np.linalg.solve(normal, gradient[..., None])[..., 0]
     return into_domain(trial)
 
 
-MEAN_DIAGONAL = np.eye(3) / 3.0
-"""Times the trace of a 3 x 3 matrix: its mean diagonal as a matrix."""
-
-
-def _beyond(unit: Array, edge: float) -> tuple[np.ndarray, np.ndarray]:
-    """Which points lie beyond a share `edge` of the disk, and of the interval."""
+def _is_beyond(unit: Array, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return which points lie outside a disk of radius `size`, and which outside the interval [-size, size]."""
     squares = unit * unit
-    return squares[..., 0] + squares[..., 1] > edge * edge, squares[..., 2] > edge * edge
+    return squares[..., 0] + squares[..., 1] > size * size, squares[..., 2] > size * size
 
 
-def _along_edges(
-    unit: Array, normal: Array, gradient: Array, trace: Array, on_rim: np.ndarray, at_end: np.ndarray
+def _restrict_to_edges(
+    unit: Array, normal: Array, gradient: Array, trace: Array, on_circle: np.ndarray, at_end: np.ndarray
 ) -> tuple[Array, Array]:
-    """Normal equations and gradient for steps along the edges that the gradient leads out of."""
-    outward, along, end = np.zeros_like(unit), np.zeros_like(unit), np.zeros_like(unit)
-    reach = np.hypot(unit[..., 0], unit[..., 1])
-    outward[..., :2] = unit[..., :2] / np.maximum(reach, ON_EDGE)[..., None]
-    along[..., 0], along[..., 1] = -outward[..., 1], outward[..., 0]
-    end[..., 2] = np.sign(unit[..., 2])
-    push, press = -(gradient * outward).sum(axis=-1), -(gradient * end).sum(axis=-1)
-    push, press = np.where(on_rim, np.maximum(push, 0.0), 0.0), np.where(at_end, np.maximum(press, 0.0), 0.0)
-    normal = normal + _outer(along, push)
-    normal = normal + _outer(outward, (push > 0.0) * WALL * trace) + _outer(end, (press > 0.0) * WALL * trace)
-    return normal, gradient + push[..., None] * outward + press[..., None] * end
+    """Modify the normal equations so that steps follow the edges across which the negative gradient points.
+
+    Args:
+        unit: Points of D, shape (..., 3).
+        normal: Damped matrices J'J, shape (..., 3, 3).
+        gradient: Gradients J'r, shape (..., 3).
+        trace: Traces of J'J, shape (...).
+        on_circle: Whether each point lies on the edge of the disk, shape (...).
+        at_end: Whether each point lies at an end of the interval, shape (...).
+
+    Returns:
+        Modified matrices, shape (..., 3, 3), and modified gradients, shape (..., 3).
+    """
+    radius = np.hypot(unit[..., 0], unit[..., 1])
+    circle_normal = np.zeros_like(unit)
+    circle_normal[..., :2] = unit[..., :2] / np.maximum(radius, EDGE_TOLERANCE)[..., None]
+    circle_tangent = np.zeros_like(unit)
+    circle_tangent[..., 0] = -circle_normal[..., 1]
+    circle_tangent[..., 1] = circle_normal[..., 0]
+    end_normal = np.zeros_like(unit)
+    end_normal[..., 2] = np.sign(unit[..., 2])
+
+    # Outward components of the negative gradient, which are the Lagrange multipliers of the active edges
+    circle_multiplier = np.where(on_circle, np.maximum(-(gradient * circle_normal).sum(axis=-1), 0.0), 0.0)
+    end_multiplier = np.where(at_end, np.maximum(-(gradient * end_normal).sum(axis=-1), 0.0), 0.0)
+
+    normal = normal + _outer_product(circle_tangent, circle_multiplier)
+    circle_stiffness = (circle_multiplier > 0.0) * EDGE_STIFFNESS * trace
+    end_stiffness = (end_multiplier > 0.0) * EDGE_STIFFNESS * trace
+    normal = normal + _outer_product(circle_normal, circle_stiffness) + _outer_product(end_normal, end_stiffness)
+    gradient = gradient + circle_multiplier[..., None] * circle_normal + end_multiplier[..., None] * end_normal
+    return normal, gradient
 
 
-def _outer(vector: Array, weight: Array) -> Array:
-    return weight[..., None, None] * vector[..., :, None] * vector[..., None, :]
+def _outer_product(vector: Array, factor: Array) -> Array:
+    """Compute factor * v v' for vectors v of shape (..., 3) and factors of shape (...)."""
+    return factor[..., None, None] * vector[..., :, None] * vector[..., None, :]
 
 
 def into_domain(unit: Array) -> Array:
-    """The nearest points of D, shape (..., 3); those in D are left as they are."""
-    beyond_rim, beyond_end = _beyond(unit, 1.0)
-    if not np.count_nonzero(beyond_rim | beyond_end):
+    """Replace points outside D by the nearest point of D; points and result have the shape (..., 3)."""
+    outside_disk, outside_interval = _is_beyond(unit, 1.0)
+    if not np.count_nonzero(outside_disk | outside_interval):
         return unit
-    reach = np.maximum(np.sqrt(unit[..., 0] ** 2 + unit[..., 1] ** 2), 1.0)
-    return np.concatenate([unit[..., :2] / reach[..., None], np.clip(unit[..., 2:], -1.0, 1.0)], axis=-1)
+    radius = np.maximum(np.sqrt(unit[..., 0] ** 2 + unit[..., 1] ** 2), 1.0)
+    return np.concatenate([unit[..., :2] / radius[..., None], np.clip(unit[..., 2:], -1.0, 1.0)], axis=-1)

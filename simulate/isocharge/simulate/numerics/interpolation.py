@@ -1,6 +1,6 @@
-"""Lagrange polynomials on Gauss-Lobatto and Chebyshev nodes, local cubics on even grids, and Gauss rules.
+"""Lagrange interpolation on Gauss-Lobatto and Chebyshev nodes, cubic interpolation on uniform grids, and Gauss rules.
 
-The polynomials go through the barycentric form, which is stable at any order (Berrut and Trefethen 2004).
+The Lagrange polynomials are evaluated in barycentric form, which is stable at any order (Berrut and Trefethen 2004).
 """
 
 from functools import lru_cache
@@ -10,50 +10,70 @@ from scipy.special import eval_legendre, roots_jacobi
 
 from isocharge.common.arrays import Array, Integers
 
+MIN_DIFFERENCE = 1e-200
+"""Distance from a node below which a point is treated as the node, because the barycentric quotient would overflow."""
+
 
 @lru_cache(maxsize=32)
 def lobatto_nodes(order: int) -> Array:
-    """Gauss-Lobatto-Legendre nodes, shape (order + 1,), ascending from -1 to 1: the extrema of P_order and the ends."""
+    """Return the Gauss-Lobatto-Legendre nodes: the extrema of the Legendre polynomial P_order, and -1 and 1.
+
+    Returns:
+        Nodes in ascending order, shape (order + 1,).
+    """
     interior = roots_jacobi(order - 1, 1.0, 1.0)[0] if order > 1 else np.empty(0)
-    return _frozen(np.concatenate([[-1.0], interior, [1.0]]))
+    return _read_only(np.concatenate([[-1.0], interior, [1.0]]))
 
 
 @lru_cache(maxsize=32)
 def lobatto_weights(order: int) -> Array:
-    """Barycentric weights of `lobatto_nodes`, shape (order + 1,): proportional to 1 / P_order(x_j).
+    """Return the barycentric weights of `lobatto_nodes`, shape (order + 1,).
 
-    Wang, Huybrechs and Vandewalle (2014): the square root of the quadrature weight, with alternating sign.
+    They are proportional to 1 / P_order(x_j) with the Legendre polynomial P_order. Up to the alternating
+    sign they are the square roots of the quadrature weights (Wang, Huybrechs and Vandewalle 2014).
     """
     weights: Array = 1.0 / eval_legendre(order, lobatto_nodes(order))
-    return _frozen(weights / np.abs(weights).max())
+    return _read_only(weights / np.abs(weights).max())
 
 
 @lru_cache(maxsize=32)
 def lobatto_quadrature(order: int) -> Array:
-    """Weights of the Gauss-Lobatto rule on `lobatto_nodes`, shape (order + 1,): exact up to degree 2 order - 1."""
-    return _frozen(np.asarray(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2)))
+    """Return the weights of the Gauss-Lobatto rule on `lobatto_nodes`, shape (order + 1,).
+
+    The rule integrates polynomials up to the degree 2 order - 1 exactly.
+    """
+    return _read_only(np.asarray(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2)))
 
 
 @lru_cache(maxsize=32)
 def modal_matrix(order: int) -> Array:
-    """Matrix from values on `lobatto_nodes` to Legendre coefficients, shape (order + 1, order + 1)."""
-    return _frozen(np.linalg.inv(np.polynomial.legendre.legvander(lobatto_nodes(order), order)).astype(np.float64))
+    """Return the matrix that maps values on `lobatto_nodes` to Legendre coefficients, shape (order + 1, order + 1)."""
+    return _read_only(np.linalg.inv(np.polynomial.legendre.legvander(lobatto_nodes(order), order)).astype(np.float64))
 
 
-def _frozen(values: Array) -> Array:
-    """The same array, which cannot be written to: it is cached."""
+def _read_only(values: Array) -> Array:
+    """Mark an array as read-only, because it is cached and returned to several callers."""
     values.flags.writeable = False
     return values
 
 
 def chebyshev_nodes(count: int, low: float, high: float) -> Array:
-    """Chebyshev nodes of the first kind on [low, high], ascending, shape (count,)."""
+    """Return the Chebyshev nodes of the first kind on the interval [low, high], ascending, shape (count,)."""
     angle = (2.0 * np.arange(count, 0, -1) - 1.0) * np.pi / (2.0 * count)
     return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * np.cos(angle))
 
 
 def barycentric_weights(nodes: Array) -> Array:
-    """Barycentric weights of any distinct nodes, shape (n,), scaled by the interval so that they do not overflow."""
+    """Compute the barycentric weights of distinct nodes.
+
+    The differences of the nodes are scaled with the length of the interval, so that their products do not overflow.
+
+    Args:
+        nodes: Interpolation nodes, shape (n,).
+
+    Returns:
+        Weights, shape (n,). A common factor of all weights has no effect on the interpolation.
+    """
     scale = 4.0 / np.ptp(nodes) if nodes.size > 1 else 1.0
     difference = (nodes[:, None] - nodes[None, :]) * scale
     np.fill_diagonal(difference, 1.0)
@@ -61,18 +81,18 @@ def barycentric_weights(nodes: Array) -> Array:
 
 
 def lagrange_values(nodes: Array, weights: Array, at: Array) -> Array:
-    """Values of the Lagrange polynomials.
+    """Evaluate the Lagrange polynomials of given nodes.
 
     Args:
         nodes: Interpolation nodes, shape (n,).
-        weights: Their barycentric weights, shape (n,).
-        at: Where to evaluate, shape (m,).
+        weights: Barycentric weights of the nodes, shape (n,).
+        at: Points of evaluation, shape (m,).
 
     Returns:
-        Shape (m, n); each row adds up to one.
+        Value of each polynomial at each point, shape (m, n). Each row adds up to one.
     """
     difference = at[:, None] - nodes[None, :]
-    row, node = np.nonzero(np.abs(difference) < 1e-200)  # closer, the quotient below would overflow
+    row, node = np.nonzero(np.abs(difference) < MIN_DIFFERENCE)
     difference[row, node] = 1.0
     terms = weights / difference
     values: Array = terms / (terms @ np.ones(nodes.size))[:, None]
@@ -82,49 +102,81 @@ def lagrange_values(nodes: Array, weights: Array, at: Array) -> Array:
 
 @lru_cache(maxsize=32)
 def derivative_matrix(order: int) -> Array:
-    """Matrix D of shape (order + 1, order + 1): (D f)_i is the derivative at node i of the interpolant of f."""
-    nodes, weights = lobatto_nodes(order), lobatto_weights(order)
+    """Return the matrix D for which (D f)_i is the derivative at node i of the interpolant of the nodal values f.
+
+    Returns:
+        Matrix for `lobatto_nodes`, shape (order + 1, order + 1).
+    """
+    nodes = lobatto_nodes(order)
+    weights = lobatto_weights(order)
     difference = nodes[:, None] - nodes[None, :]
     np.fill_diagonal(difference, 1.0)
     matrix = weights[None, :] / weights[:, None] / difference
     np.fill_diagonal(matrix, 0.0)
     np.fill_diagonal(matrix, -matrix.sum(axis=1))
-    return _frozen(matrix)
+    return _read_only(matrix)
 
 
 def basis(order: int, at: Array) -> tuple[Array, Array]:
-    """Values and derivatives, each of shape (m, order + 1), of the Lobatto basis at points `at` of shape (m,)."""
+    """Evaluate the Lagrange basis on `lobatto_nodes`, and its derivatives.
+
+    Args:
+        order: Order of the polynomials.
+        at: Points of evaluation in [-1, 1], shape (m,).
+
+    Returns:
+        Values and derivatives, each of shape (m, order + 1).
+    """
     values = lagrange_values(lobatto_nodes(order), lobatto_weights(order), at)
     return values, values @ derivative_matrix(order)
 
 
 def tensor_values(order: int, xi: Array, eta: Array) -> Array:
-    """Basis on the square [-1, 1]^2, nodes in tensor order (xi fast), at points of shape (n,): (n, (order + 1)^2)."""
-    nodes, weights = lobatto_nodes(order), lobatto_weights(order)
-    return _product(lagrange_values(nodes, weights, xi), lagrange_values(nodes, weights, eta))
+    """Evaluate the tensor-product basis on the square [-1, 1]^2.
+
+    Args:
+        order: Order of the polynomials in each direction.
+        xi: First coordinate of the points, shape (n,).
+        eta: Second coordinate of the points, shape (n,).
+
+    Returns:
+        Values, shape (n, (order + 1)^2). The nodes are numbered in tensor order, in which xi varies fastest.
+    """
+    nodes = lobatto_nodes(order)
+    weights = lobatto_weights(order)
+    return _tensor_product(lagrange_values(nodes, weights, xi), lagrange_values(nodes, weights, eta))
 
 
 def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
-    """Values as `tensor_values` and derivatives by xi and eta, shape (2, n, (order + 1)^2)."""
-    in_xi, d_xi = basis(order, xi)
-    in_eta, d_eta = basis(order, eta)
-    return _product(in_xi, in_eta), np.stack([_product(d_xi, in_eta), _product(in_xi, d_eta)])
+    """Evaluate the tensor-product basis and its derivatives; see `tensor_values` for the arguments.
+
+    Returns:
+        Values, shape (n, (order + 1)^2), and derivatives with respect to xi and eta, shape (2, n, (order + 1)^2).
+    """
+    xi_values, xi_slopes = basis(order, xi)
+    eta_values, eta_slopes = basis(order, eta)
+    by_xi = _tensor_product(xi_slopes, eta_values)
+    by_eta = _tensor_product(xi_values, eta_slopes)
+    return _tensor_product(xi_values, eta_values), np.stack([by_xi, by_eta])
 
 
-def _product(a: Array, b: Array) -> Array:
-    return (b[:, :, None] * a[:, None, :]).reshape(len(a), b.shape[1] * a.shape[1])
+def _tensor_product(xi_values: Array, eta_values: Array) -> Array:
+    """Multiply every value in xi, shape (n, p), by every value in eta, shape (n, q): shape (n, q * p)."""
+    products = eta_values[:, :, None] * xi_values[:, None, :]
+    return products.reshape(len(xi_values), eta_values.shape[1] * xi_values.shape[1])
 
 
 def cubic_weights(at: Array, count: int, periodic: bool = False) -> tuple[Integers, Array]:
-    """Weights of the four neighbours of places between the nodes 0, 1, ..., count - 1.
+    """Compute the weights of cubic interpolation between the four nearest nodes of a uniform grid.
 
     Args:
-        at: Places in steps of the grid, any shape; beyond an end they are extrapolated.
+        at: Points of evaluation in units of the spacing, any shape. The nodes are 0, 1, ..., count - 1, and points
+            beyond the last node are extrapolated.
         count: Number of nodes, at least four.
-        periodic: Whether node `count` is node 0 again.
+        periodic: Whether the grid is periodic, so that node `count` is the same as node 0.
 
     Returns:
-        Numbers of the neighbours and their weights, each of shape (..., 4).
+        Numbers of the four nodes, and their weights, each of shape (..., 4).
     """
     first = np.floor(at).astype(np.intp) - 1
     if not periodic:
@@ -133,25 +185,43 @@ def cubic_weights(at: Array, count: int, periodic: bool = False) -> tuple[Intege
     a, b, c, d = t, t - 1.0, t - 2.0, t - 3.0
     weights = np.concatenate([-b * c * d / 6.0, a * c * d / 2.0, -a * b * d / 2.0, a * b * c / 6.0], axis=-1)
     number = first[..., None] + np.arange(4)
-    return number % count if periodic else number, weights
+    if periodic:
+        number = number % count
+    return number, weights
 
 
 def gauss_line(count: int) -> tuple[Array, Array]:
-    """Gauss points on [0, 1] and shares, which add up to one; each of shape (count,)."""
-    at, weight = np.polynomial.legendre.leggauss(count)
-    return 0.5 * (at + 1.0), 0.5 * weight
+    """Return the Gauss rule on [0, 1]: points and weights, which add up to one, each of shape (count,)."""
+    points, weights = np.polynomial.legendre.leggauss(count)
+    return 0.5 * (points + 1.0), 0.5 * weights
 
 
 @lru_cache(maxsize=32)
 def gauss_reference_square(count: int) -> tuple[Array, Array, Array]:
-    """Gauss points (xi, eta) on [-1, 1]^2, xi fast, and their weights, which add up to 4; each of shape (count^2,)."""
+    """Return the Gauss rule on the square [-1, 1]^2.
+
+    Args:
+        count: Number of points in each direction.
+
+    Returns:
+        Coordinates xi and eta of the points, where xi varies fastest, and weights, which add up to 4; each of shape
+        (count^2,).
+    """
     line, weight = np.polynomial.legendre.leggauss(count)
     xi, eta = np.meshgrid(line, line)
-    return _frozen(xi.ravel()), _frozen(eta.ravel()), _frozen(np.outer(weight, weight).ravel())
+    return _read_only(xi.ravel()), _read_only(eta.ravel()), _read_only(np.outer(weight, weight).ravel())
 
 
 @lru_cache(maxsize=32)
 def gauss_square(count: int) -> tuple[Array, Array]:
-    """Gauss points on [0, 1]^2, shape (count^2, 2), and shares, which add up to one."""
+    """Return the Gauss rule on the square [0, 1]^2.
+
+    Args:
+        count: Number of points in each direction.
+
+    Returns:
+        Points, shape (count^2, 2), and weights, shape (count^2,), which add up to one.
+    """
     xi, eta, weights = gauss_reference_square(count)
-    return _frozen(0.5 * (np.stack([xi, eta], axis=1) + 1.0)), _frozen(0.25 * weights)
+    points = 0.5 * (np.stack([xi, eta], axis=1) + 1.0)
+    return _read_only(points), _read_only(0.25 * weights)

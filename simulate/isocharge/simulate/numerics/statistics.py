@@ -6,5 +6,5 @@ from isocharge.common.arrays import Array
 
 
 def rms(values: Array) -> float:
-    """Root mean square of all values."""
+    """Compute the root mean square of all elements of an array."""
     return float(np.sqrt(np.mean(np.square(values))))

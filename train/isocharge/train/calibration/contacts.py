@@ -86,7 +86,7 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
         slopes = presses.residual_slopes(charge_slopes)
         return presses.residual(row_factor * charge, contact), (slopes * domain.scale).swapaxes(1, 2)
 
-    unit, residual = minimise(residuals, (start - domain.centre) / domain.scale, least=LEAST_CHANGE)
+    unit, residual = minimise(residuals, (start - domain.centre) / domain.scale, min_change=LEAST_CHANGE)
     return AdjustedContacts(unit * domain.scale + domain.centre, residual)
 
 
