@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.simulate import Circle, Electrode, Polygon, Probe, Sensor, load_sensor
-from isocharge.simulate.forward.charge_spline import SPACING
+from isocharge.simulate.forward.charge_spline import MAX_KNOT_SPACING
 from isocharge.simulate.sensor.sensor import Readout
 
 # What the paper says
@@ -67,7 +67,7 @@ class Choices:
     degree: int = 4
     length: float = 20.0
     printed_length: float = 12.0
-    spacing: float = SPACING
+    spacing: float = MAX_KNOT_SPACING
     radius: float = 8.0
     presses: int = 300
     thickness: tuple[float, ...] = (0.025, 0.05, 0.11, 0.2, 0.35, 0.6, 1.0)

@@ -47,7 +47,7 @@ def near_spline(near_map: ForwardMap) -> ChargeSpline:
 def narrow_family(prior: FilmPrior) -> FilmFamily:
     """Compared with four direct solves in place of 24."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("isocharge.simulate.forward.film_family.CHECKS", 4)
+        patch.setattr("isocharge.simulate.forward.film_family.CHECK_COUNT", 4)
         return FilmFamily.build(prior, radius=3.0, force_range=(0.8, 1.2), counts=(2, 2, 2, 2, 2))
 
 

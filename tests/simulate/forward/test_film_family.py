@@ -40,7 +40,7 @@ def test_maps_agree_with_direct_solves_on_films_that_were_not_solved(prior, fami
 def test_a_family_is_checked_over_all_its_forces_and_places(prior, family, monkeypatch):
     checked = []
     monkeypatch.setattr(film_family, "relative_error", lambda _, *press: checked.append(press) or 1e-4 * len(checked))
-    assert film_family._check_against_solves(family, prior, Domain(3.0, (0.2, 1.2))) == 1e-4 * film_family.CHECKS
+    assert film_family._check_against_solves(family, prior, Domain(3.0, (0.2, 1.2))) == 1e-4 * film_family.CHECK_COUNT
     distance, _, force = np.array(checked).T
     assert (0.2 <= force.min() < 0.3, 0.8 < force.max() <= 1.2) == (True, True)
     assert (distance.min() < 1.0, distance.max()) == (True, 3.0)

@@ -28,13 +28,13 @@ class Straight:
     def electrodes(self):
         return tuple(map(str, range(self.offset.size)))
 
-    def by_force(self, logs):
+    def force_weights(self, logs):
         return np.exp(logs)[..., None]
 
-    def terms(self, position):
+    def scaled_charges(self, position):
         return (self.offset + position @ self.linear + position**2 @ self.quadratic)[:, None]
 
-    def slopes(self, position):
+    def scaled_gradients(self, position):
         moved = self.linear.T + 2.0 * position[:, None, :] * self.quadratic.T
         return moved[:, None]
 
@@ -54,7 +54,7 @@ def spread(charges, count, seed):
 @pytest.mark.parametrize("seed", range(2))
 def test_linear_charges_in_white_noise_give_the_textbook_gaussian(seed):
     made, white = straight(seed), 0.01
-    noisy = made.terms(np.array([[0.2, -0.3]]))[:, 0] + white * np.random.default_rng(seed).normal(size=(1, 4))
+    noisy = made.scaled_charges(np.array([[0.2, -0.3]]))[:, 0] + white * np.random.default_rng(seed).normal(size=(1, 4))
     mean, std = Posterior(made, NoiseModel("white", white, 0.0), 1.0).mean_and_std(noisy)
     covariance = white**2 * np.linalg.inv(made.linear @ made.linear.T)
     best = np.linalg.lstsq(made.linear.T, (noisy - made.offset)[0], rcond=None)[0]
@@ -74,7 +74,7 @@ def test_at_the_edge_of_the_disk_the_gaussian_is_cut_off():
 def test_two_places_with_the_same_charges_are_both_found():
     """Charges even in x: the mean is in the middle, where the contact certainly is not, and the deviation says so."""
     made = Straight(np.array([100.0, 100.0]), np.array([[0.0, 0.0], [0.0, 1.0]]), np.array([[1.0, 0.0], [0.0, 0.0]]))
-    noisy = made.terms(np.array([[0.6, 0.1]]))[:, 0]
+    noisy = made.scaled_charges(np.array([[0.6, 0.1]]))[:, 0]
     mean, std = Posterior(made, NoiseModel("white", 0.001, 0.0), 1.0).mean_and_std(noisy)
     assert mean[0, :2] == pytest.approx([0.0, 0.1], abs=1e-4)
     assert std[0, 0] == pytest.approx(0.6, rel=1e-3)

@@ -1,4 +1,4 @@
-"""The map from contacts to charges: one protocol that everything speaks that gives or needs charges; its checks."""
+"""The protocol of maps from contacts to charges, their domains, and checks of contacts and charges."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ from isocharge.common.errors import ChargeError, SceneError
 STEPS = (0.05, 0.05, 1e-3)
 """Steps of the central differences in x and y (mm) and in ln F (dimensionless)."""
 
-SLACK = 1.0 + 1e-9
-"""Factor by which rounding may carry a contact out of a domain."""
+LIMIT_TOLERANCE = 1.0 + 1e-9
+"""Factor by which a contact may exceed the limits of a domain because of rounding."""
 
 
 @dataclass(frozen=True)
 class Domain:
-    """Contacts for which a map holds: a disk about the film's centre, and a range of forces.
+    """Contacts for which a map is valid: a disk about the centre of the film, and a range of forces.
 
     Attributes:
         radius: Largest distance from the centre, mm.
@@ -30,50 +30,68 @@ class Domain:
 
     @property
     def centre(self) -> Array:
-        """Middle of (x, y, ln F), shape (3,), mm and logarithm of N."""
+        """Centre of the domain in (x, y, ln F), shape (3,), mm and logarithm of N."""
         low, high = np.log(self.force_range)
         return np.array([0.0, 0.0, 0.5 * (low + high)])
 
     @property
     def scale(self) -> Array:
-        """Half width of (x, y, ln F), shape (3,), mm and logarithm of N."""
+        """Half width of the domain in (x, y, ln F), shape (3,), mm and logarithm of N."""
         low, high = np.log(self.force_range)
         return np.array([self.radius, self.radius, max(0.5 * (high - low), 0.05)])
 
     def to_unit(self, contact: Array) -> Array:
-        """Contacts (x, y, F), shape (n, 3), to [-1, 1]^3: (x, y, ln F), centred and scaled."""
+        """Scale contacts to [-1, 1]^3, with the logarithm of the force.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Scaled contacts, shape (n, 3).
+        """
         logs = np.stack([contact[:, 0], contact[:, 1], np.log(contact[:, 2])], axis=1)
         return np.asarray((logs - self.centre) / self.scale)
 
     def to_contact(self, unit: Array) -> Array:
-        """The inverse of `to_unit`: shape (..., 3) to (x, y, F), shape (..., 3)."""
+        """Convert scaled contacts, shape (..., 3), into contacts (x, y, F), same shape. This is the inverse of
+        `to_unit`."""
         contact: Array = unit * self.scale + self.centre
         contact[..., 2] = np.exp(contact[..., 2])
         return contact
 
     @property
     def places(self) -> str:
-        """Words that say where contacts may lie."""
+        """Description of the positions in the domain, for messages."""
         return f"at most {self.radius:g} mm from the centre"
 
     def within(self, radius: float) -> "Domain":
-        """Return the domain of the same forces on a disk about the origin of this radius, mm."""
+        """Return the domain with the same forces and another radius, mm."""
         return Domain(radius, self.force_range)
 
     def contains(self, contact: Array) -> Booleans:
-        """Return which contacts (x, y, F), shape (n, 3), mm and N, lie in the domain, shape (n,); NaN does not."""
-        inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.radius * SLACK
+        """Return whether contacts lie in the domain. Contacts with NaN do not.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Shape (n,).
+        """
+        inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.radius * LIMIT_TOLERANCE
         return np.asarray(inside & _are_within(contact[:, 2], self.force_range))
 
     def check(self, contact: Array, source: str) -> Array:
-        """Return the contacts as an array of floats, and refuse contacts outside the domain.
+        """Raise an error if a contact lies outside the domain.
 
         Args:
-            contact: (x, y, F), shape (n, 3), mm and N.
-            source: The map that is asked, for the message: "forward map".
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            source: Name of the map in the error message, such as "forward map".
+
+        Returns:
+            The contacts as an array of floats.
 
         Raises:
-            SceneError: If they are of another shape, or with the first contact that lies outside.
+            SceneError: If the array has another shape, or a contact lies outside the domain.
         """
         contact = as_contacts(contact, source)
         inside = self.contains(contact)
@@ -89,10 +107,14 @@ class Domain:
 
 
 def as_contacts(contact: Array, source: str) -> Array:
-    """Contacts (x, y, F) as an array of floats, shape (n, 3).
+    """Convert contacts into an array of floats, and check its shape.
+
+    Args:
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        source: Name of the map in the error message.
 
     Raises:
-        SceneError: If they are of another shape.
+        SceneError: If the array has another shape.
     """
     contact = np.asarray(contact, dtype=float)
     if contact.ndim != 2 or contact.shape[1] != 3:
@@ -104,7 +126,7 @@ def as_contacts(contact: Array, source: str) -> Array:
 
 
 class ChargeMap(Protocol):
-    """Charges as a function of the contact (x, y, F), mm and N."""
+    """Map from contacts (x, y, F) to touch charges."""
 
     @property
     def electrodes(self) -> tuple[str, ...]:
@@ -112,25 +134,32 @@ class ChargeMap(Protocol):
 
     @property
     def domain(self) -> Domain:
-        """The contacts for which it holds."""
+        """Contacts for which the map is valid."""
 
     def charges(self, contact: Array) -> Array:
-        """Touch charges, shape (n, n_electrode), pC, of contacts (x, y, F), shape (n, 3), mm and N."""
+        """Compute the charges, shape (n, n_electrode), pC, of contacts (x, y, F), shape (n, 3), mm and N."""
 
     def derivatives(self, contact: Array) -> Array:
-        """d(Q)/d(x, y, ln F) at contacts, shape (n, 3): (n, n_electrode, 3), pC/mm, pC/mm and pC."""
+        """Compute the derivatives of the charges with respect to x, y and ln F.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
+        """
 
 
 @runtime_checkable
 class LinearisedMap(ChargeMap, Protocol):
-    """A charge map that gives charges and derivatives at once, in less time."""
+    """A charge map that computes charges and derivatives together in less time."""
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """What `charges` and `derivatives` give."""
+        """Compute the results of `charges` and `derivatives` together."""
 
 
 def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
-    """Charges and derivatives of contacts, at once where the map can; see `ChargeMap`."""
+    """Compute charges and derivatives of contacts, together if the map supports it; see `ChargeMap`."""
     if isinstance(charge_map, LinearisedMap):
         return charge_map.linearised(contact)
     return charge_map.charges(contact), charge_map.derivatives(contact)
@@ -138,13 +167,13 @@ def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class FunctionMap:
-    """Any function of contacts as a map, with derivatives by central differences.
+    """A charge map that evaluates a function, with derivatives by central differences.
 
     Attributes:
-        function: Contacts (x, y, F), shape (n, 3), mm and N, to charges, shape (n, n_electrode), pC.
+        function: Function that converts contacts (x, y, F), shape (n, 3), mm and N, into charges, shape
+            (n, n_electrode), pC.
         electrodes: Names of the electrodes.
-        domain: Where the function holds. Differences call it up to `STEPS` outside; state a slightly smaller domain if
-            it does not hold there.
+        domain: Contacts for which the function is valid. The differences evaluate it up to `STEPS` outside the domain.
     """
 
     function: Callable[[Array], Array]
@@ -161,41 +190,42 @@ class FunctionMap:
 
 
 @dataclass(frozen=True)
-class _Within:
-    """A map on a smaller domain; see `ChargeMap`."""
+class _RestrictedMap:
+    """A charge map that is restricted to a smaller domain; see `ChargeMap`."""
 
-    whole: ChargeMap
+    unrestricted: ChargeMap
     domain: Domain
 
     @property
     def electrodes(self) -> tuple[str, ...]:
-        return self.whole.electrodes
+        return self.unrestricted.electrodes
 
     def charges(self, contact: Array) -> Array:
-        return self.whole.charges(contact)
+        return self.unrestricted.charges(contact)
 
     def derivatives(self, contact: Array) -> Array:
-        return self.whole.derivatives(contact)
+        return self.unrestricted.derivatives(contact)
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        return linearised(self.whole, contact)
+        return linearised(self.unrestricted, contact)
 
 
 def within(charge_map: ChargeMap, radius: float) -> ChargeMap:
-    """The same charges on a smaller disk, radius in mm."""
-    return _Within(charge_map, charge_map.domain.within(radius))
+    """Restrict a charge map to a disk with a smaller radius (mm)."""
+    return _RestrictedMap(charge_map, charge_map.domain.within(radius))
 
 
 def differences(function: Callable[[Array], Array], contact: Array, steps: tuple[float, float, float] = STEPS) -> Array:
-    """Central differences of a function of contacts: the only ones of the project.
+    """Compute the derivatives of a function of contacts by central differences.
 
     Args:
-        function: Contacts (x, y, F), shape (n, 3), mm and N, to values, shape (n, k). Called once, with all steps.
-        contact: Where to differentiate, shape (n, 3).
-        steps: In x and y, mm, and in ln F.
+        function: Function that converts contacts (x, y, F), shape (n, 3), mm and N, into values, shape (n, k). It is
+            called once for all steps.
+        contact: Contacts at which the derivatives are computed, shape (n, 3), mm and N.
+        steps: Steps in x and y, mm, and in ln F.
 
     Returns:
-        Derivatives by (x, y, ln F), shape (n, k, 3), in the values' unit per mm, per mm, and by ln F.
+        Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1.
     """
     moved = []
     for axis, step in enumerate(steps):
@@ -209,7 +239,12 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
 
 
 def check_forces(force: Array | float, force_range: tuple[float, float], source: str) -> None:
-    """Refuse forces outside a range (N); `source` says what has it.
+    """Raise an error if a force lies outside a range.
+
+    Args:
+        force: Forces, a number or shape (n,), N.
+        force_range: Smallest and largest force, N.
+        source: Name of the map with this range in the error message.
 
     Raises:
         SceneError: If a force lies outside.
@@ -217,28 +252,36 @@ def check_forces(force: Array | float, force_range: tuple[float, float], source:
     forces = np.atleast_1d(force)
     inside = _are_within(forces, force_range)
     if not inside.all():
-        i, (low, high) = int(np.argmin(inside)), force_range
-        which = f"force of press {i}" if forces.size > 1 else "force"
-        raise SceneError(f"{which}: expected {low:g} to {high:g} N, which the {source} covers, got {forces[i]:g} N")
+        low, high = force_range
+        first_outside = int(np.argmin(inside))
+        name = f"force of press {first_outside}" if forces.size > 1 else "force"
+        raise SceneError(
+            f"{name}: expected {low:g} to {high:g} N, which the {source} covers, got {forces[first_outside]:g} N"
+        )
 
 
 def _are_within(force: Array, force_range: tuple[float, float]) -> Booleans:
-    """Which forces lie in a range; NaN does not."""
-    return np.asarray((force >= force_range[0] / SLACK) & (force <= force_range[1] * SLACK))
+    """Return whether forces lie in a range, both in N. NaN does not."""
+    return np.asarray((force >= force_range[0] / LIMIT_TOLERANCE) & (force <= force_range[1] * LIMIT_TOLERANCE))
 
 
 def check_radius(radius: float, largest: float, source: str) -> None:
-    """Refuse a radius (mm) that is not positive or larger than `largest`; `source` says what has that limit.
+    """Raise an error if a radius is not positive or too large.
+
+    Args:
+        radius: Radius, mm.
+        largest: Largest accepted radius, mm.
+        source: Name of the map with this limit in the error message.
 
     Raises:
         SceneError: If the radius lies outside.
     """
-    if not 0.0 < radius <= largest * SLACK:
+    if not 0.0 < radius <= largest * LIMIT_TOLERANCE:
         raise SceneError(f"radius: expected up to the {source}'s {largest:g} mm, got {radius:g} mm")
 
 
 def check_determined(electrodes: int) -> None:
-    """Refuse sensors whose charges cannot determine a contact anywhere.
+    """Raise an error if a sensor has too few electrodes to determine a contact.
 
     Raises:
         SceneError: If there are fewer than three electrodes.
@@ -251,11 +294,11 @@ def check_determined(electrodes: int) -> None:
 
 
 def as_charges(charge: Array, electrode_names: tuple[str, ...]) -> Array:
-    """Charges of presses as float64, one for each electrode.
+    """Convert charges into an array of floats, and check its shape and values.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC.
-        electrode_names: In the order of the charges.
+        electrode_names: Names of the electrodes, in the order of the charges.
 
     Raises:
         ChargeError: If the charges are not finite or not one for each electrode.

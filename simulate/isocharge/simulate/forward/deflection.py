@@ -1,4 +1,4 @@
-"""The deflection of a film under a round probe as a table over force and distance, for pictures of it."""
+"""Table of the deflection of a film under a circular probe over force and distance, for the live view."""
 
 import numpy as np
 
@@ -11,35 +11,40 @@ from isocharge.simulate.sensor.sensor_file import film_to_dict
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
 from isocharge.simulate.solver.press import press
 
-RINGS, ANGLES = 20, 13
-"""Rings about the probe, and angles of half a turn, of the table."""
+RINGS = 20
+"""Number of rings about the probe in the table."""
+
+ANGLES = 13
+"""Number of angles of half a turn in the table."""
 
 FORCES = (0.05, 0.3, 2.0)
+"""Forces of the table, N."""
 
-FARTHEST = 16.0 / 45.0
-"""Distance from the centre up to which the table goes, in film radii: beyond all working areas."""
+MAX_DISTANCE = 16.0 / 45.0
+"""Largest distance of a press from the centre in the table, in film radii."""
 
 DISTANCES = 5
+"""Number of distances in the table."""
 
-INNER = 0.999999
-"""Share of the film's radius within which a point of the rim lies for certain."""
+INNER_RADIUS = 0.999999
+"""Radius of points near the rim that lie on the film in spite of rounding, in film radii."""
 
 
 def deflection_field(
     film: Film, probe: Circle, forces: tuple[float, ...] = FORCES, *, distances: int = DISTANCES
 ) -> DeflectionField:
-    """Solve the film under presses of several forces at several distances from its centre.
+    """Solve the film under presses with several forces at several distances from the centre.
 
     Args:
         film: The film.
-        probe: Its footprint, round.
-        forces: Increasing, N.
-        distances: Number of distances, from 0 to `FARTHEST`, at least 2.
+        probe: The circular probe.
+        forces: Increasing forces, N.
+        distances: Number of distances from 0 to `MAX_DISTANCE`, at least 2.
 
     Raises:
         SolveError: If a press has no equilibrium.
     """
-    places = np.linspace(0.0, FARTHEST * film.radius, distances).tolist()
+    places = np.linspace(0.0, MAX_DISTANCE * film.radius, distances).tolist()
     rings = np.concatenate([[0.0], np.geomspace(0.5 * probe.radius / film.radius, 1.0, RINGS - 1)])
     table = np.zeros((len(forces), distances, RINGS, ANGLES))
     for column, distance in enumerate(track(places, "solving the film", distances)):
@@ -58,8 +63,19 @@ def deflection_field(
 
 
 def _on_rings(solved: Equilibrium, distance: float, rings: Array) -> Array:
-    """Deflection on the rings, mm, shape (rings, angles); the rim does not move."""
-    points = points_mm(solved.film.radius, solved.probe.reach, distance, np.minimum(rings, INNER), ANGLES).ravel()
+    """Compute the deflection on rings about the probe.
+
+    Args:
+        solved: The solved press.
+        distance: Distance of the press from the centre, mm.
+        rings: Positions of the rings between the centre of the probe (0) and the rim (1), shape (n_ring,).
+
+    Returns:
+        Deflection, shape (n_ring, n_angle), mm. It is zero at the rim.
+    """
+    points = points_mm(
+        solved.film.radius, solved.probe.reach, distance, np.minimum(rings, INNER_RADIUS), ANGLES
+    ).ravel()
     deflected = deflection(solved, np.stack([points.real, points.imag], axis=1)).reshape(len(rings), ANGLES)
     deflected[-1] = 0.0
     return deflected

@@ -1,5 +1,6 @@
-"""A family of presses of one probe: where it is solved, and how presses between are interpolated."""
+"""A family of presses of one probe: the presses that are solved, and the interpolation between them."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -24,7 +25,7 @@ from isocharge.simulate.solver.load_case import SolveSettings, check_press
 from isocharge.simulate.solver.press import press
 
 ROTATIONS = 7
-"""Smallest number of orientations: only the first harmonics of the rim, far from the probe, reach the probe."""
+"""Smallest number of orientations. The influence of the distant rim on the probe has only a few harmonics."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +33,12 @@ class Family:
     """Nodes at which a family of presses is solved.
 
     Attributes:
-        domain: The presses that it covers.
-        distance: Distances from the centre, Chebyshev nodes, shape (n_distance,), mm.
-        force: Forces, Chebyshev nodes in the logarithm, shape (n_force,), N.
-        rotation: Of the probe against the direction of the press, evenly spread over a turn, shape (n_rotation,), rad.
-        folds: Order of the probe's rotational symmetry: how often it maps onto itself in a full turn.
+        domain: Presses that the family covers.
+        distance: Distances from the centre, at Chebyshev nodes, shape (n_distance,), mm.
+        force: Forces, at Chebyshev nodes in the logarithm, shape (n_force,), N.
+        rotation: Rotations of the probe relative to the direction of the press, evenly spaced over a full turn, shape
+            (n_rotation,), rad.
+        folds: Order of the rotational symmetry of the probe: the number of periods in a full turn.
     """
 
     domain: Domain
@@ -47,46 +49,70 @@ class Family:
 
     @classmethod
     def spread(cls, domain: Domain, count: tuple[int, int], period: float, rotations: int = ROTATIONS) -> "Family":
-        """Nodes for a probe.
+        """Distribute the nodes for a probe.
 
         Args:
-            domain: The presses to cover.
-            count: Number of distances and of forces.
-            period: Angle after which the probe looks the same, rad; 0 for a round one.
-            rotations: Smallest number of orientations.
+            domain: Presses to cover.
+            count: Number of distances and number of forces.
+            period: Smallest rotation that maps the probe onto itself, rad; 0 for an axisymmetric probe.
+            rotations: Smallest number of orientations of a probe that is not axisymmetric.
         """
+        distance_count, force_count = count
         low, high = np.log(domain.force_range)
-        force = np.exp(chebyshev_nodes(count[1], low, high)) if high > low else np.array([domain.force_range[0]])
-        folds = round(2.0 * np.pi / period) if period > 0.0 else 1
-        n_rotation = folds * (-(-rotations // folds)) if period > 0.0 else 1
+        force = np.array([domain.force_range[0]])
+        if high > low:
+            force = np.exp(chebyshev_nodes(force_count, low, high))
+        folds = 1
+        n_rotation = 1
+        if period > 0.0:
+            folds = round(2.0 * np.pi / period)
+            n_rotation = folds * math.ceil(rotations / folds)
         rotation = 2.0 * np.pi * np.arange(n_rotation) / n_rotation
-        return cls(domain, chebyshev_nodes(count[0], 0.0, domain.radius), force, rotation, folds)
+        return cls(domain, chebyshev_nodes(distance_count, 0.0, domain.radius), force, rotation, folds)
 
     @property
     def solved_rotations(self) -> Array:
-        """Orientations that must be solved: one period of the probe."""
+        """Orientations that must be solved, which cover one period of the probe, rad."""
         return self.rotation[: self.rotation.size // self.folds]
 
     def weights(self, distance: Array, force: Array, rotation: Array) -> Array:
-        """Interpolation weights for presses, shape (n, n_distance * n_force * n_rotation)."""
-        by_distance = lagrange_values(self.distance, barycentric_weights(self.distance), distance)
-        logs = np.log(self.force)
-        by_force = lagrange_values(logs, barycentric_weights(logs), np.log(force))
-        both = by_distance[:, :, None, None] * by_force[:, None, :, None]
-        return np.asarray((both * self._by_rotation(rotation)[:, None, None, :]).reshape(distance.size, -1))
+        """Compute the weights of the nodes for the interpolation to presses.
 
-    def _by_rotation(self, rotation: Array) -> Array:
-        """Trigonometric interpolation on an even spread: each weight is a Dirichlet kernel, shape (n, n_rotation)."""
+        Args:
+            distance: Distances from the centre, shape (n,), mm.
+            force: Forces, shape (n,), N.
+            rotation: Rotations of the probe relative to the direction of the press, shape (n,), rad.
+
+        Returns:
+            Shape (n, n_distance * n_force * n_rotation).
+        """
+        distance_weights = lagrange_values(self.distance, barycentric_weights(self.distance), distance)
+        log_force = np.log(self.force)
+        force_weights = lagrange_values(log_force, barycentric_weights(log_force), np.log(force))
+        products = distance_weights[:, :, None, None] * force_weights[:, None, :, None]
+        rotation_weights = self._rotation_weights(rotation)[:, None, None, :]
+        return np.asarray((products * rotation_weights).reshape(distance.size, -1))
+
+    def _rotation_weights(self, rotation: Array) -> Array:
+        """Compute the weights of trigonometric interpolation (Dirichlet kernels), shape (n, n_rotation)."""
         count = self.rotation.size
         harmonics = np.arange(1, count // 2 + 1)
-        factor = np.where(2 * harmonics == count, 1.0, 2.0)  # an even spread does not see the highest one's sine
+        factor = np.where(2 * harmonics == count, 1.0, 2.0)  # the sine of the highest harmonic is zero at all nodes
         phase = (rotation[:, None] - self.rotation)[..., None] * harmonics
         return np.asarray((1.0 + np.cos(phase) @ factor) / count)
 
     def solve(self, sensor: Sensor, probe: Probe, settings: SolveSettings, executor: Executor | None) -> Array:
-        """Scaled stress at the nodes, as `unfold` takes it: (n_distance, n_solved_rotation, n_force, ...).
+        """Solve the presses of the family.
 
-        The settings give theory, mesh and width of the thin rings, the same for all members.
+        Args:
+            sensor: The sensor.
+            probe: The probe.
+            settings: Theory, mesh and width of the thin rings, which are the same for all presses.
+            executor: Executor that runs the solves; None for this process.
+
+        Returns:
+            Scaled stress at the nodes of the mesh, shape
+            (n_distance, n_solved_rotation, n_force, n_element * n_local * 3), which is the argument of `unfold`.
         """
         chains = [
             Chain(sensor.film, probe.rotated(float(rotation)), float(distance), self.force, sensor.surface, settings)
@@ -97,14 +123,15 @@ class Family:
         return solved.reshape(self.distance.size, self.solved_rotations.size, self.force.size, -1)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
-        """Fields of all orientations from those that were solved, each node in its rotated place.
+        """Compute the fields of all orientations from the solved orientations, by the symmetry of the probe.
 
         Args:
-            solved: Shape (n_distance, n_solved_rotation, n_force, n_element * n_local * 3), in the probe's frame.
-            mesh: Their template.
+            solved: Scaled stress in a frame that rotates with the probe, shape
+                (n_distance, n_solved_rotation, n_force, n_element * n_local * 3).
+            mesh: Template of the mesh.
 
         Returns:
-            Shape (n_distance * n_force * n_rotation, n_element * n_local * 3), ordered as `weights`.
+            Shape (n_distance * n_force * n_rotation, n_element * n_local * 3), in the order of `weights`.
         """
         n_distance, n_rotation, n_force, _ = solved.shape
         field = np.moveaxis(solved, 1, 2).reshape(n_distance, n_force, n_rotation, mesh.n_element, -1, 3)
@@ -115,25 +142,38 @@ class Family:
         return np.asarray(np.concatenate(parts, axis=2).reshape(-1, solved.shape[-1]))
 
     def probes_between(self, count: int) -> Iterator[tuple[float, float, float, float]]:
-        """Presses to check the interpolation with: between the nodes and, last, at the edge of the family.
+        """Generate presses between the nodes, which are used to check the interpolation.
+
+        The last press lies at the largest distance.
+
+        Args:
+            count: Number of presses.
 
         Yields:
-            Distance (mm), angle (rad), force (N) and orientation (rad).
+            Distance (mm), direction (rad), force (N) and orientation (rad).
         """
-        shares = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
+        distance_shares = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
         low, high = np.log(self.domain.force_range)
-        for number, share in enumerate([*shares, 1.0]):
-            force = np.clip(np.exp(low + (high - low) * ((0.5 + 0.618 * number) % 1.0)), *self.domain.force_range)
-            yield float(self.domain.radius * share), 2.4 * number, float(force), 0.7 * number
+        for number, distance_share in enumerate([*distance_shares, 1.0]):
+            force_share = (0.5 + 0.618 * number) % 1.0
+            force = np.clip(np.exp(low + (high - low) * force_share), *self.domain.force_range)
+            yield float(self.domain.radius * distance_share), 2.4 * number, float(force), 0.7 * number
 
 
 def check_family(film: Film, probe: Probe, domain: Domain) -> None:
-    """Refuse domains that hold presses which cannot exist.
+    """Raise an error if some presses of a domain cannot exist.
+
+    Args:
+        film: The film.
+        probe: The probe.
+        domain: The presses.
 
     Raises:
-        SceneError: If radius or forces are no positive numbers, or the outermost or strongest press cannot exist.
+        SceneError: If the radius or the forces are not positive numbers, if the film is not axisymmetric, or if the
+            outermost press with the largest force cannot exist.
     """
-    radius, (low, high) = domain.radius, domain.force_range
+    radius = domain.radius
+    low, high = domain.force_range
     if not (0.0 < low <= high and np.isfinite(high)):
         raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {low} to {high}")
     if not (np.isfinite(radius) and radius > 0.0):
@@ -153,16 +193,16 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
 
 @dataclass(frozen=True)
 class Chain:
-    """Presses on one film at one place that differ by their forces; each is solved from the one before.
+    """Presses on one film at one position with different forces. Each solve starts from the equilibrium before.
 
     Attributes:
         film: The film.
-        probe: The footprint, rotated as it is.
-        distance: Of its centroid from the centre, mm.
-        forces: N, in their order.
-        surface: Where in the thickness the stress is read.
+        probe: The probe, with its rotation.
+        distance: Distance of the centroid of the footprint from the centre of the film, mm.
+        forces: Forces in the order in which they are solved, shape (n_force,), N.
+        surface: Surface in the thickness at which the stress is read.
         settings: Theory, mesh and width of the thin rings.
-        read: What is wanted of each: stresses at the nodes, shape (..., 3).
+        read: Function that computes stresses at the nodes, shape (..., 3), from an equilibrium.
     """
 
     film: Film
@@ -175,7 +215,15 @@ class Chain:
 
 
 def solve_chains(chains: Sequence[Chain], executor: Executor | None) -> Array:
-    """What each chain reads at the nodes, seen from the probe, shape (n_chain, n_force, its size)."""
+    """Solve chains of presses.
+
+    Args:
+        chains: The chains, which have the same mesh and number of forces.
+        executor: Executor that runs the chains; None for this process.
+
+    Returns:
+        Stresses that `Chain.read` computes, in a frame that rotates with the probe, shape (n_chain, n_force, n_value).
+    """
     return np.stack(list(track(in_order(executor, _solve_chain, chains), "solving the film", len(chains))))
 
 
@@ -187,22 +235,33 @@ def solve_films(
     executor: Executor | None,
     read: Callable[[Equilibrium, Surface], Array] = nodal_stress,
 ) -> Array:
-    """What presses of round probes read on the films of a grid, of the radius and Young's modulus of one of them.
+    """Solve presses with circular probes on the films of a grid.
+
+    Args:
+        film: Film whose radius, Young's modulus and Poisson's ratio all films have.
+        surface: Surface in the thickness at which the stress is read.
+        grid: Grid of distances, loads, pretensions, thicknesses and probe radii.
+        settings: Theory, mesh and width of the thin rings.
+        executor: Executor that runs the solves; None for this process.
+        read: Function that computes stresses at the nodes, shape (..., 3), from an equilibrium.
 
     Returns:
-        What `read` gives at the nodes of the template, shape (*grid.shape, its size).
+        Stresses that `read` computes, shape (*grid.shape, n_value).
     """
-    a, chains = film.radius, []
+    radius = film.radius
+    chains = []
     for distance, tension, thickness, reach in product(grid.distance, grid.tension, grid.thickness, grid.reach):
-        other = replace(film, pretension=float(tension) * film.young, thickness=float(thickness) * a)
-        forces = grid.load[::-1] * film.young * other.thickness * a
-        chains.append(Chain(other, Circle(float(reach) * a), float(distance) * a, forces, surface, settings, read))
+        grid_film = replace(film, pretension=float(tension) * film.young, thickness=float(thickness) * radius)
+        forces = grid.load[::-1] * film.young * grid_film.thickness * radius  # from the largest force on
+        probe = Circle(float(reach) * radius)
+        chains.append(Chain(grid_film, probe, float(distance) * radius, forces, surface, settings, read))
     rows = solve_chains(chains, executor)[:, ::-1]
     by_axis = rows.reshape(*(grid.shape[axis] for axis in (0, 2, 3, 4, 1)), -1)
     return np.moveaxis(by_axis, 4, 1)
 
 
 def _solve_chain(chain: Chain) -> Array:
+    """Solve one chain, and return the stresses that it reads, shape (n_force, n_value)."""
     start: Equilibrium | None = None
     rows = []
     for force in chain.forces.tolist():

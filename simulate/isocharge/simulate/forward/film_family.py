@@ -1,17 +1,17 @@
-"""The forward map of every film at once: presses of a round probe, solved over the dimensionless groups of the film.
+"""Forward maps of all films of a family, from presses with circular probes on a grid of dimensionless parameters.
 
-With a the film's radius, E h its stretching stiffness and R the probe's radius, the scaled stress under a press depends
-on five numbers (mechanics.scaling):
+If a is the radius of the film, E h its stretching stiffness and R the radius of the probe, the scaled stress under a
+press depends on five numbers (`mechanics.scaling`):
 
     distance / a,   F / (E h a),   pretension / E,   h / a,   R / a,
 
-and on Poisson's ratio, which is one number for a family. In the frame of the template, which follows the probe, the
-nodal stress is a smooth function of all five: it is solved on a grid of Chebyshev nodes and interpolated. The grid's
-stresses have few independent directions, so they are stored as the coefficients of some fifty modes (the proper
-orthogonal decomposition, Sirovich 1987). The forward map of one film is a contraction over the last three numbers, and
-takes a millisecond.
+and on Poisson's ratio, which is the same for all films of a family. In a frame that moves with the probe, the stress at
+the nodes of the template is a smooth function of the five numbers. It is solved on a grid of Chebyshev nodes and
+interpolated. The stresses on the grid are stored as a proper orthogonal decomposition with about fifty modes (Sirovich
+1987). The forward map of one film is a contraction over the last three numbers, which takes a millisecond.
 
-In a file, coefficients and modes are integers, of fewer bits where there is little of a mode: some 3e-5 of a charge.
+Files contain the coefficients and modes as integers. Modes with small contributions have fewer bits. The rounding
+changes a charge by about 3e-5.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,45 +37,50 @@ from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 from isocharge.simulate.solver.press import needed_resolution
 
-COUNTS = (5, 12, 8, 2, 5)
-"""Nodes along each axis."""
+NODE_COUNTS = (5, 12, 8, 2, 5)
+"""Number of grid nodes along each of `AXES`."""
 
-SPARE_BITS = 4.0
-"""See `bits_of`."""
+MAX_BITS = 16
+"""Number of bits of the values of the mode with the largest contribution in a file; see `bits_of`."""
 
-IMPERFECTIONS = "imperfections."
-"""What the names of their arrays begin with."""
+EXTRA_BITS = 4.0
+"""Number of bits that each mode gets in addition to those that its size requires; see `bits_of`."""
 
-MODES_LEFT = 8e-5
-"""Share of the stresses that the modes may leave out: root mean square, each node's stress relative to its own size."""
+IMPERFECTION_PREFIX = "imperfections."
+"""Beginning of the names of the arrays of `FilmModes` in a file."""
 
-LARGEST_ERROR = 2e-3
-"""Largest relative error of any charge against direct solves that a family may have, dimensionless: the lightest
-presses on the tautest films have it, whose charges are a few pC; a thousandth of 100 pC is 1e-4."""
+MAX_TRUNCATION_ERROR = 8e-5
+"""Largest relative error of the stresses by the decomposition (root mean square)."""
 
-CHECKS = 24
-"""Number of direct solves that a family is compared with."""
+MAX_FAMILY_ERROR = 2e-3
+"""Largest relative error of a charge with respect to direct solves that a family may have.
 
-SLACK = 1e-9
-"""Relative tolerance of the limits: rounding of units."""
+The largest errors are those of small forces on films with a large pretension, whose charges are a few pC.
+"""
+
+CHECK_COUNT = 24
+"""Number of direct solves with which a family is compared."""
+
+LIMIT_TOLERANCE = 1e-9
+"""Relative tolerance of the limits of a family, which allows for the rounding of units."""
 
 
 @dataclass(frozen=True)
 class FilmFamily:
-    """Scaled stress under presses of a round probe on all films of one Poisson's ratio.
+    """Scaled stress under presses with circular probes, for all films with the same Poisson's ratio.
 
     Attributes:
         poisson: Poisson's ratio.
-        surface: Where in the thickness the stress is read: "middle", "top" or "bottom".
-        limits: Smallest and largest value along each axis.
-        grid: Where it is solved.
-        resolution: Mesh of the solves.
-        layer: Width of the thin rings at the rim over the film's radius.
-        coefficients: Of the modes at the grid's nodes, shape (n_distance, n_load, n_tension, n_thickness, n_reach,
-            n_mode).
-        modes: Scaled stress C : E' at the nodes of every element, shape (n_mode, n_element * n_local * 3).
-        error: Largest relative error of a charge against the direct solves that the build compared with.
-        imperfections: The modes of the films' imperfections; None in files of before they were solved.
+        surface: Surface in the thickness at which the stress is read: "middle", "top" or "bottom".
+        limits: Smallest and largest value along each axis, dimensionless.
+        grid: Grid of films and presses that were solved.
+        resolution: Fineness of the mesh of the solves.
+        layer: Width of the thin rings at the rim, in film radii.
+        coefficients: Coefficients of the modes at the grid nodes, shape (n_distance, n_load, n_tension, n_thickness,
+            n_reach, n_mode).
+        modes: Modes of the scaled stress C : E' at the nodes of every element, shape (n_mode, n_element * n_local * 3).
+        error: Largest relative error of a charge with respect to the direct solves of `build`.
+        imperfections: Stress fields of the imperfections; None if they were not solved.
     """
 
     poisson: float
@@ -96,49 +101,57 @@ class FilmFamily:
         radius: float = DEFAULT_RADIUS,
         force_range: tuple[float, float] = DEFAULT_FORCE_RANGE,
         *,
-        counts: tuple[int, ...] = COUNTS,
+        counts: tuple[int, ...] = NODE_COUNTS,
         executor: Executor | None = None,
     ) -> "FilmFamily":
-        """Solve the films that a calibration may find, some five thousand presses, and check the interpolation.
+        """Solve about five thousand presses on the films that a calibration may find, and check the interpolation.
 
         Args:
-            prior: The films.
+            prior: Prior distribution of the films.
             radius: Largest distance of a press from the centre, mm.
             force_range: Smallest and largest force, N.
-            counts: Nodes along each of `AXES`; a narrow spread needs fewer.
-            executor: Runs the solves; None for this process.
+            counts: Number of grid nodes along each of `AXES`. A narrow prior distribution needs fewer nodes.
+            executor: Executor that runs the solves; None for this process.
 
         Raises:
             SceneError: If some presses cannot exist.
-            SolveError: If an equilibrium or the interpolation error is not reached.
+            SolveError: If a press has no equilibrium, or the interpolation error exceeds `MAX_FAMILY_ERROR`.
         """
-        domain, film, surface = Domain(radius, force_range), prior.sensor.film, prior.sensor.surface
+        domain = Domain(radius, force_range)
+        film = prior.sensor.film
+        surface = prior.sensor.surface
         limits = _limits_of(prior, domain)
-        grid, a = FilmGrid.spread(limits, counts), film.radius
-        check_family(prior.sensor.coated_film, Circle(limits["reach"][1] * a), domain)
-        middle = float(np.sqrt(force_range[0] * force_range[1]))
-        layer = layer_for(film, middle)
+        grid = FilmGrid.spread(limits, counts)
+        smallest_reach, largest_reach = limits["reach"]
+        check_family(prior.sensor.coated_film, Circle(largest_reach * film.radius), domain)
+        middle_force = float(np.sqrt(force_range[0] * force_range[1]))
+        layer = layer_for(film, middle_force)
         settings = SolveSettings(theory=THEORY, layer=layer)
-        smallest = Circle(limits["reach"][0] * a)
-        resolution = needed_resolution(film, smallest, (radius, 0.0), middle, settings)
+        smallest_probe = Circle(smallest_reach * film.radius)
+        resolution = needed_resolution(film, smallest_probe, (radius, 0.0), middle_force, settings)
         settings = replace(settings, resolution=resolution)
-        coefficients, modes = decompose(solve_films(film, surface, grid, settings, executor), MODES_LEFT)
+        coefficients, modes = decompose(solve_films(film, surface, grid, settings, executor), MAX_TRUNCATION_ERROR)
         family = cls(film.poisson, surface, limits, grid, resolution, layer, coefficients, modes, np.nan)
         error = _check_against_solves(family, prior, domain)
-        if error > LARGEST_ERROR:
+        if error > MAX_FAMILY_ERROR:
             raise SolveError(
-                f"the films of {prior.sensor.name} interpolate to {error:.2g} only, expected {LARGEST_ERROR:g}; ask "
+                f"the films of {prior.sensor.name} interpolate to {error:.2g} only, expected {MAX_FAMILY_ERROR:g}; ask "
                 "for a smaller radius, range of forces or spread"
             )
         return replace(family, error=error)
 
     def forward_map(self, sensor: Sensor, probe: Circle) -> ForwardMap:
-        """The forward map of one film, by interpolation.
+        """Interpolate the forward map of one film.
+
+        Args:
+            sensor: Sensor with a film of the family.
+            probe: Probe with a radius of the family.
 
         Raises:
-            SceneError: If the film or the probe is not one of the family.
+            SceneError: If the film or the probe does not belong to the family.
         """
-        film, a = sensor.film, sensor.film.radius
+        film = sensor.film
+        a = film.radius
         groups = {
             "tension": film.pretension / film.young,
             "thickness": film.thickness / a,
@@ -146,35 +159,41 @@ class FilmFamily:
         }
         self._check_inside(sensor.coated_film, sensor.surface, groups)
         tension, thickness, reach = (self.grid.weights(name, value) for name, value in groups.items())
-        by_film = np.einsum("t,h,p->thp", tension, thickness, reach).ravel()
-        sizes = self.coefficients.shape
-        by_press = by_film @ self.coefficients.reshape(sizes[0] * sizes[1], -1, sizes[-1])
-        load = film.young * film.thickness * a
+        film_weights = np.einsum("t,h,p->thp", tension, thickness, reach).ravel()
+        n_distance, n_load, *_, n_mode = self.coefficients.shape
+        press_coefficients = film_weights @ self.coefficients.reshape(n_distance * n_load, -1, n_mode)
+        force_unit = film.young * film.thickness * a
         low, high = self.limits["load"]
+        _, largest_distance = self.limits["distance"]
         family = Family(
-            domain=Domain(self.limits["distance"][1] * a, (low * load, high * load)),
+            domain=Domain(largest_distance * a, (low * force_unit, high * force_unit)),
             distance=self.grid.distance * a,
-            force=self.grid.load * load,
+            force=self.grid.load * force_unit,
             rotation=np.zeros(1),
             folds=1,
         )
-        table = by_press @ self.modes
+        table = press_coefficients @ self.modes
         return ForwardMap(sensor, probe, family, THEORY, self.resolution, self.layer, table, self.error)
 
     def mode_map(self, sensor: Sensor, probe: Circle, names: Sequence[str] = tuple(MODES)) -> ModeMap:
-        """The modes of one film; only what the names need is computed.
+        """Return the map of the imperfection modes of one film. Only the fields that these modes need are computed.
+
+        Args:
+            sensor: Sensor with a film of the family.
+            probe: Probe with a radius of the family.
+            names: Names of the modes, from `MODES`.
 
         Raises:
-            SceneError: If the film or the probe is not one of the family, or it has no such modes.
+            SceneError: If the film or the probe does not belong to the family, or the family has no such modes.
         """
         if self.imperfections is None:
             raise SceneError("this family of films has no modes of imperfections; add FilmModes.build")
         return self.imperfections.mode_map(self.forward_map(sensor, probe), names)
 
     def to_arrays(self) -> dict[str, Any]:
-        """The family as arrays, numbers and texts, for a file."""
-        more = {} if self.imperfections is None else self.imperfections.to_arrays()
-        bits = bits_of(self.coefficients, self.modes, 16, SPARE_BITS)
+        """Return the family as arrays, numbers and texts for a file."""
+        imperfections = {} if self.imperfections is None else self.imperfections.to_arrays()
+        bits = bits_of(self.coefficients, self.modes, MAX_BITS, EXTRA_BITS)
         coefficients, scale = quantised(self.coefficients, (0, 1, 2, 3, 4), bits)
         modes, size = quantised(self.modes, 1, bits[:, None])
         return {
@@ -186,25 +205,33 @@ class FilmFamily:
             "coefficients": coefficients,
             "modes": modes,
             "mode_scale": np.float32(scale.ravel()[:, None] * size),
-            **{IMPERFECTIONS + name: value for name, value in more.items()},
+            **{IMPERFECTION_PREFIX + name: value for name, value in imperfections.items()},
         }
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any]) -> "FilmFamily":
-        """The inverse of `to_arrays`, to the resolution of the file.
+        """Create the family from the arrays that `to_arrays` returned.
 
         Raises:
-            InputError: If something is missing or does not fit together.
+            InputError: If an array is missing, or the shapes are inconsistent.
         """
         try:
             shape = tuple(int(size) for size in arrays["grid_shape"])
-            coefficients, modes, scale = arrays["coefficients"], arrays["modes"], arrays["mode_scale"]
-            if coefficients.shape != (*shape, len(modes)) or scale.shape != (len(modes), 1) or len(shape) != len(AXES):
+            coefficients = arrays["coefficients"]
+            modes = arrays["modes"]
+            scale = arrays["mode_scale"]
+            has_scales = scale.shape == (len(modes), 1)
+            has_coefficients = coefficients.shape == (*shape, len(modes))
+            if not (has_coefficients and has_scales and len(shape) == len(AXES)):
                 raise ValueError(f"coefficients {coefficients.shape} and modes {modes.shape} do not fit {shape}")
             sizes = len(arrays["limits"]), arrays["grid"].size, arrays["resolution"].size
             if sizes != (len(AXES), sum(shape), len(fields(Resolution))):
                 raise ValueError(f"limits, grid and resolution have {sizes} numbers")
-            more = {name.removeprefix(IMPERFECTIONS): arrays[name] for name in arrays if name.startswith(IMPERFECTIONS)}
+            imperfections = {
+                name.removeprefix(IMPERFECTION_PREFIX): arrays[name]
+                for name in arrays
+                if name.startswith(IMPERFECTION_PREFIX)
+            }
             if str(arrays["surface"]) not in get_args(Surface):
                 raise ValueError(f"surface {arrays['surface']!s}")
             return cls(
@@ -219,12 +246,22 @@ class FilmFamily:
                 coefficients=coefficients.astype(float),
                 modes=modes * np.asarray(scale, dtype=float),
                 error=float(arrays["error"]),
-                imperfections=FilmModes.from_arrays(more, modes.shape[1]) if more else None,
+                imperfections=FilmModes.from_arrays(imperfections, modes.shape[1]) if imperfections else None,
             )
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise InputError(f"film family: expected the arrays that to_arrays gives ({error})") from error
 
     def _check_inside(self, film: Film, surface: Surface, groups: dict[str, float]) -> None:
+        """Raise an error if a film does not belong to the family.
+
+        Args:
+            film: The film.
+            surface: Surface in the thickness at which the stress is read.
+            groups: Tension, thickness and reach of the film and its probe, dimensionless.
+
+        Raises:
+            SceneError: If the film does not belong to the family.
+        """
         if (film.poisson, surface) != (self.poisson, self.surface):
             raise SceneError(
                 f"film: expected the family's Poisson's ratio {self.poisson} and surface {self.surface!r}, got "
@@ -234,31 +271,39 @@ class FilmFamily:
             raise SceneError(f"film: expected an axisymmetric film, got {film.asymmetries}; use modes for these")
         for name, value in groups.items():
             low, high = self.limits[name]
-            if not low * (1.0 - SLACK) - 1e-15 <= value <= high * (1.0 + SLACK):
+            if not low * (1.0 - LIMIT_TOLERANCE) - 1e-15 <= value <= high * (1.0 + LIMIT_TOLERANCE):
                 raise SceneError(f"film: {name} {value:.4g} is outside the family: expected {low:.4g} to {high:.4g}")
 
 
 def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) -> float:
-    """Largest relative error of a charge over presses of films drawn at random."""
-    rng, errors, (low, high) = np.random.default_rng(0), [], domain.force_range
-    for number, parameters in enumerate(prior.draw(rng, CHECKS)):
+    """Compute the largest relative error of a charge with respect to direct solves, for presses on random films."""
+    rng = np.random.default_rng(0)
+    low, high = domain.force_range
+    errors = []
+    for number, parameters in enumerate(prior.draw(rng, CHECK_COUNT)):
         forward_map = family.forward_map(*prior.film(parameters))
-        distance, angle = domain.radius * np.sqrt((number + 1.0) / CHECKS), 2.4 * number
+        distance = domain.radius * np.sqrt((number + 1.0) / CHECK_COUNT)
+        angle = 2.4 * number
         force = float(low * (high / low) ** rng.random())
         errors.append(relative_error(forward_map, distance, angle, force))
     return max(errors)
 
 
 def _limits_of(prior: FilmPrior, domain: Domain) -> FilmLimits:
-    """All that the presses of a domain can be on the films that a calibration may find."""
-    low, high = (dict(zip(prior.names, bound.tolist(), strict=True)) for bound in prior.bounds)
-    film, a = prior.sensor.film, prior.sensor.film.radius
-    stiffness = [film.young * film.thickness * a * np.exp(bound["young"] + bound["thickness"]) for bound in (low, high)]
-    softest = film.young * np.exp(low["young"])
+    """Return the limits of the dimensionless parameters of the presses on the films that a calibration may find."""
+    low_bounds, high_bounds = prior.bounds
+    low = dict(zip(prior.names, low_bounds.tolist(), strict=True))
+    high = dict(zip(prior.names, high_bounds.tolist(), strict=True))
+    film = prior.sensor.film
+    a = film.radius
+    min_stiffness = film.young * film.thickness * a * np.exp(low["young"] + low["thickness"])
+    max_stiffness = film.young * film.thickness * a * np.exp(high["young"] + high["thickness"])
+    min_young = film.young * np.exp(low["young"])
+    min_force, max_force = domain.force_range
     return {
         "distance": (0.0, domain.radius / a),
-        "load": (domain.force_range[0] / stiffness[1], domain.force_range[1] / stiffness[0]),
-        "tension": (low["pretension"] / softest, high["pretension"] / softest),
+        "load": (min_force / max_stiffness, max_force / min_stiffness),
+        "tension": (low["pretension"] / min_young, high["pretension"] / min_young),
         "thickness": (film.thickness / a * np.exp(low["thickness"]), film.thickness / a * np.exp(high["thickness"])),
         "reach": ((prior.probe.radius + low["probe_radius"]) / a, (prior.probe.radius + high["probe_radius"]) / a),
     }

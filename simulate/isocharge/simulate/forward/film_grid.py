@@ -1,4 +1,4 @@
-"""The grid of a family of films: its axes, its nodes, and stresses on it as the coefficients of few modes."""
+"""The grid of a family of films, and the low-rank decomposition of the stresses at its nodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,28 +11,32 @@ from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 AXES = ("distance", "load", "tension", "thickness", "reach")
-"""The numbers that a press of a film is described by, in the order of the grid's axes."""
+"""Dimensionless coordinates of a press on a film, in the order of the axes of the grid."""
 
 THEORY = Theory(stretching=True, bending=True, pretensioned=True)
-"""All terms: a family holds slack films and taut ones."""
+"""Theory of all solves of a family, which includes all terms because the pretension varies."""
 
 SOFTENING = 4e-4
-"""Added to the tension before its logarithm is taken: about the strain that a press of 0.05 N induces, below which the
-pretension makes no difference."""
+"""Strain that is added to the pretension strain before its logarithm is taken.
+
+It is about the strain that a press of 0.05 N induces. Smaller pretensions have no effect.
+"""
 
 FilmLimits = dict[str, tuple[float, float]]
-"""Smallest and largest value along each of `AXES`, all dimensionless."""
+"""Smallest and largest value along each of `AXES`, dimensionless."""
 
 
 @dataclass(frozen=True)
 class FilmGrid:
-    """Nodes of a family, one array for each of `AXES`, ascending.
+    """Nodes of a family, with one ascending array for each of `AXES`.
+
+    E is Young's modulus, h the thickness and a the radius of the film.
 
     Attributes:
-        distance: Of the press from the film's centre over the film's radius a.
-        load: F / (E h a).
+        distance: Distance of the press from the centre of the film over a.
+        load: Force over E h a.
         tension: Pretension over E.
-        thickness: h / a.
+        thickness: Thickness h over a.
         reach: Radius of the probe over a.
     """
 
@@ -44,13 +48,20 @@ class FilmGrid:
 
     @classmethod
     def spread(cls, limits: FilmLimits, counts: Sequence[int]) -> "FilmGrid":
-        """Chebyshev nodes between the limits: of load, reach and softened tension in the logarithm."""
+        """Distribute Chebyshev nodes between limits.
+
+        The nodes of the load, the reach and the tension (plus `SOFTENING`) are Chebyshev nodes in the logarithm.
+
+        Args:
+            limits: Smallest and largest value along each axis.
+            counts: Number of nodes along each of `AXES`.
+        """
         axes = {name: (_stretched(name, low), _stretched(name, high)) for name, (low, high) in limits.items()}
         nodes = [chebyshev_nodes(count, *axes[name]) for name, count in zip(AXES, counts, strict=True)]
         return cls(*(_unstretched(name, values) for name, values in zip(AXES, nodes, strict=True)))
 
     def weights(self, axis: str, at: float) -> Array:
-        """Interpolation weights of an axis at one value, shape (n_node,)."""
+        """Compute the weights of the nodes of an axis for the interpolation to a value `at`, shape (n_node,)."""
         nodes = _stretched(axis, getattr(self, axis))
         return np.asarray(lagrange_values(nodes, barycentric_weights(nodes), np.array([_stretched(axis, at)]))[0])
 
@@ -61,51 +72,82 @@ class FilmGrid:
 
 
 def _stretched(axis: str, value: Array | float) -> Any:
-    """The coordinate in which an axis is interpolated by polynomials."""
+    """Return the coordinate in which the values of an axis are interpolated by polynomials."""
     if axis in ("load", "reach"):
         return np.log(value)
-    return np.log(value + SOFTENING) if axis == "tension" else value
+    if axis == "tension":
+        return np.log(value + SOFTENING)
+    return value
 
 
 def _unstretched(axis: str, value: Array) -> Array:
+    """Convert interpolation coordinates of an axis into values. This is the inverse of `_stretched`."""
     if axis in ("load", "reach"):
         return np.exp(value)
-    return np.maximum(np.exp(value) - SOFTENING, 0.0) if axis == "tension" else value
+    if axis == "tension":
+        return np.maximum(np.exp(value) - SOFTENING, 0.0)
+    return value
 
 
-def bits_of(coefficients: Array, modes: Array, most: int, spare: float) -> Array:
-    """Bits for each mode, shape (n_mode,): fewer, but for `spare` ones, for those of which there is little.
+def bits_of(coefficients: Array, modes: Array, max_bits: int, extra_bits: float) -> Array:
+    """Compute the number of bits with which each mode of a decomposition is stored.
+
+    Modes with small contributions need fewer bits for the same absolute error.
 
     Args:
-        coefficients: Shape (..., n_mode).
-        modes: Shape (n_mode, n).
-        most: Bits of the largest mode.
-        spare: As many modes share the error, each is given some bits more than its size asks for.
+        coefficients: Coefficients of the modes, shape (..., n_mode).
+        modes: Modes, shape (n_mode, n).
+        max_bits: Number of bits of the mode with the largest contribution.
+        extra_bits: Number of bits that each mode gets in addition, because the errors of many modes add up.
+
+    Returns:
+        Shape (n_mode,).
     """
     largest = np.abs(coefficients).reshape(-1, len(modes)).max(axis=0) * np.abs(modes).max(axis=1)
-    return np.asarray(np.clip(np.round(most + spare + np.log2(largest / largest.max())), 2.0, most))
+    relative_bits = np.log2(largest / largest.max())
+    return np.asarray(np.clip(np.round(max_bits + extra_bits + relative_bits), 2.0, max_bits))
 
 
 def quantised(values: Array, axis: int | tuple[int, ...], bits: Array | int) -> tuple[np.ndarray, Array]:
-    """Integers of some bits, and the scales along an axis that give the values back: values = integers * scale."""
+    """Round values to integers with a scale.
+
+    Args:
+        values: The values.
+        axis: Axes along which the values have the same scale.
+        bits: Number of bits of the integers, a number or an array that broadcasts with the scales.
+
+    Returns:
+        The integers, shape of `values`, and the scales. The values are approximately integers * scales.
+    """
     scale = np.abs(values).max(axis=axis, keepdims=True) / (2 ** (bits - 1) - 1)
     return np.round(values / scale).astype(np.int16), scale
 
 
-def decompose(stress: Array, left_out: float) -> tuple[Array, Array]:
-    """Coefficients and modes of scaled stresses of shape (..., n): the fewest that leave out a share.
+def decompose(stress: Array, max_error: float) -> tuple[Array, Array]:
+    """Compute a low-rank decomposition of stresses (proper orthogonal decomposition).
 
-    Every node counts relative to its own stress: the peak under the probe would else hide the electrodes.
+    The stress at each node is scaled by its root mean square. Otherwise the large stress under the probe would dominate
+    the stress at the electrodes.
+
+    Args:
+        stress: Scaled stresses of all presses, shape (..., n).
+        max_error: Largest relative error of the decomposition (root mean square).
+
+    Returns:
+        Coefficients, shape (..., n_mode), and modes, shape (n_mode, n), with the smallest number of modes.
     """
     flat = stress.reshape(-1, stress.shape[-1])
-    size = np.repeat(np.sqrt((flat.reshape(len(flat), -1, 3) ** 2).sum(axis=2).mean(axis=0)), 3)
+    node_stress = np.sqrt((flat.reshape(len(flat), -1, 3) ** 2).sum(axis=2).mean(axis=0))
+    size = np.repeat(node_stress, 3)
     relative = flat / size
-    few = len(relative) < relative.shape[1]  # the smaller of both products has the same values
-    values, vectors = np.linalg.eigh(relative @ relative.T if few else relative.T @ relative)
-    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
-    left = np.sqrt(np.maximum(1.0 - np.cumsum(values) / values.sum(), 0.0))
-    count = int(np.argmax(left <= left_out)) + 1
+    has_fewer_rows = len(relative) < relative.shape[1]
+    gram = relative @ relative.T if has_fewer_rows else relative.T @ relative
+    ascending_values, ascending_vectors = np.linalg.eigh(gram)
+    values = np.maximum(ascending_values[::-1], 0.0)
+    vectors = ascending_vectors[:, ::-1]
+    error = np.sqrt(np.maximum(1.0 - np.cumsum(values) / values.sum(), 0.0))
+    count = int(np.argmax(error <= max_error)) + 1
     modes = vectors[:, :count].T
-    if few:
+    if has_fewer_rows:
         modes = modes @ relative / np.sqrt(values[:count, None])
     return (relative @ modes.T).reshape(*stress.shape[:-1], count), modes * size

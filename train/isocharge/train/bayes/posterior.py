@@ -215,21 +215,21 @@ class Posterior:
     @cached_property
     def _profile(self) -> ForceProfile:
         """Charges as a function of the force."""
-        return ForceProfile.of(self.charges.by_force, self.charges.domain.force_range)
+        return ForceProfile.of(self.charges.force_weights, self.charges.domain.force_range)
 
     @cached_property
     def _roots(self) -> _RootCells:
         """The first cells."""
         cells = Cells.roots(self.radius)
         points = (cells.centre[:, None] + _grid(3, 0.5 * cells.side)).reshape(-1, 2)
-        slopes = self.charges.slopes(onto_disk(points, self.radius))
+        slopes = self.charges.scaled_gradients(onto_disk(points, self.radius))
         point_slope = np.linalg.norm(slopes, axis=-1).max(axis=1)
         largest_slope = point_slope.reshape(len(cells), 9, -1).max(axis=1)
         return _RootCells(cells, self._terms(cells), largest_slope)
 
     def _terms(self, cells: Cells) -> Array:
         """Compute the terms of the charges at the centres of cells, shape (n, n_term, n_electrode)."""
-        return self.charges.terms(onto_disk(cells.centre, self.radius))
+        return self.charges.scaled_charges(onto_disk(cells.centre, self.radius))
 
     def _integrate(self, charge: Array) -> Array:
         """Compute means and standard deviations, shape (2, n, 3), for charges of shape (n, n_electrode), pC."""
@@ -303,7 +303,7 @@ class Posterior:
         Returns:
             Chi-squared, shape (n,), and the largest slope of its square root, shape (n,), 1/mm.
         """
-        force_weights = self.charges.by_force(log_force)
+        force_weights = self.charges.force_weights(log_force)
         expected = np.einsum("nk,nke->ne", force_weights, terms)
         sigma = self.noise.sigma(expected)
         deviation = (charge - expected) / sigma
@@ -321,8 +321,8 @@ class Posterior:
         Returns:
             Shape (n,), 1/mm.
         """
-        force_weights = self.charges.by_force(log_force)
-        slopes = self.charges.slopes(onto_disk(cells.centre, self.radius))
+        force_weights = self.charges.force_weights(log_force)
+        slopes = self.charges.scaled_gradients(onto_disk(cells.centre, self.radius))
         expected = np.einsum("nk,nke->ne", force_weights, terms)
         position_jacobian = np.einsum("nk,nkei->nei", force_weights, slopes)
         force_jacobian = self._profile.slope(log_force, expected)[..., None]
@@ -340,7 +340,7 @@ class Posterior:
         Returns:
             Logarithms of the forces, and logarithms of weight times likelihood, shape (n, N_FORCE_NODES) each.
         """
-        terms = self.charges.terms(position)
+        terms = self.charges.scaled_charges(position)
         best = self._profile.best(terms, charge, self.noise)
         expected = self._profile.charge(best, terms)
         inverse_std = np.linalg.norm(self._profile.slope(best, expected) / self.noise.sigma(expected), axis=1)
@@ -350,7 +350,7 @@ class Posterior:
         high = np.minimum(best + half_width, largest)[:, None]
         nodes, weights = np.polynomial.legendre.leggauss(N_FORCE_NODES)
         log_force = 0.5 * (low + high) + 0.5 * (high - low) * nodes
-        expected = np.einsum("nmk,nke->enm", self.charges.by_force(log_force), terms)
+        expected = np.einsum("nmk,nke->enm", self.charges.force_weights(log_force), terms)
         variance = self.noise.variance(expected)
         chi2 = ((charge.T[:, :, None] - expected) ** 2 / variance).sum(axis=0)
         log_likelihood = -0.5 * (chi2 + np.log(variance.prod(axis=0)))
