@@ -31,19 +31,26 @@ def listening(listener: Listener) -> Iterator[None]:
 
 
 def report(title: str, done: int, total: int, note: str = "") -> None:
-    """Tell the listener, if there is one, how far a piece of work is."""
+    """Report the progress of a piece of work to the listener, if there is one.
+
+    Args:
+        title: Title of the work for people, such as "solving the film".
+        done: Number of finished items.
+        total: Number of all items.
+        note: Further text for people.
+    """
     listener = _listener.get()
     if listener:
         listener(title, done, total, note)
 
 
 def track(items: Iterable[Item], title: str, total: int | None = None) -> Iterator[Item]:
-    """The items one by one; each counts as done when the next is asked for.
+    """Yield the items and report the progress. An item counts as done when the next one is requested.
 
     Args:
-        items: What the work goes through.
-        title: Of the work, for people: "solving the film".
-        total: Number of items; may be absent if they have a length.
+        items: The items of the work.
+        title: Title of the work for people, such as "solving the film".
+        total: Number of items; it may be absent if the items have a length.
     """
     count = len(items) if total is None else total  # type: ignore[arg-type]
     for done, item in enumerate(items, start=1):

@@ -86,8 +86,8 @@ class Recorder:
         self._header = {KIND: VERSION, "model": model, "policy": policy, "device": dict(device)}
         if name:
             self._header["name"] = name
-        self._last: Chunk | None = None  # the chunk that was given last, and the size of the file before it
-        self._begin = 0
+        self._last_chunk: Chunk | None = None
+        self._size_before_last = 0  # size of the file before the last chunk, bytes
 
     def __enter__(self) -> Self:
         """Create the file.
@@ -109,13 +109,17 @@ class Recorder:
         self._file.close()
 
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
-        """Write a chunk and the lines of its records, once: after an interruption it may be given again."""
-        if chunk is self._last and self._file.tell() > self._begin:
+        """Write a chunk and the lines of its records.
+
+        After an interruption the same chunk may be passed again. It is written once.
+        """
+        if chunk is self._last_chunk and self._file.tell() > self._size_before_last:
             return
         data = base64.b64encode(chunk.data).decode()
-        head = json.dumps({"chunk": [chunk.timestamp, chunk.clock_ns, chunk.outage_s, data]})
-        self._last, self._begin = chunk, self._file.tell()
-        self._write("\n".join([head, *records]))
+        chunk_line = json.dumps({"chunk": [chunk.timestamp, chunk.clock_ns, chunk.outage_s, data]})
+        self._last_chunk = chunk
+        self._size_before_last = self._file.tell()
+        self._write("\n".join([chunk_line, *records]))
 
     def tare(self) -> None:
         """Write a request for a new tare."""
@@ -126,7 +130,7 @@ class Recorder:
         self._write('{"back": true}')
 
     def model(self, label: str) -> None:
-        """Write the label, `name/version`, of the model of all that follows."""
+        """Write the label, `name/version`, of the model that computes the records from here on."""
         self._write(json.dumps({"use": label}))
 
     def mark(self, marker: Marker) -> None:
@@ -134,7 +138,7 @@ class Recorder:
         self._write(json.dumps({"marker": list(marker)}))
 
     def _write(self, lines: str) -> None:
-        """Write whole lines or none, over what an interruption left of them."""
+        """Write whole lines or none; a partial write of an interruption is overwritten."""
         if self.failed:
             return
         try:
@@ -145,7 +149,12 @@ class Recorder:
 
 
 class Event(NamedTuple):
-    """A chunk with the latencies of its records (us), or a request for a new tare (no chunk)."""
+    """A chunk of the recording, or a request for a new tare.
+
+    Attributes:
+        chunk: The chunk; None for a request for a new tare.
+        latencies_us: Latencies of the records of the chunk, us.
+    """
 
     chunk: Chunk | None
     latencies_us: tuple[float, ...] = ()
@@ -156,26 +165,26 @@ class Back(NamedTuple):
 
 
 class NewModel(NamedTuple):
-    """The label, `name/version`, of the model that computed all that follows."""
+    """The label, `name/version`, of the model that computed the records from here on."""
 
     label: str
 
 
 class Recording:
-    """A recording to read.
+    """Reads a recording.
 
     Attributes:
-        model: The model's label, `name/version`.
+        model: Label of the model, `name/version`, at the beginning of the recording.
         policy: Which frames got a record.
         device: Content of the device file.
-        name: The film's own name in the records; empty for that of the model's sensor.
+        name: Name of the film in the records; empty if it is the name of the model's sensor.
     """
 
     def __init__(self, path: Path) -> None:
         """Read the first line.
 
         Raises:
-            RecordingError: If it cannot be read, or is no recording of this version.
+            RecordingError: If the file cannot be read, or is not a recording of this version.
         """
         self._path = path
         try:
@@ -193,10 +202,13 @@ class Recording:
                 f"{path}: recording version {header.isocharge_recording} is not supported (this version reads "
                 f"{VERSION})"
             )
-        self.model, self.policy, self.device, self.name = header.model, header.policy, header.device, header.name
+        self.model = header.model
+        self.policy = header.policy
+        self.device = header.device
+        self.name = header.name
 
     def events(self) -> Iterator[Event | Marker | NewModel | Back]:
-        """Chunks, requests for a new tare, markers and changes of the model, in their order.
+        """Yield the chunks, requests for a new tare, markers and changes of the model, in their order.
 
         Raises:
             RecordingError: If a line other than the last one is damaged.
@@ -209,31 +221,38 @@ class Recording:
                 continue
             if chunk is not None:
                 yield Event(chunk, tuple(latencies_us))
-            chunk, latencies_us = entry.bytes_that_came, []
+            chunk = entry.recorded_chunk
+            latencies_us = []
             if chunk is None:
-                yield entry.moment
+                yield entry.other_event
         if chunk is not None:
             yield Event(chunk, tuple(latencies_us))
 
     def records(self, kind: type[Line]) -> Iterator[Line]:
-        """The records as they were written, in their order, each as a struct of the fields that are wanted.
+        """Yield the records as they were written, in their order.
+
+        Args:
+            kind: Struct with the fields that are read of each record.
 
         Raises:
-            RecordingError: If a line other than the last one is damaged, or a record is another one.
+            RecordingError: If a line other than the last one is damaged, or a record lacks a field of the struct.
         """
-        return self._lines(kind, only='{"timestamp"')
+        return self._lines(kind, beginning='{"timestamp"')
 
-    def _lines(self, kind: type[Line], only: str = "") -> Iterator[Line]:
-        """Each line after the first, those alone that begin so."""
-        number, characters, size = 1, 0, self._path.stat().st_size
+    def _lines(self, kind: type[Line], beginning: str = "") -> Iterator[Line]:
+        """Yield the lines after the first one, decoded; only lines with the given beginning, if there is one."""
+        number = 1
+        characters = 0
+        size = self._path.stat().st_size
         try:
             with self._path.open(encoding="utf-8", errors="replace") as file:
                 for line in bounded_lines(file, LONGEST_ENTRY):
                     if not line.endswith("\n"):
-                        return  # the power failed while it was written
-                    if number > 1 and (line.startswith(only) or not line.startswith("{")):
+                        return  # the power failed while the line was written
+                    if number > 1 and (line.startswith(beginning) or not line.startswith("{")):
                         yield parse_json(line, "", RecordingError, kind)
-                    number, characters = number + 1, characters + len(line)
+                    number += 1
+                    characters += len(line)
                     if number % 1000 == 0:
                         report("reading", min(characters, size), size)
         except (OSError, ValueError) as error:
@@ -241,7 +260,7 @@ class Recording:
 
 
 class _Header(Struct):
-    """The first line."""
+    """The first line of a recording."""
 
     isocharge_recording: int
     model: ModelLabel
@@ -255,7 +274,7 @@ class _Header(Struct):
 
 
 class _Entry(Struct):
-    """A later line: one of these keys, or a record."""
+    """A later line of a recording: a record, or an object with one of the other keys."""
 
     timestamp: float | None = None
     latency_us: Latency | None = None
@@ -272,36 +291,41 @@ class _Entry(Struct):
             raise WrongKey("chunk")
 
     @property
-    def bytes_that_came(self) -> Chunk | None:
-        """The chunk, if it is one."""
+    def recorded_chunk(self) -> Chunk | None:
+        """The chunk of this line; None if the line is not a chunk."""
         if self.chunk is None:
             return None
         timestamp, clock_ns, outage_s, data = self.chunk
         return Chunk(data, timestamp, clock_ns, outage_s)
 
     @property
-    def moment(self) -> Event | Marker | NewModel | Back:
-        """What happened, if it is neither record nor chunk."""
+    def other_event(self) -> Event | Marker | NewModel | Back:
+        """The event of this line, if the line is neither a record nor a chunk."""
         if self.marker is not None:
             return Marker(*self.marker)
         if self.back is not None:
             return Back()
-        return Event(None) if self.use is None else NewModel(self.use)
+        if self.use is not None:
+            return NewModel(self.use)
+        return Event(None)
 
 
 class RecordedClock:
-    """The clock of a replay: for each record it shows the time at which that record was built."""
+    """The clock of a replay. For each record it shows the time at which the original record was built."""
 
     def __init__(self) -> None:
         self._base_ns = 0
         self._latencies_us: deque[float] = deque()
 
     def set(self, event: Event) -> None:
-        """The next records are those of this chunk."""
+        """Set the clock to a chunk, whose records are built next."""
         self._base_ns = event.chunk.clock_ns if event.chunk else 0
         self._latencies_us = deque(event.latencies_us)
 
     def __call__(self) -> int:
-        """Nanoseconds on the clock of `Chunk.clock_ns`: the arrival itself once the records of the chunk are over."""
+        """Return the time of the next record on the clock of `Chunk.clock_ns`, ns.
+
+        After the last record of the chunk, the time of its arrival is returned.
+        """
         latency_us = self._latencies_us.popleft() if self._latencies_us else 0.0
         return self._base_ns + round(latency_us * 1e3)

@@ -54,15 +54,15 @@ class Chain:
 
     Attributes:
         gain_pC: Charge per unit of the device, with sign, shape (electrodes,), pC.
-        zero: What the device shows without charge, shape (electrodes,), in its unit.
+        zero: Values that the device shows without charge, shape (electrodes,), in its unit.
         limit_pC: Largest charge that the converter can show, pC.
-        hum: How mains hum is estimated.
+        hum: Settings of the estimate of mains hum.
         tare: Which frames are quiet enough for a tare.
         tau_s: Time constant of each amplifier, shape (electrodes,), s; None if charges do not leak.
-        leak: How the offset current of the amplifiers is learned.
-        memory: What a held press does to the charges of the film.
-        touch: When something touches; without it, every frame with a tare is in contact.
-        thermal: How warming of the film is estimated.
+        leak: Settings of the estimate of the amplifiers' offset current.
+        memory: Memory of the film: how a held press changes its charges.
+        touch: Thresholds of a touch; without them, every frame with a tare is in contact.
+        thermal: Settings of the estimate of warming.
         pyro: Charge of each electrode over the mean magnitude of all when the film warms, shape (electrodes,),
             dimensionless; 1.0 if all electrodes are alike.
         largest: Largest value of a valid reading, in the unit of the device.

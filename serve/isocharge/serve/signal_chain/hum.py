@@ -21,7 +21,7 @@ LEAST_TURN = 0.02
 
 
 class HumRule(Rule, frozen=True, kw_only=True):
-    """How hum is estimated; the section `[hum]` of a device file.
+    """Settings of the estimate of hum; the section `[hum]` of a device file.
 
     Attributes:
         frequency_Hz: Frequency of the mains, 50 or 60 Hz.
@@ -57,7 +57,7 @@ def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) 
     """Subtract the hum from a frame, and update the estimate.
 
     Args:
-        rule: How hum is estimated.
+        rule: Settings of the estimate of hum.
         hum: State after the frame before.
         raw_pC: Charges of the frame, shape (electrodes,), pC.
         t_s: Time on the clock of the device, s.

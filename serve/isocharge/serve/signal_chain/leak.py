@@ -25,7 +25,7 @@ from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
 
 class LeakRule(Rule, frozen=True, kw_only=True):
-    """How the inflow of the amplifiers is estimated; a part of the section `[leak]` of a device file.
+    """Settings of the estimate of the inflow; a part of the section `[leak]` of a device file.
 
     Attributes:
         learn: Whether the inflow b is estimated.
@@ -82,7 +82,7 @@ def undo_leak(
     """Return the state after the next frame.
 
     Args:
-        rule: How the inflow is estimated.
+        rule: Settings of the estimate of the inflow.
         tau_s: Time constant of each amplifier, shape (electrodes,), s.
         leak: State after the frame before.
         output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
@@ -119,7 +119,7 @@ def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array,
     """Return the state with a corrected inflow.
 
     Args:
-        rule: How the inflow is estimated.
+        rule: Settings of the estimate of the inflow.
         leak: State of this frame with the inflow of the frame before.
         surplus_pC: Innovation that the inflow does not explain, shape (electrodes,), pC. It is clipped.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.

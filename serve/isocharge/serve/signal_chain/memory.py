@@ -86,7 +86,7 @@ MIN_CREEP_PC = 1e-9
 
 
 class MemoryRule(Rule, frozen=True, kw_only=True):
-    """How a held press changes the charges of the film; the section `[memory]` of a device file.
+    """Memory of the film: how a held press changes its charges; the section `[memory]` of a device file.
 
     Attributes:
         creep: Share of a charge that is lost in each decade of time.
@@ -218,9 +218,9 @@ def undo_memory(
     """Return the state after the next frame. The touch charge is `leak.charge_pC`.
 
     Args:
-        rule: How the film behaves.
-        leak_rule: How the inflow is estimated, how old the values are with which a touch begins, and how long the
-            estimates pause after a release.
+        rule: Memory of the film.
+        leak_rule: Settings of the estimate of the inflow: also the age of the values with which a touch begins, and
+            the pause of the estimates after a release.
         tau_s: Time constant of each amplifier, shape (electrodes,), s; None if charges do not leak.
         memory: State after the frame before.
         output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.

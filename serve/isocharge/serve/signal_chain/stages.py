@@ -34,7 +34,7 @@ class Gain(Stage):
 
         Args:
             gain_pC: Charge per unit of the device, with sign, shape (electrodes,), pC; None if the unit is pC.
-            zero: What the device shows without charge, shape (electrodes,), in its unit; None for zeros.
+            zero: Values that the device shows without charge, shape (electrodes,), in its unit; None for zeros.
         """
         self._gain_pC = gain_pC
         self._zero = zero
@@ -183,7 +183,7 @@ class MemoryStage(OffsetStage):
 
         Args:
             rule: Memory of the film.
-            leak_rule: How the offset of the amplifiers is learned.
+            leak_rule: Settings of the estimate of the amplifiers' inflow.
             tau_s: Time constant of each amplifier, shape (electrodes,), s; None if charges do not leak.
         """
         self._rule = rule
@@ -311,7 +311,7 @@ class Warming(Stage):
         """Begin without any warming.
 
         Args:
-            rule: How warming is estimated.
+            rule: Settings of the estimate of warming.
             misfit: Misfit of the model that currently answers.
             offset_stage: Stage that holds the charge at rest, to which the warming is added.
             ratios: Charge of each electrode over the mean magnitude of all, shape (electrodes,), dimensionless.

@@ -44,7 +44,7 @@ def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None
     """Return the tare of the latest frames, or None if they are too few or not quiet.
 
     Args:
-        rule: Number of frames, and how quiet they have to be.
+        rule: Number of frames, and limits of their noise and offset.
         waiting_pC: Charges of the latest frames, at most `rule.frames`, shape (k, electrodes), pC.
         frames: Number of frames since the search began.
 
@@ -65,7 +65,7 @@ def measure_tare(rule: TareRule, raw_pC: Array) -> Tare:
     """Return the mean and the noise of frames in which nothing touches the film.
 
     Args:
-        rule: How quiet the frames have to be.
+        rule: Limits of noise and offset of quiet frames.
         raw_pC: Charges of the frames, shape (n, electrodes), pC.
 
     Raises:

@@ -31,7 +31,7 @@ Misfit = Callable[[Array], Reals]
 
 
 class ThermalRule(Rule, frozen=True, kw_only=True):
-    """How warming is estimated; a part of the section `[common_mode]` of a device file.
+    """Settings of the estimate of warming; a part of the section `[common_mode]` of a device file.
 
     Attributes:
         every_s: Time between two estimates, s.
@@ -86,7 +86,7 @@ def track_thermal_drift(
     """Return the state after the next frame in contact.
 
     Args:
-        rule: How warming is estimated.
+        rule: Settings of the estimate of warming.
         state: State after the frame before.
         charge_pC: Touch charges without the warming so far, shape (electrodes,), pC.
         misfit: Misfit of the model that answers.
@@ -121,7 +121,7 @@ def _predicted(
     """Return the predicted variance of p, its covariance with the slope, and the variance of the slope.
 
     Args:
-        rule: How warming is estimated.
+        rule: Settings of the estimate of warming.
         state: State at the last estimate.
         waited_s: Time since the last estimate, s.
         warmth_s: Time constant with which the slope of p decays, s; None if the slope is not predicted.
