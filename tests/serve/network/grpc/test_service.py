@@ -101,7 +101,7 @@ def test_flags_that_are_not_raw(serve):
         (
             {"inputs": [tensor([[1.0] * 3])], "outputs": [{"name": "contact_correlation"}]},
             "INVALID_ARGUMENT",
-            "expected one of contact, contact_std, misfit, got 'contact_correlation', which linear/2 has not",
+            "expected one of contact, contact_std, misfit, got 'contact_correlation', which linear/2 does not have",
         ),
         ({"inputs": [tensor([[1.0] * 3], shape=[5000, 3])]}, "RESOURCE_EXHAUSTED", "at most 4096 presses"),
         ({"model_name": "cubic"}, "NOT_FOUND", "'cubic' is not found; serving: linear/1, linear/2"),
@@ -144,19 +144,19 @@ def test_tls(handler, authority, tls_files):
         pass
 
 
-def test_errors_that_are_ours_are_not_told(serve, store, monkeypatch, caplog):
+def test_message_of_an_internal_error_is_logged_and_not_sent(serve, store, monkeypatch, caplog):
     def fail(*_):
         raise ZeroDivisionError("a secret")
 
-    monkeypatch.setattr(store, "all", fail)
+    monkeypatch.setattr(store, "loaded_versions", fail)
     with pytest.raises(grpc.RpcError, match="internal error") as caught:
         call(serve()(), "ServerReady")
     assert caught.value.code() is grpc.StatusCode.INTERNAL
     assert "a secret" in caplog.text
 
 
-def test_compiled_messages_are_those_of_the_source(tmp_path):
-    """`make proto` was not forgotten. Only what a reader sees is compared: compilers differ in details."""
+def test_compiled_protocol_file_equals_the_source(tmp_path):
+    """Only the descriptors are compared, because compilers differ in details."""
     made = tmp_path / "made.binpb"
     words = [sys.executable, "-m", "grpc_tools.protoc", f"-I{PROTO.parent}", f"--descriptor_set_out={made}", PROTO.name]
     subprocess.run(words, check=True)

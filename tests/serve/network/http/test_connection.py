@@ -1,4 +1,4 @@
-"""One connection, without a network: the answers do not depend on how the requests are cut into pieces."""
+"""HTTP connections without a network: the responses do not depend on how the requests are split into pieces."""
 
 import asyncio
 
@@ -16,11 +16,11 @@ TRAILED = b"POST /one HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\
 
 
 class Echo:
-    """Answers with what it was asked."""
+    """Handler that responds with the method, path, headers and body of the request."""
 
     limits = ServerLimits()
 
-    def blocks(self, _path):
+    def may_block(self, _path):
         return False
 
     def answer(self, method, path, headers, body, _client=None):
@@ -31,7 +31,7 @@ class Echo:
 
 
 class Wire(asyncio.Transport):
-    """Keeps what is sent."""
+    """Transport that stores the sent bytes."""
 
     def __init__(self):
         super().__init__()
@@ -121,8 +121,8 @@ def test_pieces_that_begin_and_end_anywhere(connect, requests, cuts):
     assert answers(connect, [*filter(None, [*pieces, rest])]) == answers(connect, byte_by_byte(data))
 
 
-def test_a_body_is_no_request(connect):
-    """The second half of a request looks like a request that was answered before."""
+def test_body_that_looks_like_an_earlier_request_is_not_answered_as_a_request(connect):
+    """The second part of the request equals a complete request that was answered before."""
     outer = request(b"POST", b"/two", b"", b"first\r\n\r\n" + INNER, chunked=False)
     at = outer.index(INNER)
     sent, _ = answers(connect, [INNER, outer[:at], outer[at:], INNER])
@@ -130,19 +130,19 @@ def test_a_body_is_no_request(connect):
     assert sent.count(b"'/two'") == 1
 
 
-def test_the_end_of_a_head_is_no_head(connect):
-    """What completed a request once is no request when it comes alone."""
+def test_end_of_an_earlier_request_alone_is_refused(connect):
+    """The bytes that completed a request are not a request themselves."""
     sent, closed = answers(connect, [INNER[:1], INNER[1:], INNER[1:]])
     assert (sent.count(b"HTTP/1.1 200"), sent.count(b"HTTP/1.1 400"), closed) == (1, 1, True)
 
 
 @pytest.mark.parametrize("blank", [b"\r\n\r\n", b"\n\r\n\r\n"])
-def test_blank_lines_are_no_requests(connect, blank):
+def test_blank_lines_before_a_request_are_ignored(connect, blank):
     sent, _ = answers(connect, [blank, blank, INNER, blank, blank])
     assert sent.count(b"HTTP/1.1 200") == 1
 
 
-def test_trailers_are_no_headers(connect):
+def test_trailers_are_not_headers(connect):
     """Of a request that is answered, and of the next one."""
     sent, _ = answers(connect, [TRAILED + b"0\r\nHost: y\r\nA: b\r\n\r\n", INNER])
     assert [sent.count(part) for part in (b"HTTP/1.1 200", b"b'y'", b"b'a'")] == [2, 0, 0]
@@ -159,7 +159,7 @@ def test_what_goes_with_a_body_is_bounded_as_headers(connect, endless, piece):
     assert (sent[:12], closed) == (b"HTTP/1.1 431", True)
 
 
-def test_many_small_chunks_are_a_body(connect):
+def test_many_small_chunks_are_one_body(connect):
     data = TRAILED[: TRAILED.index(b"3\r\n")] + b"1\r\nx\r\n" * 20_000 + b"0\r\n\r\n"
     sent, _ = answers(connect, [data[at : at + 4096] for at in range(0, len(data), 4096)])
     assert b"x" * 20_000 in sent

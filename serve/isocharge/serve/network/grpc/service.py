@@ -1,12 +1,12 @@
-"""The gRPC server: `inference.GRPCInferenceService` on the models, limits, token and certificate of the HTTP server.
+"""gRPC server: `inference.GRPCInferenceService` with the models, limits, token and certificate of the HTTP server.
 
-It has an event loop of its own. An open call costs no thread, so that no number of clients that open calls and wait can
-hold up the others. What a client sends is a stream to grpcio also where it is one message: so the token is checked, and
-the bounds hold, before a message comes, and whether one comes at all. A client may open calls and say nothing: when all
-places are taken, the call that has waited longest for its client gives its place to the new one.
+The server runs in its own event loop, and an open call needs no thread, so that idle calls do not delay other clients.
+All methods are declared as streams of messages from the client. The token and the limits can therefore be checked
+before the first message arrives. If the largest number of calls is open, a new call replaces the call that has waited
+longest for a message from its client.
 
-The messages are built from the compiled `inference.proto`. They live in a separate pool, so that a program may use this
-server and another implementation of the same protocol, whose messages have the same names, side by side.
+The message classes are built from the compiled `inference.proto` in a separate descriptor pool, so that a program may
+also use another implementation of the protocol, whose messages have the same names.
 """
 
 import asyncio
@@ -37,17 +37,18 @@ from isocharge.serve.network.protocol.inference import (
     InferAnswer,
     InferRequest,
     answer_inference,
-    packed,
-    request_of,
+    binary_tensor,
+    parse_request,
 )
 from isocharge.serve.network.protocol.response import client_message, statuses
 from isocharge.serve.network.traffic import Exchange
 
 SERVICE = "inference.GRPCInferenceService"
+"""Full name of the service."""
 
 
-def _load() -> Any:
-    """The service's descriptor."""
+def _service_descriptor() -> Any:
+    """Return the descriptor of the service from the compiled protocol file."""
     compiled = files("isocharge.serve.network.grpc").joinpath("inference.binpb").read_bytes()
     pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(compiled).file:
@@ -56,56 +57,68 @@ def _load() -> Any:
 
 
 METHODS: dict[str, tuple[type[Any], type[Any]]] = {
-    method.name: (GetMessageClass(method.input_type), GetMessageClass(method.output_type)) for method in _load().methods
+    method.name: (GetMessageClass(method.input_type), GetMessageClass(method.output_type))
+    for method in _service_descriptor().methods
 }
-"""Method name to the classes of its request and its answer."""
+"""Classes of the request and of the response of each method, by its name."""
+
+CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
+"""Field of a tensor's contents that holds the numbers, by number type."""
 
 
-CONTENTS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
-"""Which field of a tensor's contents has its numbers."""
+def read_request(message: Any, loaded: LoadedVersion, batch: int) -> InferRequest:
+    """Read a ModelInferRequest. If the input is raw, the outputs are requested as raw contents, too.
 
-
-def read_infer(message: Any, loaded: LoadedVersion, batch: int) -> InferRequest:
-    """The request in a ModelInferRequest. Raw numbers are answered with raw numbers, typed ones with typed ones.
+    Args:
+        message: The message.
+        loaded: The model.
+        batch: Largest number of presses in one request.
 
     Raises:
-        RequestError, ChargeError, TooLarge: If it is not one for this model.
+        RequestError: If the message is not a request for this model.
+        ChargeError: If a charge is not finite.
+        TooLarge: If there are more presses than `batch`.
     """
     raw = message.raw_input_contents
     if len(raw) > 1:
         raise RequestError(f"expected one input tensor, got {len(raw)} raw contents")
     content = {
         "id": message.id,
-        "inputs": [_input(tensor, raw) for tensor in message.inputs],
-        "outputs": [{"name": output.name, "parameters": _unsupported(output)} for output in message.outputs],
+        "inputs": [_input_object(tensor, raw) for tensor in message.inputs],
+        "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
         "parameters": {"binary_data_output": bool(raw)},
     }
-    return request_of(content, raw[0] if raw else b"", loaded, batch)
+    return parse_request(content, raw[0] if raw else b"", loaded, batch)
 
 
-def _input(tensor: Any, raw: Any) -> dict[str, Any]:
-    """A tensor as JSON would have it."""
-    parameters: dict[str, Any] = _unsupported(tensor)
+def _input_object(tensor: Any, raw: Any) -> dict[str, Any]:
+    """Return an input tensor as the JSON object of the HTTP protocol."""
+    parameters: dict[str, Any] = _unsupported_parameters(tensor)
     content = {"name": tensor.name, "datatype": tensor.datatype, "shape": list(tensor.shape), "parameters": parameters}
     if raw:
         parameters["binary_data_size"] = len(raw[0])
     if tensor.HasField("contents") or not raw:
-        content["data"] = list(getattr(tensor.contents, CONTENTS.get(tensor.datatype, "fp32_contents")))
+        field = CONTENT_FIELDS.get(tensor.datatype, "fp32_contents")
+        content["data"] = list(getattr(tensor.contents, field))
     return content
 
 
-def _unsupported(tensor: Any) -> dict[str, bool]:
-    """The parameters of a tensor that change what a request means and that this server does not know."""
+def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
+    """Return the parameters of a tensor that this server must refuse, because they change the meaning of a request."""
     return {name: True for name in ("shared_memory_region", "classification") if name in tensor.parameters}
 
 
-def write_answer(answer: InferAnswer, message: Any) -> Any:
-    """Fill a ModelInferResponse."""
-    message.model_name, message.model_version, message.id = answer.name, answer.version, answer.id
+def write_response(answer: InferAnswer) -> Any:
+    """Return the outputs of a model as a ModelInferResponse."""
+    _, response_type = METHODS["ModelInfer"]
+    message = response_type()
+    message.model_name = answer.name
+    message.model_version = answer.version
+    message.id = answer.id
     for name, rows in answer.outputs.items():
         tensor = message.outputs.add(name=name, datatype="BYTES" if name == FLAGS else "FP32", shape=rows.shape)
         if name in answer.binary:
-            message.raw_output_contents.append(packed(rows))
+            message.raw_output_contents.append(binary_tensor(rows))
         elif name == FLAGS:
             tensor.contents.bytes_contents.extend(text.encode() for text in rows[:, 0].tolist())
         else:
@@ -113,19 +126,25 @@ def write_answer(answer: InferAnswer, message: Any) -> Any:
     return message
 
 
-OPEN = ("ServerLive", "ServerReady")
+METHODS_WITHOUT_TOKEN = ("ServerLive", "ServerReady")
 """Methods that need no token."""
 
-BLOCKING = ("RepositoryModelLoad", "RepositoryModelUnload")
-"""Methods that may take longer than others should wait: they are answered in other threads."""
+SLOW_METHODS = ("RepositoryModelLoad", "RepositoryModelUnload")
+"""Methods that may take long and are answered in other threads."""
 
 STREAM = "ModelStreamInfer"
-"""The method of many messages."""
+"""Name of the method that receives and sends many messages."""
 
 
 @dataclass
 class _Call:
-    """What is known of a call for counters and log: the model that was asked, and the sizes of its messages."""
+    """Properties of a call for counters and log.
+
+    Attributes:
+        model: Label `name/version` of the requested model; None if the call names no model.
+        bytes_in: Total size of the received messages, bytes.
+        bytes_out: Total size of the sent messages, bytes.
+    """
 
     model: str | None = None
     bytes_in: int = 0
@@ -133,15 +152,17 @@ class _Call:
 
 
 class Service:
-    """Answers calls from the models of a handler, within its limits."""
+    """Answers calls with the models, the token and the limits of a handler."""
 
     def __init__(self, handler: Handler) -> None:
-        """No call is open yet."""
-        self._limits, self._traffic, self._token = handler.limits, handler.traffic, handler.token
-        self._store = store = handler.store
-        self._open = 0
-        self._waiting: dict[asyncio.Timeout, None] = {}  # in the order in which they began to wait
-        self._traffic.open["grpc"] = lambda: self._open
+        store = handler.store
+        self._store = store
+        self._limits = handler.limits
+        self._traffic = handler.traffic
+        self._token = handler.token
+        self._open_calls = 0
+        self._waiting: dict[asyncio.Timeout, None] = {}  # an ordered set of the calls that wait for a message
+        self._traffic.open["grpc"] = lambda: self._open_calls
         self._answers: dict[str, Callable[[Any], Any]] = {
             "ServerLive": lambda _: {"live": True},
             "ServerReady": lambda _: {"ready": bool(store.loaded_versions())},
@@ -160,49 +181,78 @@ class Service:
         }
 
     def handlers(self) -> grpc.GenericRpcHandler:
-        """The service as grpcio takes it."""
+        """Return the handlers of all methods for grpcio."""
         methods = {name: grpc.stream_unary_rpc_method_handler(partial(self._handle, name)) for name in METHODS}
         methods[STREAM] = grpc.stream_stream_rpc_method_handler(partial(self._handle, STREAM))
         return grpc.method_handlers_generic_handler(SERVICE, methods)
 
     async def _handle(self, name: str, _: object, context: grpc.aio.ServicerContext) -> Any:
-        call, began, status, error_kind = _Call(), time.perf_counter_ns(), "CANCELLED", None
+        """Answer a call, and count it with its status and its error."""
+        call = _Call()
+        start_ns = time.perf_counter_ns()
+        status = "CANCELLED"  # if the client disconnects
+        error_type = None
         try:
-            with self._place():
-                if self._token is not None and name not in OPEN:
-                    self._token.check(_authorization(context))
-                answered = await (self._converse(context, call) if name == STREAM else self._once(name, context, call))
+            result = await self._answer_call(name, context, call)
             status = "OK"
-            return answered
+            return result
         except TimeoutError as error:
-            status, error_kind = "DEADLINE_EXCEEDED", type(error).__name__
+            status = "DEADLINE_EXCEEDED"
+            error_type = type(error).__name__
             message = "the call waited too long for its client, or others needed its place"
-        except Exception as error:  # the one place where an error becomes an answer
-            status, error_kind, message = statuses(error)[1], type(error).__name__, client_message(error)
-        finally:  # a client that went away cancels the call
-            ns, sizes = time.perf_counter_ns() - began, (call.bytes_in, call.bytes_out)
-            peer = context.peer() if self._traffic.log else None
-            self._traffic.note(Exchange("grpc", name, status, call.model, error_kind, ns, *sizes, peer))
+        except Exception as error:  # every error is sent to the client
+            _, status = statuses(error)
+            error_type = type(error).__name__
+            message = client_message(error)
+        finally:
+            self._traffic.note(
+                Exchange(
+                    transport="grpc",
+                    route=name,
+                    status=status,
+                    model=call.model,
+                    error=error_type,
+                    ns=time.perf_counter_ns() - start_ns,
+                    bytes_in=call.bytes_in,
+                    bytes_out=call.bytes_out,
+                    client=context.peer() if self._traffic.log else None,
+                )
+            )
         return await context.abort(grpc.StatusCode[status], message)
 
-    async def _once(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes:
-        """Answer the one message of a call."""
-        data = await self._next(context, self._limits.header_seconds)
+    async def _answer_call(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes | None:
+        """Check the number of calls and the token, and answer the messages of a call.
+
+        Returns:
+            The response; None for the method `STREAM`, whose responses have been sent.
+        """
+        with self._open_call():
+            if self._token is not None and name not in METHODS_WITHOUT_TOKEN:
+                self._token.check(_authorization(context))
+            if name == STREAM:
+                await self._answer_stream(context, call)
+                return None
+            return await self._answer_message(name, context, call)
+
+    async def _answer_message(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes:
+        """Return the response to the only message of a call."""
+        data = await self._next_message(context, self._limits.header_seconds)
         if data is grpc.aio.EOF:
             raise RequestError(f"{name}: expected a message, got none")
-        if name in BLOCKING:
+        if name in SLOW_METHODS:
             return await asyncio.to_thread(self._answer, name, data, call)
         return self._answer(name, data, call)
 
-    async def _converse(self, context: grpc.aio.ServicerContext, call: _Call) -> None:
-        """Answer each message of a stream."""
-        seconds = self._limits.header_seconds
-        while (data := await self._next(context, seconds)) is not grpc.aio.EOF:
+    async def _answer_stream(self, context: grpc.aio.ServicerContext, call: _Call) -> None:
+        """Send a response to each message of a stream."""
+        timeout_s = self._limits.header_seconds
+        while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
             async with asyncio.timeout(self._limits.body_seconds):
                 await context.write(self._answer(STREAM, data, call))
-            seconds = self._limits.idle_seconds
+            timeout_s = self._limits.idle_seconds
 
     def _answer(self, name: str, data: bytes, call: _Call) -> bytes:
+        """Return the serialized response to a serialized message."""
         request_type, response_type = METHODS[name]
         call.bytes_in += len(data)
         try:
@@ -227,45 +277,47 @@ class Service:
 
     def _infer(self, request: Any) -> Any:
         loaded = self._store.get(request.model_name, request.model_version)
-        read = partial(read_infer, request, loaded, self._limits.batch)
-        return answer_inference(loaded, read, lambda answer: write_answer(answer, METHODS["ModelInfer"][1]()))
+        read = partial(read_request, request, loaded, self._limits.batch)
+        return answer_inference(loaded, read, write_response)
 
     def _infer_in_stream(self, request: Any) -> Any:
-        """One answer for one request of a stream; an error is an answer too, and the stream goes on."""
-        status, response = "OK", METHODS[STREAM][1]
+        """Return the response to one request of a stream. An error is sent as a response, and the stream continues."""
+        _, response_type = METHODS[STREAM]
         try:
-            answer = response(infer_response=self._infer(request))
+            response = response_type(infer_response=self._infer(request))
+            status = "OK"
         except Exception as error:
-            status, answer = statuses(error)[1], response(error_message=client_message(error))
+            response = response_type(error_message=client_message(error))
+            _, status = statuses(error)
         self._traffic.count("grpc", f"{STREAM} message", status)
-        return answer
+        return response
 
     @contextmanager
-    def _place(self) -> Iterator[None]:
-        """A place for a call; if there is none, the one that has waited longest for its client ends.
+    def _open_call(self) -> Iterator[None]:
+        """Count an open call. If there are too many calls, end the call that has waited longest for a message.
 
         Raises:
-            TooMany: If none waits.
+            TooMany: If there are too many calls, and no call waits for a message.
         """
-        if self._open >= self._limits.connections:
+        if self._open_calls >= self._limits.connections:
             if not self._waiting:
                 raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
             oldest = next(iter(self._waiting))
             del self._waiting[oldest]
             oldest.reschedule(asyncio.get_running_loop().time())
-        self._open += 1
+        self._open_calls += 1
         try:
             yield
         finally:
-            self._open -= 1
+            self._open_calls -= 1
 
-    async def _next(self, context: grpc.aio.ServicerContext, seconds: float) -> Any:
-        """The next message of a call, or grpc.aio.EOF.
+    async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
+        """Wait for the next message of a call, and return it; return grpc.aio.EOF at the end of the call.
 
         Raises:
-            TimeoutError: If it takes longer, or the place is needed.
+            TimeoutError: If the message does not arrive in time, or a new call replaces this call.
         """
-        async with asyncio.timeout(seconds) as timeout:
+        async with asyncio.timeout(timeout_s) as timeout:
             self._waiting[timeout] = None
             try:
                 return await context.read()
@@ -274,33 +326,35 @@ class Service:
 
 
 def _authorization(context: grpc.aio.ServicerContext) -> bytes:
-    """The value of the metadata `authorization`, empty if there is none."""
-    sent = dict(context.invocation_metadata() or ()).get("authorization", "")
-    return sent.encode() if isinstance(sent, str) else bytes(sent)
+    """Return the value of the metadata `authorization`; empty if there is none."""
+    value = dict(context.invocation_metadata() or ()).get("authorization", "")
+    return value.encode() if isinstance(value, str) else bytes(value)
 
 
 GRACE_SECONDS = 10
-"""Time that requests which have begun get when the server stops, s."""
+"""Time that requests which have begun have to finish when the server stops, s."""
 
-STREAMS = 100
-"""Calls of one connection at a time, as HTTP/2 advises at least; a client's further calls wait on its side."""
+MAX_CALLS_PER_CONNECTION = 100
+"""Largest number of open calls of one connection, which is the smallest number that HTTP/2 recommends. Further calls
+wait on the side of the client."""
 
 
 @contextmanager
 def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> Iterator[str]:
-    """Serve for as long as the block lasts.
+    """Run a gRPC server while the block runs.
 
     Args:
-        handler: Handler of the HTTP server; its models, limits and token are used. Clients send the token as metadata
+        handler: Handler of the HTTP server, whose models, limits and token are used. Clients send the token as metadata
             `authorization`.
-        host, port: Where to listen; port 0 takes a free one.
-        tls: Certificate and key; without them the connection is plain.
+        host: Name or address on which to listen.
+        port: TCP port; 0 selects a free port.
+        tls: Certificate and key; None for no TLS.
 
     Yields:
         The address, `grpc://host:port` or `grpcs://host:port`.
 
     Raises:
-        ListenError: If the address is taken or impossible.
+        ListenError: If the address is in use or cannot be used.
         InputError: If a TLS file cannot be used.
     """
     with _event_loop() as loop:
@@ -308,17 +362,18 @@ def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) 
         def run(coroutine: Coroutine[Any, Any, Any]) -> Any:
             return asyncio.run_coroutine_threadsafe(coroutine, loop).result()
 
-        place = f"[{host}]" if ":" in host else host
-        server, listening = run(_start(handler, f"{place}:{port}", tls))
+        url_host = f"[{host}]" if ":" in host else host
+        server, actual_port = run(_start(handler, f"{url_host}:{port}", tls))
+        scheme = "grpcs" if tls else "grpc"
         try:
-            yield f"{'grpcs' if tls else 'grpc'}://{place}:{listening}"
+            yield f"{scheme}://{url_host}:{actual_port}"
         finally:
             run(server.stop(GRACE_SECONDS))
 
 
 @contextmanager
 def _event_loop() -> Iterator[asyncio.AbstractEventLoop]:
-    """An event loop that runs in its own thread."""
+    """Run an event loop in its own thread while the block runs."""
     loop = uvloop.new_event_loop()
     thread = Thread(target=loop.run_forever, name="grpc")
     thread.start()
@@ -331,14 +386,14 @@ def _event_loop() -> Iterator[asyncio.AbstractEventLoop]:
         loop.close()
 
 
-async def _start(handler: Handler, place: str, tls: Tls | None) -> tuple[grpc.aio.Server, int]:
-    """A server that answers, and the port that it listens on."""
+async def _start(handler: Handler, address: str, tls: Tls | None) -> tuple[grpc.aio.Server, int]:
+    """Start a server on `host:port`, and return it with the port on which it listens."""
     limits = handler.limits
     server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=2 * limits.connections)
     server.add_generic_rpc_handlers((Service(handler).handlers(),))
-    listening = _listen(server, place, tls)
+    port = _listen(server, address, tls)
     await server.start()
-    return server, listening
+    return server, port
 
 
 def _options(limits: ServerLimits) -> list[tuple[str, int]]:
@@ -346,7 +401,7 @@ def _options(limits: ServerLimits) -> list[tuple[str, int]]:
         ("grpc.max_receive_message_length", limits.body_bytes),
         ("grpc.max_metadata_size", limits.header_bytes),
         ("grpc.absolute_max_metadata_size", limits.header_bytes),
-        ("grpc.max_concurrent_streams", STREAMS),
+        ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
         ("grpc.max_allowed_incoming_connections", limits.connections),
         ("grpc.server_handshake_timeout_ms", round(1e3 * limits.header_seconds)),
         ("grpc.max_connection_idle_ms", round(1e3 * limits.idle_seconds)),
@@ -354,13 +409,13 @@ def _options(limits: ServerLimits) -> list[tuple[str, int]]:
     ]
 
 
-def _listen(server: grpc.aio.Server, place: str, tls: Tls | None) -> int:
-    """The port that the server listens on."""
+def _listen(server: grpc.aio.Server, address: str, tls: Tls | None) -> int:
+    """Let a server listen on `host:port`, and return the port."""
     try:
         if tls is None:
-            return int(server.add_insecure_port(place))
-        return int(server.add_secure_port(place, grpc.ssl_server_credentials([tls.key_and_certificate()])))
+            return int(server.add_insecure_port(address))
+        return int(server.add_secure_port(address, grpc.ssl_server_credentials([tls.key_and_certificate()])))
     except RuntimeError as error:
         raise ListenError(
-            f"cannot listen on {place} for gRPC: {error}; choose another --grpc-port or --host"
+            f"cannot listen on {address} for gRPC: {error}; choose another --grpc-port or --host"
         ) from error

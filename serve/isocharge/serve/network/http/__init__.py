@@ -1,4 +1,4 @@
-"""The Open Inference Protocol over HTTP, within bounds of size and time."""
+"""HTTP server of the Open Inference Protocol, with limits of size and time."""
 
 from isocharge.common.extras import require
 

@@ -1,13 +1,13 @@
-"""HTTP/1.1 on one connection, bounded in size and in time.
+"""HTTP/1.1 on one connection, with limits of size and time.
 
-A request is collected until it is complete, and then answered at once in the event loop: that takes microseconds. Only
-what may take long is answered in another thread; the requests that follow it on the same connection wait.
+A complete request is answered at once in the event loop, because most answers take microseconds. Requests that may take
+longer are answered in another thread; later requests of the same connection wait until the answer is sent.
 
-A timer for each request would cost as much as parsing it, so a connection notes the deadline of its next step, and the
-server looks through its connections now and then (`close_overdue`).
+A timer for each request would cost as much time as parsing the request. Each connection therefore stores the deadline
+of its next step, and the server regularly compares all deadlines with the clock (`close_overdue`).
 
-A client may send thousands of requests at once, and the server has one thread for all connections: what arrives is
-parsed in slices, and after `TURN_SECONDS` it is the turn of other connections.
+A client may send thousands of requests at once, and all connections share one thread. Long data are therefore parsed in
+slices, and after `TURN_SECONDS` the event loop continues with the other connections.
 """
 
 import asyncio
@@ -28,26 +28,27 @@ from isocharge.serve.network.protocol import Handler, Response
 from isocharge.serve.network.protocol.response import error_response, refusal
 from isocharge.serve.network.traffic import Client
 
-UNSENT_BYTES = 1 << 22
-"""Answers that may wait for a client that sends requests and reads none, bytes; then the connection is closed."""
+MAX_UNSENT_BYTES = 1 << 22
+"""Largest size of the responses that wait for a client that does not read, bytes. Then the connection is closed."""
 
 SLICE_BYTES = 4096
-"""Bytes that are parsed at a time; nearly every request is shorter."""
+"""Number of bytes that are parsed at a time. Nearly every request is shorter."""
 
 TURN_SECONDS = 250e-6
-"""Time after which a connection that has more to parse lets others go first, s."""
+"""Time after which a connection with more data to parse yields to other connections, s."""
 
 LINGER_SECONDS = 2.0
-"""Time that a refused client may go on sending, s: if the connection closed at once, it might never read why."""
+"""Time for which the connection of a refused client stays open, s, so that the client can read the reason."""
 
 STATUS_LINES = {status.value: b"HTTP/1.1 %d %s\r\n" % (status, status.phrase.encode()) for status in HTTPStatus}
+"""Status line for each status code."""
 
-LAST = b"connection: close\r\n\r\n"
-"""End of the head of a connection's last answer."""
+CLOSING_HEADER = b"connection: close\r\n\r\n"
+"""End of the headers of the last response of a connection."""
 
 
 class Phase(Enum):
-    """The next thing that a connection waits for."""
+    """What a connection is waiting for. The values are used in error messages."""
 
     IDLE = "a request"
     HEADERS = "the end of the headers"
@@ -55,7 +56,14 @@ class Phase(Enum):
 
 
 class Head(NamedTuple):
-    """The head of a complete request; after the last request of a connection the client wants it closed."""
+    """Request line and headers of a complete request.
+
+    Attributes:
+        method: Method in capitals.
+        path: Path without query, with percent signs decoded.
+        headers: Names in lower case, and values.
+        is_last: Whether the client asks to close the connection after the response.
+    """
 
     method: str
     path: str
@@ -64,47 +72,73 @@ class Head(NamedTuple):
 
 
 class Connection(asyncio.Protocol):
-    """One connection.
+    """One connection of the server.
+
+    Args:
+        handler: Answers the requests.
+        connections: Open connections of the server.
+        loop: Event loop of the server.
 
     Attributes:
-        deadline: Until when the client may take for its next step, s by the clock of the loop.
-        has_asked: Whether a request was ever complete.
+        deadline: Time at which the connection is ended if the client has not taken its next step, s, on the clock of
+            the event loop.
+        has_completed_request: Whether the client has sent at least one complete request.
     """
 
     def __init__(self, handler: Handler, connections: "set[Connection]", loop: asyncio.AbstractEventLoop) -> None:
-        """Set up a connection of a server; `connections` are those that are open."""
-        self.deadline, self.has_asked = math.inf, False
-        self._handler, self._limits, self._connections, self._loop = handler, handler.limits, connections, loop
+        self.deadline = math.inf
+        self.has_completed_request = False
+        self._handler = handler
+        self._limits = handler.limits
+        self._connections = connections
+        self._loop = loop
         self._transport: asyncio.Transport
         self._client: Client = None
-        self._phase = self._timed = Phase.IDLE
+
+        # The request that is being parsed.
+        self._phase = Phase.IDLE
+        self._timed_phase = Phase.IDLE  # the phase for which the deadline was set
         self._parser = self._new_parser()
-        self._url, self._headers, self._body = b"", list[tuple[bytes, bytes]](), bytearray()
-        self._piece = self._fed = 0  # bytes of this piece; bytes since the request began, or since the last of its body
-        self._starts_in_piece = True  # whether this piece begins with a request
-        self._has_answered = False  # whether a request of this piece was answered
+        self._url = b""
+        self._headers: list[tuple[bytes, bytes]] = []
+        self._body = bytearray()
         self._expects_continue = False
+
+        # The data that are being parsed.
+        self._piece_bytes = 0
+        self._request_bytes = 0  # since the request began, or since the latest part of its body
+        self._starts_in_piece = True  # whether the present piece of data begins with a request
+        self._has_answered = False  # whether a request of the present piece was answered
         self._unparsed = bytearray()
         self._turn: asyncio.Handle | None = None
-        self._head: Head | None = None  # of the request that was complete last
-        self._repeat, self._repeat_bytes = b"", 0  # its text and size if it came in one piece, to know it again
-        self._answering: asyncio.Task[None] | None = None  # the answer that takes long
-        self._waiting: deque[tuple[Head, bytes]] = deque()  # complete requests behind it, with their bodies
-        self._is_stopping = self._is_refused = self._is_half_closed = self._is_blocked = False
+
+        # The latest complete request. If it came in one piece, its text and size are stored to recognise a repetition.
+        self._head: Head | None = None
+        self._repeated_head = b""
+        self._repeated_bytes = 0
+
+        # The answer that is computed in another thread, and the complete requests that wait for it, with their bodies.
+        self._answering: asyncio.Task[None] | None = None
+        self._waiting: deque[tuple[Head, bytes]] = deque()
+
+        self._is_stopping = False
+        self._is_refused = False
+        self._is_half_closed = False
+        self._is_blocked = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Accept a connection, or refuse it if there are too many."""
+        """Accept the connection, or refuse it if there are too many connections."""
         self._transport = transport
         peer = transport.get_extra_info("peername")
         self._client = (str(peer[0]), int(peer[1])) if isinstance(peer, tuple) else None
         self._connections.add(self)
-        self._allow(self._limits.header_seconds)
+        self._set_deadline(self._limits.header_seconds)
         if len(self._connections) > self._limits.connections and not self._make_room():
             self._refuse(refusal(503, f"all {self._limits.connections} connections are taken; try again later"))
 
     def _make_room(self) -> bool:
-        """End the connection that has waited longest without one complete request; False if each has had one."""
-        silent = [other for other in self._connections if other is not self and not other.has_asked]
+        """End the oldest connection that has not sent a complete request; return False if there is none."""
+        silent = [other for other in self._connections if other is not self and not other.has_completed_request]
         if not silent:
             return False
         oldest = min(silent, key=lambda other: other.deadline)
@@ -113,55 +147,55 @@ class Connection(asyncio.Protocol):
         return True
 
     def connection_lost(self, _error: Exception | None) -> None:
-        """The connection is over, and what it sent is forgotten."""
+        """Discard the data of a connection that has ended."""
         self._connections.discard(self)
         self._unparsed.clear()
         self._waiting.clear()
 
     def data_received(self, data: bytes) -> None:
-        """Parse at once what is short and may be answered now; the rest in slices, in turns with other connections."""
+        """Parse short data at once, and long or postponed data in slices, in turns with other connections."""
         if self._is_refused or self._transport.is_closing():
             return
         if self._unparsed or self._answering or self._is_blocked or len(data) > SLICE_BYTES:
             self._unparsed += data
             if self._turn is None:
                 self._take_turn()
-        elif len(data) == self._repeat_bytes and data.startswith(self._repeat) and self._head is not None:
-            self._answer(self._head, data[len(self._repeat) :])
+        elif len(data) == self._repeated_bytes and data.startswith(self._repeated_head) and self._head is not None:
+            self._answer(self._head, data[len(self._repeated_head) :])
         else:
-            is_new = self._phase is Phase.IDLE
+            begins_request = self._phase is Phase.IDLE
             self._parse(data)
-            if is_new and self._has_answered:
+            if begins_request and self._has_answered:
                 self._remember(data)
 
     def eof_received(self) -> bool:
-        """The client sends no more; what it has asked for is still answered, where the transport can do that."""
+        """Handle the end of the client's data. Return whether the connection stays open for outstanding responses."""
         self._is_half_closed = bool(self._unparsed or self._answering)
         return self._is_half_closed and self._transport.can_write_eof()
 
     def pause_writing(self) -> None:
-        """The client does not read its answer; it has `body_seconds` to go on."""
-        self._allow(self._limits.body_seconds)
+        """Stop reading, because the client does not read its responses, and give it `body_seconds` to continue."""
+        self._set_deadline(self._limits.body_seconds)
         self._is_blocked = True
         self._transport.pause_reading()
 
     def resume_writing(self) -> None:
-        """The client has read what was waiting."""
+        """Continue, because the client has read its responses."""
         self._is_blocked = False
-        self._allow(self._limits.idle_seconds)
+        self._set_deadline(self._limits.idle_seconds)
         if self._turn is None:
             self._take_turn()
 
     def shutdown(self) -> None:
-        """The server stops: a request that has begun is still answered, as the last one."""
+        """Close the connection, because the server stops. A request that has begun is still answered."""
         self._is_stopping = True
         if self._is_refused:
             self._transport.abort()
         elif self._phase is Phase.IDLE and not self._answering:
             self._transport.close()
 
-    def overdue(self) -> None:
-        """End a connection that took too long; a client that is sending gets the reason."""
+    def end_overdue(self) -> None:
+        """End the connection after its deadline. If a request has begun, the client receives the reason."""
         if self._phase is Phase.IDLE or self._is_refused:
             self._transport.abort()
         else:
@@ -172,21 +206,22 @@ class Connection(asyncio.Protocol):
         self._transport.abort()
 
     def _take_turn(self) -> None:
-        """Parse slices for as long as a turn lasts."""
-        self._turn, end = None, time.perf_counter() + TURN_SECONDS
+        """Parse slices of the unparsed data for at most `TURN_SECONDS`."""
+        self._turn = None
+        turn_end = time.perf_counter() + TURN_SECONDS
         while self._unparsed and not (self._answering or self._is_blocked or self._is_refused):
             if self._transport.is_closing():
                 return
-            if time.perf_counter() > end:
+            if time.perf_counter() > turn_end:
                 self._turn = self._loop.call_soon(self._take_turn)
                 break
             piece = bytes(self._unparsed[:SLICE_BYTES])
             del self._unparsed[:SLICE_BYTES]
             self._parse(piece)
-        self._go_on_reading()
+        self._resume_reading()
 
-    def _go_on_reading(self) -> None:
-        """Read more once everything is parsed; a client that sends no more has had its last answer then."""
+    def _resume_reading(self) -> None:
+        """Read more data after all data are parsed; close the connection if the client has ended its data."""
         if self._transport.is_closing():
             return
         if self._unparsed:
@@ -198,15 +233,17 @@ class Connection(asyncio.Protocol):
 
     def _new_parser(self) -> httptools.HttpRequestParser:
         parser = httptools.HttpRequestParser(self)
-        parser.set_dangerous_leniencies(lenient_data_after_close=True)  # it is ignored
+        # Data after the last request are ignored instead of being an error.
+        parser.set_dangerous_leniencies(lenient_data_after_close=True)
         return parser
 
     def _parse(self, data: bytes) -> None:
-        """Parse a piece; a request that is then still incomplete is measured and timed."""
-        self._piece = len(data)
-        self._fed += self._piece
+        """Parse a piece of data, and check the size of a request that is still incomplete."""
+        self._piece_bytes = len(data)
+        self._request_bytes += self._piece_bytes
         self._starts_in_piece = self._phase is Phase.IDLE
-        self._has_answered, self._repeat_bytes = False, 0
+        self._has_answered = False
+        self._repeated_bytes = 0
         try:
             self._parser.feed_data(data)
         except httptools.HttpParserUpgrade as upgrade:
@@ -214,42 +251,48 @@ class Connection(asyncio.Protocol):
         except httptools.HttpParserError:
             self._refuse(refusal(400, "Invalid HTTP request received."))
         if self._phase is not Phase.IDLE and not self._is_refused:
-            self._measure_incomplete()
+            self._check_incomplete_request()
 
-    def _measure_incomplete(self) -> None:
-        if self._fed > self._limits.header_bytes:  # of a head; or of trailers, or of what goes with a chunk
+    def _check_incomplete_request(self) -> None:
+        """Check the size of the headers, trailers and chunk extensions, and set the deadline of a new phase."""
+        if self._request_bytes > self._limits.header_bytes:
             self._refuse_headers()
-        elif self._timed is not self._phase:
-            self._timed = self._phase
+        elif self._timed_phase is not self._phase:
+            self._timed_phase = self._phase
             is_head = self._phase is Phase.HEADERS
-            self._allow(self._limits.header_seconds if is_head else self._limits.body_seconds)
+            self._set_deadline(self._limits.header_seconds if is_head else self._limits.body_seconds)
 
     def _parse_without_upgrade(self, rest: bytes) -> None:
-        """Parse a request that asks for another protocol as if it had not, with a new parser: HTTP lets a server do so.
+        """Parse a request again without its `Upgrade` header, which HTTP allows a server to ignore.
 
-        The old parser has taken everything after the headers for that protocol.
+        A new parser is needed, because the old parser treats everything after the headers as another protocol.
         """
         method = self._parser.get_method()
         if method == b"CONNECT":
             self._refuse(refusal(400, "CONNECT: this server opens no tunnels"))
         if self._is_refused:
             return
-        self._parser, self._phase = self._new_parser(), Phase.IDLE
+        self._parser = self._new_parser()
+        self._phase = Phase.IDLE
         lines = [b"%s: %s" % header for header in self._headers if header[0] != b"upgrade"]
         self._parse(b"\r\n".join([b"%s %s HTTP/1.1" % (method, self._url), *lines, b"", rest]))
 
     def on_message_begin(self) -> None:
-        """A request begins, somewhere in this piece of data; of what is before it in the piece, it knows nothing."""
-        self._phase, self._fed = Phase.HEADERS, self._piece if self._starts_in_piece else 0
-        self._starts_in_piece = self._expects_continue = False
-        self._url, self._headers, self._body = b"", [], bytearray()
+        """Begin a request. The parser calls this method, and does not report where in the piece the request begins."""
+        self._phase = Phase.HEADERS
+        self._request_bytes = self._piece_bytes if self._starts_in_piece else 0
+        self._starts_in_piece = False
+        self._expects_continue = False
+        self._url = b""
+        self._headers = []
+        self._body = bytearray()
 
     def on_url(self, url: bytes) -> None:
-        """A piece of the request line's target."""
+        """Append a part of the target in the request line."""
         self._url += url
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """A header; a trailer is ignored."""
+        """Append a header. Trailers are ignored."""
         if self._phase is Phase.BODY:
             return
         name = name.lower()
@@ -258,19 +301,21 @@ class Connection(asyncio.Protocol):
         self._headers.append((name, value))
 
     def on_headers_complete(self) -> None:
-        """The headers are complete; they are measured if enough bytes arrived for them to be too long."""
-        longest = self._fed + SLICE_BYTES  # with the piece in which the request began, if that began with another
-        self._phase, self._fed = Phase.BODY, 0
-        if longest > self._limits.header_bytes and self._header_bytes() > self._limits.header_bytes:
+        """Check the size of the complete headers, and send `100 Continue` if the client waits for it."""
+        # The piece in which the request began is not counted if it began with another request.
+        max_possible_bytes = self._request_bytes + SLICE_BYTES
+        self._phase = Phase.BODY
+        self._request_bytes = 0
+        if max_possible_bytes > self._limits.header_bytes and self._header_bytes() > self._limits.header_bytes:
             self._refuse_headers()
         elif self._expects_continue and not self._is_refused and not self._parser.should_upgrade():
             self._transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
     def on_body(self, body: bytes) -> None:
-        """A piece of the body, up to the limit."""
+        """Append a part of the body, and check the size of the body."""
         if self._is_refused:
             return
-        self._fed = 0
+        self._request_bytes = 0
         self._body += body
         try:
             self._limits.check_body(len(self._body))
@@ -278,12 +323,14 @@ class Connection(asyncio.Protocol):
             self._refuse(error_response(error))
 
     def on_message_complete(self) -> None:
-        """The request is complete: answer it, unless it was refused, or is to be parsed again."""
+        """Answer the complete request, unless it was refused, or must be parsed again without its upgrade."""
         if self._is_refused or self._transport.is_closing() or self._parser.should_upgrade():
             return
-        self._phase, self.has_asked = Phase.IDLE, True
+        self._phase = Phase.IDLE
+        self.has_completed_request = True
         method = self._parser.get_method().decode("latin-1")
-        head = self._head = Head(method, _path(self._url), self._headers, not self._parser.should_keep_alive())
+        head = Head(method, _path(self._url), self._headers, not self._parser.should_keep_alive())
+        self._head = head
         if self._answering:
             self._waiting.append((head, bytes(self._body)))
         elif self._handler.may_block(head.path):
@@ -297,12 +344,14 @@ class Connection(asyncio.Protocol):
 
     def _answer_in_thread(self, head: Head, body: bytes) -> None:
         self._answering = self._loop.create_task(self._answer_later(head, body))
-        self._timed, self.deadline = Phase.IDLE, math.inf
+        self._timed_phase = Phase.IDLE
+        self.deadline = math.inf
 
     async def _answer_later(self, head: Head, body: bytes) -> None:
-        """Answer in another thread, and then the requests that came behind, in their order."""
-        request = head.method, head.path, head.headers, body, self._client
-        response = await asyncio.to_thread(self._handler.answer, *request)
+        """Answer a request in another thread, and then the requests that arrived later, in their order."""
+        response = await asyncio.to_thread(
+            self._handler.answer, head.method, head.path, head.headers, body, self._client
+        )
         self._answering = None
         self._write(response, head)
         while self._waiting and self._answering is None:
@@ -314,30 +363,32 @@ class Connection(asyncio.Protocol):
         self._take_turn()
 
     def _remember(self, data: bytes) -> None:
-        """Remember the head of a request if it came alone and in one piece.
+        """Store the head of a request that came alone and in one piece, to recognise a repetition of the head.
 
-        Clients send the same head again and again. Where its bytes are the same, and as many bytes follow it, the
-        parser would say the same of it again.
+        Clients send the same head again and again. If the bytes of the head and the size of the body are equal, the
+        parser would give the same result again.
         """
         head, end, body = data.partition(b"\r\n\r\n")
         if body == self._body and self._phase is Phase.IDLE:
-            self._repeat, self._repeat_bytes = head + end, len(data)
+            self._repeated_head = head + end
+            self._repeated_bytes = len(data)
 
     def _write(self, response: Response, head: Head) -> None:
-        """Send an answer in one piece, and wait for the next request."""
+        """Send a response in one piece, and set the deadline of the next request."""
         if self._is_refused or self._transport.is_closing():
             return
         is_last = self._is_stopping or head.is_last
-        self._transport.write(_text_of(response, is_last=is_last, with_body=head.method != "HEAD"))
+        self._transport.write(_response_bytes(response, is_last=is_last, with_body=head.method != "HEAD"))
         if is_last:
             self._transport.close()
-        elif self._is_blocked and self._transport.get_write_buffer_size() > UNSENT_BYTES:
+        elif self._is_blocked and self._transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
             self._transport.abort()
-        self._timed = Phase.IDLE
-        self._allow(self._limits.idle_seconds)
+        self._timed_phase = Phase.IDLE
+        self._set_deadline(self._limits.idle_seconds)
 
-    def _allow(self, seconds: float) -> None:
-        if not (self._is_blocked or self._answering):  # the time for a client that reads no answer is running already
+    def _set_deadline(self, seconds: float) -> None:
+        """Set the deadline, unless the client does not read its responses or an answer is being computed."""
+        if not (self._is_blocked or self._answering):
             self.deadline = self._loop.time() + seconds
 
     def _header_bytes(self) -> int:
@@ -348,38 +399,43 @@ class Connection(asyncio.Protocol):
         self._refuse(refusal(431, f"the request line and headers are longer than {limit} bytes"))
 
     def _refuse(self, response: Response) -> None:
-        """Answer without asking the application, read no more requests, and hang up when the client does or soon."""
+        """Send a refusal without calling the handler for an answer, and read no more requests.
+
+        The connection is closed when the client closes it, or after `LINGER_SECONDS`.
+        """
         if self._is_refused or self._transport.is_closing():
             return
         self._is_refused = True
         self._unparsed.clear()
         self._handler.refused(response, self._client)
-        self._transport.write(_text_of(response, is_last=True))
+        self._transport.write(_response_bytes(response, is_last=True))
         if self._transport.can_write_eof():
             self._transport.write_eof()
-            self._allow(LINGER_SECONDS)
+            self._set_deadline(LINGER_SECONDS)
         else:
             self._transport.close()
 
 
-def _text_of(response: Response, *, is_last: bool, with_body: bool = True) -> bytes:
-    """A response as HTTP sends it; the last one says that the connection closes."""
+def _response_bytes(response: Response, *, is_last: bool, with_body: bool = True) -> bytes:
+    """Return a response as the bytes that are sent. The last response states that the connection is closed."""
     parts = [STATUS_LINES[response.status]]
     for name, value in response.headers:
         parts += (name, b": ", value, b"\r\n")
-    parts += (LAST if is_last else b"\r\n", response.body if with_body else b"")
+    parts.append(CLOSING_HEADER if is_last else b"\r\n")
+    if with_body:
+        parts.append(response.body)
     return b"".join(parts)
 
 
 @lru_cache(64)
 def _path(url: bytes) -> str:
-    """The path in a request line's target, percent signs undone."""
+    """Return the path in the target of a request line, with percent signs decoded."""
     path = httptools.parse_url(url).path or b"/"
     return urllib.parse.unquote_to_bytes(path).decode("utf-8", "replace")
 
 
 def close_overdue(connections: Iterable[Connection], now: float) -> None:
-    """End every connection whose time is over."""
+    """End every connection whose deadline is before `now`, s, on the clock of the event loop."""
     for connection in list(connections):
         if connection.deadline < now:
-            connection.overdue()
+            connection.end_overdue()

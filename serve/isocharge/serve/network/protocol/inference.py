@@ -1,7 +1,7 @@
-"""One inference for every transport: a request as charges, the model's outputs, the answer as bytes.
+"""One inference of the Open Inference Protocol: reading the request, running the model, writing the response.
 
-An answer is JSON, then binary tensors if a header says so. gRPC's messages say the same in other words: they are read
-by `request_of`, too.
+A body is JSON, which may be followed by binary tensors; a header then states the length of the JSON. The gRPC service
+converts its messages to the same JSON objects and uses `parse_request`, too.
 """
 
 import struct
@@ -30,19 +30,19 @@ from isocharge.serve.network.model_store import LoadedVersion
 from isocharge.serve.prediction.contact import Contacts
 
 DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
-"""Number types of charges, little-endian as the protocol has them."""
+"""Number types of charges. The protocol prescribes little-endian numbers."""
 
 FLAGS = "flags"
-"""The output that only requests get that name it: the flags of each press, words with commas between them."""
+"""Name of the output with the flags of each press, separated by commas. It is computed only on request."""
 
 Rows = np.ndarray[Any, Any]
-"""Of an output: numbers, or of `flags` texts, shape (n, width)."""
+"""Values of an output, shape (n, width): numbers, or texts for the output `flags`."""
 
 Unsupported = Annotated[None, Meta(description="nothing, as this server does not support it")]
 
 
 class Parameters(Struct, frozen=True):
-    """Parameters of a request, an input or an output; unknown ones are ignored, as Triton does."""
+    """Parameters of a request, an input or an output. Unknown parameters are ignored, as Triton does."""
 
     binary_data: bool | None = None
     binary_data_output: bool = False
@@ -52,7 +52,7 @@ class Parameters(Struct, frozen=True):
 
 
 class InputTensor(Struct, frozen=True):
-    """Charges, pC; the numbers are looked at when the shape is known."""
+    """Input tensor with the charges, pC. The numbers are checked later, when the shape is known to be valid."""
 
     name: Literal["charge_pC"]
     datatype: Literal["FP32", "FP64"]
@@ -62,14 +62,14 @@ class InputTensor(Struct, frozen=True):
 
 
 class OutputTensor(Struct, frozen=True):
-    """An output that is asked for."""
+    """Requested output."""
 
     name: Literal["contact", "contact_std", "contact_correlation", "misfit", "flags"]
     parameters: Parameters = Parameters()
 
 
 class InferBody(Struct, frozen=True):
-    """What a request says."""
+    """Body of a request for an inference."""
 
     inputs: Annotated[list[InputTensor], Meta(min_length=1, max_length=1, description="a list with one tensor")]
     id: str = ""
@@ -78,13 +78,13 @@ class InferBody(Struct, frozen=True):
 
 
 class InferRequest(NamedTuple):
-    """Charges for a model, and which of its outputs to answer with.
+    """Charges for a model, and the outputs that the client requests.
 
     Attributes:
-        id: Echoed in the answer; empty if the request has none.
-        charge_pC: Shape (n, electrodes), pC.
-        outputs: Names, in the order of the answer.
-        binary: Names of the outputs that are sent in binary.
+        id: Identifier that is repeated in the response; empty if the request has none.
+        charge_pC: Charges, shape (n, electrodes), pC.
+        outputs: Names of the requested outputs, in the order of the response.
+        binary: Names of the outputs that are sent as binary tensors.
     """
 
     id: str
@@ -97,9 +97,11 @@ class InferAnswer(NamedTuple):
     """Outputs of a model for one request.
 
     Attributes:
-        name, version: The model that answered.
-        id, binary: As in the request.
-        outputs: By name, shape (n, width).
+        name: Name of the model.
+        version: Version of the model.
+        id: Identifier from the request.
+        outputs: Outputs by name, each of shape (n, width).
+        binary: Names of the outputs that are sent as binary tensors.
     """
 
     name: str
@@ -110,10 +112,10 @@ class InferAnswer(NamedTuple):
 
 
 def read_object(text: bytes) -> dict[str, Any]:
-    """A JSON object; no text at all counts as an empty one.
+    """Parse a JSON object. An empty text is parsed as an empty object.
 
     Raises:
-        RequestError: If it is anything else.
+        RequestError: If the text is not a JSON object.
     """
     try:
         content = orjson.loads(text) if text else {}
@@ -125,62 +127,82 @@ def read_object(text: bytes) -> dict[str, Any]:
 
 
 def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, batch: int) -> InferRequest:
-    """The request in a body.
+    """Read a request from the body of an HTTP request.
 
     Args:
         body: The body, not compressed.
-        header_length: Value of Inference-Header-Content-Length, None without binary data.
-        loaded, batch: As in `request_of`.
+        header_length: Value of the header Inference-Header-Content-Length; None if the request has no binary tensor.
+        loaded: The model.
+        batch: Largest number of presses in one request.
 
     Raises:
-        RequestError, ChargeError, TooLarge: As `request_of`.
+        RequestError: If the body is not a request for this model.
+        ChargeError: If a charge is not finite.
+        TooLarge: If there are more presses than `batch`.
     """
     if header_length is None:
-        return request_of(read_object(body), b"", loaded, batch)
-    # isdigit first: int() accepts signs, blanks and underscores, and takes long for a long text.
+        return parse_request(read_object(body), b"", loaded, batch)
+    # isdigit is tested first, because int() accepts signs, blanks and underscores, and is slow for a long text.
     if not header_length.isdigit() or len(header_length) > 12 or int(header_length) > len(body):
         raise RequestError(
             f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
             f"got {header_length.decode('latin-1')!r:.50}"
         )
-    end = int(header_length)
-    return request_of(read_object(body[:end]), memoryview(body)[end:], loaded, batch)
+    json_length = int(header_length)
+    return parse_request(read_object(body[:json_length]), memoryview(body)[json_length:], loaded, batch)
 
 
-def request_of(content: dict[str, Any], binary: bytes | memoryview, loaded: LoadedVersion, batch: int) -> InferRequest:
-    """The request that a JSON object makes.
+def parse_request(
+    content: dict[str, Any], binary: bytes | memoryview, loaded: LoadedVersion, batch: int
+) -> InferRequest:
+    """Parse a request from a JSON object.
 
     Args:
-        content: The object as it came.
-        binary: The bytes after the JSON; the numbers of the input, if it announces them.
-        loaded: The model; a request that names no outputs gets all that it has.
-        batch: Presses that one request may have.
+        content: The object.
+        binary: Bytes that follow the JSON. They are the charges if the input has the parameter `binary_data_size`.
+        loaded: The model. If the request names no outputs, all outputs of the model are computed.
+        batch: Largest number of presses in one request.
 
     Raises:
-        RequestError: If it is not one for this model.
+        RequestError: If the object is not a request for this model.
         ChargeError: If a charge is not finite.
         TooLarge: If there are more presses than `batch`.
     """
     body = convert(content, InferBody, "", RequestError)
-    by_default, names = body.parameters.binary_data_output, loaded.outputs
-    in_binary = frozenset(names if by_default else ())
+    default_is_binary = body.parameters.binary_data_output
     if body.outputs:
-        wanted = {output.name: output.parameters.binary_data for output in body.outputs}
-        if len(wanted) < len(body.outputs):
-            raise RequestError("outputs: expected each name once")
-        if CORRELATION in wanted and CORRELATION not in names:
-            label = loaded.metadata.label
-            raise RequestError(
-                f"outputs: expected one of {', '.join(names)}, got {CORRELATION!r}, which {label} has not"
-            )
-        names = tuple(wanted)
-        in_binary = frozenset(name for name, flag in wanted.items() if (by_default if flag is None else flag))
-    return InferRequest(body.id, _charges(body.inputs[0], binary, loaded.metadata.electrodes, batch), names, in_binary)
+        names, binary_names = _requested_outputs(body.outputs, loaded, default_is_binary=default_is_binary)
+    else:
+        names = loaded.outputs
+        binary_names = frozenset(names if default_is_binary else ())
+    charges = _charges(body.inputs[0], binary, loaded.metadata.electrodes, batch)
+    return InferRequest(body.id, charges, names, binary_names)
+
+
+def _requested_outputs(
+    outputs: list[OutputTensor], loaded: LoadedVersion, *, default_is_binary: bool
+) -> tuple[tuple[str, ...], frozenset[str]]:
+    """Return the names of the requested outputs, and the names of those that are sent as binary tensors."""
+    is_binary = {output.name: output.parameters.binary_data for output in outputs}
+    if len(is_binary) < len(outputs):
+        raise RequestError("outputs: expected each name once")
+    if CORRELATION in is_binary and CORRELATION not in loaded.outputs:
+        raise RequestError(
+            f"outputs: expected one of {', '.join(loaded.outputs)}, got {CORRELATION!r}, which "
+            f"{loaded.metadata.label} does not have"
+        )
+    binary_names = frozenset(
+        name for name, choice in is_binary.items() if choice or (choice is None and default_is_binary)
+    )
+    return tuple(is_binary), binary_names
 
 
 def _charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[str, ...], batch: int) -> Singles:
-    """Charges, shape (n, electrodes), pC; nothing of that size is touched before the shape is checked."""
-    shape, dtype, size = tensor.shape, DATATYPES[tensor.datatype], tensor.parameters.binary_data_size
+    """Return the charges of an input tensor, shape (n, electrodes), pC.
+
+    The shape is checked before any memory of that size is used.
+    """
+    shape = tensor.shape
     if len(shape) != 2 or shape[0] < 1 or shape[1] != len(electrodes):
         raise RequestError(
             f"input {INPUT!r}: expected the shape [n, {len(electrodes)}] with n > 0, "
@@ -188,38 +210,41 @@ def _charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[
         )
     if shape[0] > batch:
         raise TooLarge(f"input {INPUT!r}: expected at most {batch} presses in one request, got {shape[0]}")
-    if size is None and not binary:
+    binary_size = tensor.parameters.binary_data_size
+    if binary_size is None and not binary:
         return _from_values(tensor.data, shape, electrodes)
-    expected = shape[0] * shape[1] * dtype.itemsize
-    if not size == len(binary) == expected or tensor.data is not None:
+    dtype = DATATYPES[tensor.datatype]
+    expected_size = shape[0] * shape[1] * dtype.itemsize
+    if not binary_size == len(binary) == expected_size or tensor.data is not None:
         raise RequestError(
-            f"expected either `data` or {expected} bytes after the JSON, announced by `binary_data_size` of the "
-            f"input and Inference-Header-Content-Length, got binary_data_size {size!r:.50} and {len(binary)} bytes"
+            f"expected either `data` or {expected_size} bytes after the JSON, announced by `binary_data_size` of the "
+            f"input and Inference-Header-Content-Length, got binary_data_size {binary_size!r:.50} and {len(binary)} "
+            "bytes"
         )
-    # A copy: what follows a JSON text may lie at any address, and a runtime expects numbers at even ones.
+    # The copy is aligned. The bytes after a JSON text may begin at any address.
     return as_float32(np.frombuffer(binary, dtype).reshape(shape).copy(), electrodes)
 
 
 def _from_values(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
-    """Charges from a list of numbers, flat or nested as the shape."""
+    """Return the charges from a list of numbers, which is flat or nested like the shape."""
     rows, columns = shape
-    # struct is several times faster than making and testing arrays, for a few numbers; it takes True as 1.0, so a list
-    # that holds one or the other is looked at below.
+    # For a few numbers, struct is several times faster than creating and testing arrays. It converts True to 1.0, so
+    # that a list with a number that equals True or False is converted by `_from_array`.
     if type(values) is list and len(values) == rows * columns and not (True in values or False in values):
         charges = np.empty(shape, np.float32)
         if write_finite(partial(_packer(len(values)), charges.data, 0), values):
             return charges
-    return _examined(values, shape, electrodes)
+    return _from_array(values, shape, electrodes)
 
 
 @lru_cache(64)
 def _packer(count: int) -> Callable[..., None]:
-    """Packs this many float32 numbers into a buffer."""
+    """Return a function that packs this many float32 numbers into a buffer."""
     return struct.Struct(f"={count}f").pack_into
 
 
-def _examined(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
-    """Charges from values that may be rows of numbers; the error says what is wrong with others."""
+def _from_array(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
+    """Return the charges from values of any kind; raise RequestError or ChargeError if they are not valid."""
     numbers = _as_array(values)
     if numbers.dtype.kind not in "fiu" or list(numbers.shape) not in (shape, [shape[0] * shape[1]]):
         raise RequestError(
@@ -230,37 +255,42 @@ def _examined(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Sin
 
 
 def _as_array(values: Any) -> np.ndarray[Any, Any]:
-    """An array of a list, or of lists in a list; true and false, which arrays take for 1 and 0, stay what they are."""
+    """Convert a list, or a list of lists, to an array.
+
+    If the values contain true or false, the array has the type object, because NumPy would convert them to 1 and 0. If
+    the values form no array, the result is an array of None.
+    """
     try:
-        rows = values if isinstance(values, list) and values and isinstance(values[0], list) else [values]
-        has_flags = any(type(row) is list and any(type(value) is bool for value in row) for row in rows)
-        return np.asarray(values, object if has_flags else None)
+        is_nested = isinstance(values, list) and bool(values) and isinstance(values[0], list)
+        rows = values if is_nested else [values]
+        has_booleans = any(type(row) is list and any(type(value) is bool for value in row) for row in rows)
+        return np.asarray(values, object if has_booleans else None)
     except (ValueError, OverflowError):
         return np.array(None)
 
 
 def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
-    """Put an answer into bytes: the body, and where its JSON ends if binary tensors follow."""
+    """Return the body of a response, and the length of its JSON if binary tensors follow, otherwise None."""
     content: dict[str, Any] = {"model_name": answer.name, "model_version": answer.version}
     if answer.id:
         content["id"] = answer.id
-    parts = {name: packed(rows) for name, rows in answer.outputs.items() if name in answer.binary}
-    content["outputs"] = [_tensor(name, rows, parts.get(name)) for name, rows in answer.outputs.items()]
+    tensors = {name: binary_tensor(rows) for name, rows in answer.outputs.items() if name in answer.binary}
+    content["outputs"] = [_json_tensor(name, rows, tensors.get(name)) for name, rows in answer.outputs.items()]
     text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
-    if not parts:
+    if not tensors:
         return text, None
-    return b"".join([text, *parts.values()]), len(text)
+    return b"".join([text, *tensors.values()]), len(text)
 
 
-def packed(rows: Rows) -> bytes:
-    """Numbers as they lie in memory, texts each behind its length (u32), little-endian."""
+def binary_tensor(rows: Rows) -> bytes:
+    """Return an output as bytes, little-endian: float32 numbers, or texts that each follow their length (u32)."""
     if not rows.dtype.hasobject:
         return rows.astype("<f4", copy=False).tobytes()
     return b"".join(struct.pack("<I", len(text)) + text.encode() for text in rows.ravel().tolist())
 
 
-def _tensor(name: str, rows: Rows, binary: bytes | None) -> dict[str, Any]:
-    """One tensor: its numbers or texts, flat and row by row, or how many bytes of them follow the JSON."""
+def _json_tensor(name: str, rows: Rows, binary: bytes | None) -> dict[str, Any]:
+    """Return an output as a JSON object with its values row by row, or with the size of the binary tensor."""
     is_text = name == FLAGS
     tensor = {"name": name, "datatype": "BYTES" if is_text else "FP32", "shape": rows.shape}
     if binary is not None:
@@ -268,81 +298,89 @@ def _tensor(name: str, rows: Rows, binary: bytes | None) -> dict[str, Any]:
     return tensor | {"data": rows.ravel().tolist() if is_text else rows.ravel()}
 
 
-Written = TypeVar("Written")
+ResponseType = TypeVar("ResponseType")
 
 
 def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> tuple[dict[str, Rows], int, int]:
-    """Run the model; may be called from any thread.
+    """Run the model. This function may be called from any thread.
+
+    Args:
+        loaded: The model.
+        charge_pC: Charges, shape (n, electrodes), pC.
+        names: Names of the requested outputs.
 
     Returns:
-        Outputs by name, shape (n, width); how many presses were not checked for their misfit, as nobody asked for it;
-        and how many have one above the limit of the model, or none that is a number.
+        The outputs by name, each of shape (n, width); the number of presses whose misfit was not computed, because it
+        was not requested; and the number of presses whose misfit is NaN or above the limit of the model.
 
     Raises:
-        ModelError: If its graph fails.
+        ModelError: If onnxruntime fails to run the graph.
     """
     if FLAGS in names:
         outputs, unchecked, alarms = infer(loaded, charge_pC, loaded.outputs)
         outputs[FLAGS] = _flags(loaded, outputs)
         return {name: outputs[name] for name in names}, unchecked, alarms
     if len(charge_pC) == 1:
-        row, columns = _one_press(loaded, charge_pC[0])
-        misfit = row[:, columns["misfit"]]
-        return (
-            {name: row[:, columns[name]] for name in names},
-            0,
-            int(not misfit.item() <= loaded.validity.misfit_limit),
-        )
+        return _infer_single_press(loaded, charge_pC[0], names)
+
+    count = len(charge_pC)
     outputs = dict[str, Rows](run(loaded.model.session, charge_pC, names))
-    check_output_shapes(outputs, len(charge_pC), loaded.metadata.label)
+    check_output_shapes(outputs, count, loaded.metadata.label)
     if "misfit" not in outputs:
-        return outputs, len(charge_pC), 0
-    return outputs, 0, len(charge_pC) - int(np.count_nonzero(outputs["misfit"] <= loaded.validity.misfit_limit))
+        return outputs, count, 0
+    good_count = int(np.count_nonzero(outputs["misfit"] <= loaded.validity.misfit_limit))
+    return outputs, 0, count - good_count
 
 
-def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
-    """The flags of presses, shape (n, 1)."""
-    known = [outputs[name] for name in ("contact", "contact_std", "misfit")]
-    columns = np.concatenate([*known, np.zeros_like(outputs["contact"])], axis=1).T  # correlations decide no flag
-    words = [",".join(flags) for flags in loaded.validity.batch_flags(Contacts(*columns))]
-    return np.array(words, dtype=object)[:, np.newaxis]
-
-
-def _one_press(loaded: LoadedVersion, charge_pC: Singles) -> tuple[Singles, dict[str, slice]]:
-    """All outputs in a row, shape (1, n), and where they lie; from bound memory, which is faster than a plain run."""
+def _infer_single_press(
+    loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]
+) -> tuple[dict[str, Rows], int, int]:
+    """Run the model for one press in bound memory, which is faster than `session.run`; see `infer`."""
     press = loaded.press()
     row = np.empty((1, press.size), np.float32)
     try:
         press.run_into(charge_pC, row[0])
-    except Exception as error:  # onnxruntime's exceptions have no common base of their own
+    except Exception as error:  # onnxruntime's exceptions have no common base class of their own
         raise run_error(error) from error
-    return row, press.columns
+    columns = press.columns
+    misfit = row[:, columns["misfit"]].item()
+    is_alarm = not misfit <= loaded.validity.misfit_limit  # also true for NaN
+    return {name: row[:, columns[name]] for name in names}, 0, int(is_alarm)
+
+
+def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
+    """Return the flags of presses, separated by commas, shape (n, 1)."""
+    correlations = np.zeros_like(outputs["contact"])  # they do not influence the flags
+    parts = [outputs["contact"], outputs["contact_std"], outputs["misfit"], correlations]
+    contacts = Contacts(*np.concatenate(parts, axis=1).T)
+    texts = [",".join(flags) for flags in loaded.validity.batch_flags(contacts)]
+    return np.array(texts, dtype=object)[:, np.newaxis]
 
 
 def answer_inference(
-    loaded: LoadedVersion, read: Callable[[], InferRequest], write: Callable[[InferAnswer], Written]
-) -> Written:
-    """Read a request, run the model, write the answer, and count it.
+    loaded: LoadedVersion, read: Callable[[], InferRequest], write: Callable[[InferAnswer], ResponseType]
+) -> ResponseType:
+    """Read a request, run the model, write the response, and count the request.
 
     Args:
         loaded: The model.
-        read: Returns the request, or raises what is wrong with it.
-        write: Turns the answer into what the transport sends.
+        read: Function that returns the request, or raises an error if the request is not valid.
+        write: Function that converts the outputs to the response of the transport.
 
     Raises:
-        Whatever `read` raises.
+        IsochargeError: The errors of `read`, and ModelError if the model fails.
     """
-    clock = time.perf_counter_ns
-    began = clock()
+    clock_ns = time.perf_counter_ns
+    start_ns = clock_ns()
     try:
         request = read()
-        was_read = clock()
+        read_end_ns = clock_ns()
         outputs, unchecked, alarms = infer(loaded, request.charge_pC, request.outputs)
-        ran = clock()
-        written = write(InferAnswer(loaded.metadata.name, loaded.version, request.id, outputs, request.binary))
+        run_end_ns = clock_ns()
+        response = write(InferAnswer(loaded.metadata.name, loaded.version, request.id, outputs, request.binary))
     except Exception:
-        loaded.statistics.failed(clock() - began)
+        loaded.statistics.failed(clock_ns() - start_ns)
         raise
-    stages_ns = was_read - began, ran - was_read, clock() - ran
+    stages_ns = (read_end_ns - start_ns, run_end_ns - read_end_ns, clock_ns() - run_end_ns)
     loaded.statistics.succeeded(len(request.charge_pC), stages_ns, unchecked, alarms)
-    return written
+    return response

@@ -1,7 +1,4 @@
-"""Responses as plain values, and the one place where the exception tree becomes statuses and messages, of gRPC too.
-
-Bodies may be compressed, gzip and deflate, in both directions, bounded.
-"""
+"""HTTP responses as plain values, statuses of errors for HTTP and gRPC, and compression of bodies."""
 
 import gzip
 import logging
@@ -14,7 +11,7 @@ from isocharge.common import errors
 
 log = logging.getLogger(__name__)
 
-_STATUS: tuple[tuple[type[Exception], int, str], ...] = (
+_STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (errors.ModelNotFound, 404, "NOT_FOUND"),
     (errors.UnknownPath, 404, "NOT_FOUND"),
     (errors.WrongMethod, 405, "UNIMPLEMENTED"),
@@ -26,27 +23,34 @@ _STATUS: tuple[tuple[type[Exception], int, str], ...] = (
     (errors.InputError, 400, "INVALID_ARGUMENT"),
     (Exception, 500, "INTERNAL"),
 )
-"""Error, HTTP status, gRPC status; the first class that fits counts."""
+"""Class of an error, its HTTP status and its gRPC status. The first matching class of the list is used."""
 
-INTERNAL = "internal error; the server's log says more"
-"""The message of an error that isocharge did not raise on purpose."""
+INTERNAL_MESSAGE = "internal error; the server's log says more"
+"""Message to the client for an error that is no IsochargeError."""
 
 
 def statuses(error: Exception) -> tuple[int, str]:
-    """The HTTP status of an error, and the name of its gRPC status."""
-    return next((code, name) for kind, code, name in _STATUS if isinstance(error, kind))
+    """Return the HTTP status of an error and the name of its gRPC status."""
+    return next((code, name) for kind, code, name in _STATUSES if isinstance(error, kind))
 
 
 def client_message(error: Exception) -> str:
-    """The message that a client gets; an error that isocharge did not raise on purpose goes into the log instead."""
+    """Return the message to the client. An error that is no IsochargeError is written to the log instead."""
     if isinstance(error, errors.IsochargeError):
         return str(error)
     log.exception("a request failed", exc_info=error)
-    return INTERNAL
+    return INTERNAL_MESSAGE
 
 
 class Response(NamedTuple):
-    """An answer: status, headers, body; and the kind of the error, if it is one."""
+    """HTTP response.
+
+    Attributes:
+        status: Status code.
+        headers: Names in lower case, and values.
+        body: The body.
+        error: Type of the error; None if there was no error.
+    """
 
     status: int
     headers: list[tuple[bytes, bytes]]
@@ -55,23 +59,25 @@ class Response(NamedTuple):
 
 
 def response_of(status: int, content_type: bytes, body: bytes, error: str | None = None) -> Response:
-    """A response with the headers that each one has."""
-    return Response(status, [(b"content-type", content_type), (b"content-length", b"%d" % len(body))], body, error)
+    """Return a response with the headers `content-type` and `content-length`."""
+    headers = [(b"content-type", content_type), (b"content-length", b"%d" % len(body))]
+    return Response(status, headers, body, error)
 
 
 def json_response(content: Any) -> Response:
-    """A value as a response in JSON."""
+    """Return a response with a value as JSON."""
     return response_of(200, b"application/json", orjson.dumps(content))
 
 
 def refusal(status: int, message: str, error: str | None = None) -> Response:
-    """The response to a request that is not answered: {"error": message}."""
+    """Return the response to a request that is refused: {"error": message}."""
     return response_of(status, b"application/json", orjson.dumps({"error": message}), error)
 
 
 def error_response(error: Exception) -> Response:
-    """The response to a request that raised an error."""
-    response = refusal(statuses(error)[0], client_message(error), type(error).__name__)
+    """Return the response to a request that raised an error."""
+    http_status, _ = statuses(error)
+    response = refusal(http_status, client_message(error), type(error).__name__)
     if isinstance(error, errors.WrongMethod):
         response.headers.append((b"allow", error.allowed.encode()))
     if isinstance(error, errors.TokenError):
@@ -79,67 +85,75 @@ def error_response(error: Exception) -> Response:
     return response
 
 
-WORTH_BYTES = 1024
-"""Size from which an answer is compressed, bytes: to send a shorter one is faster than to set up a compressor."""
+MIN_COMPRESSED_BYTES = 1024
+"""Smallest size of a body that is compressed, bytes. Sending a shorter body is faster than setting up a compressor."""
 
-_WINDOW = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
-"""zlib's `wbits` of each encoding; HTTP's deflate is the zlib format."""
+_WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
+"""Argument `wbits` of zlib for each encoding. The encoding `deflate` of HTTP is the zlib format."""
 
 
 def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
-    """Undo the Content-Encoding of a request.
+    """Decompress the body of a request.
 
     Args:
-        body: As it came.
-        encoding: Value of the header, lower case.
-        limit: Largest size of the result; nothing beyond it is ever unpacked.
+        body: The compressed body.
+        encoding: Value of the header Content-Encoding in lower case; empty if the request has none.
+        limit: Largest size of the result, bytes. Decompression stops at this size.
 
     Raises:
-        UnknownEncoding: If it is neither gzip, deflate nor identity.
+        UnknownEncoding: If the encoding is not gzip, deflate or identity.
         TooLarge: If the result is larger than the limit.
-        RequestError: If the data are damaged, cut short, or go on after their end.
+        RequestError: If the data are damaged or incomplete, or other data follow them.
     """
     if encoding in (b"", b"identity"):
         return body
-    if encoding not in _WINDOW:
-        raise errors.UnknownEncoding(f"Content-Encoding {_text(encoding)}: expected gzip, deflate or identity")
-    reader = zlib.decompressobj(_WINDOW[encoding])
+    if encoding not in _WINDOW_BITS:
+        raise errors.UnknownEncoding(f"Content-Encoding {_shown(encoding)}: expected gzip, deflate or identity")
+    decompressor = zlib.decompressobj(_WINDOW_BITS[encoding])
     try:
-        plain = reader.decompress(body, limit + 1)
+        plain = decompressor.decompress(body, limit + 1)
     except zlib.error as error:
         raise errors.RequestError(
-            f"the body is not {_text(encoding)}, as its Content-Encoding says: {error}"
+            f"the body is not {_shown(encoding)}, as its Content-Encoding states: {error}"
         ) from error
     if len(plain) > limit:
         raise errors.TooLarge(f"the body unpacks to more than {limit} bytes; send smaller batches")
-    if not reader.eof or reader.unused_data:
-        raise errors.RequestError(f"the body ends before, or goes on after, the end of its {_text(encoding)} data")
+    if not decompressor.eof or decompressor.unused_data:
+        raise errors.RequestError(f"the body ends before, or goes on after, the end of its {_shown(encoding)} data")
     return plain
 
 
 def compress(body: bytes, accepted: bytes) -> tuple[bytes, bytes]:
-    """Compress an answer if its client takes that and it is worth it.
+    """Compress the body of a response if the client accepts an encoding and the body is long enough.
 
     Args:
-        body: As it is.
-        accepted: The request's Accept-Encoding.
+        body: The body.
+        accepted: Value of the header Accept-Encoding of the request.
 
     Returns:
-        The body and its Content-Encoding, empty if it stays as it is.
+        The body and its Content-Encoding, which is empty if the body was not compressed.
     """
-    names = _accepted(accepted) if len(body) >= WORTH_BYTES else ()
-    if b"gzip" in names:
+    if len(body) < MIN_COMPRESSED_BYTES:
+        return body, b""
+    encodings = _accepted_encodings(accepted)
+    if b"gzip" in encodings:
         return gzip.compress(body, compresslevel=1, mtime=0), b"gzip"
-    if b"deflate" in names:
+    if b"deflate" in encodings:
         return zlib.compress(body, level=1), b"deflate"
     return body, b""
 
 
-def _accepted(header: bytes) -> set[bytes]:
-    """Names in an Accept-Encoding that are not weighted zero."""
-    parts = [part.replace(b" ", b"").lower().partition(b";q=") for part in header.split(b",")]
-    return {name for name, _, weight in parts if weight.strip(b"0.") or not weight}
+def _accepted_encodings(header: bytes) -> set[bytes]:
+    """Return the names in an Accept-Encoding whose weight is not zero."""
+    names = set()
+    for part in header.split(b","):
+        name, _, weight = part.replace(b" ", b"").lower().partition(b";q=")
+        is_zero = weight != b"" and weight.strip(b"0.") == b""
+        if not is_zero:
+            names.add(name)
+    return names
 
 
-def _text(encoding: bytes) -> str:
+def _shown(encoding: bytes) -> str:
+    """Return the name of an encoding for an error message."""
     return repr(encoding.decode("latin-1"))[:50]
