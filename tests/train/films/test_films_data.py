@@ -1,4 +1,4 @@
-"""What networks for all films learn from: each film's own charges, nearest contacts, and what no contact explains."""
+"""Training data of the networks for all films: charges of each film, nearest contacts, and projections."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -25,7 +25,7 @@ from isocharge.train.training.network import compress_length
 
 
 def charges(prior, family, parameters, contact):
-    """Of one film, by its own forward map."""
+    """Compute the charges of one film with its own forward map."""
     return family.forward_map(*prior.film(parameters)).charges(contact.astype(float))
 
 
@@ -54,52 +54,56 @@ def source(films):
 
 
 def test_misfit_examples_are_those_of_their_film(source, monkeypatch):
-    """The residual is at a contact of the film: charge less noise times residual lies on its map, hence has none."""
+    """The charge without sigma times the residual is the charge of a contact, so its own residual is zero."""
     monkeypatch.setattr(films_data, "N_CANDIDATES", 64)
     drawn = draw_misfit_films(source, 2, 12, seed=1)
     for parameters, charge, residual in zip(drawn.parameters, drawn.charge, drawn.target, strict=True):
         charge_map = source.charge_map(parameters)
-        near = np.linalg.norm(residual, axis=1) < 5.0
-        nearest = charge[near] - source.noise.sigma(charge[near]) * residual[near]
-        found, left = search(charge_map, nearest, source.noise.sigma(nearest), candidates=64)
-        assert near.any()
-        assert np.linalg.norm(left, axis=1).max() < 0.05
-        assert (np.hypot(found[:, 0], found[:, 1]) <= source.domain.radius * (1 + 1e-9)).all()
+        is_near = np.linalg.norm(residual, axis=1) < 5.0
+        assert is_near.any()
+        nearest_charge = charge[is_near] - source.noise.sigma(charge[is_near]) * residual[is_near]
+        contact, new_residual = search(charge_map, nearest_charge, source.noise.sigma(nearest_charge), candidates=64)
+        assert np.linalg.norm(new_residual, axis=1).max() < 0.05
+        assert (np.hypot(contact[:, 0], contact[:, 1]) <= source.domain.radius * (1 + 1e-9)).all()
 
 
-def test_what_no_contact_explains_is_perpendicular_to_the_derivatives(source):
+def test_the_projection_is_perpendicular_to_the_derivatives_of_the_charges(source):
     drawn = draw_near_films(source, 2, 5, seed=1)
-    for parameters, charge, across in zip(drawn.parameters, drawn.charge, drawn.target, strict=True):
+    for parameters, charge, projection in zip(drawn.parameters, drawn.charge, drawn.target, strict=True):
         charge_map = source.charge_map(parameters)
-        contact, left = search(charge_map, charge, source.noise.sigma(charge), candidates=256)
-        assert np.linalg.norm(left, axis=1).max() < 0.05
+        contact, residual = search(charge_map, charge, source.noise.sigma(charge), candidates=256)
+        assert np.linalg.norm(residual, axis=1).max() < 0.05
         slopes = charge_map.derivatives(contact) / source.noise.sigma(charge)[:, :, None]
         slopes /= np.linalg.norm(slopes, axis=1, keepdims=True)
-        np.testing.assert_allclose(across @ slopes, 0.0, atol=0.02)
-        np.testing.assert_allclose(across @ across, across, atol=1e-9)
-        np.testing.assert_allclose(np.trace(across, axis1=1, axis2=2), 1.0)  # four charges, three unknowns
+        np.testing.assert_allclose(projection @ slopes, 0.0, atol=0.02)
+        np.testing.assert_allclose(projection @ projection, projection, atol=1e-9)
+        np.testing.assert_allclose(np.trace(projection, axis1=1, axis2=2), 1.0)  # four charges, three unknowns
 
 
-def test_good_presses_are_off_by_up_to_eight_times_the_noise_and_count_ten_times():
-    """Charges of 400 pC with 5 pC of noise, all of which no contact explains; answers that are wrong by 1 each.
+def test_good_presses_have_up_to_eight_times_the_noise_and_ten_times_the_weight():
+    """The charges are 400 pC with a noise of 5 pC, the projection is the identity, and each answer is wrong by 1.
 
-    Factors are 1 + 7 u^3 with u uniform; their mean square is 1 + 14 / 4 + 49 / 7.
+    The factors of the noise are 1 + 7 u^3 with u uniform, so their mean square is 1 + 14 / 4 + 49 / 7.
     """
-    clean, off = np.full((50, 8, 4), 400.0), []
+    clean = np.full((50, 8, 4), 400.0)
+    deviations = []
     examples = DrawnFilms(np.zeros((50, 1)), clean, 0.0 * clean)
-    near = replace(examples, target=np.broadcast_to(np.eye(4), (50, 8, 4, 4)))
+    good = replace(examples, target=np.broadcast_to(np.eye(4), (50, 8, 4, 4)))
     inputs = SimpleNamespace(values=lambda charge, _: (charge - 400.0) / 5.0, context=torch.tensor)
 
     def wrong_by_one(deviation, _):
-        off.append(deviation)
+        deviations.append(deviation)
         return compress_length(deviation) + 1.0
 
     config = FilmsConfig(batch_films=2048)
-    stage = misfit_stage(wrong_by_one, inputs, examples, near, NoiseModel("mine", 3.0, 0.01), config)
-    losses = stage.loss(0, torch.Generator().manual_seed(0)).item(), stage.score()[0]
-    assert losses == pytest.approx((10.0 * 4.0 + 4.0, 10.0 * 4.0 + 4.0), rel=1e-5)
-    assert [len(films) for films in off] == [1024, 1024, 3, 50]  # 6 % of the examples are watched
-    assert torch.mean(off[1] ** 2).item() == pytest.approx(11.5, rel=0.08)
+    stage = misfit_stage(wrong_by_one, inputs, examples, good, NoiseModel("mine", 3.0, 0.01), config)
+    loss = stage.loss(0, torch.Generator().manual_seed(0)).item()
+    validation_score, _ = stage.score()
+    assert loss == pytest.approx(10.0 * 4.0 + 4.0, rel=1e-5)
+    assert validation_score == pytest.approx(10.0 * 4.0 + 4.0, rel=1e-5)
+    assert [len(films) for films in deviations] == [1024, 1024, 3, 50]  # 6 % of the examples are for validation
+    _, good_deviation, *_ = deviations
+    assert torch.mean(good_deviation**2).item() == pytest.approx(11.5, rel=0.08)
 
 
 def test_charges_that_are_not_positive_are_refused(films):

@@ -1,4 +1,4 @@
-"""A tiny fit of all films end to end, going on where it was stopped; its file, read back and refused where damaged."""
+"""The network for all films: a short training, its continuation after a stop, and its file."""
 
 import io
 import json
@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from isocharge.common.activations import ACTIVATIONS, Activation
 from isocharge.common.errors import ModelError
 from isocharge.common.progress import listening
 from isocharge.common.resumable_run import resume_parts
@@ -30,28 +31,44 @@ def data(random_films):
     return films_bytes(random_films(load_sensor("four-25um-biaxial"))[0])
 
 
-def test_read_is_written(data, random_films):
-    written, again = random_films(load_sensor("four-25um-biaxial"))[0], films_from_bytes(data, FILE)
-    assert (again.prior, again.domain, again.noise) == (written.prior, written.domain, written.noise)
+def test_a_file_gives_the_written_model_back(data, random_films):
+    written, _, _ = random_films(load_sensor("four-25um-biaxial"))
+    read = films_from_bytes(data, FILE)
+    assert read.prior == written.prior
+    assert read.domain == written.domain
+    assert read.noise == written.noise
     for part in ("contact", "misfit"):
-        weights, read = getattr(written, part).arrays, getattr(again, part).arrays
-        assert weights.keys() == read.keys()
-        for name, values in weights.items():
-            step = np.abs(values).max(axis=-1, keepdims=True) / 2047
-            assert (np.abs(read[name] - values) <= 0.51 * step).all(), name
+        written_arrays = getattr(written, part).arrays
+        read_arrays = getattr(read, part).arrays
+        assert read_arrays.keys() == written_arrays.keys()
+        for name, values in written_arrays.items():
+            rounding_step = np.abs(values).max(axis=-1, keepdims=True) / 2047
+            assert (np.abs(read_arrays[name] - values) <= 0.51 * rounding_step).all(), name
 
 
-def test_what_a_released_file_says_is_written_again(films, pytestconfig):
-    """Sensor, spread, domain and noise, which the file has in m, Pa and C; and weights of twelve bits stay the same."""
+def test_a_file_keeps_the_activation(films):
+    softplus = Activation("softplus", lambda x: np.logaddexp(0.0, x), "softplus", "Softplus", c_source="")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(ACTIVATIONS, "softplus", softplus)
+        contact = replace(films.contact, activation=softplus)
+        misfit = replace(films.misfit, activation=softplus)
+        read = films_from_bytes(films_bytes(replace(films, contact=contact, misfit=misfit)), FILE)
+    assert read.contact.activation is softplus
+    assert read.misfit.activation is softplus
+
+
+def test_a_released_file_is_written_again_with_the_same_content(films, pytestconfig):
+    """The file has other units than the program, and weights of twelve bits; neither changes the numbers."""
     path = pytestconfig.rootpath / "models" / "four-25um-biaxial-films" / "1" / FILE
     with np.load(path) as released, np.load(io.BytesIO(films_bytes(films))) as again:
         assert json.loads(str(again["about"])) == json.loads(str(released["about"]))
         assert np.abs(again["contact.bases.1"].astype(int) - released["contact.bases.1"]).max() <= 1
-    known = films.prior.spread, films.prior.probe.radius, films.noise
-    assert known == (FilmSpread(), 1.0, noise_model("reference"))
+    assert films.prior.spread == FilmSpread()
+    assert films.prior.probe.radius == 1.0
+    assert films.noise == noise_model("reference")
 
 
-def test_a_missing_file_says_what_it_belongs_to(tmp_path):
+def test_the_error_of_a_missing_file_names_the_command_that_writes_it(tmp_path):
     with pytest.raises(ModelError, match=r"films\.npz: cannot be read .* `isocharge train fit --films` writes it"):
         read_films(tmp_path)
 
@@ -70,7 +87,7 @@ def test_a_small_file_that_unpacks_to_very_much_is_refused_before_it_is_unpacked
 
 
 def altered(data, **changes):
-    """The file with some arrays replaced, changed by a function or (None) left out, and a checksum that fits."""
+    """Return a file with a valid checksum in which some arrays are replaced, changed by a function, or left out."""
     with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name] for name in file.files if name != "sha256"}
     changed = {name: change(arrays[name]) if callable(change) else change for name, change in changes.items()}
@@ -85,7 +102,7 @@ def newer(about):
 
 
 @pytest.mark.parametrize(
-    ("spoilt", "said"),
+    ("damage", "message"),
     [
         (lambda _: b"", "damaged"),
         (lambda data: data[: int(0.9999 * len(data))], "damaged"),
@@ -104,9 +121,9 @@ def newer(about):
         ),
     ],
 )
-def test_a_file_that_is_damaged_or_newer(data, spoilt, said):
-    with pytest.raises(ModelError, match=rf"films\.npz: .*{said}"):
-        films_from_bytes(spoilt(data), FILE)
+def test_a_damaged_or_newer_file_is_refused(data, damage, message):
+    with pytest.raises(ModelError, match=rf"films\.npz: .*{message}"):
+        films_from_bytes(damage(data), FILE)
 
 
 TINY = FilmsConfig(
@@ -118,7 +135,7 @@ SHORT = replace(TINY, films=16, presses=16, watched=4, steps=30, misfit_films=2,
 
 @pytest.fixture
 def solved(films, monkeypatch):
-    """The solves are those of a released network: the tests of the simulator cover how they come about."""
+    """Use the forward maps of a released network instead of solving new ones."""
 
     class Solved(films_fit.FilmFamily):
         @classmethod
@@ -136,7 +153,7 @@ def solved(films, monkeypatch):
 
 @pytest.mark.usefixtures("solved")
 @pytest.mark.slow
-def test_a_tiny_fit_end_to_end(films, tmp_path):
+def test_a_short_training_gives_a_model_that_is_served(films, tmp_path):
     released = release_films(fit_films(films.prior, TINY), tmp_path / "tiny-films", command="a command")
     model = load_model(released.folder)
     check_golden(model)
@@ -144,14 +161,14 @@ def test_a_tiny_fit_end_to_end(films, tmp_path):
     assert model.metadata.made_with["config"]["radius_mm"] == 8.0
     assert len(Predictor(released.folder).predict([100.0, 90.0, 80.0, 70.0])) == 10
     trained = read_films(released.folder)
-    assert evaluate_films(trained, 6, 64).known["position_rms_mm"] < 1.5  # of 4.6 mm by chance
+    assert evaluate_films(trained, 6, 64).with_known_film["position_rms_mm"] < 1.5  # of 4.6 mm by chance
     card = (released.folder / "card.md").read_text()
-    assert "`model.onnx` is that plain model for the film" in card
+    assert "`model.onnx` is the model of the film" in card
     assert f"| position, rms | {model.metadata.made_with['films']['position_rms_mm']:g} mm |" in card
 
 
 @pytest.mark.usefixtures("solved")
-def test_a_stopped_fit_goes_on_with_the_same_weights(films, tmp_path, monkeypatch):
+def test_a_stopped_training_continues_with_the_same_weights(films, tmp_path, monkeypatch):
     monkeypatch.setattr(descent, "SAVE_EVERY_S", 0.0)
     monkeypatch.setattr(descent, "REPORT_EVERY", 10)
     identity = films_identity(films.prior, SHORT)
@@ -173,15 +190,15 @@ def test_a_stopped_fit_goes_on_with_the_same_weights(films, tmp_path, monkeypatc
             np.testing.assert_array_equal(getattr(again, part).arrays[name], values)
 
 
-def test_the_film_that_is_assumed_has_the_lower_error(films):
-    """`model.onnx` is folded for the film that errs least over all films when none is known."""
+def test_the_assumed_film_has_the_lower_error(films):
+    """Of the described film and the mean of the prior, the model assumes the one with the lower errors."""
     errors = evaluate_films(films, 6, 64)
     assert np.array_equal(errors.parameters, films.prior.mean)
     assert not np.array_equal(films.prior.mean, films.prior.described)
-    assert errors.known["position_rms_mm"] < 0.5 * errors.unknown["position_rms_mm"]
+    assert errors.with_known_film["position_rms_mm"] < 0.5 * errors.with_assumed_film["position_rms_mm"]
 
 
-def test_the_card_says_what_was_measured(films):
+def test_the_card_lists_the_measured_errors(films):
     about = load_model(find_model("four-25um-biaxial-films")).metadata
     known = dict.fromkeys([key for _, key, _ in ROWS], 0.25) | {"coverage_68": 0.67, "coverage_95": 0.95}
     errors = FilmsErrors(known, {key: 0.5 * value for key, value in known.items()}, about.errors, "a film")

@@ -237,7 +237,7 @@ def test_a_model_of_measured_presses_is_judged_by_them_and_says_so(dataset, tmp_
     assert errors["measured_presses"] == held.sum()
     assert errors["position_median_mm"] == pytest.approx(np.median(np.hypot(*off.T)), rel=1e-3)
     assert f"## Errors on {held.sum()} measured presses that training never saw" in card
-    words = "The model was fitted to measurements of one film", "The truth behind these figures is the simulator"
+    words = "The model was trained on measurements of one film", "These figures compare with the simulator"
     assert [said in card for said in words] == [True, False]
     assert not [name for name in errors if name.startswith("clean_")]
 

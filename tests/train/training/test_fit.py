@@ -1,4 +1,4 @@
-"""A fit: repeatable, seeded, ends early, fails loudly, goes on after a kill; what its settings may be."""
+"""Training: it is reproducible, stops early, reports failures and continues after a kill; ranges of its settings."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,56 +34,61 @@ def test_a_teacher_answers_in_the_coordinates_of_the_network():
     np.testing.assert_allclose(log_std, np.log([[0.1, 0.05, 0.1 / np.log(5.0)]]), rtol=1e-6)
 
 
-def stage(scores, steps=20 * REPORT_EVERY, warm_up_steps=0):
-    """A small network that is pulled to a target, with given scores at successive evaluations."""
+def stage_with_scores(scores, steps=20 * REPORT_EVERY, warm_up_steps=0):
+    """Return the training of a small network with given validation scores, and the list of weights at each score."""
     torch.manual_seed(0)
-    part, given, seen = TrainablePerceptron(2, (4, 4), 1), iter(scores), []
+    network = TrainablePerceptron(2, (4, 4), 1)
+    remaining_scores = iter(scores)
+    weights_at_scores = []
 
     def loss(_, random):
         inputs = torch.rand(8, 2, generator=random)
-        return ((part(inputs) - inputs.sum(dim=1, keepdim=True)) ** 2).mean()
+        return ((network(inputs) - inputs.sum(dim=1, keepdim=True)) ** 2).mean()
 
     def score():
-        seen.append({name: values.clone() for name, values in part.state_dict().items()})
-        return next(given), "text"
+        weights_at_scores.append({name: values.clone() for name, values in network.state_dict().items()})
+        return next(remaining_scores), "text"
 
-    return TrainingStage("stage", part, loss, score, steps, warm_up_steps), seen
-
-
-def run(made, patience=10**6):
-    calls = []
-    with listening(lambda _, done, *rest: calls.append((done, *rest))):
-        Descent(made, 1e-2, patience, seed=0).run()
-    return calls
+    return TrainingStage("stage", network, loss, score, steps, warm_up_steps), weights_at_scores
 
 
-def same(one, other):
+def run_stage(stage, patience=10**6):
+    """Run a training and return its progress reports."""
+    reports = []
+    with listening(lambda _, done, *rest: reports.append((done, *rest))):
+        Descent(stage, 1e-2, patience, seed=0).run()
+    return reports
+
+
+def have_same_weights(one, other):
     return all(torch.equal(one[name], other[name]) for name in one)
 
 
 @pytest.mark.usefixtures("_short_reports")
-def test_it_ends_when_nothing_better_has_come_for_long():
-    made, seen = stage([5.0, 2.0, *[3.0] * 18])
-    calls = run(made, patience=3 * REPORT_EVERY)
-    assert [step for step, *_ in calls] == [REPORT_EVERY * k for k in (1, 2, 3, 4, 5)]
-    assert same(made.network.state_dict(), seen[1])
-    assert calls[0][1] == 20 * REPORT_EVERY
-    assert calls[0][2].startswith("loss ")
-    assert calls[0][2].endswith("text")
+def test_training_stops_early_with_the_best_weights():
+    stage, weights_at_scores = stage_with_scores([5.0, 2.0, *[3.0] * 18])
+    reports = run_stage(stage, patience=3 * REPORT_EVERY)
+    assert [step for step, *_ in reports] == [REPORT_EVERY * k for k in (1, 2, 3, 4, 5)]
+    assert have_same_weights(stage.network.state_dict(), weights_at_scores[1])
+    _, total, text = reports[0]
+    assert total == 20 * REPORT_EVERY
+    assert text.startswith("loss ")
+    assert text.endswith("text")
 
 
 @pytest.mark.usefixtures("_short_reports")
-def test_nothing_counts_while_another_loss_is_trained():
-    made, seen = stage([0.0, 0.0, 2.0, 3.0], steps=4 * REPORT_EVERY, warm_up_steps=2 * REPORT_EVERY)
-    run(made, patience=REPORT_EVERY + 1)
-    assert same(made.network.state_dict(), seen[2])
+def test_weights_of_the_warm_up_are_never_the_best():
+    steps = 4 * REPORT_EVERY
+    stage, weights_at_scores = stage_with_scores([0.0, 0.0, 2.0, 3.0], steps, warm_up_steps=2 * REPORT_EVERY)
+    run_stage(stage, patience=REPORT_EVERY + 1)
+    assert have_same_weights(stage.network.state_dict(), weights_at_scores[2])
 
 
 @pytest.mark.usefixtures("_short_reports")
-def test_a_score_that_is_no_number_is_an_error():
-    made, _ = stage([float("nan")] * 20)
+def test_a_score_of_nan_is_an_error():
+    stage, _ = stage_with_scores([float("nan")] * 20)
     with pytest.raises(TrainingError, match=r"the stage loss is .* at step 20 of 400; lower training.learning_rate"):
-        run(made)
+        run_stage(stage)
 
 
 def settings(hidden=(16, 16), misfit_hidden=(8, 8), weights="float32", electrodes=0, **training):
@@ -94,7 +99,7 @@ def settings(hidden=(16, 16), misfit_hidden=(8, 8), weights="float32", electrode
 
 @pytest.fixture
 def split_once(trained, monkeypatch):
-    """The split of the short fit, whatever is fitted: its search for folds takes longer than these fits."""
+    """Use the split of the session's training, because the search for folds takes longer than these trainings."""
     monkeypatch.setattr(Split, "of", lambda *_: trained.split)
 
 
@@ -153,23 +158,23 @@ def test_coverage_where_the_truth_is_known(sensor):
     assert np.mean(deviation < 1.96, axis=0) == pytest.approx([0.95] * 3, abs=0.04)
 
 
-def test_the_first_loss_is_least_squares_and_deviations_follow_without_pulling():
-    """The slope by a mean is that of least squares, and by a deviation none where it is as large as the error."""
-    mean, unit = torch.randn((2, 20, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+def test_the_warm_up_loss_is_least_squares_for_the_mean():
+    """The gradient of the standard deviations is zero if they are as large as the errors."""
+    mean, target = torch.randn((2, 20, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     mean.requires_grad_()
-    log_std = torch.log(torch.abs(mean - unit)).detach().requires_grad_()
-    warm_up_loss(mean, log_std, unit).backward()
-    np.testing.assert_allclose(mean.grad, 60.0 / 20 * (mean - unit).detach(), rtol=1e-9)
+    log_std = torch.log(torch.abs(mean - target)).detach().requires_grad_()
+    warm_up_loss(mean, log_std, target).backward()
+    np.testing.assert_allclose(mean.grad, 60.0 / 20 * (mean - target).detach(), rtol=1e-9)
     np.testing.assert_allclose(log_std.grad, 0.0, atol=1e-12)
 
 
-def test_the_loss_of_a_student_is_the_divergence_of_gaussians():
+def test_the_loss_of_a_student_is_the_kullback_leibler_divergence_of_gaussians():
     random = torch.Generator().manual_seed(3)
-    mean, log_std, taught_mean, taught_log_std = (torch.randn(50, 3, generator=random) for _ in range(4))
-    teacher = torch.distributions.Normal(taught_mean, taught_log_std.exp())
+    mean, log_std, teacher_mean, teacher_log_std = (torch.randn(50, 3, generator=random) for _ in range(4))
+    teacher = torch.distributions.Normal(teacher_mean, teacher_log_std.exp())
     student = torch.distributions.Normal(mean, log_std.exp())
     expected = torch.distributions.kl_divergence(teacher, student).sum(dim=1).mean()
-    torch.testing.assert_close(distillation_loss(mean, log_std, taught_mean, taught_log_std), expected)
+    torch.testing.assert_close(distillation_loss(mean, log_std, teacher_mean, teacher_log_std), expected)
 
 
 @pytest.mark.usefixtures("split_once")
@@ -191,25 +196,30 @@ def test_a_student_learns_the_answers_and_not_the_presses(dataset, fitted):
 def test_rounded_weights_are_whole_numbers_times_the_scale_of_their_output(dataset):
     data = TrainingData.of(dataset)
     rounded, exact = (train_network(data, settings(weights=form)).network for form in ("int8", "float32"))
-    for part, other in ((rounded.contact, exact.contact), (rounded.misfit_vector, exact.misfit_vector)):
-        for matrix, before in zip(part.hidden_matrices(), other.hidden_matrices(), strict=True):
-            scale = matrix.abs().amax(dim=1, keepdim=True) / LARGEST_INT8
-            torch.testing.assert_close(matrix / scale, (matrix / scale).round(), atol=1e-4, rtol=0.0)
-            assert (matrix - before).abs().max() <= 0.51 * scale.max()  # rounded, and trained no further
-            assert not torch.equal(matrix, before)
-        assert not torch.equal(part.layers[-1].weight, other.layers[-1].weight)  # trained on
+    pairs = [(rounded.contact, exact.contact), (rounded.misfit_vector, exact.misfit_vector)]
+    for rounded_perceptron, perceptron in pairs:
+        matrices = zip(rounded_perceptron.hidden_matrices(), perceptron.hidden_matrices(), strict=True)
+        for rounded_matrix, matrix in matrices:
+            scale = rounded_matrix.abs().amax(dim=1, keepdim=True) / LARGEST_INT8
+            multiples = rounded_matrix / scale
+            torch.testing.assert_close(multiples, multiples.round(), atol=1e-4, rtol=0.0)
+            assert (rounded_matrix - matrix).abs().max() <= 0.51 * scale.max()  # not trained after the rounding
+            assert not torch.equal(rounded_matrix, matrix)
+        *_, rounded_last = rounded_perceptron.linear_layers()
+        *_, last = perceptron.linear_layers()
+        assert not torch.equal(rounded_last.weight, last.weight)  # trained after the rounding
 
 
 class Killed(BaseException):
-    """As sudden as a SIGKILL, but caught by the test."""
+    """Stands for a SIGKILL; no code but the test catches it."""
 
 
 LONGER = settings((12, 12), (10, 10), steps=20, misfit_steps=230, batch=64)
 
 
 @pytest.mark.usefixtures("split_once")
-def test_a_killed_fit_goes_on_with_its_own_presses_and_settings_alone(dataset, tmp_path, monkeypatch):
-    """Killed in the second network: the first and its examples are not made again, and the weights are the same."""
+def test_a_killed_training_continues_only_with_its_own_presses_and_settings(dataset, tmp_path, monkeypatch):
+    """After a kill in the second network, the first network and the examples are not computed again."""
     monkeypatch.setattr(descent, "SAVE_EVERY_S", 0.0)
 
     def kill(title, *_):

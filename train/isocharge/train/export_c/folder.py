@@ -65,12 +65,15 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
     rules = {"HUM": chain.hum, "TARE": chain.tare, "LEAK": leak, "TOUCH": chain.touch, "THERMAL": chain.thermal}
     for prefix, rule in rules.items():
         settings: dict[str, Any] = {} if rule is None else asdict(rule)
-        settings.pop("pC_per_K", None)
-        numbers[SWITCHES[prefix]] = str(int(settings.pop("on", False)))
-        if rule is leak and leak is not None:
-            settings = {"tau_s": None} | settings | {"tau_s": chain.tau_s}  # keeps tau_s first; one for each electrode
+        is_on = settings.pop("on", False)
+        numbers[SWITCHES[prefix]] = str(int(is_on))
+        settings.pop("pC_per_K", None)  # a chain in C has no pyroelectric charges
+        if prefix == "LEAK" and leak is not None:
+            del settings["tau_s"]
+            settings = {"tau_s": chain.tau_s, **settings}  # a time constant for each electrode, not only one
         for name, value in settings.items():
-            numbers[f"{prefix}_{C_NAMES.get(name, name.upper())}"] = _number(value)
+            c_name = C_NAMES.get(name, name.upper())
+            numbers[f"{prefix}_{c_name}"] = _number(value)
     lines = "\n".join(f"#define ISOCHARGE_{name} {text}" for name, text in numbers.items())
     return source_text("isocharge_device.h", board=c_comment(device.name), lines=lines)
 

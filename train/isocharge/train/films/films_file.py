@@ -144,7 +144,7 @@ def _checksum(arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def _about(films: FilmsModel) -> dict[str, Any]:
-    """Return the JSON object of a model. The activation is left out if it is tanh, as in files of before."""
+    """Return the JSON object of a model. If the activation is tanh, the object has no entry for it."""
     prior = films.prior
     activation = films.contact.activation
     about = {

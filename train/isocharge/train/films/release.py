@@ -42,15 +42,15 @@ class FilmsErrors:
     """Errors on new films of a prior, and the film that a model assumes before a calibration.
 
     Attributes:
-        known: Errors if the parameters of each film are known.
-        unknown: Errors on the same films if each of them is taken for the assumed film.
+        with_known_film: Errors if the parameters of each film are known.
+        with_assumed_film: Errors on the same films if each of them is taken for the assumed film.
         parameters: Parameters of the assumed film, shape (n_parameter,). It is the described film or the mean of the
             prior, whichever gives the lower errors.
         description: The assumed film in words, with the errors of both.
     """
 
-    known: Mapping[str, float]
-    unknown: Mapping[str, float]
+    with_known_film: Mapping[str, float]
+    with_assumed_film: Mapping[str, float]
     parameters: Array
     description: str
 
@@ -89,8 +89,8 @@ def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PR
     best, other = sorted(rms_mm, key=lambda name: rms_mm[name])
     pretension_MPa = choices[best][films.prior.index("pretension")]
     description = (
-        f"the film {best}, with a pretension of {pretension_MPa:g} MPa.\nThat film errs least over all films "
-        f"({rms_mm[best]:g} mm rms; {other}: {rms_mm[other]:g} mm)"
+        f"the film {best}, with a pretension of {pretension_MPa:g} MPa.\nThe error over all films is then "
+        f"{rms_mm[best]:g} mm rms (with the film {other}: {rms_mm[other]:g} mm)"
     )
     return FilmsErrors(errors_with(parameters), choice_errors[best], choices[best], description)
 
@@ -128,7 +128,7 @@ def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command:
     data = films_bytes(films)
     as_written = films_from_bytes(data, FILE)
     errors = evaluate_films(as_written, N_FILMS)
-    provenance = Provenance(made_with={**films.made_with, "films": dict(errors.known)}, files={FILE: data})
+    provenance = Provenance(made_with={**films.made_with, "films": dict(errors.with_known_film)}, files={FILE: data})
     fitted = as_written.film(errors.parameters, provenance=provenance)
     return release(fitted, folder, version=version, command=command, card=partial(films_card, as_written, errors))
 
@@ -137,24 +137,25 @@ def films_card(films: FilmsModel, errors: FilmsErrors, about: ModelMetadata, fit
     """Return the text of `card.md`."""
     low, high = fitted.domain.force_range
     spread = films.prior.spread
-    known = errors.known
-    unknown = errors.unknown
+    known_film = errors.with_known_film
+    assumed_film = errors.with_assumed_film
     exact = about.errors
     electrodes = ", ".join(about.electrodes)
     correlated = ", `contact_correlation` (xy, xF, yF)"
-    lines = [f"| {text} | {known[key]:g} {unit} | {unknown[key]:g} {unit} |" for text, key, unit in ROWS]
+    lines = [f"| {text} | {known_film[key]:g} {unit} | {assumed_film[key]:g} {unit} |" for text, key, unit in ROWS]
     lines += [
-        f"| coverage of the {level} % intervals | {100 * known[f'coverage_{level}']:.3g} % | "
-        f"{100 * unknown[f'coverage_{level}']:.3g} % |"
+        f"| coverage of the {level} % intervals | {100 * known_film[f'coverage_{level}']:.3g} % | "
+        f"{100 * assumed_film[f'coverage_{level}']:.3g} % |"
         for level in (68, 95)
     ]
     return f"""# {about.name}, version {about.version}
 
-A network for every film that the sensor `{about.sensor["name"]}` may be. `films.npz` holds it; told a film, it gives a
-plain model of that film in under a second. `isocharge train calibrate` does that after a few presses on a real film.
+A network for every film that the sensor `{about.sensor["name"]}` may be. The file `films.npz` holds it. From the
+parameters of a film, it computes a model of that film in under a second. `isocharge train calibrate` estimates these
+parameters from a few presses on a real film.
 
-`model.onnx` is that plain model for {errors.description}.
-It serves before anything is calibrated, and errs as the right column says.
+`model.onnx` is the model of {errors.description}.
+It can be used before a calibration; its errors are then those of the right column.
 
 | | |
 |---|---|
@@ -179,21 +180,21 @@ It serves before anything is calibrated, and errs as the right column says.
 
 Forces log-uniform, positions uniform over the working area, noise as above.
 
-| error | told the film | `model.onnx`, not told |
+| error | the film is known | `model.onnx`, the film is unknown |
 |---|---|---|
 {chr(10).join(lines)}
 
-On the very film that it assumes, `model.onnx` errs by {exact["position_rms_mm"]:g} mm rms (median
-{exact["position_median_mm"]:g} mm) and {exact["force_rms_percent"]:g} % of the force. 1 % of good presses of that film
-exceed a misfit of {exact["misfit_p99"]:g}, 0.1 % one of {exact["misfit_p999"]:g}.
+On the film that it assumes, `model.onnx` has an error of {exact["position_rms_mm"]:g} mm rms (median
+{exact["position_median_mm"]:g} mm) and {exact["force_rms_percent"]:g} % of the force. 1 % of the good presses of that
+film have a misfit above {exact["misfit_p99"]:g}, and 0.1 % above {exact["misfit_p999"]:g}.
 
 ## Limits
 
-- The truth behind these figures is the simulator. A film that wrinkles, creeps or is not uniform is none of these.
-- The tauter a film, the nearer to the centre its charges stop telling the place: the worst films above. A map that
-  folds within the working area cannot be turned back there by any model.
-- One press at a time. Outside the working area and forces the answer is finite and wrong; the misfit is then large in
-  many cases, not in all.
+- These figures compare with the simulator. It does not simulate films that wrinkle, creep or are not uniform.
+- On films with a large pretension, different contacts near the edge of the working area can have the same charges. No
+  model can tell such contacts apart. These are the worst films above.
+- The model assumes one press at a time. Outside the working area and the range of forces, the answer is finite and
+  wrong. The misfit is then large in many cases, but not in all.
 
 ## Make it again
 

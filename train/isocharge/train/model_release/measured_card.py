@@ -44,9 +44,9 @@ def measured_card(metadata: ModelMetadata) -> str:
     )
     position, force = measured["std_factors"]
     how = f"""\
-Each press was judged by one of {measured["folds"]} networks, the one that did not learn from its place. The model
-learned the mean answers of all; that mean errs slightly less. The standard deviations were multiplied by {position:g}
-for positions and {force:g} for forces, so that the intervals hold 68 and 95 % of these presses.
+The errors are those of {measured["folds"]} networks, each on the places on which it was not trained. The model
+learned the mean of their answers, whose errors are slightly smaller. The standard deviations were multiplied by
+{position:g} for positions and {force:g} for forces, so that the intervals contain 68 and 95 % of these presses.
 """
     return f"""# {metadata.name}, version {metadata.version}
 
@@ -70,12 +70,12 @@ its neighbours between presses; a network gives it. 1 % of the presses are farth
 
 ## Limits
 
-- The model knows this sensor on its rig on the day of the measurement; another one, or this one after months, can
-  differ by far more. `isocharge serve check` says so from a few presses.
+- The model is valid for this sensor on its rig on the day of the measurement. Another sensor, or the same sensor after
+  months, can have far larger errors. `isocharge serve check` measures them with a few presses.
 - One press at a time. Outside the working area and forces the answer is finite and wrong; the misfit is then large in
   many cases, not in all.
-- The answer is the mean over presses distributed as those that were measured: where charges say little it shrinks
-  towards their middle.
+- The answer is a posterior mean for presses with the distribution of the measured ones. Where the charges carry little
+  information, it is therefore close to the centre of the measured presses.
 
 ## Make it again
 

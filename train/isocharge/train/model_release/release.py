@@ -56,26 +56,26 @@ class Release:
 
 
 SIMULATED_TRUTH = """\
-- The truth behind these figures is the simulator, not a film. On a real film, pretension and gains that
-  nobody has measured matter more.
+- These figures compare with the simulator, not with a real film. On a real film, an unknown pretension and unknown
+  gains cause larger errors.
 """
 
 MEASURED_TRUTH = """\
-- The model was fitted to measurements of one film. The errors are those of that film and its rig on the day of the
-  measurement; another film, or this one after months, can differ by far more. `isocharge serve check` says so from a
-  few presses.
+- The model was trained on measurements of one film. The errors are those of this film and its rig on the day of the
+  measurement. Another film, or the same film after months, can have far larger errors. `isocharge serve check` measures
+  them with a few presses.
 """
 
 NO_NOISE = """\
-The presses as they were measured: no noise was added, and what the rig does not know of places and forces is in the
-errors.
+No noise was added to these presses. The errors include those of the places and forces that the rig measured.
 """
 
 LIMITS = """\
 - The model assumes one press at a time, inside its working area and its range of forces. The answer to any other press
-  is finite and wrong. If the electrodes lie on one circle, most presses far outside the working area look like a press
-  inside it: the misfit is then small and the answer carries no flag.
-- The deviations hold for the noise named above; gains that are off by 1 % add more than all of it.
+  is finite and wrong. If the electrodes lie on one circle, most presses far outside the working area have the charges
+  of a press inside it, so the misfit is small and the answer carries no flag.
+- The standard deviations are valid for the noise named above. Gains that are wrong by 1 % cause larger errors than this
+  noise.
 """
 
 

@@ -30,7 +30,7 @@ class Regression:
     """One ridge regression of the last layer.
 
     Attributes:
-        target: Function from the present answers to the wanted answers, both of shape (n, n_answer).
+        target: Function from the present answers to the target answers, both of shape (n, n_answer).
         ridge: Penalty on the change of the weights.
     """
 
