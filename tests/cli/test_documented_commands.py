@@ -77,6 +77,16 @@ def test_a_documented_command_line_parses(words, is_complete):
             raise
 
 
+def test_the_reference_lists_every_command():
+    group = typer.main.get_command(app)
+    commands = set()
+    for name, command in group.commands.items():
+        names = [f"{name} {part}" for part in command.commands] if name in GROUPS else [name]
+        commands.update(f"isocharge {command_name}" for command_name in names)
+    reference = (ROOT / "REFERENCE.md").read_text("utf-8").partition("## Commands")[2]
+    assert sorted(re.findall(r"^\| `(isocharge .+?)` \|", reference, re.MULTILINE)) == sorted(commands)
+
+
 @pytest.mark.parametrize(
     "words",
     [
