@@ -12,7 +12,7 @@ from isocharge.simulate.numerics.statistics import rms
 from isocharge.train import BayesProblem, FitConfig, NetworkConfig, TrainingConfig, bayes_estimate, fit, release
 from isocharge.train.data.charge_field import ChargeField
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
-from isocharge.train.rig.rig_film import corrected_film
+from isocharge.train.rig.corrected_film import correct_film
 from kept import kept
 
 RADIUS, FORCES = 1.5, (0.1, 0.3)
@@ -82,7 +82,7 @@ def test_measured_presses_correct_charges_of_both_signs(film):
     charge = noise_model("reference").add(1.04 * film.charges(contact), np.random.default_rng(2))
     std = np.full(300, 1e-4), np.full(300, 1e-4)
     presses = MeasuredPresses(contact, charge, *std, film.electrodes, tuple(range(2, 302)))
-    corrected = corrected_film(presses, film, film.domain, noise_model("reference"))
+    corrected = correct_film(presses, film, film.domain, noise_model("reference"))
     truth = 1.04 * film.charges(contact)
     assert rms((corrected.charges(contact) - truth) / noise_model("reference").sigma(truth)) < 0.3
     assert corrected.scatter == pytest.approx(1.0, abs=0.1)

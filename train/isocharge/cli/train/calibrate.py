@@ -103,18 +103,43 @@ def calibrate_command(
             knows_temperature = presses is not None and presses.knows_temperature
             problem = replace(problem, earlier=read_earlier(earlier, problem, knows_temperature=knows_temperature))
         if presses is not None:
-            say(f"fitting the film to {len(presses)} presses")
-            result = calibrate(presses, problem)
-        if result is not None:
-            for caution in result.cautions:
-                say(f"caution: {caution}")
-            if output is not None:
-                _write(result, output)
+            result = _fit(presses, problem)
+        if result is not None and output is not None:
+            _write(result, output)
 
     proposed: list[ProposedPress] = []
     if next_count:
         film = None if result is None else result.posterior
         proposed = next_presses(problem, next_count, film, position_std_mm=position_std_mm, force_std=force_std)
+    _print_result(result, proposed, json=json)
+
+
+def calibrate_into(presses: MeasuredPresses, problem: CalibrationProblem, output: Path, *, json: bool) -> None:
+    """Calibrate a film, write its model, and print the result; the common part of `calibrate` and `fit`.
+
+    Args:
+        presses: The measured presses.
+        problem: Films that the sensor may be.
+        output: Folder to write.
+        json: Whether to print one JSON object instead of text.
+    """
+    with calibration_folder(output, problem):
+        result = _fit(presses, problem)
+        _write(result, output)
+    _print_result(result, [], json=json)
+
+
+def _fit(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
+    """Return the calibration by presses."""
+    say(f"fitting the film to {len(presses)} presses")
+    result = calibrate(presses, problem)
+    for caution in result.cautions:
+        say(f"caution: {caution}")
+    return result
+
+
+def _print_result(result: CalibrationResult | None, proposed: list[ProposedPress], *, json: bool) -> None:
+    """Print a calibration, if there is one, and the presses that are proposed."""
     if json:
         table = {} if result is None else result_table(result)
         show_json(table | {"next": [vars(press) for press in proposed]})

@@ -20,14 +20,16 @@ from isocharge.cli.shared.options import (
     refuse,
 )
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
+from isocharge.cli.train.calibrate import calibrate_into
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.common.errors import InputError
+from isocharge.common.errors import InputError, ModelError, SceneError
 from isocharge.common.resumable_run import ResumableRun, resume_parts
 from isocharge.serve import MeasuredPresses
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import Circle, FilmPrior, load_sensor, local_workers, parse_probe, read_dataset
 from isocharge.simulate.sensor.probe import PROBE_HELP
 from isocharge.train import (
+    CalibrationProblem,
     FilmsConfig,
     FilmsModel,
     FitConfig,
@@ -67,7 +69,7 @@ def fit_command(
         typer.Argument(
             metavar="DATASET|PRESSES.csv",
             help="Dataset folder of `isocharge simulate sweep` or of measured presses; or a CSV file of measured "
-            "presses, 50 with --sensor, 500 without: x_mm, y_mm, force_N and the electrodes' names (pC). "
+            "presses, three or more with --sensor, 500 without: x_mm, y_mm, force_N and the electrodes' names (pC). "
             "(default: --sensor)",
         ),
     ] = None,
@@ -107,9 +109,10 @@ def fit_command(
 
     The presses come from DATASET, or are simulated first: --probe and --radius say how, and belong to --sensor.
 
-    From measured presses the film is calibrated, what is then still wrong everywhere is corrected, and a fifth is held
-    out: the errors are of those presses as measured. Without --sensor the presses alone are learned, of any sensor with
-    three to eight channels: every other column is one. Their errors are of networks that left out the presses' places.
+    From measured presses with --sensor the film is calibrated, as by `isocharge train calibrate`. If no network for all
+    films fits the sensor, the presses correct the sensor as described, and a fifth of them is held out for the errors.
+    Without --sensor the presses alone are learned, of any sensor with three to eight channels: every other column is
+    one. Their errors are of networks that left out the presses' places.
 
     With --films the sensor's film is not taken as described: pretension, stiffness, coefficients, gains and the place
     of the electrodes are drawn as they spread between films, and the folder also gets films.npz, the network for all of
@@ -137,7 +140,7 @@ def fit_command(
         identity = films_identity(prior, sizes)
         release_resumably(train_films, identity, target, release_films, fresh=fresh, json=json)
         return
-    if sensor:  # before anything is simulated
+    if sensor and not (dataset and dataset.is_file()):  # before anything is simulated
         check_target(output, version, load_sensor(sensor).electrode_names)
     settings = load_config(config) if config else FitConfig()
     if dataset and dataset.is_file() and not sensor:
@@ -148,10 +151,17 @@ def fit_command(
             lambda run: train(run=run), presses_identity(presses, settings), target, release, fresh=fresh, json=json
         )
         return
+    rig = None
+    if dataset and not dataset.is_dir():
+        rig = _rig(dataset, sensor, probes, radius, (position_std_mm, force_std))
+        problem = calibration_problem(rig, models)
+        if problem is not None:
+            refuse_training_options(config, version, radius)
+            calibrate_into(rig.presses, problem, output, json=json)
+            return
     with shown_progress():
-        if dataset and not dataset.is_dir():
-            rig = _rig(dataset, sensor, probes, radius, (position_std_mm, force_std))
-            data = rig_data(rig, rig.problem(models), seed=settings.training.seed)
+        if rig is not None:
+            data = rig_data(rig, seed=settings.training.seed)
         else:
             data = _presses(dataset, sensor, probes, radius)
     target = check_target(output, version, data.sensor.electrode_names)
@@ -197,6 +207,32 @@ def _rig(file: Path, sensor: str | None, probes: list[str], radius: str, stds: t
     described = load_sensor(str(sensor))
     presses = read_presses_of(file, described.electrode_names, *stds)
     return Rig(presses, described, parse_probe(probes[0]), radius_mm_of(radius))
+
+
+def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | None:
+    """Return how to calibrate the film of measured presses; None, with a warning, if no network for all films fits.
+
+    Args:
+        rig: The presses, the sensor and the probe.
+        models: Folder of models that is searched first.
+    """
+    try:
+        return CalibrationProblem.of(rig.sensor, rig.probe, models)
+    except (ModelError, SceneError) as error:
+        say(f"caution: the film is not calibrated, and the presses correct the sensor as described: {error}")
+        return None
+
+
+def refuse_training_options(config: Path | None, version: int, radius: str) -> None:
+    """Refuse options that have no meaning if the film is calibrated, because no network is trained then."""
+    refuse(
+        {
+            "--config: this film is calibrated by the presses, and no network is trained; leave it out": config,
+            "--version: each calibration is the next version in its folder; leave it out": version != 1,
+            "--radius: the model of a calibrated film has the working area of the network for all films; leave it "
+            "out": radius != DEFAULT_TEXT,
+        }
+    )
 
 
 def _films(

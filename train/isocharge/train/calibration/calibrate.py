@@ -14,6 +14,7 @@ from isocharge.serve.prediction.measured_presses import MeasuredPresses, row_wor
 from isocharge.simulate import Circle, Sensor
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
+from isocharge.train.calibration.cross_validation import HeldOutAnswers, cross_validate
 from isocharge.train.calibration.diagnosis import check_channels, check_places, explain, find_mistakes, misfit, outside
 from isocharge.train.calibration.film_fit import MISTAKEN, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.hypotheses import Hypothesis
@@ -113,8 +114,36 @@ class CalibrationResult:
 
     @property
     def fitted(self) -> Fitted:
-        """The network of this film, for `evaluate` and `release`; its deviations contain the film's uncertainty."""
-        return self.fitted_film(self.posterior.parameters, release=True)
+        """The network of this film, for `evaluate` and `release`; its deviations contain the film's uncertainty.
+
+        With enough presses its errors are those of the presses, as calibrations without them answer them.
+        """
+        fitted = self.fitted_film(self.posterior.parameters, release=True)
+        if self.held_out is None:
+            return fitted
+        return replace(fitted, test=self.held_out.presses, cross_validated=self.held_out.answers)
+
+    @cached_property
+    def held_out(self) -> HeldOutAnswers | None:
+        """Answers to the presses by calibrations without them; None if there are too few presses, see `cross_validate`.
+
+        The answers are computed when they are first used, which takes about as long as the calibration.
+        """
+        if self.moved:
+            return None
+        warming = self.posterior.warming
+        at_C = None if warming is None else warming.at_C
+        return cross_validate(self.problem, self.presses, self.posterior, self._network_of, at_C)
+
+    def _network_of(self, film: FilmPosterior) -> Fitted:
+        """Return the network of another film, near this one, with the uncertainty of that film."""
+
+        def factor(contact: Array) -> Array:
+            return self.problem.charges.factor(film.unknowns, contact)
+
+        contact_covariance = self.sensitivity.contact_covariance(film.joint)
+        variance = np.einsum("nii->ni", contact_covariance)
+        return self.problem.fitted(film.parameters, (self.sensitivity.contact, variance), factor, release=False)
 
     def fitted_film(self, parameters: Array, *, release: bool = False) -> Fitted:
         """Return the network of a film near this one, with the same discrepancy and the same uncertainty.
@@ -171,7 +200,26 @@ class CalibrationResult:
             "Forces are as right as the load cell, and places as the origin and the axes of the stage: an error of "
             "theirs is in every answer, beside these."
         )
-        return (errors, *film, *self._temperature_sentences(), rig, *self._discrepancy_sentences(), *self.cautions)
+        return (
+            errors,
+            *self._held_out_sentences(),
+            *film,
+            *self._temperature_sentences(),
+            rig,
+            *self._discrepancy_sentences(),
+            *self.cautions,
+        )
+
+    def _held_out_sentences(self) -> Iterator[str]:
+        """Yield the errors on presses that were held out, if there are enough."""
+        if self.held_out is None:
+            return
+        held_out_errors = self.held_out.errors
+        yield (
+            f"Calibrations that each leave out a fifth of the places err on the {len(self.held_out.presses)} presses "
+            f"there by {held_out_errors['position_rms_mm']:.2g} mm and {held_out_errors['force_rms_percent']:.2g} % "
+            "(root mean square, with the errors of the measured places and forces)."
+        )
 
     def _temperature_sentences(self) -> Iterator[str]:
         """Yield what a kelvin does to the film, if the temperatures of the presses are known."""

@@ -177,6 +177,29 @@ def fit_film(charges: FilmCharges, data: PressData, before: FilmEstimate, at_C: 
     return _posterior(problem, data, freedom, settled, at_C)
 
 
+def refit_film(
+    charges: FilmCharges, data: PressData, before: FilmEstimate, near: FilmPosterior, at_C: float | None = None
+) -> FilmPosterior:
+    """Return the film that explains presses, if it is close to a film that is known.
+
+    The search begins at the known film and its most probable hypothesis, so it takes less time than `fit_film`.
+
+    Args:
+        charges: The films.
+        data: The presses. None of them is left out.
+        before: Estimate of the film before the presses.
+        near: The known film, which explains most of these presses.
+        at_C: Temperature of the film before and after, degrees Celsius; None if temperatures were not measured.
+    """
+    problem = _FitProblem.of(charges, before, knows_temperature=at_C is not None)
+    freedom = np.maximum(data.measured.sum(axis=1) - 3.0, 0.0)
+    every_press = np.ones(len(data), dtype=bool)
+    hypothesis = max(near.weights, key=lambda each: near.weights[each])
+    solved = problem.solve(data, every_press, problem.unit_of(near), hypothesis)
+    settled = problem.settle(data, every_press, freedom, solved, Hypothesis())
+    return _posterior(problem, data, freedom, settled, at_C)
+
+
 def _posterior(
     problem: "_FitProblem", data: PressData, freedom: Array, settled: "_SettledFit", at_C: float | None
 ) -> FilmPosterior:
@@ -348,6 +371,14 @@ class _FitProblem:
     def _prior_covariance(self, hypothesis: Hypothesis) -> Array:
         """Return the covariance of the unknowns before the presses."""
         return self.covariance + hypothesis.covariance(self.layout)
+
+    def unit_of(self, posterior: FilmPosterior) -> Array:
+        """Return the unknowns of a film, parameters over their prior standard deviations, shape (n_unknown,)."""
+        unit = np.zeros(self.layout.count)
+        unit[self.layout.parameters] = posterior.parameters / self.charges.prior.std
+        unit[self.layout.coefficients] = posterior.coefficients
+        unit[self.layout.nuisances] = [posterior.nuisances[nuisance.name].value for nuisance in NUISANCES]
+        return unit
 
     def _film(self, unit: Array) -> Array:
         """Return the unknowns of the film, as `FilmCharges.film` takes them."""

@@ -38,6 +38,7 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.calibrate import CalibrationResult, film_without_presses
 from isocharge.train.calibration.calibration_file import film_table, read_film
 from isocharge.train.calibration.contact_error import ContactError
+from isocharge.train.calibration.cross_validation import FOLD_COUNT
 from isocharge.train.calibration.following import pretensions_of
 from isocharge.train.calibration.picture import calibration_picture
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
@@ -146,10 +147,18 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
         "error_left": error_table(result.error_left),
         "error_left_before": error_table(result.error_left_before),
         "error_of_noise": error_table(result.sensitivity.noise_error),
+        "held_out": held_out_table(result),
         "quantities": {name: quantity.to_dict() for name, quantity in result.quantities.items()},
         **film,
         "words": list(result.summary),
     }
+
+
+def held_out_table(result: CalibrationResult) -> dict[str, float] | None:
+    """Return the errors on presses that were held out, for JSON; None if there are too few presses."""
+    if result.held_out is None:
+        return None
+    return {"presses": len(result.held_out.presses), "folds": FOLD_COUNT, **result.held_out.errors}
 
 
 def error_table(error: ContactError) -> dict[str, float]:
@@ -226,7 +235,32 @@ combinations above are known; `calibration.json` has their correlations.
 
 ## The model on this film
 
-On fresh simulated presses of the film as calibrated, with noise:
+{_errors_section(result, about)}
+{LIMITS}
+## Make it again
+
+```bash
+{about.made_with.get("command") or "(made by a program, see metadata)"}
+```
+"""
+
+
+def _errors_section(result: CalibrationResult, about: ModelMetadata) -> str:
+    """Return the table of errors, and the sentences about the presses on which they were measured."""
+    introduction = "On new simulated presses on the film as calibrated, with noise:"
+    conclusion = (
+        "What not knowing the film leaves is added to these errors; `contact_std` contains it, as a common factor."
+    )
+    if result.held_out is not None:
+        introduction = (
+            f"On {len(result.held_out.presses)} measured presses. They are divided by their places into {FOLD_COUNT} "
+            "parts, and each part is\nanswered by a calibration without it:"
+        )
+        conclusion = (
+            "These errors contain those of the measured places and forces, and of a film that was calibrated with a "
+            "fifth fewer\nplaces. The model itself is calibrated with all presses."
+        )
+    return f"""{introduction}
 
 | error | figure |
 |---|---|
@@ -234,14 +268,7 @@ On fresh simulated presses of the film as calibrated, with noise:
 | position, rms | {about.errors["position_rms_mm"]:g} mm |
 | force, rms | {about.errors["force_rms_percent"]:g} % |
 
-What not knowing the film leaves comes on top; `contact_std` has it in, as a common factor.
-
-{LIMITS}
-## Make it again
-
-```bash
-{about.made_with.get("command") or "(made by a program, see metadata)"}
-```
+{conclusion}
 """
 
 

@@ -1,1 +1,1 @@
-"""Presses measured on a rig, to training data of the film under it: calibrated physics and a smooth correction."""
+"""Training data from presses on a sensor whose film cannot be calibrated: the sensor as described, corrected."""

@@ -1,4 +1,4 @@
-"""The film under a rig: calibration takes what physics explains, the correction what is left, and nothing else."""
+"""Correction of a forward map by measured presses: planted corrections are found, and noise is not corrected."""
 
 from dataclasses import replace
 
@@ -9,8 +9,9 @@ from tests.train.rig.conftest import DOMAIN, measured, systematic
 from isocharge.simulate import noise_model
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.data.presses import draw_contacts
-from isocharge.train.rig import rig_film
-from isocharge.train.rig.rig_film import Residuals, calibrated_film, corrected_film, fit_correction
+from isocharge.train.rig import correction as correction_module
+from isocharge.train.rig.corrected_film import correct_film
+from isocharge.train.rig.correction import Residuals, fit_correction
 
 
 def contacts(rng, count, radius=8.0):
@@ -39,7 +40,7 @@ def test_a_planted_correction_comes_back(seed):
 def test_noise_alone_is_not_corrected():
     """At two standard errors, at most one of six draws may look like a correction; then a tiny one."""
     corrections = [fit_correction(residuals(seed, 60, lambda contact: 0.0 * systematic(contact))) for seed in range(6)]
-    real = [correction for correction in corrections if not correction.nothing]
+    real = [correction for correction in corrections if not correction.is_zero]
     assert len(real) <= 1
     fresh = contacts(np.random.default_rng(5), 500)
     assert all(np.sqrt(np.mean(each.log_factor(fresh) ** 2)) < 0.004 for each in real)
@@ -48,7 +49,7 @@ def test_noise_alone_is_not_corrected():
 def test_presses_in_pieces_ask_for_the_same_correction(monkeypatch):
     presses = residuals(0, 200, systematic)
     whole = fit_correction(presses)
-    monkeypatch.setattr(rig_film, "CHUNK", 64)
+    monkeypatch.setattr(correction_module, "CHUNK_SIZE", 64)
     pieces = fit_correction(presses)
     np.testing.assert_allclose(pieces.coefficients, whole.coefficients, rtol=1e-6, atol=1e-9)
     assert pieces.freedom == pytest.approx(whole.freedom)
@@ -71,36 +72,15 @@ def left(film, truth, share):
     return [100.0 * float(np.sqrt(np.mean(error**2))) for error in errors]
 
 
-@pytest.mark.slow
-def test_what_calibration_cannot_take_the_correction_does(problem, truth):
-    film = calibrated_film(measured(truth, 120), problem, DOMAIN)
-    calibrated, corrected = left(film, truth, 1.0)
-    assert calibrated > 1.0
-    assert corrected < 0.5 * calibrated
-
-
-def test_a_film_that_physics_explains_is_not_corrected(problem, truth, caplog):
-    """Nor by a press that was misread: it is left out."""
-    presses = measured(truth, 24, 0.0)
-    presses.charge_pC[7, 2] *= 3.0
-    film = calibrated_film(presses, problem, DOMAIN)
-    assert film.calibration.bad_lines == (9,)
-    assert "line 9: left out" in caplog.text
-    assert film.correction.nothing
-    assert left(film, truth, 0.0)[1] < 0.5
-    assert not film.scattered
-    assert film.scatter == pytest.approx(1.0, abs=0.4)
-
-
 def test_a_described_film_is_corrected_by_many_presses(truth, caplog):
     """Scatter that noise and rig do not explain is known; presses unlike all others are left out."""
     presses = measured(truth, 300)
     presses.charge_pC[5] *= 4.0
-    film = corrected_film(presses, truth, DOMAIN, noise_model("reference"))
-    assert "presses are left out, which are nothing like the others: line 7; look at them" in caplog.text
+    film = correct_film(presses, truth, DOMAIN, noise_model("reference"))
+    assert "line 7: left out, since these presses differ from all others" in caplog.text
     calibrated, corrected = left(film, truth, 1.0)
     assert corrected < 0.3 * calibrated
     assert film.correction_percent(presses.contact) == pytest.approx(calibrated, rel=0.2)
     exact = replace(presses, position_std_mm=presses.position_std_mm / 10, force_std=presses.force_std / 10)
-    assert not film.scattered
-    assert corrected_film(exact, truth, DOMAIN, noise_model("reference")).scattered
+    assert not film.is_scattered
+    assert correct_film(exact, truth, DOMAIN, noise_model("reference")).is_scattered

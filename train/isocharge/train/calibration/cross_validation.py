@@ -1,0 +1,104 @@
+"""Errors of a calibration on presses that it was not fitted to, by cross-validation over places.
+
+The places are divided into folds. For each fold, the film is fitted again to the presses at all other places, and the
+network of that film answers the charges of the fold. The errors therefore contain what no parameter describes, the
+noise, and the errors of the measured places and forces.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from isocharge.common.arrays import Booleans
+from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.train.calibration.diagnosis import outside
+from isocharge.train.calibration.film_fit import FilmPosterior, refit_film
+from isocharge.train.calibration.press_data import PressData
+from isocharge.train.calibration.problem import CalibrationProblem
+from isocharge.train.data.presses import FEWEST_MEASURED, LabelledPresses, complete, folds_by_place
+from isocharge.train.model_release.evaluate import ONLY_SIMULATED, contact_errors
+from isocharge.train.training.fitted import Answers, Fitted
+
+FOLD_COUNT = 5
+"""Number of folds."""
+
+MAX_FITTED_PRESSES = 250
+"""Largest number of presses to which a film is fitted again; more take time and change the film little."""
+
+
+@dataclass(frozen=True)
+class HeldOutAnswers:
+    """Presses, and the answers of networks of films that were fitted without them.
+
+    Attributes:
+        presses: The presses as they were measured.
+        answers: Contacts and misfits that the networks compute from the charges of the presses. The standard deviations
+            are those of the differences from the measured contacts: they contain those of the measured contacts.
+    """
+
+    presses: LabelledPresses
+    answers: Answers
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Errors of position, mm, and force, percent, by name, as `evaluate` gives them."""
+        contact, std, _ = self.answers
+        all_errors = contact_errors(contact, std, self.presses.contact)
+        return {name: error for name, error in all_errors.items() if name not in ONLY_SIMULATED}
+
+
+def cross_validate(
+    problem: CalibrationProblem,
+    presses: MeasuredPresses,
+    posterior: FilmPosterior,
+    network_of: Callable[[FilmPosterior], Fitted],
+    at_C: float | None = None,
+) -> HeldOutAnswers | None:
+    """Answer measured presses with networks of films that were fitted without these presses.
+
+    Args:
+        problem: Films that the sensor may be.
+        presses: The presses to which the film was fitted.
+        posterior: Film that explains these presses. Presses that it leaves out are neither fitted nor judged.
+        network_of: Function that returns the network of a film.
+        at_C: Temperature of the film, degrees Celsius; None if the temperatures of the presses are unknown.
+
+    Returns:
+        The presses that can be judged and their answers; None if there are fewer than `FEWEST_MEASURED`. A press can be
+        judged if its place, force and charges are known, and the networks answer there.
+    """
+    is_judged = complete(presses) & ~posterior.bad & ~outside(presses.contact, problem.domain)
+    if is_judged.sum() < FEWEST_MEASURED:
+        return None
+    fold = np.full(len(presses), -1)
+    fold[is_judged] = folds_by_place(presses.contact[is_judged], FOLD_COUNT)
+    data = PressData.of(presses, problem.noise, problem.charges.domain)
+
+    contact = np.empty((len(presses), 3))
+    std = np.empty((len(presses), 3))
+    misfit = np.empty((len(presses), 1))
+    for number in range(FOLD_COUNT):
+        is_held_out = fold == number
+        is_fitted = _thinned(~is_held_out & ~posterior.bad)
+        with threadpool_limits(1):  # many small matrices, for which a second thread only waits
+            film = refit_film(problem.charges, data[is_fitted], problem.before, posterior, at_C)
+        answers = network_of(film).predict(presses.charge_pC[is_held_out])
+        contact[is_held_out], std[is_held_out], misfit[is_held_out] = answers
+    force_std_N = presses.force_std * presses.contact[:, 2]
+    measured_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, force_std_N])
+    std = np.hypot(std, measured_std)
+    return HeldOutAnswers(
+        LabelledPresses(presses.contact[is_judged], presses.charge_pC[is_judged], measured=True),
+        Answers(contact[is_judged], std[is_judged], misfit[is_judged]),
+    )
+
+
+def _thinned(chosen: Booleans) -> Booleans:
+    """Return at most `MAX_FITTED_PRESSES` of the chosen presses, evenly spaced, shape (n,)."""
+    rows = np.flatnonzero(chosen)
+    stride = max(1, -(-len(rows) // MAX_FITTED_PRESSES))
+    thinned = np.zeros_like(chosen)
+    thinned[rows[::stride]] = True
+    return thinned

@@ -1,0 +1,87 @@
+"""Forward map of a described sensor, corrected by measured presses."""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+import scipy  # loads a part when it is used
+
+from isocharge.common.arrays import Array
+from isocharge.serve.prediction.measured_presses import MeasuredPresses, row_words
+from isocharge.simulate import Domain, ForwardMap, NoiseModel
+from isocharge.simulate.numerics.statistics import rms
+from isocharge.train.rig.correction import Correction, Residuals, fit_correction
+
+_log = logging.getLogger(__name__)
+
+GROSS_ERROR_RATIO = 100.0
+"""Squared residual of a press over that of the median press, above which the press is left out: ten times as far off.
+"""
+
+MAX_ROUNDS = 3
+"""Largest number of fits without such presses. A press with a gross error may hide that others are good."""
+
+SCATTER_PROBABILITY = 1e-3
+"""Probability of a scatter as large as the measured one, below which the scatter is reported."""
+
+SCATTER_RATIO = 1.3
+"""Ratio of the scatter to the expected one, above which the scatter is reported."""
+
+
+@dataclass(frozen=True)
+class CorrectedFilm:
+    """A film as the presses show it.
+
+    Attributes:
+        forward_map: Forward map of the sensor as described.
+        correction: Correction by the presses.
+        domain: Contacts for which the film is needed.
+        scatter: Root-mean-square residual of the corrected presses over the expected one.
+        is_scattered: Whether the scatter is larger than noise and errors of the contacts explain.
+    """
+
+    forward_map: ForwardMap
+    correction: Correction
+    domain: Domain
+    scatter: float
+    is_scattered: bool
+
+    def charges(self, contact: Array) -> Array:
+        """Return the charges of contacts (x, y, F), shape (n, 3), mm and N: shape (n, n_electrode), pC."""
+        return np.asarray(self.forward_map.charges(contact) * np.exp(self.correction.log_factor(contact)))
+
+    def correction_percent(self, contact: Array) -> float:
+        """Return the root mean square of the correction at contacts (n, 3), percent of the charges."""
+        return 100.0 * rms(self.correction.log_factor(contact))
+
+
+def correct_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Domain, noise: NoiseModel) -> CorrectedFilm:
+    """Correct a forward map by presses. Presses with gross errors are left out, with a warning.
+
+    Args:
+        presses: Presses whose places, forces and charges are known.
+        forward_map: Forward map, which is solved a little beyond the presses.
+        domain: Contacts for which the film is needed.
+        noise: Noise of the charges.
+    """
+    residuals = Residuals.of(presses, forward_map, noise)
+    correction = fit_correction(residuals)
+    is_gross = np.zeros(len(residuals), dtype=bool)
+    for _ in range(MAX_ROUNDS):
+        chi2 = residuals.chi2(correction.log_factor(presses.contact))
+        was_gross = is_gross
+        is_gross = chi2 > GROSS_ERROR_RATIO * np.median(chi2)
+        if np.array_equal(is_gross, was_gross):
+            break
+        correction = fit_correction(residuals[~is_gross])
+    if is_gross.any():
+        left_out = presses[is_gross]
+        words = row_words(left_out.lines, left_out.row_noun)
+        _log.warning("%s: left out, since these presses differ from all others; look at them again", words)
+        residuals = residuals[~is_gross]
+
+    total_chi2 = residuals.chi2(correction.log_factor(residuals.contact)).sum()
+    freedom = max(residuals.log_ratio.size - correction.freedom, 1.0)
+    scatter = float(np.sqrt(total_chi2 / freedom))
+    is_improbable = scipy.stats.chi2.sf(total_chi2, freedom) < SCATTER_PROBABILITY
+    return CorrectedFilm(forward_map, correction, domain, scatter, bool(scatter > SCATTER_RATIO and is_improbable))

@@ -1,0 +1,143 @@
+"""Smooth correction of the charges of a forward map, fitted to measured presses by generalised least squares.
+
+The correction is a factor on the charge of each electrode, with the polynomials of `calibration.discrepancy` in place
+and logarithm of the force. The covariance of the residuals contains the noise of the charges, and the errors of the
+measured places and forces, which act through the derivatives of the map. Several sizes of the correction are weighed by
+the presses. If no correction is the most probable size, the charges are not corrected.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.simulate import NoiseModel
+from isocharge.simulate.forward.charge_map import ChargeMap, Domain, differences
+from isocharge.train.calibration.discrepancy import term_count, terms
+from isocharge.train.calibration.film_charges import CONTACT_STEPS
+from isocharge.train.calibration.hypotheses import Hypothesis, Linearised, weigh
+
+SIZES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
+"""Sizes of the correction that are weighed, dimensionless: a sensor that is not calibrated may be far off."""
+
+MIN_RATIO = 0.5
+"""Ratio of the measured charge to that of the map below which the logarithm is continued by its tangent."""
+
+CHUNK_SIZE = 2048
+"""Number of presses whose equations are in memory at the same time."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Differences between measured presses and a forward map.
+
+    Attributes:
+        contact: Measured contacts (x, y, F), shape (n, 3), mm and N.
+        log_ratio: ln(measured charge / charge of the map), shape (n, n_electrode); see `_log_ratio`.
+        covariance: Covariance of the logarithms by noise and by errors of the contacts, shape
+            (n, n_electrode, n_electrode).
+    """
+
+    contact: Array
+    log_ratio: Array
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.contact)
+
+    def __getitem__(self, rows: Integers | Booleans) -> "Residuals":
+        return Residuals(self.contact[rows], self.log_ratio[rows], self.covariance[rows])
+
+    @classmethod
+    def of(cls, presses: MeasuredPresses, charge_map: ChargeMap, noise: NoiseModel) -> "Residuals":
+        """Compute the residuals of presses whose places, forces and charges are known."""
+        charge = charge_map.charges(presses.contact)
+        slopes = differences(charge_map.charges, presses.contact, CONTACT_STEPS) / charge[:, :, None]
+        contact_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
+        contact_covariance = np.einsum("nei,ni,nfi->nef", slopes, contact_std**2, slopes)
+        noise_variance = (noise.sigma(charge) / charge) ** 2
+        noise_covariance = noise_variance[:, :, None] * np.eye(charge.shape[1])
+        return cls(presses.contact, _log_ratio(presses.charge_pC / charge), contact_covariance + noise_covariance)
+
+    def chi2(self, correction: Array) -> Array:
+        """Return the squared residual of each press after a correction.
+
+        Args:
+            correction: What is added to ln Q, shape (n, n_electrode).
+
+        Returns:
+            Squared residuals over their covariance, shape (n,).
+        """
+        corrected = (self.log_ratio - correction)[:, :, None]
+        return np.asarray((corrected * np.linalg.solve(self.covariance, corrected)).sum(axis=(1, 2)))
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Smooth factors on the charges of a forward map. A contact beyond the presses has those of the nearest press.
+
+    Attributes:
+        domain: Places and forces of the presses.
+        coefficients: Coefficients of the polynomials, shape (n_term, n_electrode).
+        freedom: Effective number of coefficients that the presses determine; the prior determines the others.
+    """
+
+    domain: Domain
+    coefficients: Array
+    freedom: float
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether the charges are not corrected."""
+        return not self.coefficients.any()
+
+    def log_factor(self, contact: Array) -> Array:
+        """Return what is added to ln Q at contacts (x, y, F), shape (n, 3), mm and N: shape (n, n_electrode)."""
+        return np.asarray(terms(contact, self.domain) @ self.coefficients)
+
+
+def fit_correction(residuals: Residuals) -> Correction:
+    """Fit a correction to residuals. It is zero if the residuals are most probable without a correction."""
+    x, y, force = residuals.contact.T
+    n_electrode = residuals.log_ratio.shape[1]
+    domain = Domain(float(np.hypot(x, y).max()), (float(force.min()), float(force.max())))
+    n_coefficient = term_count() * n_electrode
+
+    normal = np.zeros((n_coefficient, n_coefficient))
+    moment = np.zeros(n_coefficient)
+    square = 0.0
+    for start in range(0, len(residuals), CHUNK_SIZE):
+        rows = np.arange(start, min(start + CHUNK_SIZE, len(residuals)))
+        chunk = _linearised(residuals[rows], domain)
+        normal += chunk.normal
+        moment += chunk.moment
+        square += chunk.square
+
+    hypotheses = [Hypothesis(size=size) for size in SIZES]
+    mixture = weigh(
+        {0.0: Linearised(normal, moment, square)},
+        lambda hypothesis: hypothesis.size**2 * np.eye(n_coefficient),
+        hypotheses,
+    )
+    if mixture.best.size == 0.0:
+        return Correction(domain, np.zeros((term_count(), n_electrode)), 0.0)
+    freedom = float(np.einsum("pq,qp->", mixture.covariance, normal))
+    return Correction(domain, mixture.mean.reshape(term_count(), -1), freedom)
+
+
+def _linearised(residuals: Residuals, domain: Domain) -> Linearised:
+    """Return the squared residuals as a function of the coefficients."""
+    whitening = np.linalg.inv(np.linalg.cholesky(residuals.covariance))
+    polynomials = terms(residuals.contact, domain)
+    design = polynomials[:, None, :, None] * whitening[:, :, None, :]
+    whitened = -np.einsum("nge,ne->ng", whitening, residuals.log_ratio)
+    n_coefficient = term_count() * residuals.log_ratio.shape[1]
+    return Linearised.of(design.reshape(-1, n_coefficient), whitened.ravel(), np.zeros(n_coefficient))
+
+
+def _log_ratio(ratio: Array) -> Array:
+    """Return the logarithms of ratios of any sign. Below `MIN_RATIO`, charges are mostly noise, the tangent is used."""
+    logarithm = np.log(np.maximum(ratio, MIN_RATIO))
+    tangent = np.minimum(ratio / MIN_RATIO - 1.0, 0.0)
+    return np.asarray(logarithm + tangent)
