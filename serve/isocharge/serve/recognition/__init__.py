@@ -1,5 +1,6 @@
-"""What a board sends, from its bytes alone: framing, checksum, fields, columns, number and clock.
+"""Recognition of the format of a board from its bytes alone: framing, checksum, fields, columns, counter and clock.
 
-Bytes in, a table for the section `[frames]` of a device file out. Nothing is known beforehand; of several descriptions
-that fit, the one is taken in which the bytes need the fewest bits.
+The result is a table for the section `[frames]` of a device file. Nothing about the board is known in advance. If
+several descriptions fit, the description with the smallest score is chosen: the number of bits that it needs to encode
+the bytes.
 """

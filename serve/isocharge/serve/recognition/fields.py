@@ -1,9 +1,9 @@
-"""Which bytes of a frame are its sync, its number, its clock and its channels.
+"""Recognition of the fields of a frame: sync bytes, frame counter, clock and channels.
 
-Every way to part the bytes into fields has a score: the bits that the values of one frame need, besides what is known
-from the frame before, and `Weights` for what each part is. The lowest score wins: of two ways that explain the bytes
-alike the simpler one, above all channels of one type side by side. `tests/benchmarks/fit_recognition.py` fits the
-weights on random boards.
+Every division of the bytes into fields has a score, in bits: the number of bits that the values of a frame need if the
+frame before is known, plus the `Weights` of the fields. The division with the lowest score is chosen. Of two divisions
+that explain the bytes equally well, this is the simpler one, such as adjacent channels of one type.
+`tests/benchmarks/fit_recognition.py` fits the weights on random boards.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,56 +18,67 @@ from isocharge.serve.frames.frame_layout import ByteOrder
 from isocharge.serve.recognition.framing import Bytes, usual_bytes
 
 COUNTING_SHARE = 0.9
-"""Share of steps by which a counter or a clock goes on, dimensionless: frames may be lost, and counters start anew."""
+"""Smallest share of regular steps of a counter or a clock. Frames may be lost, and counters may restart."""
 
 STEADY_SPREAD = 0.7
-"""Largest distance of a usual step of a clock from its median step, in that step."""
+"""Largest deviation of a regular step of a clock from the median step, relative to the median step."""
 
 CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
     rate_Hz: ("t_us", 1e6 / rate_Hz)
     for rate_Hz in (100.0, 1e4, 1e5, 1024.0, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6)
 }
-"""Name of its field and value of one tick in the unit that the name says, by the rate at which a clock ticks, Hz."""
+"""Name of the field, and value of one tick in the unit of that name, by the tick rate of a clock, Hz."""
 
 TOLERANCE = 0.06
-"""Largest relative difference of a clock's rate from a usual one, dimensionless: frames arrive in bursts."""
+"""Largest relative deviation of a tick rate from a common one. It is not small, because frames arrive in bursts."""
 
 PLAUSIBLE = (1e-7, 1e8)
 """Smallest and largest typical magnitude of a floating-point channel."""
 
 TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "f32", "f64")
-"""Types of numbers, as device files write them."""
+"""Types of numbers, as in device files."""
 
 
 def steady_step(step: Array) -> float:
-    """The mean step of values that go on by steps of about one size, without those over lost frames; 0 for others."""
+    """Return the mean of the regular steps of a counter or clock; 0 if the steps are not regular.
+
+    Args:
+        step: Differences of the values of consecutive frames, shape (n,).
+    """
     median = np.median(step)
-    usual = step[np.abs(step - median) <= STEADY_SPREAD * median]
-    return float(usual.mean()) if len(usual) >= COUNTING_SHARE * len(step) else 0.0
+    regular = step[np.abs(step - median) <= STEADY_SPREAD * median]
+    if len(regular) < COUNTING_SHARE * len(step):
+        return 0.0
+    return float(regular.mean())
 
 
 def clock_of(step: Array, rate_Hz: float) -> tuple[str, float] | None:
-    """The name of a clock's field, and the value of one tick in the unit that the name says; None if it is no clock.
+    """Return the name of the field of a clock, and the value of one tick in the unit of that name.
 
     Args:
-        step: From frame to frame, shape (n,).
-        rate_Hz: Frames per second, Hz.
+        step: Differences of the values of consecutive frames, shape (n,).
+        rate_Hz: Number of frames per second, Hz.
+
+    Returns:
+        The name and the value, or None if the values are not those of a clock.
     """
-    ticks_Hz = steady_step(step) * rate_Hz
-    return next((clock for usual_Hz, clock in CLOCKS.items() if abs(ticks_Hz / usual_Hz - 1.0) < TOLERANCE), None)
+    tick_rate_Hz = steady_step(step) * rate_Hz
+    for common_rate_Hz, clock in CLOCKS.items():
+        if abs(tick_rate_Hz / common_rate_Hz - 1.0) < TOLERANCE:
+            return clock
+    return None
 
 
 @dataclass(frozen=True)
 class Weights:
-    """What a part of a frame adds to the score, bits.
+    """Contributions of the parts of a frame to the score, bits.
 
     Attributes:
-        row: A row of channels of one type.
-        channel: A channel, besides the size of its steps.
-        constant: A byte that is always the same and nothing else, or a channel that is always the same.
-        noise: A byte that varies and is nothing else; a byte of the stream outside all frames.
-        fraction: Share of the bits of a floating-point number that tell its value from one of equal size,
-            dimensionless.
+        row: Contribution of a row of adjacent channels of one type.
+        channel: Contribution of a channel, in addition to the bits of its steps.
+        constant: Contribution of a constant byte without a meaning, or of a constant channel.
+        noise: Contribution of a varying byte without a meaning, and of a byte outside of all frames.
+        fraction: Share of the bits of a floating-point number that belong to its significant digits, dimensionless.
     """
 
     row: float = 4.0
@@ -81,14 +92,14 @@ class Part(NamedTuple):
     """A part of a frame.
 
     Attributes:
-        role: What it is.
-        kind: Its type in a device file.
-        size: Bytes.
-        score: What it adds, bits, without the row that a channel may begin.
-        is_constant: Whether it is a channel that never varies: such a one begins no row.
-        name: Of its field in a device file, but for channels.
-        scale: Value of one tick of a clock, in the unit that its name says.
-        row: The type that the channels of a row have in common; empty for other parts.
+        role: Meaning of the part.
+        kind: Type of the number, as in device files.
+        size: Number of bytes.
+        score: Contribution to the score without that of a new row, bits.
+        is_constant: Whether the part is a channel with a constant value. Such a channel does not begin a row.
+        name: Name of the field in a device file; empty for channels.
+        scale: Value of one tick of a clock, in the unit of its name.
+        row: Type that the channels of a row have in common; empty for other parts.
     """
 
     role: Literal["pad", "seq", "clock", "channel"]
@@ -103,24 +114,33 @@ class Part(NamedTuple):
 
 @np.errstate(all="ignore")
 def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) -> list[list[Part]]:
-    """The parts that may begin at each byte of a frame; the byte alone, without a meaning, is the first of them.
+    """Return the possible parts that begin at each byte of a frame; the first is a single byte without a meaning.
 
     Args:
-        rows: Frames, each with the one after it, shape (n, 2 * length): where a frame begins need not be known.
+        rows: Bytes of the frames, each followed by the next frame, shape (n, 2 * length). Where a frame begins need not
+            be known.
         order: Byte order of the numbers.
-        rate_Hz: Frames per second, Hz; a clock ticks at a usual rate.
-        weights: Of the score.
+        rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
+        weights: Contributions to the score.
     """
-    (usual, constant), length = usual_bytes(rows), rows.shape[1] // 2
-    is_zero, way = constant & (usual == 0), 1 if order == "little" else -1
+    usual, constant = usual_bytes(rows)
+    is_zero = constant & (usual == 0)
+    length = rows.shape[1] // 2
+    byte_step = 1 if order == "little" else -1
     parts_at: list[list[Part]] = []
-    for at in range(length):
-        parts_at.append([Part("pad", "pad", 1, weights.constant if constant[at] else weights.noise)])
+    for position in range(length):
+        pad_score = weights.constant if constant[position] else weights.noise
+        parts_at.append([Part("pad", "pad", 1, pad_score)])
         for kind in TYPES:
-            there = slice(at, at + int(kind[1:]) // 8)
-            if there.stop <= 2 * length:
-                parts_at[at] += _numbers(
-                    rows[:, there][:, ::way], constant[there][::way], is_zero[there][::way], kind, rate_Hz, weights
+            span = slice(position, position + int(kind[1:]) // 8)
+            if span.stop <= 2 * length:
+                parts_at[position] += _numbers(
+                    rows[:, span][:, ::byte_step],
+                    constant[span][::byte_step],
+                    is_zero[span][::byte_step],
+                    kind,
+                    rate_Hz,
+                    weights,
                 )
     return parts_at
 
@@ -128,74 +148,108 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
 def _numbers(
     cut: Bytes, constant: Booleans, is_zero: Booleans, kind: str, rate_Hz: float, weights: Weights
 ) -> Iterator[Part]:
-    """What bytes, lowest first, may be as a number of a type: a frame's number or a clock, and a channel.
+    """Yield the possible meanings of bytes as a number of a type: frame counter or clock, and channel.
 
     Args:
-        cut: The bytes, shape (n, size).
-        constant, is_zero: Which of them are always the same, and always 0, shape (size,).
-        kind: The type.
-        rate_Hz: Frames per second, Hz.
-        weights: Of the score.
+        cut: The bytes, the lowest first, shape (n, size).
+        constant: Whether each byte is constant, shape (size,).
+        is_zero: Whether each byte is always 0, shape (size,).
+        kind: Type of the number.
+        rate_Hz: Number of frames per second, Hz.
+        weights: Contributions to the score.
     """
     size = len(constant)
     if constant.all():
         yield Part("channel", kind, size, weights.constant, is_constant=True, row=kind)
         return
-    values, half = _values(cut, kind), 1 << (8 * size - 1)
-    step = going = np.diff(values)
-    rest = float(np.median(np.abs(values)))
-    unit = rest * 256.0 ** (np.argmin(is_zero) - weights.fraction * size) if kind[0] == "f" else 1.0
-    if kind[0] == "f" and not PLAUSIBLE[0] < rest < PLAUSIBLE[1]:
-        return
-    if kind[0] == "u":
-        going = (step + half) % (2 * half) - half  # a counter begins anew
-        rest = float(np.median(np.abs(values - half)))
-    if kind[0] == "u" and size != 3 and steady_step(going) == 1.0:
+    is_float = kind[0] == "f"
+    is_unsigned = kind[0] == "u"
+    values = _values(cut, kind)
+    step = np.diff(values)
+    counter_step = step
+    magnitude = float(np.median(np.abs(values)))
+    unit = 1.0
+    if is_float:
+        unit = magnitude * 256.0 ** (np.argmin(is_zero) - weights.fraction * size)
+        if not PLAUSIBLE[0] < magnitude < PLAUSIBLE[1]:
+            return
+    if is_unsigned:
+        half_range = 1 << (8 * size - 1)
+        counter_step = (step + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
+        magnitude = float(np.median(np.abs(values - half_range)))
+    if is_unsigned and size != 3 and steady_step(counter_step) == 1.0:
         yield Part("seq", kind, size, 0.0, name="seq")
-    elif kind[0] != "i" and size not in (1, 3) and (clock := clock_of(going, rate_Hz)) is not None:
-        yield Part("clock", kind, size, _bits(going - np.median(going), unit, size), False, *clock)
-    yield Part("channel", kind, size, weights.channel + _bits(np.append(step, rest), unit, size), row=kind)
+    elif kind[0] != "i" and size not in (1, 3):
+        clock = clock_of(counter_step, rate_Hz)
+        if clock is not None:
+            name, scale = clock
+            score = _bits(counter_step - np.median(counter_step), unit, size)
+            yield Part("clock", kind, size, score, name=name, scale=scale)
+    channel_score = weights.channel + _bits(np.append(step, magnitude), unit, size)
+    yield Part("channel", kind, size, channel_score, row=kind)
 
 
 def split_frame(
     parts_at: Sequence[Sequence[Part]], syncs: Iterable[int], weights: Weights
 ) -> tuple[float, int, tuple[Part, ...]]:
-    """The way to part a frame with the lowest score: the score in bits, the bytes of the sync, the parts after it.
+    """Divide a frame into parts with the lowest score.
 
     Args:
-        parts_at: The parts that may begin at each byte before the checksum.
-        syncs: Bytes that the sync may have; the shortest of equal ones is taken.
-        weights: Of the score.
+        parts_at: Possible parts that begin at each byte before the checksum.
+        syncs: Possible lengths of the sync, bytes. The shortest one with the lowest score is chosen.
+        weights: Contributions to the score.
+
+    Returns:
+        The score in bits, the length of the sync in bytes, and the parts after the sync.
     """
 
     @cache
-    def lowest(at: int, row: str) -> tuple[float, tuple[Part, ...]]:
-        """The lowest score of the bytes from one on, after a channel of a row, and their parts."""
-        if at >= len(parts_at):
-            return (0.0 if at == len(parts_at) else np.inf), ()
+    def lowest(position: int, row: str) -> tuple[float, tuple[Part, ...]]:
+        """Return the lowest score of the bytes from a position on, and their parts, after a channel of type `row`."""
+        if position == len(parts_at):
+            return 0.0, ()
+        if position > len(parts_at):
+            return np.inf, ()
         best: tuple[float, tuple[Part, ...]] = (np.inf, ())
-        for part in parts_at[at]:
+        for part in parts_at[position]:
             begins_row = part.row not in ("", row)
-            tail, parts = lowest(at + part.size, part.row)
-            score = part.score + weights.row * begins_row + tail
-            if score < best[0] and not (begins_row and part.is_constant):
-                best = (score, (part, *parts))
+            if begins_row and part.is_constant:
+                continue
+            rest_score, rest_parts = lowest(position + part.size, part.row)
+            score = part.score + rest_score
+            if begins_row:
+                score = part.score + weights.row + rest_score
+            if score < best[0]:
+                best = (score, (part, *rest_parts))
         return best
 
-    scored = [(lowest(sync, "")[0] + weights.constant * (sync == 1), sync) for sync in syncs]  # one byte is seldom all
+    scored = []
+    for sync in syncs:
+        score, _ = lowest(sync, "")
+        if sync == 1:  # a sync of a single byte is rare
+            score += weights.constant
+        scored.append((score, sync))
     score, sync = min(scored)
     return score, sync, lowest(sync, "")[1]
 
 
 def _values(cut: Bytes, kind: str) -> Array:
-    """The bytes of a number in all frames, lowest first, shape (n, size), as values of a type, shape (n,)."""
+    """Return the values of a number in all frames, shape (n,).
+
+    Args:
+        cut: Bytes of the number, the lowest first, shape (n, size).
+        kind: Type of the number.
+    """
     size = cut.shape[1]
     if kind[0] == "f":
         return np.ascontiguousarray(cut).view(f"<f{size}")[:, 0].astype(float)
     values: Array = cut @ 256.0 ** np.arange(size)
-    return values - 256.0**size * (values >= 256.0**size / 2) if kind[0] == "i" else values
+    if kind[0] == "i":
+        is_negative = values >= 256.0**size / 2
+        values = values - 256.0**size * is_negative
+    return values
 
 
 def _bits(step: Array, unit: float, size: int) -> float:
-    """Mean number of bits for the size of steps of numbers; a step of no finite size needs all that there are."""
+    """Return the mean number of bits that steps of a number need, in steps of `unit`; at most its size in bits."""
     return float(np.fmin(np.log2(1.0 + np.abs(step) / unit), 8 * size).mean())

@@ -1,11 +1,12 @@
-"""Where frames begin, how long they are, and which checksum they end with: bytes to windows of one length.
+"""Recognition of the framing: where frames begin, how long they are, and with which checksum they end.
 
-A stuffed stream is parted by its delimiter. Otherwise some bytes of every frame are the same, and come again after the
-length of a frame: of all pairs of bytes the one is taken whose most frequent distance to its next occurrence covers
-most of the stream. Where within a frame that pair stands is not known yet.
+A stream with byte stuffing is split at its delimiter. In other streams some bytes are the same in every frame, so they
+occur again after the length of a frame. Of all pairs of bytes, the pair is chosen whose most frequent distance to its
+next occurrence covers the largest part of the stream. At which position of the frame this pair lies is not known yet.
 
-Named checksums are tried from every first byte. Of cyclic checks without a name only the polynomials have to be tried:
-in frames of one length, start and final value and whatever is the same in all frames add up to a constant.
+Named checksums are tried from every first byte. For cyclic redundancy checks without a name, only the polynomials have
+to be tried: in frames of one length, the initial value, the final value and all constant bytes together contribute a
+constant.
 """
 
 from collections import Counter
@@ -25,38 +26,38 @@ from isocharge.serve.frames.stuffing import STUFFINGS, Stuffing
 Bytes = NDArray[np.uint8]
 
 SHORTEST, LONGEST = 4, 256
-"""Shortest and longest frame that is looked for, bytes."""
+"""Shortest and longest frame that is recognised, bytes."""
 
 FEWEST = 5
-"""Smallest number of frames from which anything is recognised."""
+"""Smallest number of frames from which a format is recognised."""
 
 MOST_BYTES = 1 << 16
-"""Bytes of a stream that are examined."""
+"""Number of bytes of a stream that are examined."""
 
 STUFFED_SHARE = 0.9
-"""Share of pieces between delimiters that are frames of one length, dimensionless."""
+"""Smallest share of the pieces between delimiters that must have one length, dimensionless."""
 
 COVERED_SHARE = 0.4
-"""Share of a stream that frames of one length cover, dimensionless."""
+"""Smallest share of a stream that frames of one length must cover, dimensionless."""
 
 SINGLE_SHARE = 0.05
-"""Share of a stream that a single byte has to cover more than a pair, which seldom occurs by chance, dimensionless."""
+"""Share of a stream by which a single byte must cover more than a pair, which rarely repeats by chance."""
 
 MOST_LENGTHS = 3
-"""Number of lengths that are tried."""
+"""Number of frame lengths that are tried."""
 
 CONSTANT_SHARE = 0.98
-"""Share of frames in which a constant byte has its value, dimensionless: some may be damaged."""
+"""Smallest share of frames in which a constant byte has its value, because some frames may be damaged."""
 
 
 class Windows(NamedTuple):
     """Frames of one length in a stream.
 
     Attributes:
-        framing: One of `isocharge.serve.frames.frame_layout.Framing`.
-        stream: All bytes, shape (n,).
-        starts: Where windows begin, shape (frames,).
-        length: Bytes in each.
+        framing: Kind of framing, one of `isocharge.serve.frames.frame_layout.Framing`.
+        stream: All bytes of the stream, shape (n,).
+        starts: Positions at which the windows begin, shape (frames,).
+        length: Number of bytes in a window.
     """
 
     framing: str
@@ -65,19 +66,22 @@ class Windows(NamedTuple):
     length: int
 
     def rows(self) -> Bytes:
-        """The bytes of each window and as many after it, shape (frames, 2 * length): frames begin anywhere in it."""
+        """Return the bytes of each window and as many bytes after it, shape (frames, 2 * length).
+
+        A frame begins at the same, unknown position of every window.
+        """
         starts = self.starts[self.starts + 2 * self.length <= len(self.stream)]
         return np.asarray(self.stream[starts[:, None] + np.arange(2 * self.length)])
 
 
 def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
-    """The most frequent byte at each place of a frame, and whether nearly all frames have it, shape (length,)."""
+    """Return the most frequent byte at each position, and whether nearly all frames have it, shape (length,) each."""
     usual = np.array([np.bincount(column).argmax() for column in rows.T], np.uint8)
     return usual, (rows == usual).mean(axis=0) >= CONSTANT_SHARE
 
 
 def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Windows]:
-    """Every way to cut a stream into frames, the most certain first."""
+    """Yield every possible division of a stream into frames, the most certain first."""
     data = b"".join(chunks)[:MOST_BYTES]
     if are_datagrams:
         common = gcd(*map(len, chunks))
@@ -101,34 +105,51 @@ def _stuffed(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
     length, count = _most_common_length(decoded)
     if count < STUFFED_SHARE * len(pieces) or not SHORTEST <= length <= LONGEST:
         return
-    if name == "cobs" or count > _most_common_length(pieces)[1]:  # else every frame happens to begin with that byte
+    # If decoding makes the lengths no more regular, every frame only happens to begin with the delimiter.
+    if name == "cobs" or count > _most_common_length(pieces)[1]:
         yield _side_by_side(name, b"".join(piece for piece in decoded if len(piece) == length), length)
 
 
 def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
-    """The most frequent length, and how often it occurs."""
-    return Counter(map(len, pieces)).most_common(1)[0] if pieces else (0, 0)
+    """Return the most frequent length of the pieces, and how often it occurs."""
+    if not pieces:
+        return 0, 0
+    return Counter(map(len, pieces)).most_common(1)[0]
 
 
 def _synchronised(stream: Bytes) -> Iterator[Windows]:
-    single = stream.astype(np.int64)
-    best: dict[int, tuple[float, NDArray[np.int64]]] = {}
-    for codes, less in ((256 * single[:-1] + single[1:], 0.0), (single, SINGLE_SHARE)):
+    """Yield the divisions of a stream at bytes that repeat after the length of a frame."""
+    single_bytes = stream.astype(np.int64)
+    byte_pairs = 256 * single_bytes[:-1] + single_bytes[1:]
+    best: dict[int, tuple[float, NDArray[np.int64]]] = {}  # by length: covered share, and positions
+    for codes, penalty in ((byte_pairs, 0.0), (single_bytes, SINGLE_SHARE)):
         for length, starts in _repeats(codes):
-            coverage = len(starts) * length / len(stream) - less
-            if coverage > best.get(length, (COVERED_SHARE - less,))[0]:
+            coverage = len(starts) * length / len(stream) - penalty
+            if coverage > best.get(length, (COVERED_SHARE - penalty,))[0]:
                 best[length] = coverage, starts
-    for length in sorted(best, key=lambda length: (-round(best[length][0], 1), length))[:MOST_LENGTHS]:
-        yield Windows(SYNC, stream, best[length][1], length)
+
+    def by_coverage(length: int) -> tuple[float, int]:
+        coverage, _ = best[length]
+        return -round(coverage, 1), length
+
+    for length in sorted(best, key=by_coverage)[:MOST_LENGTHS]:
+        _, starts = best[length]
+        yield Windows(SYNC, stream, starts, length)
 
 
 def _repeats(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Distances to the next occurrence of a code that are frequent, and where these codes stand."""
+    """Yield the frequent distances from a code to its next occurrence, and the positions of the code.
+
+    Args:
+        codes: Bytes, or pairs of bytes as numbers, at each position of the stream, shape (n,).
+    """
     order = np.argsort(codes, kind="stable")
-    gaps, firsts = np.diff(order), order[:-1]
+    gaps = np.diff(order)
+    firsts = order[:-1]
     repeats = (np.diff(codes[order]) == 0) & (gaps >= SHORTEST) & (gaps <= LONGEST)
-    gaps, firsts = gaps[repeats], firsts[repeats]
-    keys = codes[firsts] * (LONGEST + 1) + gaps
+    gaps = gaps[repeats]
+    firsts = firsts[repeats]
+    keys = codes[firsts] * (LONGEST + 1) + gaps  # one number for each pair of code and distance
     for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
         length = int(key) % (LONGEST + 1)
         if count * length >= COVERED_SHARE * len(codes):
@@ -144,23 +165,29 @@ CYCLIC = {
         1: (0x07, 0x31, 0x1D, 0x2F, 0x9B, 0x39, 0xD5),
     }.items()
 }
-"""Cyclic checks that are looked for without a name, by their bytes, without start and final value."""
+"""Cyclic redundancy checks that are tried without a name, by their size in bytes, with initial and final value 0."""
 
 FEWEST_ROWS, MOST_ROWS = 6, 24
-"""Smallest number of different frames for a checksum, and how many are looked at."""
+"""Smallest number of different frames from which a checksum is recognised, and largest number that is examined."""
 
 FITTING_SHARE = 0.75
-"""Share of frames whose checksum fits, dimensionless: some may be damaged."""
+"""Smallest share of frames whose checksum must fit, because some frames may be damaged."""
 
 MOST_SKIPPED = 16
-"""Largest first byte that a checksum covers."""
+"""Largest position of the first byte that a checksum covers."""
 
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
 
 
 class Check(NamedTuple):
-    """A checksum that fits: its bytes, 0 for none, their order, and its keys in a device file."""
+    """A checksum that fits.
+
+    Attributes:
+        size: Number of bytes; 0 if the frames have no checksum.
+        order: Byte order.
+        keys: Keys of the checksum in a device file.
+    """
 
     size: int
     order: ByteOrder
@@ -168,40 +195,54 @@ class Check(NamedTuple):
 
 
 def find_checks(rows: Bytes) -> Iterator[Check]:
-    """Checksums that fit frames, shape (n, length), the widest first."""
+    """Yield the checksums that fit the frames, the widest first.
+
+    Args:
+        rows: Bytes of the frames, shape (n, length).
+    """
     rows = np.unique(rows, axis=0)
-    rows = rows[np.random.default_rng(0).permutation(len(rows))[:MOST_ROWS]]  # neighbours differ in few bits only
+    shuffled = np.random.default_rng(0).permutation(len(rows))  # sorted neighbours differ in a few bits only
+    rows = rows[shuffled[:MOST_ROWS]]
     if len(rows) < FEWEST_ROWS:
         return
-    constant, frames = usual_bytes(rows)[1], [row.tobytes() for row in rows]
-    skipped = int(np.argmin([*constant[:MOST_SKIPPED], False]))
+    _, constant = usual_bytes(rows)
+    frames = [row.tobytes() for row in rows]
+    n_leading_constant = int(np.argmin([*constant[:MOST_SKIPPED], False]))
     for size in CYCLIC:
         if size + 2 > len(constant) or constant[-size:].all():
             continue
+        last_begin = min(n_leading_constant, len(constant) - size - 1)
         for order in ORDERS[:size]:
-            named = _named(frames, size, order, range(min(skipped, len(constant) - size - 1) + 1))
+            named = _named(frames, size, order, range(last_begin + 1))
             yield from islice(chain(named, _unnamed(frames, size, order)), 1)
 
 
 def _named(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> Iterator[Check]:
+    """Yield the named checksums that fit, with the position of the first byte that they cover."""
     names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
     for begin in begins:
         for name in names:
             if _fits(CHECKSUMS[name].compute, frames, begin, size, order):
-                yield Check(size, order, {"checksum": name} | ({"checksum_from": begin} if begin else {}))
+                keys: dict[str, Any] = {"checksum": name}
+                if begin:
+                    keys["checksum_from"] = begin
+                yield Check(size, order, keys)
 
 
 def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size: int, order: ByteOrder) -> bool:
-    """Whether nearly all frames end with their checksum; four decide whether the others are looked at."""
+    """Return whether nearly all frames end with their checksum.
 
-    def fitting(part: list[bytes]) -> int:
-        return sum(compute(frame[begin:-size]) == int.from_bytes(frame[-size:], order) for frame in part)
+    The first four frames decide whether the others are examined, which saves time.
+    """
 
-    return fitting(frames[:4]) >= 2 and fitting(frames) >= FITTING_SHARE * len(frames)
+    def count_fitting(some_frames: list[bytes]) -> int:
+        return sum(compute(frame[begin:-size]) == int.from_bytes(frame[-size:], order) for frame in some_frames)
+
+    return count_fitting(frames[:4]) >= 2 and count_fitting(frames) >= FITTING_SHARE * len(frames)
 
 
 def _unnamed(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check]:
-    """Cyclic checks by their parameters, in which the constant part is the final value."""
+    """Yield the cyclic redundancy checks that fit, by their parameters. The constant part is their final value."""
     for crc in CYCLIC[size]:
         finals = Counter(crc(frame[:-size]) ^ int.from_bytes(frame[-size:], order) for frame in frames)
         final, count = finals.most_common(1)[0]

@@ -1,4 +1,4 @@
-"""What a board sends: our binary frames, lines of text, or frames of fixed length that are described."""
+"""Recognition of the format of a board: the binary frames of isocharge, lines of text, or frames of fixed length."""
 
 from collections.abc import Iterator, Sequence
 from itertools import count, groupby
@@ -24,13 +24,13 @@ from isocharge.serve.recognition.framing import (
 )
 
 MOST_FRAMES = 300
-"""Frames that are examined."""
+"""Number of frames that are examined."""
 
-MOST_TURNS = 24
-"""Bytes at which a frame is tried to begin, of those that may be a sync."""
+MOST_STARTS = 24
+"""Number of constant bytes that are tried as the first byte of a frame."""
 
 LONGEST_SYNC = 6
-"""Longest sync, bytes: what follows may be constant for a while only."""
+"""Longest sync, bytes. The bytes after it may be constant only by chance."""
 
 WEIGHTS = Weights()
 
@@ -38,13 +38,13 @@ WEIGHTS = Weights()
 def described_frames(
     chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False, weights: Weights = WEIGHTS
 ) -> dict[str, Any] | None:
-    """The section `[frames]` of a device file for frames of fixed length; None if the bytes are none.
+    """Return the section `[frames]` of a device file for frames of fixed length; None if there are no such frames.
 
     Args:
-        chunks: The bytes as they came.
-        seconds: Time in which they came, s; the unit of a clock follows from it.
+        chunks: The bytes as they arrived.
+        seconds: Time in which they arrived, s, from which the unit of a clock follows.
         are_datagrams: Whether each chunk is a datagram.
-        weights: Of the score.
+        weights: Contributions to the score.
     """
     seconds *= min(1.0, MOST_BYTES / max(1, sum(map(len, chunks))))
     for _, group in groupby(framings(chunks, are_datagrams=are_datagrams), key=lambda windows: windows.framing):
@@ -55,41 +55,55 @@ def described_frames(
 
 
 def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterator[tuple[float, dict[str, Any]]]:
-    """Every description of frames: of each begin, checksum and byte order; without a checksum only if none fits.
+    """Yield every possible description of the frames with its score: for each start, checksum and byte order.
 
-    The score is in bits for each byte of the stream, those too that are in no frame: frames of other lengths are
-    compared.
+    Descriptions without a checksum are tried only if no checksum fits. The score is in bits for each byte of the
+    stream, including the bytes outside of all frames, so that frames of different lengths can be compared.
     """
-    length, rows = windows.length, windows.rows()[:MOST_FRAMES]
+    length = windows.length
+    rows = windows.rows()[:MOST_FRAMES]
     if len(rows) < FEWEST - 1:
         return
+    has_sync = windows.framing == SYNC
     usual, constant = usual_bytes(rows[:, :length])
-    fixed = constant & (usual != 0)  # zeros are the high bytes of numbers
-    turns = np.flatnonzero(fixed)[:MOST_TURNS].tolist() if windows.framing == SYNC else [0]
-    checks = [(turn, check) for turn in turns for check in find_checks(rows[:, turn : turn + length])]
+    may_be_sync = constant & (usual != 0)  # zeros are mostly the high bytes of numbers
+    starts = np.flatnonzero(may_be_sync)[:MOST_STARTS].tolist() if has_sync else [0]
+    checks = [(start, check) for start in starts for check in find_checks(rows[:, start : start + length])]
     covered = min(1.0, len(windows.starts) * length / len(windows.stream))
+    rate_Hz = len(windows.stream) / length / seconds
     for order in ORDERS:
-        parts_at = parts_of(rows, order, len(windows.stream) / length / seconds, weights)
-        for turn, check in checks or [(turn, Check(0, order, {})) for turn in turns]:
-            turned = (parts_at[turn:] + parts_at[:turn])[: length - check.size]
-            longest = int(np.argmin([*np.roll(fixed, -turn)[:LONGEST_SYNC], False]))
-            syncs = range(1, longest + 1) if windows.framing == SYNC else [0]
-            score, sync, parts = split_frame(turned, syncs, weights)
+        parts_at = parts_of(rows, order, rate_Hz, weights)
+        for start, check in checks or [(start, Check(0, order, {})) for start in starts]:
+            frame_parts = (parts_at[start:] + parts_at[:start])[: length - check.size]
+            syncs: Sequence[int] = [0]
+            if has_sync:
+                longest = int(np.argmin([*np.roll(may_be_sync, -start)[:LONGEST_SYNC], False]))
+                syncs = range(1, longest + 1)
+            score, sync, parts = split_frame(frame_parts, syncs, weights)
             if any(part.role == "channel" for part in parts):
-                begin = np.roll(usual, -turn)[:sync].tobytes()
+                sync_bytes = np.roll(usual, -start)[:sync].tobytes()
                 bits = covered * score / length + (1.0 - covered) * weights.noise
-                yield bits, _table(windows, begin, check, order, parts)
+                yield bits, _table(windows, sync_bytes, check, order, parts)
 
 
 def _table(windows: Windows, sync: bytes, check: Check, order: ByteOrder, parts: Sequence[Part]) -> dict[str, Any]:
-    table = {"sync": sync.hex(" ").upper()} if windows.framing == SYNC else {"framing": windows.framing}
-    orders = {"checksum_order": check.order} if check.size > 1 and check.order != order else {}
-    layout = {"length": windows.length, "byte_order": order} | check.keys | orders
-    return {"format": "described"} | table | layout | {"fields": _fields(parts)}
+    """Return the section `[frames]` of a device file."""
+    table: dict[str, Any] = {"format": "described"}
+    if windows.framing == SYNC:
+        table["sync"] = sync.hex(" ").upper()
+    else:
+        table["framing"] = windows.framing
+    table["length"] = windows.length
+    table["byte_order"] = order
+    table |= check.keys
+    if check.size > 1 and check.order != order:
+        table["checksum_order"] = check.order
+    table["fields"] = _fields(parts)
+    return table
 
 
 def _fields(parts: Sequence[Part]) -> list[dict[str, Any]]:
-    """The fields of a device file; a second number or clock is padding, and neighbouring paddings are one."""
+    """Return the fields of a device file. A second counter or clock becomes padding, and adjacent padding is joined."""
     fields: list[dict[str, Any]] = []
     roles: list[str] = []
     for part in parts:
@@ -98,30 +112,37 @@ def _fields(parts: Sequence[Part]) -> list[dict[str, Any]]:
         if part.role == "channel":
             fields.append({"name": f"ch{number}", "type": part.kind})
         elif part.role != "pad" and number == 1:
-            fields.append({"name": part.name, "type": part.kind} | ({"scale": part.scale} if part.scale != 1.0 else {}))
+            field: dict[str, Any] = {"name": part.name, "type": part.kind}
+            if part.scale != 1.0:
+                field["scale"] = part.scale
+            fields.append(field)
         elif fields and fields[-1]["type"] == PADDING:
             fields[-1]["count"] = fields[-1].get("count", 1) + part.size
         else:
-            fields.append({"type": PADDING} | ({"count": part.size} if part.size > 1 else {}))
+            padding: dict[str, Any] = {"type": PADDING}
+            if part.size > 1:
+                padding["count"] = part.size
+            fields.append(padding)
     return fields
 
 
 CLEAR_SHARE = 0.4
-"""Share of bytes in good frames from which nothing else is looked for, dimensionless; echoes may stand between them."""
+"""Share of bytes in intact frames from which no other format is tried. Echoes may lie between the frames."""
 
 
 def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False) -> dict[str, Any] | None:
-    """The section `[frames]` of a device file; None if nothing is recognised.
+    """Return the section `[frames]` of a device file; None if no format is recognised.
 
     Args:
-        chunks: The bytes as they came.
-        seconds: Time in which they came, s.
+        chunks: The bytes as they arrived.
+        seconds: Time in which they arrived, s.
         are_datagrams: Whether each chunk is a datagram.
     """
     frames, share = _read(BinaryParser(), chunks)
     if len(frames) >= FEWEST and share > CLEAR_SHARE:
         return {"format": "binary"}
-    text, parser = None, TextParser()
+    text = None
+    parser = TextParser()
     frames, share = _read(parser, chunks)
     frames = [frame for frame in frames if len(frame.values) == len(frames[-1].values)]
     if parser.layout is not None and len(frames) >= FEWEST:
@@ -132,15 +153,16 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
 
 
 def _read(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], float]:
-    """The frames that a parser finds, and the share of bytes that they explain."""
+    """Return the frames that a parser finds, and the share of the bytes that lie in these frames."""
     frames = [frame for chunk in chunks for frame in parser.feed(chunk)]
     return frames, 1.0 - parser.counts.bytes_dropped / max(1, sum(map(len, chunks)))
 
 
 def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[str, Any]:
-    """The keys of a device file; columns without names get names, once one of them has a meaning.
+    """Return the keys of a device file for lines of text.
 
-    The header of a CSV is written down: who comes later will not see it.
+    Columns without names get names if one of them has a meaning. The header of a CSV stream becomes part of the device
+    file, because a program that starts later does not receive it.
     """
     last = frames[-1]
     meanings = _meanings(frames, rate_Hz)
@@ -157,13 +179,16 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[
 
 @np.errstate(over="ignore", invalid="ignore")
 def _meanings(frames: Sequence[Frame], rate_Hz: float) -> dict[int, str]:
-    """`seq`, `t_us`, `t_ms` or `t_s` by position among the values, of columns that count frames or time."""
+    """Return `seq`, `t_us`, `t_ms` or `t_s` by the position of the columns that count frames or time."""
     meanings: dict[int, str] = {}
-    has_number, has_clock = frames[-1].seq is not None, frames[-1].t_us is not None
+    has_counter = frames[-1].seq is not None
+    has_clock = frames[-1].t_us is not None
     for position, step in enumerate(np.diff([frame.values for frame in frames], axis=0).T):
         name, scale = clock_of(step, rate_Hz) or ("", 0.0)
-        if not has_number and steady_step(step) == 1.0:
-            meanings[position], has_number = SEQ, True
-        elif not has_clock and scale == 1.0:  # text has no scale
-            meanings[position], has_clock = name, True
+        if not has_counter and steady_step(step) == 1.0:
+            meanings[position] = SEQ
+            has_counter = True
+        elif not has_clock and scale == 1.0:  # lines of text have no scale
+            meanings[position] = name
+            has_clock = True
     return meanings
