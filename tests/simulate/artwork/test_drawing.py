@@ -1,4 +1,4 @@
-"""Drawings read back by other programs: svgelements and ezdxf."""
+"""DXF and SVG drawings, read again with ezdxf and svgelements, and straight leads."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -10,12 +10,12 @@ from svgelements import SVG, Path
 
 from isocharge.common.errors import SensorError
 from isocharge.simulate import Electrode, load_sensor
-from isocharge.simulate.artwork.drawing import RULER, draw_layout, to_dxf, to_svg
+from isocharge.simulate.artwork.drawing import RULER_LENGTH, draw_layout, to_dxf, to_svg
 from isocharge.simulate.artwork.leads import straight_leads
 from isocharge.simulate.artwork.reading import read_artwork
 
 MICROMETRE = 1e-3
-"""In mm."""
+"""One micrometre, mm."""
 
 
 @pytest.fixture(params=["four-25um-biaxial-15mm", "shapes"])
@@ -36,7 +36,7 @@ def box(points):
     return [*np.min(points, axis=0), *np.max(points, axis=0)]
 
 
-def test_dxf_has_the_places_and_sizes_of_the_sensor(sensor, drawing, tmp_path):
+def test_dxf_has_the_positions_and_sizes_of_the_sensor(sensor, drawing, tmp_path):
     path = tmp_path / "layout.dxf"
     path.write_text(to_dxf(drawing), "utf-8")
     document = ezdxf.readfile(path)
@@ -55,7 +55,7 @@ def test_dxf_has_the_places_and_sizes_of_the_sensor(sensor, drawing, tmp_path):
 
 @pytest.fixture
 def with_traces(sensor):
-    """Traces, and a back that two electrodes share."""
+    """A sensor whose electrodes have traces and share a polygon on the back."""
     back = (((-30.0, -30.0), (30.0, -30.0), (30.0, 30.0), (1.0, 29.0), (-30.0, 30.0)),)
     bent = [((x, y), (1.5 * x, 1.5 * y), (1.6 * x, 1.5 * y + 3.0)) for x, y in (e.centre for e in sensor.electrodes)]
     traced = (e.with_trace(path, 0.5) for e, path in zip(sensor.electrodes[:2], bent, strict=False))
@@ -63,9 +63,8 @@ def with_traces(sensor):
     return replace(sensor, electrodes=tuple(named))
 
 
-@pytest.mark.parametrize("scale", [1.0, 25.4])
-def test_a_drawing_is_read_as_the_electrodes_that_it_shows(with_traces, scale, tmp_path):
-    """Also in inches, where every length is another number."""
+@pytest.mark.parametrize("scale", [1.0, 25.4], ids=["mm", "inches"])
+def test_read_artwork_returns_the_electrodes_that_were_drawn(with_traces, scale, tmp_path):
     drawing = draw_layout(with_traces, straight_leads(with_traces))
     if scale != 1.0:
         drawing.units = ezdxf.units.IN
@@ -90,8 +89,8 @@ def drawn(path, *lines):
     return path
 
 
-def test_lines_of_a_foreign_drawing(tmp_path):
-    """A clockwise square, its trace in two lines that cross, and a disk of four arcs: no names, no unit."""
+def test_read_artwork_of_a_drawing_without_names_and_unit(tmp_path):
+    """The drawing has a clockwise square, a trace of two lines that cross, and a disk of four arcs."""
     bulge = np.tan(np.pi / 8)
     disk = [(22.0, 0.0, bulge), (20.0, 2.0, bulge), (18.0, 0.0, bulge), (20.0, -2.0, bulge)]
     lines = [[(2.0, 2.0), (2.0, 12.0)], [(0.0, 11.0), (8.0, 11.0)], [(0.0, 0.0), (0.0, 4.0), (4.0, 4.0), (4.0, 0.0)]]
@@ -107,24 +106,24 @@ SQUARE = [(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)]
 @pytest.mark.parametrize(
     ("lines", "layers", "message"),
     [
-        ([([(0.0, 0.0), (9.0, 0.0)], 0.0)], ("metal",), r"layer 'metal': LWPOLYLINE #\w+ is open and has no width"),
-        ([([SQUARE[k] for k in (0, 1, 3, 2)], 0.0)], ("metal",), "LWPOLYLINE #.* does not cross itself"),
-        ([(SQUARE, 0.0)], ("copper",), "layer 'copper' has no lines; those that have are metal"),
-        ([(SQUARE, 0.0)], ("0",), r"layer '0': LINE #\w+: expected one of LWPOLYLINE, POLYLINE"),
+        pytest.param([([(0.0, 0.0), (9.0, 0.0)], 0.0)], ("metal",), r"#\w+ is open and has no width", id="open line"),
+        pytest.param([([SQUARE[k] for k in (0, 1, 3, 2)], 0.0)], ("metal",), "#.* does not cross itself", id="bow tie"),
+        pytest.param([(SQUARE, 0.0)], ("copper",), "has no lines; the layers with lines are metal", id="layer"),
+        pytest.param([(SQUARE, 0.0)], ("0",), r"LINE #\w+: expected one of LWPOLYLINE, POLYLINE", id="not an outline"),
     ],
 )
-def test_drawings_that_show_no_electrodes(tmp_path, lines, layers, message):
+def test_read_artwork_of_a_drawing_without_electrodes_raises_sensor_error(tmp_path, lines, layers, message):
     with pytest.raises(SensorError, match=message):
         read_artwork(drawn(tmp_path / "mine.dxf", *lines), *layers)
 
 
-def test_a_file_that_is_no_drawing(tmp_path):
+def test_read_artwork_of_a_text_file_raises_sensor_error(tmp_path):
     (tmp_path / "mine.dxf").write_text("film")
     with pytest.raises(SensorError, match=r"mine\.dxf: expected a DXF file"):
         read_artwork(tmp_path / "mine.dxf")
 
 
-def test_svg_is_the_same_drawing_to_scale(sensor, drawing, tmp_path):
+def test_svg_is_to_scale(sensor, drawing, tmp_path):
     path = tmp_path / "layout.svg"
     path.write_text(to_svg(drawing), "utf-8")
     svg = SVG.parse(str(path), ppi=25.4)  # a pixel is a millimetre
@@ -136,14 +135,14 @@ def test_svg_is_the_same_drawing_to_scale(sensor, drawing, tmp_path):
         left, low, right, high = box(electrode.corners)
         expected = [middle[0] + left, middle[1] - high, middle[0] + right, middle[1] - low]
         assert np.abs(boxes - expected).max(axis=1).min() < MICROMETRE
-    assert np.abs(boxes[:, 2] - boxes[:, 0] - RULER).min() < MICROMETRE
+    assert np.abs(boxes[:, 2] - boxes[:, 0] - RULER_LENGTH).min() < MICROMETRE
 
 
 def sampled(path):
     return path[0] + np.linspace(0.0, 1.0, 2000)[:, None] * (path[1] - path[0])
 
 
-def test_leads_reach_the_rim_and_cross_nothing(sensor):
+def test_leads_reach_the_rim_without_crossing_leads_or_electrodes(sensor):
     leads = straight_leads(sensor)
     assert leads.without == ()
     assert leads.summary == f"all {len(sensor.electrodes)} leads go straight to the rim"
@@ -160,11 +159,11 @@ def test_leads_reach_the_rim_and_cross_nothing(sensor):
         assert min(np.hypot(*(sampled(second) - point).T).min() for point in sampled(first)[::10]) > 0.59
 
 
-def test_an_electrode_without_a_straight_way_is_named():
-    """A ring of squares without gaps that are wide enough, and one in the middle."""
+def test_electrode_without_a_straight_lead_is_reported():
+    """The gaps in a ring of squares are too narrow for the lead of the square in the middle."""
     angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
     ring = [Electrode.of_square(f"R{n}", (10.0 * np.cos(a), 10.0 * np.sin(a)), 2.7) for n, a in enumerate(angles)]
     middle = Electrode.of_square("M", (0.0, 0.0), 3.0)
     leads = straight_leads(replace(load_sensor("three-25um-biaxial"), electrodes=(middle, *ring)))
     assert leads.without == ("M",)
-    assert leads.summary == "no straight way to the rim for M: lead them out on another layer"
+    assert leads.summary == "no straight lead to the rim for M: use another layer for their leads"

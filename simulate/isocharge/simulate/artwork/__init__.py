@@ -1,1 +1,1 @@
-"""A layout to scale, with straight leads, as DXF and SVG; and the folder of a design."""
+"""Drawings of a layout to scale as DXF and SVG, straight leads, electrodes from DXF files, folder of a design."""

@@ -1,4 +1,4 @@
-"""The folder of a design: sensor file, drawings, numbers and a picture."""
+"""Folder of a design: the sensor file, the drawings, the numbers and a picture."""
 
 import json
 from pathlib import Path
@@ -13,16 +13,24 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 
 
 def write_design(design: Design, folder: Path) -> None:
-    """Write `sensor.toml`, `layout.svg`, `layout.dxf`, `design.json` and `design.png`; the same design, the same bytes.
+    """Write the files `sensor.toml`, `layout.svg`, `layout.dxf`, `design.json` and `design.png` into a new folder.
+
+    The files of two equal designs are equal byte by byte.
+
+    Args:
+        design: Design to write.
+        folder: Folder to create.
 
     Raises:
-        OutputExists: If the folder is already there.
-        OutputError: If the file system refuses.
+        OutputExists: If the folder already exists.
+        OutputError: If the files cannot be written.
     """
-    case, errors, leads = design.case, design.after.to_dict()["with_nuisances"], straight_leads(design.sensor)
+    case = design.case
+    errors = design.after.to_dict()["with_nuisances"]
+    leads = straight_leads(design.sensor)
     comment = [
-        f"Places searched for {case.electrodes} electrodes over {case.radius:g} mm, goal {case.goal_name}:",
-        f"least position error {errors['worst_mm']:.3f} mm at worst, {errors['rms_mm']:.3f} mm rms.",
+        f"Positions searched for {case.electrodes} electrodes over {case.radius:g} mm, goal {case.goal_name}:",
+        f"lower limit of the position error {errors['worst_mm']:.3f} mm at worst, {errors['rms_mm']:.3f} mm rms.",
     ]
     drawing = draw_layout(design.sensor, leads)
     numbers = {**design.to_dict(), "leads": leads.summary}

@@ -1,4 +1,4 @@
-"""A layout in millimetres, a layer for each kind of thing: one drawing, written as DXF and as SVG."""
+"""Drawing of a layout in millimetres with one layer for each kind of object, written as DXF and as SVG."""
 
 import io
 from collections.abc import Iterator
@@ -20,58 +20,86 @@ with require("design"):
     from ezdxf.document import Drawing
 
 LAYERS = {"FILM": 7, "ELECTRODES": 1, "LEADS": 30, "RULER": 8, "NAMES": 8}
-"""Layers and their colours, numbers of the AutoCAD colour index; BACK is there if a back is described."""
+"""Layers of the drawing and their colours in the AutoCAD colour index."""
 
-RULER, TICK = 50.0, 10.0
-"""Length of the ruler and distance of its ticks, mm: with it a print shows whether its scale is right."""
+BACK_COLOUR = 5
+"""Colour of the layer BACK, which exists only if the sensor file describes the metal of the back."""
 
-BELOW, SHORT, HEIGHT = 4.0, 1.5, 2.0
-"""Distance of the ruler from the film, length of a tick and height of the letters, mm."""
+RULER_LENGTH = 50.0
+"""Length of the ruler, mm. The ruler shows whether a print is to scale."""
+
+TICK_DISTANCE = 10.0
+"""Distance between the ticks of the ruler, mm."""
+
+TICK_LENGTH = 1.5
+"""Length of a tick of the ruler, mm."""
+
+RULER_OFFSET = 4.0
+"""Distance of the ruler from the rim of the film, mm."""
+
+TEXT_HEIGHT = 2.0
+"""Height of the letters, mm."""
 
 MARGIN = 5.0
-"""Space around the SVG, mm."""
+"""Margin of the SVG drawing, mm."""
 
 
 def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
-    """Film, electrodes at their nominal places as closed polylines, leads with their width, names and a ruler."""
-    with _without_dates():
+    """Draw the film, the electrodes, their leads and names, and a ruler.
+
+    The electrodes are closed polylines at their nominal positions, and the leads are polylines with a width.
+
+    Args:
+        sensor: Sensor with the layout.
+        leads: Leads of the electrodes.
+    """
+    with _fixed_metadata():
         document = ezdxf.new("R2010")  # type: ignore[attr-defined]
     document.units = units.MM
     for name, colour in LAYERS.items():
         document.layers.add(name, color=colour)
-    space, radius = document.modelspace(), sensor.film.radius
-    space.add_circle((0.0, 0.0), radius, dxfattribs={"layer": "FILM"})
+    space = document.modelspace()
+    space.add_circle((0.0, 0.0), sensor.film.radius, dxfattribs={"layer": "FILM"})
     for path in leads.paths.values():
         space.add_lwpolyline(path.tolist(), dxfattribs={"layer": "LEADS", "const_width": leads.width})
-    behind = dict.fromkeys(polygon for electrode in sensor.electrodes for polygon in electrode.back)
-    if behind:
-        document.layers.add("BACK", color=5)
-    for polygon in behind:
+    back_polygons = dict.fromkeys(polygon for electrode in sensor.electrodes for polygon in electrode.back)
+    if back_polygons:
+        document.layers.add("BACK", color=BACK_COLOUR)
+    for polygon in back_polygons:
         space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "BACK"})
     for electrode in sensor.electrodes:
         for polygon in electrode.front:
             space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "ELECTRODES"})
         name = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in electrode.name)
-        space.add_text(name, height=HEIGHT, dxfattribs={"layer": "NAMES"}).set_placement(max(electrode.corners))
-    y, left = -radius - BELOW, -0.5 * RULER
-    ticks = [left + TICK * number for number in range(round(RULER / TICK) + 1)]
-    for start, end in (((left, y), (-left, y)), *(((x, y), (x, y - SHORT)) for x in ticks)):
-        space.add_line(start, end, dxfattribs={"layer": "RULER"})
-    label = space.add_text(f"{RULER:g} mm along x, the drawn direction", height=HEIGHT, dxfattribs={"layer": "RULER"})
-    label.set_placement((left, y - SHORT - 1.5 * HEIGHT))
+        text = space.add_text(name, height=TEXT_HEIGHT, dxfattribs={"layer": "NAMES"})
+        text.set_placement(max(electrode.corners))
+    _draw_ruler(space, -sensor.film.radius - RULER_OFFSET)
     return document
 
 
+def _draw_ruler(space: Any, y: float) -> None:
+    """Draw a horizontal ruler with ticks and a label at the height `y`, mm, centred at x = 0."""
+    left = -0.5 * RULER_LENGTH
+    layer = {"layer": "RULER"}
+    space.add_line((left, y), (-left, y), dxfattribs=layer)
+    for number in range(round(RULER_LENGTH / TICK_DISTANCE) + 1):
+        x = left + TICK_DISTANCE * number
+        space.add_line((x, y), (x, y - TICK_LENGTH), dxfattribs=layer)
+    text = f"{RULER_LENGTH:g} mm along x, the drawn direction"
+    label = space.add_text(text, height=TEXT_HEIGHT, dxfattribs=layer)
+    label.set_placement((left, y - TICK_LENGTH - 1.5 * TEXT_HEIGHT))
+
+
 def to_dxf(document: Drawing) -> str:
-    """The drawing as DXF; the same drawing gives the same bytes."""
+    """Return a drawing as the text of a DXF file. Equal drawings give equal texts."""
     stream = io.StringIO()
-    with _without_dates():
+    with _fixed_metadata():
         document.write(stream)
     return stream.getvalue()
 
 
 def to_svg(document: Drawing) -> str:
-    """The drawing as SVG to scale; texts are outlines."""
+    """Return a drawing as the text of an SVG file to scale, in which letters are drawn as outlines."""
     backend = SVGBackend()
     configuration = Configuration(background_policy=BackgroundPolicy.WHITE)
     Frontend(RenderContext(document), backend, config=configuration).draw_layout(document.modelspace())
@@ -80,8 +108,8 @@ def to_svg(document: Drawing) -> str:
 
 
 @contextmanager
-def _without_dates() -> Iterator[None]:
-    """Fixed dates and identifiers instead of today's."""
+def _fixed_metadata() -> Iterator[None]:
+    """Write fixed dates and identifiers instead of current ones, so that equal drawings give equal files."""
     options: Any = ezdxf.options  # type: ignore[attr-defined]
     before = options.write_fixed_meta_data_for_testing
     options.write_fixed_meta_data_for_testing = True

@@ -7,21 +7,25 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
 
-SAMPLE = 0.1
-"""Distance of the points of a lead at which its clearance is checked, mm."""
+SAMPLE_DISTANCE = 0.1
+"""Distance between the points of a lead at which the clearance is checked, mm."""
 
-TURNS = np.deg2rad([0.0, *(sign * degrees for degrees in range(1, 90) for sign in (1.0, -1.0))])
-"""Directions that are tried, against that straight outwards, rad: the nearest to it that is free is taken."""
+_DEGREES = np.arange(1.0, 90.0)
+
+TRIED_ANGLES = np.deg2rad(np.concatenate([[0.0], np.stack([_DEGREES, -_DEGREES], axis=1).ravel()]))
+"""Angles of the leads that are tried, relative to the outward radial direction, rad. They are ordered by size, so the
+first angle without a conflict deviates least from the radial direction."""
 
 
 @dataclass(frozen=True)
 class Leads:
-    """The leads of a layout.
+    """Straight leads of the electrodes of a layout.
 
     Attributes:
-        paths: By the name of its electrode, from the electrode's centre to the rim, shape (2, 2), mm.
-        without: Names of electrodes that have no straight way to the rim.
-        width: mm.
+        paths: Start and end of each lead, by the name of its electrode, shape (2, 2), mm. A lead starts at the centre
+            of the electrode and ends at the rim.
+        without: Names of the electrodes for which no straight lead was found.
+        width: Width of the leads, mm.
     """
 
     paths: dict[str, Array]
@@ -30,53 +34,67 @@ class Leads:
 
     @property
     def summary(self) -> str:
-        """For people."""
+        """Sentence that states which electrodes have no straight lead."""
         if not self.without:
             return f"all {len(self.paths)} leads go straight to the rim"
-        return f"no straight way to the rim for {', '.join(self.without)}: lead them out on another layer"
+        return f"no straight lead to the rim for {', '.join(self.without)}: use another layer for their leads"
 
 
 def straight_leads(sensor: Sensor, width: float = 0.3, clearance: float = 0.3) -> Leads:
-    """Leads of all electrodes at their nominal places, those near the rim first.
+    """Find straight leads for all electrodes at their nominal positions.
+
+    The leads are placed one after the other, beginning with the electrode that is farthest from the centre.
 
     Args:
-        sensor: The layout.
-        width: Of a lead, mm.
-        clearance: Smallest distance of a lead from other leads and electrodes, mm.
+        sensor: Sensor with the layout.
+        width: Width of the leads, mm.
+        clearance: Smallest distance between a lead and other leads and electrodes, mm.
     """
     paths: dict[str, Array] = {}
-    radius, centres = sensor.film.radius, {e.name: np.array(e.centre) for e in sensor.electrodes}
-    for electrode in sorted(sensor.electrodes, key=lambda one: -float(np.hypot(*one.centre))):
+    from_outside = sorted(sensor.electrodes, key=lambda electrode: -float(np.hypot(*electrode.centre)))
+    for electrode in from_outside:
         others = [other for other in sensor.electrodes if other != electrode]
-        for path in _ways(centres[electrode.name], radius):
-            count = int(np.ceil(np.hypot(*(path[1] - path[0])) / SAMPLE)) + 1
-            points = path[0] + np.linspace(0.0, 1.0, count)[:, None] * (path[1] - path[0])
-            away = [_from_box(points, other) - 0.5 * width for other in others]
-            away += [_from_lead(points, lead) - width for lead in paths.values()]
-            if min(away, default=np.inf) >= clearance:
+        for path in _possible_paths(np.array(electrode.centre), sensor.film.radius):
+            if _clearance(path, width, others, list(paths.values())) >= clearance:
                 paths[electrode.name] = path
                 break
-    without = tuple(name for name in centres if name not in paths)
-    return Leads({name: paths[name] for name in centres if name in paths}, without, width)
+    ordered = {name: paths[name] for name in sensor.electrode_names if name in paths}
+    without = tuple(name for name in sensor.electrode_names if name not in paths)
+    return Leads(ordered, without, width)
 
 
-def _ways(centre: Array, radius: float) -> Array:
-    """Straight ways from a place to the rim, the shortest first, shape (n, 2, 2), mm."""
-    angle = np.arctan2(centre[1], centre[0]) + TURNS
+def _possible_paths(centre: Array, radius: float) -> Array:
+    """Return straight paths from a position to the rim in the order of `TRIED_ANGLES`, shape (n, 2, 2), mm."""
+    angle = np.arctan2(centre[1], centre[0]) + TRIED_ANGLES
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    along = direction @ centre
-    length = np.sqrt(radius**2 - centre @ centre + along**2) - along
-    return np.stack([np.broadcast_to(centre, direction.shape), centre + length[:, None] * direction], axis=1)
+    projection = direction @ centre
+    length = np.sqrt(radius**2 - centre @ centre + projection**2) - projection
+    start = np.broadcast_to(centre, direction.shape)
+    end = centre + length[:, None] * direction
+    return np.stack([start, end], axis=1)
 
 
-def _from_box(points: Array, electrode: Electrode) -> float:
-    """Smallest distance of points from the boxes round the parts of an electrode, mm."""
+def _clearance(path: Array, width: float, electrodes: list[Electrode], leads: list[Array]) -> float:
+    """Return the smallest distance of the edge of a lead from electrodes and other leads, mm; infinite without them."""
+    step = path[1] - path[0]
+    count = int(np.ceil(np.hypot(*step) / SAMPLE_DISTANCE)) + 1
+    points = path[0] + np.linspace(0.0, 1.0, count)[:, None] * step
+    to_electrodes = [_distance_from_boxes(points, electrode) - 0.5 * width for electrode in electrodes]
+    to_leads = [_distance_from_lead(points, lead) - width for lead in leads]
+    return min([*to_electrodes, *to_leads], default=np.inf)
+
+
+def _distance_from_boxes(points: Array, electrode: Electrode) -> float:
+    """Return the smallest distance of points, shape (n, 2), from the bounding boxes of an electrode, mm."""
     low, high = (corners[:, None] for corners in electrode.boxes)
-    return float(np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=2).min())
+    outside = np.maximum(np.maximum(low - points, points - high), 0.0)
+    return float(np.linalg.norm(outside, axis=2).min())
 
 
-def _from_lead(points: Array, lead: Array) -> float:
-    """Smallest distance of points from a lead, mm."""
-    start, along = lead[0], lead[1] - lead[0]
-    share = np.clip((points - start) @ along / (along @ along), 0.0, 1.0)
-    return float(np.hypot(*(points - start - share[:, None] * along).T).min())
+def _distance_from_lead(points: Array, lead: Array) -> float:
+    """Return the smallest distance of points, shape (n, 2), from the centre line of a lead, shape (2, 2), mm."""
+    start = lead[0]
+    direction = lead[1] - lead[0]
+    share = np.clip((points - start) @ direction / (direction @ direction), 0.0, 1.0)
+    nearest = start + share[:, None] * direction
+    return float(np.hypot(*(points - nearest).T).min())

@@ -1,7 +1,6 @@
-"""Electrodes from the layers of a DXF drawing."""
+"""Reader of electrodes from the layers of a DXF drawing."""
 
 from itertools import chain
-from operator import itemgetter
 from pathlib import Path
 from string import ascii_uppercase
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 from isocharge.common.errors import SensorError, cut
 from isocharge.common.extras import require
 from isocharge.simulate.numerics.polygon import area_of, to_complex
-from isocharge.simulate.sensor.sensor import MAX_ELECTRODES, Electrode, check_polygon
+from isocharge.simulate.sensor.sensor import MAX_ELECTRODES, Corners, Electrode, check_polygon
 
 with require("design"):
     import ezdxf
@@ -19,77 +18,106 @@ with require("design"):
     from ezdxf.path import make_path
     from ezdxf.units import conversion_factor
 
-LINES = ("LWPOLYLINE", "POLYLINE", "CIRCLE", "ELLIPSE", "SPLINE")
-"""What outlines metal; only the first has a width that is read."""
+LINE_TYPES = ("LWPOLYLINE", "POLYLINE", "CIRCLE", "ELLIPSE", "SPLINE")
+"""DXF entities that may outline metal. Only the width of an LWPOLYLINE is read."""
 
-TEXTS = ("TEXT", "MTEXT")
-"""What names metal."""
+TEXT_TYPES = ("TEXT", "MTEXT")
+"""DXF entities that may name an electrode."""
 
-TOUCHING = 1e-3
-"""Distance up to which polygons are one electrode, mm."""
+TOUCHING_DISTANCE = 1e-3
+"""Distance below which two polygons belong to the same electrode, mm."""
 
-ROUND = 0.01
-"""Largest distance of an arc from the polygon that stands for it, mm."""
+ARC_TOLERANCE = 0.01
+"""Largest distance of an arc from the polygon that replaces it, mm."""
 
 
 def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") -> tuple[Electrode, ...]:
-    """The electrodes of a DXF drawing, such as that of `isocharge simulate design`.
+    """Read the electrodes of a DXF drawing, such as a drawing of `isocharge simulate design`.
 
-    Closed lines are polygons, open polylines with a width are traces; what touches or overlaps is one electrode. Names
-    are the nearest texts, or A, B, C... if these do not differ. A drawing without a unit is taken to be in mm.
+    Closed lines are polygons, and open polylines with a width are traces. Polygons and traces that touch or overlap
+    form one electrode. The name of an electrode is the text nearest to it. If two electrodes have the same nearest
+    text, the electrodes are named A, B, C and so on. A drawing without a unit is assumed to be in mm.
 
     Args:
-        path: The DXF file.
-        layer: Of the metal of the front.
-        back: Layer of the metal of the back, which all electrodes share; "" for a back that is metal all over.
+        path: DXF file.
+        layer: Name of the layer with the metal of the front.
+        back: Name of the layer with the metal of the back, which all electrodes share. If it is empty, the back is
+            covered with metal everywhere.
 
     Raises:
-        SensorError: If the file or a layer cannot be read, or something on it is no line, crosses itself, or is open
-            without a width.
+        SensorError: If the file or a layer cannot be read, or if an object of a layer is not a line, crosses itself, or
+            is open and has no width.
     """
     try:
         document: Any = ezdxf.readfile(path)  # type: ignore[attr-defined]
     except (OSError, ezdxf.DXFError) as error:  # type: ignore[attr-defined]
         raise SensorError(f"{path}: expected a DXF file: {error}") from error
     scale = conversion_factor(InsertUnits(document.units or InsertUnits.Millimeters), InsertUnits.Millimeters)
-    polygons, groups = _polygons(document, layer, scale, path), list[list[Electrode]]()
+    groups = _touching_groups(_polygons(document, layer, scale, path))
+    back_corners: tuple[Corners, ...] = ()
+    if back:
+        back_corners = tuple(polygon.corners for polygon in _polygons(document, back, scale, path))
+    electrodes = []
+    for name, (pad, *others) in zip(_names(document, groups, scale), groups, strict=False):
+        more = tuple(polygon.corners for polygon in others)
+        electrodes.append(Electrode(name, pad.corners, more=more, back=back_corners))
+    return tuple(electrodes)
+
+
+def _touching_groups(polygons: list[Electrode]) -> list[list[Electrode]]:
+    """Group polygons that touch or overlap, directly or through other polygons; in the order of their first polygon."""
+    groups: list[list[Electrode]] = []
     for polygon in polygons:
-        joined = [group for group in groups if any(polygon.overlaps(other, TOUCHING) for other in group)]
-        groups = [group for group in groups if group not in joined] + [[*chain(*joined), polygon]]
-    groups.sort(key=lambda group: polygons.index(group[0]))
-    behind = tuple(polygon.corners for polygon in _polygons(document, back, scale, path)) if back else ()
-    return tuple(
-        Electrode(name, pad.corners, more=tuple(polygon.corners for polygon in more), back=behind)
-        for name, (pad, *more) in zip(_names(document, groups, scale), groups, strict=False)
-    )
+        touching = []
+        separate = []
+        for group in groups:
+            if any(polygon.overlaps(other, TOUCHING_DISTANCE) for other in group):
+                touching.append(group)
+            else:
+                separate.append(group)
+        groups = [*separate, [*chain(*touching), polygon]]
+    return sorted(groups, key=lambda group: polygons.index(group[0]))
 
 
 def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list[Electrode]:
-    """The polygons of a layer, each an electrode of its own; pads before traces."""
-    shapes, polygons = [shape for shape in document.modelspace() if shape.dxftype() not in TEXTS], []
-    for shape in (shape for shape in shapes if shape.dxf.layer.lower() == layer.lower()):
+    """Read the polygons of a layer, each as an electrode of its own. Closed lines precede traces.
+
+    Args:
+        document: DXF document.
+        layer: Name of the layer.
+        scale: Unit of the drawing, mm.
+        path: File name for error messages.
+    """
+    shapes = [shape for shape in document.modelspace() if shape.dxftype() not in TEXT_TYPES]
+    pads = []
+    traces = []
+    for shape in shapes:
+        if shape.dxf.layer.lower() != layer.lower():
+            continue
         where = f"{path}: layer {layer!r}: {shape.dxftype()} #{shape.dxf.handle}"
-        if shape.dxftype() not in LINES:
-            raise SensorError(f"{where}: expected one of {', '.join(LINES)}; redraw or explode it, or delete it")
+        if shape.dxftype() not in LINE_TYPES:
+            raise SensorError(f"{where}: expected one of {', '.join(LINE_TYPES)}; redraw or explode it, or delete it")
         outline = make_path(shape)
-        closed = shape.closed if shape.dxftype() == "LWPOLYLINE" else outline.is_closed
-        corners = tuple((scale * at.x, scale * at.y) for at in outline.flattening(ROUND / scale))
-        if closed:
+        is_closed = shape.closed if shape.dxftype() == "LWPOLYLINE" else outline.is_closed
+        corners = tuple((scale * point.x, scale * point.y) for point in outline.flattening(ARC_TOLERANCE / scale))
+        width = scale * _width(shape)
+        if is_closed:
             corners = corners[:-1] if area_of(np.array(corners)) > 0.0 else corners[:0:-1]
             check_polygon(where, corners)
-        elif (width := _width_of(shape)) > 0.0:
-            (corners,) = Electrode(where, ()).with_trace(corners, scale * width).more
+            pads.append(Electrode(where, corners))
+        elif width > 0.0:
+            (corners,) = Electrode(where, ()).with_trace(corners, width).more
+            traces.append(Electrode(where, corners))
         else:
             raise SensorError(f"{where} is open and has no width; close it, or give it the width of a trace")
-        polygons.append((not closed, Electrode(where, corners)))
-    if not polygons:
-        known = ", ".join(sorted({shape.dxf.layer for shape in shapes if shape.dxftype() in LINES}))
-        raise SensorError(f"{path}: layer {layer!r} has no lines; those that have are {cut(known)}")
-    return [polygon for _, polygon in sorted(polygons, key=itemgetter(0))]
+    if not pads and not traces:
+        layers_with_lines = ", ".join(sorted({shape.dxf.layer for shape in shapes if shape.dxftype() in LINE_TYPES}))
+        raise SensorError(f"{path}: layer {layer!r} has no lines; the layers with lines are {cut(layers_with_lines)}")
+    return [*pads, *traces]
 
 
-def _width_of(line: Any) -> float:
-    """Width of a polyline that is equally wide everywhere, else 0, in the drawing's unit."""
+def _width(line: Any) -> float:
+    """Return the width of a polyline in the unit of the drawing, or 0 if the line has no width or a varying width."""
     if line.dxftype() != "LWPOLYLINE":
         return 0.0
     widths = {line.dxf.const_width or width for width in chain(*line.get_points("se"))}
@@ -97,9 +125,17 @@ def _width_of(line: Any) -> float:
 
 
 def _names(document: Any, groups: list[list[Electrode]], scale: float) -> list[str]:
-    """The texts nearest to the corners of each group's pad, or letters."""
-    shown = document.modelspace().query(" ".join(TEXTS))
-    texts = {text.plain_text(): scale * complex(*text.dxf.insert.vec2) for text in shown}
-    pads = [to_complex(np.array(group[0].corners)) for group in groups]
-    names = [min(texts, key=lambda text: np.abs(pad - texts[text]).min()) for pad in pads if texts]
-    return names if len(set(names)) == len(groups) else [*ascii_uppercase, *map(str, range(MAX_ELECTRODES))]
+    """Return the text nearest to the first polygon of each group, or letters if two groups have the same text."""
+    texts = {
+        text.plain_text(): scale * complex(*text.dxf.insert.vec2)
+        for text in document.modelspace().query(" ".join(TEXT_TYPES))
+    }
+    names = []
+    for group in groups:
+        corners = to_complex(np.array(group[0].corners))
+        distance = {text: float(np.abs(corners - position).min()) for text, position in texts.items()}
+        if distance:
+            names.append(min(distance, key=lambda text: distance[text]))
+    if len(set(names)) == len(groups):
+        return names
+    return [*ascii_uppercase, *(str(number) for number in range(MAX_ELECTRODES))]
