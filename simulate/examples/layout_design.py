@@ -9,10 +9,10 @@ Where the largest error in the area is smallest. A search from 24 random layouts
 import matplotlib.pyplot as plt
 
 from isocharge.simulate import DesignCase, design, load_sensor
-from isocharge.simulate.layout.case import KNOWN
+from isocharge.simulate.layout.case import NO_NUISANCES
 from isocharge.simulate.plots.film import draw_layout
 
-result = design(DesignCase(load_sensor("three-25um-biaxial"), electrodes=3, radius=8.0, nuisances=KNOWN))
+result = design(DesignCase(load_sensor("three-25um-biaxial"), electrodes=3, radius=8.0, nuisances=NO_NUISANCES))
 figure, pair = plt.subplots(1, 2, figsize=(11.0, 5.0), layout="constrained", sharex=True, sharey=True)
 layouts = ((result.case.sensor, result.before), (result.sensor, result.after))
 most = layouts[0][1].known.max()

@@ -21,8 +21,8 @@ FILES = ["design.json", "design.png", "layout.dxf", "layout.svg", "sensor.toml"]
 @pytest.fixture
 def _rough(monkeypatch):
     """A rough search without a look for folds: the command's own takes half a minute."""
-    monkeypatch.setattr(case_module, "CELLS", 12)
-    monkeypatch.setattr(case_module, "PRESSES", 50)
+    monkeypatch.setattr(case_module, "FINE_GRID_STEPS", 12)
+    monkeypatch.setattr(case_module, "MAX_SEARCH_PRESSES", 50)
     monkeypatch.setattr(search_module, "STARTS", 2)
     monkeypatch.setattr(charge_table, "DISTANCES", (2, 8))
     monkeypatch.setattr(design_module, "ambiguities", lambda *_: design_module.UNAMBIGUOUS)

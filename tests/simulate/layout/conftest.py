@@ -1,4 +1,4 @@
-"""A table of charges that the tests of layouts share, a small one: presses within 4 mm."""
+"""Small table of charges, for presses within 4 mm, that the tests of layouts share."""
 
 from dataclasses import replace
 
@@ -18,6 +18,6 @@ def sensor():
 
 @pytest.fixture(scope="session")
 def tables(sensor):
-    """Of two sensors with the same film."""
+    """Tables of two sensors that have the same film, by the name of the sensor."""
     table, uniaxial = kept(ChargeTable.solve, sensor, Circle(1.0), 1.0, RADIUS), load_sensor("four-25um-uniaxial")
     return {sensor.name: table, uniaxial.name: replace(table, piezo=(uniaxial.piezo.d31, uniaxial.piezo.d32))}

@@ -1,4 +1,4 @@
-"""What can be asked: rules against distances by hand, goals, and what is refused before anything is solved."""
+"""Design cases: distance rules, goals, weight maps, and errors that are raised before the film is solved."""
 
 from dataclasses import replace
 
@@ -11,20 +11,21 @@ from isocharge.simulate.layout.case import DesignCase, Nuisances, WeightMap, rea
 from isocharge.simulate.layout.design import design
 
 
-def test_rules_are_distances(sensor):
-    """Squares of 2 mm: A stays at (10, 0) with a side of 3 mm."""
+def test_clearances_are_distances_from_rim_kept_electrodes_and_other_squares(sensor):
+    """The new squares have a side of 2 mm. A is kept at (10, 0) and has a side of 3 mm."""
     case = DesignCase(sensor, 4, 8.0, keep=("A",), side=2.0)
     places = np.array([[14.0, 1.0], [-7.0, 43.0], [-7.0, 40.0]])
-    by_rim, by_stay = 44.0 - np.hypot([15.0, 8.0, 8.0], [2.0, 44.0, 41.0]), [4.0 - 2.5 - 0.5, 40.0, 37.0]
-    assert case.room(places) == pytest.approx(np.minimum(by_rim, by_stay))
-    assert case.apart(places[1:2], places)[0] == pytest.approx([42.0 - 2.5, -2.5, 3.0 - 2.5])
+    from_rim = 44.0 - np.hypot([15.0, 8.0, 8.0], [2.0, 44.0, 41.0])
+    from_kept = [4.0 - 2.5 - 0.5, 40.0, 37.0]
+    assert case.clearance(places) == pytest.approx(np.minimum(from_rim, from_kept))
+    assert case.pair_clearance(places[1:2], places)[0] == pytest.approx([42.0 - 2.5, -2.5, 3.0 - 2.5])
     traced = sensor.electrodes[0].with_trace(((10.0, 0.0), (30.0, 0.0)), 0.5)
     case_of_trace = replace(case, sensor=replace(sensor, electrodes=(traced, *sensor.electrodes[1:])))
-    assert case_of_trace.room(np.array([[20.0, 3.0], [14.0, -9.0]])) == pytest.approx([3.0 - 1.75, 9.0 - 3.0])
-    assert case.spare(places) == pytest.approx([*case.room(places), 39.5, 36.5, 0.5])
+    assert case_of_trace.clearance(np.array([[20.0, 3.0], [14.0, -9.0]])) == pytest.approx([3.0 - 1.75, 9.0 - 3.0])
+    assert case.all_clearances(places) == pytest.approx([*case.clearance(places), 39.5, 36.5, 0.5])
 
 
-def test_new_squares_are_named_anticlockwise_by_free_letters(sensor):
+def test_new_squares_are_named_anticlockwise_with_unused_letters(sensor):
     case = DesignCase(replace(sensor, calibration=Calibration(rotation=0.1)), 4, 8.0)
     made = case.layout(np.array([[0.0, -5.0], [9.0, 1.0], [-9.0, 1.0], [0.0, 5.0]]))
     assert [e.centre for e in made.electrodes] == [(9.0, 1.0), (0.0, 5.0), (-9.0, 1.0), (0.0, -5.0)]
@@ -37,56 +38,74 @@ def test_new_squares_are_named_anticlockwise_by_free_letters(sensor):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"electrodes": 2}, "expected 3 to 8, got 2; .* three unknowns"),
-        ({"electrodes": 9}, "expected 3 to 8"),
-        ({"radius": 44.5}, "leave the film of radius 45 mm"),
-        ({"radius": -1.0}, "radius: expected a positive number"),
-        ({"force": 1e4}, "beyond small strains"),
-        ({"keep": ("A", "A")}, "expected different names"),
-        ({"keep": ("A", "B", "C", "D")}, "nothing to place"),
-        ({"keep": ("Q",)}, "no electrode 'Q'"),
-        ({"gap": -1.0}, "gap: expected a length from 0 mm"),
-        ({"side": 0.0}, "side: expected a length"),
-        ({"noise": NoiseModel("mine", 0.0, 1e-3)}, "expected white noise above 0"),
-        ({"goal": WeightMap("map.csv", np.array([[20.0, 0.0, 0.0]]))}, "no place within the radius"),
-        ({"sensor": {"calibration": Calibration(rotation=0.1)}, "keep": ("A",)}, "is calibrated"),
-        ({"sensor": {"readout": "edge"}, "keep": ("A",), "side": 2.0}, "all squares have one side"),
+        pytest.param({"electrodes": 2}, "expected 3 to 8, got 2; .* three unknowns", id="too few electrodes"),
+        pytest.param({"electrodes": 9}, "expected 3 to 8", id="too many electrodes"),
+        pytest.param({"radius": 44.5}, "leave the film of radius 45 mm", id="radius beyond the film"),
+        pytest.param({"radius": -1.0}, "radius: expected a positive number", id="negative radius"),
+        pytest.param({"force": 1e4}, "beyond small strains", id="force too large"),
+        pytest.param({"keep": ("A", "A")}, "expected different names", id="duplicate kept name"),
+        pytest.param({"keep": ("A", "B", "C", "D")}, "nothing to place", id="all electrodes kept"),
+        pytest.param({"keep": ("Q",)}, "no electrode 'Q'", id="unknown kept electrode"),
+        pytest.param({"gap": -1.0}, "gap: expected a length from 0 mm", id="negative gap"),
+        pytest.param({"side": 0.0}, "side: expected a length", id="side of zero"),
+        pytest.param({"noise": NoiseModel("mine", 0.0, 1e-3)}, "expected white noise above 0", id="no white noise"),
+        pytest.param(
+            {"goal": WeightMap("map.csv", np.array([[20.0, 0.0, 0.0]]))},
+            "no position within the radius",
+            id="weights of zero",
+        ),
+        pytest.param(
+            {"sensor": {"calibration": Calibration(rotation=0.1)}, "keep": ("A",)},
+            "is calibrated",
+            id="kept electrode of a calibrated sensor",
+        ),
+        pytest.param(
+            {"sensor": {"readout": "edge"}, "keep": ("A",), "side": 2.0},
+            "all squares have one side",
+            id="different sides with edge readout",
+        ),
     ],
 )
-def test_impossible_cases(sensor, changes, message):
+def test_impossible_design_case_raises_input_error(sensor, changes, message):
     with pytest.raises(InputError, match=message):
         DesignCase(
             **{"electrodes": 4, "radius": 8.0, **changes, "sensor": replace(sensor, **changes.get("sensor", {}))}
         )
 
 
-def test_an_impossible_nuisance():
+def test_negative_nuisance_raises_input_error():
     with pytest.raises(InputError, match="pretension: expected a number from 0"):
         Nuisances(pretension=-1.0)
 
 
-def test_squares_that_do_not_fit_are_refused_before_anything_is_solved(sensor):
+def test_squares_that_do_not_fit_raise_input_error_before_the_film_is_solved(sensor):
     wall = replace(sensor, electrodes=(Electrode.of_square("A", (0.0, 0.0), 60.0),))
     for case in (DesignCase(sensor, 8, 8.0, side=30.0), DesignCase(wall, 4, 8.0, keep=("A",), side=20.0)):
         with pytest.raises(InputError, match="do not fit"):
             design(case)
 
 
-def test_a_map_of_what_matters(tmp_path):
+def test_weight_map_interpolates_linearly_and_extrapolates_the_nearest_weight(tmp_path):
     path = tmp_path / "map.csv"
     path.write_text("\ufeffx_mm, y_mm, weight\n0,0,1\n10,0,0\n0,10,0\n")
     goal = read_goal(str(path))
     assert goal.weigh(np.array([[0.0, 0.0], [5.0, 0.0], [20.0, 0.0]])) == pytest.approx([1.0, 0.5, 0.0])
     assert goal.name == "map.csv"
     line = WeightMap("line", np.array([[1.0, 0.0, 2.0], [1.0, 10.0, 3.0]]))
-    assert line.weigh(np.array([[5.0, 4.0], [1.0, 6.0]])).tolist() == [2.0, 3.0]  # nothing lies between them
+    assert line.weigh(np.array([[5.0, 4.0], [1.0, 6.0]])).tolist() == [2.0, 3.0]  # points on a line span no triangles
 
 
 @pytest.mark.parametrize(
     "text",
-    ["x,y,w\n1,2,3\n", "x_mm,y_mm,weight\n1,2\n", "x_mm,y_mm,weight\n1,2,-1\n", "x_mm,y_mm,weight\n1,nan,1\n", ""],
+    [
+        pytest.param("x,y,w\n1,2,3\n", id="wrong header"),
+        pytest.param("x_mm,y_mm,weight\n1,2\n", id="missing column"),
+        pytest.param("x_mm,y_mm,weight\n1,2,-1\n", id="negative weight"),
+        pytest.param("x_mm,y_mm,weight\n1,nan,1\n", id="NaN"),
+        pytest.param("", id="empty file"),
+    ],
 )
-def test_maps_that_cannot_be_read(tmp_path, text):
+def test_read_goal_of_an_invalid_weight_map_raises_input_error(tmp_path, text):
     path = tmp_path / "map.csv"
     path.write_text(text)
     for goal in (str(path), "best"):

@@ -1,4 +1,4 @@
-"""Charges of electrodes, and their derivatives, against presses that are solved one by one."""
+"""Charge table: charges and derivatives, compared with presses that are solved individually."""
 
 from dataclasses import replace
 
@@ -11,11 +11,12 @@ from isocharge.simulate.mechanics.theory import theory_for
 CENTRES = np.array([[2.0, 1.0], [-7.0, 4.0], [0.5, -12.0]])
 TRIANGLE = Electrode("D", ((8.0, -6.0), (12.0, -5.0), (9.0, -2.0))).with_trace(((10.0, -5.0), (12.0, -20.0)), 0.5)
 TOLERANCE = (3e-4, 0.01, 0.01, 1e-3, 0.03, 1e-3)
-"""For each column, of its largest value; the differences by place and probe radius cross the kink under the probe."""
+"""Tolerance of each column relative to its largest value. The finite differences with respect to position and probe
+radius are less exact, because they cross the kink of the stress under the probe."""
 
 
 @pytest.mark.parametrize(("name", "at"), [("four-25um-biaxial", (0.7, 0.2)), ("four-25um-uniaxial", (-1.3, 3.1))])
-def test_rows_are_the_charges_of_presses_and_their_derivatives(tables, name, at):
+def test_rows_are_the_charges_of_solved_presses_and_their_derivatives(tables, name, at):
     rows = tables[name].rows(np.array([at]), CENTRES, 3.0, (TRIANGLE,))[0]
     sensor, settings = load_sensor(name), SolveSettings(theory=theory_for(load_sensor(name), Circle(1.0), (1.0, 1.0)))
     squares = tuple(Electrode.of_square(*named, 3.0) for named in zip("ABC", CENTRES.tolist(), strict=True))

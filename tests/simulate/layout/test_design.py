@@ -1,4 +1,4 @@
-"""A whole search, a small one: three electrodes over 4 mm."""
+"""Complete design of a small layout with three electrodes for presses within 4 mm."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from isocharge.simulate import ChargeSpline, Domain, ForwardMap, FunctionMap, li
 from isocharge.simulate.layout import case as case_module
 from isocharge.simulate.layout import design as design_module
 from isocharge.simulate.layout import search as search_module
-from isocharge.simulate.layout.case import KNOWN, DesignCase, WeightMap
+from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, WeightMap
 from isocharge.simulate.layout.charge_table import ChargeTable
 from isocharge.simulate.layout.design import UNAMBIGUOUS, ambiguities, design
 from isocharge.simulate.layout.search import Search, random_layouts
@@ -18,19 +18,19 @@ from kept import kept
 
 
 def case_of(sensor, **changes):
-    return DesignCase(sensor, 3, 4.0, nuisances=KNOWN, **changes)
+    return DesignCase(sensor, 3, 4.0, nuisances=NO_NUISANCES, **changes)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _rough(tables, sensor):
-    """Fewer presses, places and layouts; a table and a film that are solved already, and read by other electrodes."""
+    """Fewer presses, positions and layouts, and a table and forward maps that have already been solved."""
     build = ForwardMap.build
     with pytest.MonkeyPatch.context() as patch:
         for module, name, value in (
-            (case_module, "CELLS", 10),
-            (case_module, "PRESSES", 60),
+            (case_module, "FINE_GRID_STEPS", 10),
+            (case_module, "MAX_SEARCH_PRESSES", 60),
             (search_module, "STARTS", 3),
-            (search_module, "GRID", 12),
+            (search_module, "GRID_STEPS", 12),
         ):
             patch.setattr(module, name, value)
         patch.setattr(ChargeTable, "solve", staticmethod(lambda sensor, *_: tables[sensor.name]))
@@ -48,8 +48,8 @@ def centres(found):
     return np.array([electrode.centre for electrode in found.sensor.electrodes])
 
 
-def test_three_electrodes_come_to_lie_on_a_wide_triangle(found, centres):
-    """On a film that is the same in all directions the best three are symmetric, and farther out than they press."""
+def test_three_electrodes_form_an_equilateral_triangle(found, centres):
+    """On an isotropic film the best layout is symmetric, and its electrodes lie farther out than the presses."""
     z = centres @ [1.0, 1j]
     assert np.abs(z) == pytest.approx(np.full(3, np.abs(z).mean()), rel=0.1)
     assert np.abs(z).min() > 7.0
@@ -57,26 +57,26 @@ def test_three_electrodes_come_to_lie_on_a_wide_triangle(found, centres):
     assert (found.summary, found.unambiguous, found.refused) == (UNAMBIGUOUS, True, 0)
 
 
-def test_its_errors_are_those_of_the_forward_map(found):
-    """Another road: solve the new sensor's forward map, make splines, and take their limits."""
+def test_errors_agree_with_the_limits_of_the_forward_map(found):
+    """The limits are computed independently from the forward map of the new sensor."""
     charges = ChargeSpline.of(ForwardMap.build(found.sensor, found.case.probe, 4.0, (1.0, 1.0)))
     contact = np.column_stack([found.after.presses, np.ones(len(found.after.presses))])
     limits = limits_at(charges, contact, found.case.noise).position
-    assert found.after.known == pytest.approx(limits, rel=0.02)
+    assert found.after.noise_alone == pytest.approx(limits, rel=0.02)
     numbers = found.after.to_dict()["noise_alone"]
     worst, rms = limits.max(), np.sqrt(np.mean(limits**2))
     assert (numbers["worst_mm"], numbers["rms_mm"], found.value) == pytest.approx((worst, rms, worst), rel=5e-3)
 
 
-def test_no_neighbour_is_much_better(found, centres, tables):
-    """Electrodes that are moved a little make the worst error larger, or hardly smaller."""
+def test_no_neighbouring_layout_is_better_by_more_than_one_percent(found, centres, tables):
+    """Small random moves of the electrodes do not reduce the largest error noticeably."""
     search, rng = Search(found.case, tables["four-25um-biaxial"]), np.random.default_rng(0)
     assert all(search.value(centres + rng.uniform(-0.4, 0.4, (3, 2))) > 0.99 * found.value for _ in range(20))
 
 
-def test_other_goals_are_better_by_their_own_measure(centres, sensor, tables, monkeypatch):
-    """The root mean square, plain and of the right half alone."""
-    monkeypatch.setattr(search_module, "ROUNDS", 2)
+def test_rms_and_weighted_goals_reduce_their_own_error(centres, sensor, tables, monkeypatch):
+    """The goals are the root mean square over the disk, and over its right half."""
+    monkeypatch.setattr(search_module, "MAX_ROUNDS", 2)
     right = WeightMap("right", np.array([[-4.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.1, 0.0, 1.0], [4.0, 0.0, 1.0]]))
     for goal in ("rms", right):
         search = Search(case_of(sensor, goal=goal), tables["four-25um-biaxial"])
@@ -85,11 +85,11 @@ def test_other_goals_are_better_by_their_own_measure(centres, sensor, tables, mo
         best = np.reshape(numbers, (-1, 2))
         assert value == pytest.approx(search.value(best))
         assert value < min(0.95 * search.value(centres), search.value(start))
-        assert search.case.spare(best).min() > -1e-3
+        assert search.case.all_clearances(best).min() > -1e-3
 
 
-def test_an_ambiguous_layout_is_refused(sensor, monkeypatch):
-    """The next one is taken; where all are ambiguous, the best."""
+def test_ambiguous_layout_is_rejected_for_the_next_one(sensor, monkeypatch):
+    """If all layouts are ambiguous, the one with the smallest error is returned."""
     answers = iter(["it folds", UNAMBIGUOUS])
     monkeypatch.setattr(Search, "refine", lambda _, places: np.append(places[0, 0], places))
     monkeypatch.setattr(design_module, "ambiguities", lambda *_: next(answers))
@@ -100,8 +100,8 @@ def test_an_ambiguous_layout_is_refused(sensor, monkeypatch):
     assert best.value < second.value
 
 
-def test_what_is_ambiguous_is_said(sensor, monkeypatch):
-    """Charges that fold at x = 3 mm, with pairs on both sides; and charges that cannot be interpolated."""
+def test_ambiguities_reports_folds_pairs_and_charges_that_cannot_be_interpolated(sensor, monkeypatch):
+    """The charges of the first map fold at x = 3 mm. The second map cannot be interpolated."""
 
     def charges(contact):
         x, y, force = contact.T

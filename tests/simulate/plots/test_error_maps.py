@@ -8,7 +8,7 @@ from matplotlib.colors import LogNorm
 
 from isocharge.simulate import Circle, load_sensor, noise_model
 from isocharge.simulate.identifiability.identification import LimitMap
-from isocharge.simulate.layout.case import KNOWN, DesignCase, Nuisances
+from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Nuisances
 from isocharge.simulate.layout.design import Design, ErrorMap
 from isocharge.simulate.numerics.disk import Rings
 from isocharge.simulate.plots.error_maps import error_maps_picture, identification_picture
@@ -18,7 +18,8 @@ PRESSES = 4.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [0.5, 1.0], [0
 
 
 @pytest.mark.parametrize(
-    ("nuisances", "before", "known"), [(KNOWN, False, "everything else known"), (Nuisances(), True, "nobody knows")]
+    ("nuisances", "before", "known"),
+    [(NO_NUISANCES, False, "everything else known"), (Nuisances(), True, "nobody knows")],
 )
 def test_a_design_is_drawn_with_its_worst_place(nuisances, before, known):
     errors = ErrorMap(PRESSES, np.ones(5), np.array([0.1, 0.2, 0.1, 3.0, 0.3]))

@@ -23,7 +23,7 @@ from isocharge.simulate import Circle, load_sensor, noise_model, parse_probe
 from isocharge.simulate.artwork.design_folder import write_design
 from isocharge.simulate.artwork.leads import straight_leads
 from isocharge.simulate.execution.code_version import code_fingerprint
-from isocharge.simulate.layout.case import KNOWN, DesignCase, Nuisances, WeightMap, read_goal
+from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Nuisances, WeightMap, read_goal
 from isocharge.simulate.layout.design import Design, design
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 
@@ -90,7 +90,7 @@ def design_command(
         probe=footprint,
         force=force,
         noise=noise_model(noise),
-        nuisances=KNOWN if known else Nuisances(),
+        nuisances=NO_NUISANCES if known else Nuisances(),
         side=side,
         seed=seed,
     )

@@ -1,1 +1,1 @@
-"""Where the electrodes should lie: the case, the table of charges, the error that is made small, the search."""
+"""Design of a layout: design case, table of charges, position error, search of the electrode positions."""

@@ -1,11 +1,11 @@
-"""What a layout is designed for: film, presses, what is made small, what nobody knows exactly, and rules."""
+"""Design case of a layout: film, presses, goal of the minimisation, nuisances, and distance rules."""
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
-import scipy  # loads a part when it is used
+import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
@@ -18,34 +18,38 @@ from isocharge.simulate.numerics.disk import lattice, square_grid
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor, electrode_index
 
-FEWEST, MOST = 3, 8
-"""Numbers of electrodes of a design."""
+MIN_ELECTRODES = 3
+"""Smallest number of electrodes of a design."""
 
-SIDE = 3.0
-"""Side of new squares where the sensor has none, mm."""
+MAX_ELECTRODES = 8
+"""Largest number of electrodes of a design."""
+
+DEFAULT_SIDE = 3.0
+"""Side of new squares if the sensor has no square electrodes, mm."""
 
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-"""Names of new electrodes: the first letters that are free."""
+"""Names of new electrodes, of which the first unused ones are taken."""
 
-PRESSES = 300
-"""Presses of the search, at most; the last steps use a fine grid."""
+MAX_SEARCH_PRESSES = 300
+"""Largest number of presses in the exchange. The refinement uses a fine grid."""
 
-CELLS = 50
-"""Steps of the fine grid from the centre outwards."""
+FINE_GRID_STEPS = 50
+"""Number of steps of the fine grid from the centre outwards."""
 
-HEADER = "x_mm,y_mm,weight"
-"""Columns of a map of what matters."""
+WEIGHT_MAP_HEADER = "x_mm,y_mm,weight"
+"""Header of the CSV file of a weight map."""
 
 
 @dataclass(frozen=True)
 class Nuisances:
-    """One standard deviation of each thing that nobody knows exactly when a press is read.
+    """Standard deviations of parameters that are not known exactly when a press is read.
 
     Attributes:
-        probe_radius: mm. A pressure between uniform and that of a rigid flat punch adds 0.05 times the radius to it:
-            beyond the footprint only the second moment of the pressure matters.
-        pretension: What a calibration leaves unknown, MPa.
-        gain: Of every electrode by itself, dimensionless.
+        probe_radius: Standard deviation of the probe radius, mm. An unknown distribution of the pressure, between
+            uniform and that of a rigid flat punch, contributes 0.05 times the radius, because only the second moment of
+            the pressure matters beyond the footprint.
+        pretension: Standard deviation of the pretension after a calibration, MPa.
+        gain: Standard deviation of the relative gain of each electrode, dimensionless.
     """
 
     probe_radius: float = 0.3
@@ -58,85 +62,100 @@ class Nuisances:
                 raise InputError(f"nuisance {name}: expected a number from 0, got {value}")
 
 
-KNOWN = Nuisances(0.0, 0.0, 0.0)
-"""Everything but the press is known."""
+NO_NUISANCES = Nuisances(probe_radius=0.0, pretension=0.0, gain=0.0)
+"""Nuisances for the case that only the contact is unknown."""
 
 
 @dataclass(frozen=True)
 class WeightMap:
-    """How much the error at a place matters.
+    """Weights of the position error as a function of the position.
 
     Attributes:
-        name: Of its file.
-        table: Rows x, y (mm) and weight, shape (n, 3).
+        name: Name of the file.
+        table: Rows of x, y (mm) and weight (dimensionless), shape (n, 3).
     """
 
     name: str
     table: Array
 
     def weigh(self, presses: Array) -> Array:
-        """Weights of presses, shape (n, 2), mm: linear between the places, beyond them that of the nearest."""
-        places, values = self.table[:, :2], self.table[:, 2]
-        weights = scipy.interpolate.NearestNDInterpolator(places, values)(presses)
-        if np.linalg.matrix_rank(places - places[0]) == 2:
-            between = scipy.interpolate.LinearNDInterpolator(places, values)(presses)
-            weights = np.where(np.isnan(between), weights, between)
+        """Compute the weights of presses by linear interpolation, and by the nearest neighbour outside the table.
+
+        Args:
+            presses: Positions (x, y), shape (n, 2), mm.
+
+        Returns:
+            Weights, shape (n,), dimensionless.
+        """
+        positions = self.table[:, :2]
+        values = self.table[:, 2]
+        weights = scipy.interpolate.NearestNDInterpolator(positions, values)(presses)
+        spans_plane = np.linalg.matrix_rank(positions - positions[0]) == 2
+        if spans_plane:
+            linear = scipy.interpolate.LinearNDInterpolator(positions, values)(presses)
+            weights = np.where(np.isnan(linear), weights, linear)
         return np.asarray(weights)
 
 
-Plain = Literal["worst", "rms"]
+NamedGoal = Literal["worst", "rms"]
 
-Goal = Plain | WeightMap
-"""What is made small: the largest error, its root mean square, or that with weights."""
+Goal = NamedGoal | WeightMap
+"""Quantity that a design minimises: the largest error, the root mean square of the errors, or their weighted root mean
+square."""
 
 
 def read_goal(text: str) -> Goal:
-    """A goal from `--goal`: "worst", "rms", or a map of what matters, a CSV file with the columns of `HEADER`.
+    """Convert the value of the option `--goal` into a goal.
+
+    Args:
+        text: "worst", "rms", or the path of a CSV file with the header `WEIGHT_MAP_HEADER`.
 
     Raises:
-        InputError: If it is no goal, or the map cannot be read.
+        InputError: If the text is not a goal, or the file cannot be read.
     """
-    if text in get_args(Plain):
-        return cast(Plain, text)
+    if text in get_args(NamedGoal):
+        return cast(NamedGoal, text)
     try:
         header, *lines = read_whole(Path(text)).decode("utf-8-sig").splitlines()
-        if header.replace(" ", "") != HEADER:
+        if header.replace(" ", "") != WEIGHT_MAP_HEADER:
             raise ValueError(f"the columns are {header!r}")
         table = np.loadtxt(lines, delimiter=",", ndmin=2)
         if table.shape[1:] != (3,) or not len(table) or not np.isfinite(table).all() or table[:, 2].min() < 0.0:
             raise ValueError("expected rows of three finite numbers, the weight from 0")
     except (OSError, ValueError) as error:
-        raise InputError(f"goal {text!r}: expected 'worst', 'rms' or a CSV file {HEADER}: {error}") from error
+        raise InputError(
+            f"goal {text!r}: expected 'worst', 'rms' or a CSV file {WEIGHT_MAP_HEADER}: {error}"
+        ) from error
     return WeightMap(Path(text).name, table)
 
 
-PROBE = Circle(1.0)
-"""The usual footprint."""
+DEFAULT_PROBE = Circle(1.0)
+"""Default probe of a design case, mm."""
 
 
 @dataclass(frozen=True)
 class DesignCase:
-    """What is asked of a design; lengths in mm, the force in N.
+    """Requirements of a design.
 
     Attributes:
-        sensor: Film, coefficients and readout, and the electrodes that may stay.
-        electrodes: Number of electrodes, those that stay included.
-        radius: Largest distance of a press from the film's centre.
-        goal: What is made small.
-        keep: Names of the sensor's electrodes that stay where they are.
-        probe: Footprint, round.
-        force: Of the presses.
-        noise: Of the readings.
-        nuisances: What nobody knows exactly.
-        side: Of the new squares; None for that of the sensor's squares.
-        gap: Smallest distance between two electrodes, along x or along y.
-        rim: Smallest distance of an electrode from the film's rim.
-        seed: Of the random layouts that the search starts from.
+        sensor: Sensor with the film, its coefficients and readout, and the electrodes that may be kept.
+        electrodes: Number of electrodes, including those that are kept.
+        radius: Largest distance of a press from the centre of the film, mm.
+        goal: Quantity that is minimised.
+        keep: Names of the electrodes of the sensor that keep their positions.
+        probe: Circular probe.
+        force: Force of the presses, N.
+        noise: Noise of the readings.
+        nuisances: Standard deviations of the parameters that are not known exactly.
+        side: Side of the new squares, mm; None for the side of the squares of the sensor.
+        gap: Smallest distance between two electrodes along x or along y, mm.
+        rim: Smallest distance of an electrode from the rim of the film, mm.
+        seed: Seed of the random layouts from which the search starts.
 
     Raises:
-        InputError: If a number is impossible or nothing is left to place.
-        SceneError: If some presses cannot exist.
-        SensorError: If an electrode that stays does not exist.
+        InputError: If a number is out of range, or all electrodes are kept.
+        SceneError: If the film cannot be pressed as required.
+        SensorError: If a kept electrode does not exist.
     """
 
     sensor: Sensor
@@ -144,7 +163,7 @@ class DesignCase:
     radius: float
     goal: Goal = "worst"
     keep: tuple[str, ...] = ()
-    probe: Circle = PROBE
+    probe: Circle = DEFAULT_PROBE
     force: float = 1.0
     noise: NoiseModel = NOISE_LEVELS["reference"]
     nuisances: Nuisances = Nuisances()
@@ -154,100 +173,139 @@ class DesignCase:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not FEWEST <= self.electrodes <= MOST:
+        if not MIN_ELECTRODES <= self.electrodes <= MAX_ELECTRODES:
             raise InputError(
-                f"electrodes: expected {FEWEST} to {MOST}, got {self.electrodes}; x, y and the force of a press are "
-                "three unknowns"
+                f"electrodes: expected {MIN_ELECTRODES} to {MAX_ELECTRODES}, got {self.electrodes}; x, y and the force "
+                "of a press are three unknowns"
             )
         check_family(self.sensor.coated_film, self.probe, Domain(self.radius, (self.force, self.force)))
-        for name, value, least in (("gap", self.gap, 0.0), ("rim", self.rim, 0.0), ("side", self.square_side, 1e-2)):
-            if not (np.isfinite(value) and value >= least):
-                raise InputError(f"{name}: expected a length from {least:g} mm, got {value} mm")
+        _check_length("gap", self.gap, 0.0)
+        _check_length("rim", self.rim, 0.0)
+        _check_length("side", self.square_side, 1e-2)
         if not self.noise.white > 0.0:
             raise InputError(
-                f"noise {self.noise.name!r}: expected white noise above 0: without it errors have no limit"
+                f"noise {self.noise.name!r}: expected white noise above 0, because errors have no lower limit "
+                "without noise"
             )
-        if not self.weights(self.presses).max() > 0.0:
-            raise InputError(f"goal {self.goal_name}: no place within the radius has a weight above 0")
-        self._check_stay()
+        if not self.weights(self.search_presses).max() > 0.0:
+            raise InputError(f"goal {self.goal_name}: no position within the radius has a weight above 0")
+        self._check_kept_electrodes()
 
-    def _check_stay(self) -> None:
+    def _check_kept_electrodes(self) -> None:
+        """Check the names of the kept electrodes, and the side of the new squares for the readout 'edge'."""
         if len(set(self.keep)) < len(self.keep):
             raise InputError(f"keep: expected different names, got {', '.join(self.keep)}")
         if len(self.keep) >= self.electrodes:
-            raise InputError(f"keep: {len(self.keep)} of {self.electrodes} electrodes stay: there is nothing to place")
-        if self.stay and self.sensor.calibration != Calibration():
+            raise InputError(
+                f"keep: {len(self.keep)} of {self.electrodes} electrodes are kept, so there is nothing to place"
+            )
+        if self.kept_electrodes and self.sensor.calibration != Calibration():
             raise InputError(f"keep: {self.sensor.name} is calibrated; start from its layout without [calibration]")
-        sides = {e.corners[1][0] - e.corners[0][0] for e in self.stay if e.square}
+        sides = {e.corners[1][0] - e.corners[0][0] for e in self.kept_electrodes if e.square}
         if self.sensor.readout == "edge" and any(abs(side - self.square_side) > 1e-6 for side in sides):
             raise InputError(f"side: with the readout 'edge' all squares have one side, got {self.square_side:g} mm")
 
     @property
     def square_side(self) -> float:
         """Side of the new squares, mm."""
-        given = (e.corners[1][0] - e.corners[0][0] for e in self.sensor.electrodes if e.square)
-        return float(self.side if self.side is not None else next(given, SIDE))
+        if self.side is not None:
+            return float(self.side)
+        squares = [electrode for electrode in self.sensor.electrodes if electrode.square]
+        if not squares:
+            return DEFAULT_SIDE
+        corners = squares[0].corners
+        return float(corners[1][0] - corners[0][0])
 
     @property
-    def stay(self) -> tuple[Electrode, ...]:
-        """The electrodes that stay."""
+    def kept_electrodes(self) -> tuple[Electrode, ...]:
+        """Electrodes of the sensor that keep their positions."""
         return tuple(self.sensor.electrodes[electrode_index(self.sensor, name)] for name in self.keep)
 
     @property
-    def new(self) -> int:
-        """Number of electrodes that are placed."""
+    def new_count(self) -> int:
+        """Number of electrodes to place."""
         return self.electrodes - len(self.keep)
 
     @property
     def goal_name(self) -> str:
-        """The goal for people: "worst", "rms" or the name of a map's file."""
+        """Name of the goal: "worst", "rms" or the file name of a weight map."""
         return self.goal.name if isinstance(self.goal, WeightMap) else self.goal
 
     @property
-    def presses(self) -> Array:
-        """Places of the presses of the search, shape (n, 2), mm."""
-        at = self.radius * lattice(PRESSES)
-        return np.stack([at.real, at.imag], axis=1)
+    def search_presses(self) -> Array:
+        """Positions of the presses of the exchange, shape (n, 2), mm."""
+        z = self.radius * lattice(MAX_SEARCH_PRESSES)
+        return np.stack([z.real, z.imag], axis=1)
 
     @property
-    def grid(self) -> Array:
-        """A fine grid of presses, shape (n, 2), mm: the worst lies beside electrodes, and a coarse one hides it."""
-        return square_grid(self.radius, self.radius / CELLS)
+    def fine_grid(self) -> Array:
+        """Positions of presses on a fine grid, shape (n, 2), mm. A coarse grid misses the largest error, which occurs
+        mostly beside an electrode."""
+        return square_grid(self.radius, self.radius / FINE_GRID_STEPS)
 
     def weights(self, presses: Array) -> Array:
-        """What presses, shape (n, 2), count in the goal, shape (n,)."""
+        """Return the weights of presses in the goal, shape (n,), for positions of shape (n, 2), mm."""
         return self.goal.weigh(presses) if isinstance(self.goal, WeightMap) else np.ones(len(presses))
 
-    def room(self, places: Array) -> Array:
-        """Distance to spare of single squares from the rim and the electrodes that stay, (n, 2) to (n,), mm."""
-        half = 0.5 * self.square_side
-        to_rim = self.sensor.film.radius - self.rim - np.hypot(*(np.abs(places) + half).T)
-        boxes = (box for electrode in self.stay for box in zip(*electrode.boxes, strict=True))
-        to_boxes = [(np.maximum(low - places, places - high) - half).max(axis=1) - self.gap for low, high in boxes]
-        return np.asarray(np.min([to_rim, *to_boxes], axis=0))
+    def clearance(self, positions: Array) -> Array:
+        """Compute by how much single squares exceed the smallest distances from the rim and the kept electrodes.
 
-    def apart(self, places: Array, others: Array) -> Array:
-        """Distance to spare between squares at `places` (n, 2) and `others` (m, 2), shape (n, m), mm."""
-        return np.asarray(np.abs(places[:, None] - others).max(axis=2) - self.square_side - self.gap)
+        Args:
+            positions: Centres of the squares, shape (n, 2), mm.
 
-    def spare(self, places: Array) -> Array:
-        """All distances to spare of a layout, shape (n + n (n - 1) / 2,), mm: negative where a rule is broken."""
-        pairs = self.apart(places, places)[np.triu_indices(len(places), 1)]
-        return np.concatenate([self.room(places), pairs])
+        Returns:
+            Excess distance, shape (n,), mm; negative if a rule is violated.
+        """
+        half_side = 0.5 * self.square_side
+        corner_distance = np.hypot(*(np.abs(positions) + half_side).T)
+        clearances = [self.sensor.film.radius - self.rim - corner_distance]
+        for electrode in self.kept_electrodes:
+            for low, high in zip(*electrode.boxes, strict=True):
+                distance = np.maximum(low - positions, positions - high) - half_side
+                clearances.append(distance.max(axis=1) - self.gap)
+        return np.asarray(np.min(clearances, axis=0))
 
-    def layout(self, places: Array) -> Sensor:
-        """The sensor with new squares at places (n, 2), named anticlockwise, beside the electrodes that stay."""
-        at = places[np.argsort(np.arctan2(places[:, 1], places[:, 0]) % (2.0 * np.pi))]
-        free = [name for name in NAMES if name not in self.keep]
+    def pair_clearance(self, positions: Array, others: Array) -> Array:
+        """Compute by how much pairs of new squares exceed the smallest distance between electrodes.
+
+        Args:
+            positions: Centres of the first squares, shape (n, 2), mm.
+            others: Centres of the second squares, shape (m, 2), mm.
+
+        Returns:
+            Excess distance, shape (n, m), mm; negative if the rule is violated.
+        """
+        distance = np.abs(positions[:, None] - others).max(axis=2)
+        return np.asarray(distance - self.square_side - self.gap)
+
+    def all_clearances(self, positions: Array) -> Array:
+        """Compute the excess distances of all rules for a layout, shape (n + n (n - 1) / 2,), mm.
+
+        Args:
+            positions: Centres of the new squares, shape (n, 2), mm.
+        """
+        pairs = np.triu_indices(len(positions), 1)
+        return np.concatenate([self.clearance(positions), self.pair_clearance(positions, positions)[pairs]])
+
+    def layout(self, positions: Array) -> Sensor:
+        """Create the sensor with new squares and the kept electrodes. The new squares are named anticlockwise.
+
+        Args:
+            positions: Centres of the new squares, shape (n, 2), mm.
+        """
+        angle = np.arctan2(positions[:, 1], positions[:, 0]) % (2.0 * np.pi)
+        anticlockwise = positions[np.argsort(angle)]
+        unused_names = [name for name in NAMES if name not in self.keep]
         squares = [
-            Electrode.of_square(name, (x, y), self.square_side) for name, (x, y) in zip(free, at.tolist(), strict=False)
+            Electrode.of_square(name, (x, y), self.square_side)
+            for name, (x, y) in zip(unused_names, anticlockwise.tolist(), strict=False)
         ]
-        electrodes = tuple(sorted((*self.stay, *squares), key=lambda electrode: electrode.name))
+        electrodes = tuple(sorted((*self.kept_electrodes, *squares), key=lambda electrode: electrode.name))
         name = f"{self.sensor.name}-{self.electrodes}-over-{self.radius:g}mm"
         return replace(self.sensor, name=name, electrodes=electrodes, calibration=Calibration())
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: everything that the design depends on, beside the sensor and the weights."""
+        """Return all parameters of the case for JSON, except the sensor and the weights."""
         return {
             "electrodes": self.electrodes,
             "radius_mm": self.radius,
@@ -266,3 +324,9 @@ class DesignCase:
             "rim_mm": self.rim,
             "seed": self.seed,
         }
+
+
+def _check_length(name: str, value: float, minimum: float) -> None:
+    """Raise an InputError if a length (mm) is not finite or smaller than the minimum (mm)."""
+    if not (np.isfinite(value) and value >= minimum):
+        raise InputError(f"{name}: expected a length from {minimum:g} mm, got {value} mm")

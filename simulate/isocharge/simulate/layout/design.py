@@ -1,4 +1,4 @@
-"""The design of a layout: solve, search, refine, and refuse what is ambiguous."""
+"""Design of a layout: table of charges, search, refinement, and rejection of ambiguous layouts."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -15,57 +15,60 @@ from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
 from isocharge.simulate.identifiability.folds import find_folds
-from isocharge.simulate.layout.case import KNOWN, DesignCase, Nuisances
+from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase
 from isocharge.simulate.layout.charge_table import ChargeTable
 from isocharge.simulate.layout.position_error import ErrorModel
 from isocharge.simulate.layout.search import Search, random_layouts
 from isocharge.simulate.numerics.disk import Rings
 from isocharge.simulate.sensor.sensor import Sensor
 
-DIGITS = 3
-"""Places are rounded to a micrometre: decimals of a millimetre."""
+DECIMALS = 3
+"""Number of decimals to which positions in mm are rounded. It corresponds to one micrometre."""
 
 UNAMBIGUOUS = "no folds, no ambiguous pairs"
-"""What is said of a layout that has neither."""
+"""Summary of a layout without folds and ambiguous pairs."""
 
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """Least position errors of one layout under the presses of a case.
+    """Lower limits of the position error of one layout under the presses of a design case.
 
     Attributes:
-        presses: Square grid, shape (n, 2), mm.
-        known: Errors if everything but the press is known, shape (n,), mm.
-        unknown: Errors with the nuisances of the case, likewise.
+        presses: Positions of the presses on a square grid, shape (n, 2), mm.
+        noise_alone: Errors caused by the noise if there are no nuisances, shape (n,), mm.
+        with_nuisances: Errors with the nuisances of the case, shape (n,), mm.
     """
 
     presses: Array
-    known: Array
-    unknown: Array
+    noise_alone: Array
+    with_nuisances: Array
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
-        """Worst error, its place and the root mean square for each level of knowledge, mm."""
+        """Return the largest error, its position and the root mean square, without and with nuisances, for JSON."""
         return {
-            name: {
-                "worst_mm": float(errors.max()),
-                "rms_mm": float(np.sqrt(np.mean(errors**2))),
-                "worst_at_mm": self.presses[np.argmax(errors)].round(DIGITS).tolist(),
-            }
-            for name, errors in (("noise_alone", self.known), ("with_nuisances", self.unknown))
+            "noise_alone": self._statistics(self.noise_alone),
+            "with_nuisances": self._statistics(self.with_nuisances),
+        }
+
+    def _statistics(self, errors: Array) -> dict[str, Any]:
+        return {
+            "worst_mm": float(errors.max()),
+            "rms_mm": float(np.sqrt(np.mean(errors**2))),
+            "worst_at_mm": self.presses[np.argmax(errors)].round(DECIMALS).tolist(),
         }
 
 
 @dataclass(frozen=True)
 class Design:
-    """A designed layout.
+    """Result of the design of a layout.
 
     Attributes:
-        case: What was asked.
-        sensor: The sensor with the new layout.
-        value: What was made small, mm.
-        summary: Folds and ambiguous pairs of the new layout over the forces of use, for people.
-        refused: Number of better layouts that are ambiguous.
-        before: Errors of the sensor that it began from; None if that has fewer than three electrodes.
+        case: Design case.
+        sensor: Sensor with the new layout.
+        value: Quantity that the search minimised, for the new layout, mm.
+        summary: Sentence about folds and ambiguous pairs of the new layout over the default range of forces.
+        refused: Number of layouts with a smaller error that were rejected because they are ambiguous.
+        before: Errors of the initial sensor; None if it has fewer than three electrodes.
         after: Errors of the new layout.
     """
 
@@ -79,15 +82,15 @@ class Design:
 
     @property
     def unambiguous(self) -> bool:
-        """Whether no two contacts give the same charges, as far as known."""
+        """Whether neither folds nor ambiguous pairs were found."""
         return self.summary == UNAMBIGUOUS
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: the case, the layout, its errors and those of the sensor it began from, and what was checked."""
+        """Return the case, the layout, the errors before and after, and the result of the checks, for JSON."""
         return {
             "case": self.case.to_dict(),
             "sensor": self.sensor.name,
-            "electrodes_mm": {e.name: np.round(e.centre, DIGITS).tolist() for e in self.sensor.electrodes},
+            "electrodes_mm": {e.name: np.round(e.centre, DECIMALS).tolist() for e in self.sensor.electrodes},
             "before": self.before.to_dict() if self.before else None,
             "after": self.after.to_dict(),
             "unambiguous": self.unambiguous,
@@ -97,35 +100,51 @@ class Design:
 
 
 def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
-    """The layout whose position errors are smallest: a minute for four electrodes.
+    """Find the layout with the smallest position errors that has neither folds nor ambiguous pairs.
+
+    If all refined layouts are ambiguous, the one with the smallest error is returned.
 
     Args:
-        case: What is asked.
-        executor: Runs solves and refinements, in this process by default. The result does not depend on it.
+        case: Design case.
+        executor: Executor that runs the solves and the refinements; this process if absent. The result does not depend
+            on the executor.
 
     Raises:
         InputError: If the electrodes do not fit.
         SolveError: If an equilibrium is not reached.
     """
-    places, starts = random_layouts(case)
+    grid, initial_layouts = random_layouts(case)
     table = ChargeTable.solve(case.sensor, case.probe, case.force, case.radius, executor)
     search = Search(case, table)
-    optima = search.optima(places, starts)
-    refined = sorted(track(in_order(executor, search.refine, optima), "refining", len(optima)), key=lambda row: row[0])
-    candidates = []
-    for value, *numbers in track(refined, "looking for folds and ambiguous pairs"):
-        sensor = case.layout(np.round(np.array(numbers).reshape(-1, 2), DIGITS))
-        candidates.append((sensor, float(value), ambiguities(case, sensor)))
-        if candidates[-1][2] == UNAMBIGUOUS:
+    optima = search.optima(grid, initial_layouts)
+    refined = list(track(in_order(executor, search.refine, optima), "refining", len(optima)))
+    refined.sort(key=lambda row: row[0])
+
+    candidates: list[tuple[Sensor, float, str]] = []
+    for value, *coordinates in track(refined, "looking for folds and ambiguous pairs"):
+        sensor = case.layout(np.round(np.array(coordinates).reshape(-1, 2), DECIMALS))
+        summary = ambiguities(case, sensor)
+        candidates.append((sensor, float(value), summary))
+        if summary == UNAMBIGUOUS:
             break
-    refused = len(candidates) - 1 if candidates[-1][2] == UNAMBIGUOUS else 0
+    refused = len(candidates) - 1 if summary == UNAMBIGUOUS else 0
+    sensor, value, summary = candidates[refused]
     before = error_map(case, table, case.sensor) if len(case.sensor.electrodes) >= 3 else None
-    return Design(case, *candidates[refused], refused, before, error_map(case, table, candidates[refused][0]))
+    return Design(case, sensor, value, summary, refused, before, error_map(case, table, sensor))
 
 
 def ambiguities(case: DesignCase, sensor: Sensor) -> str:
-    """Folds and ambiguous pairs of a layout over the forces of use by its forward map, for people."""
-    low, high = min(DEFAULT_FORCE_RANGE[0], case.force), max(DEFAULT_FORCE_RANGE[1], case.force)
+    """Search folds and ambiguous pairs of a layout over the default range of forces, and summarise them.
+
+    Args:
+        case: Design case.
+        sensor: Sensor with the layout.
+
+    Returns:
+        `UNAMBIGUOUS`, or a sentence about the folds and pairs.
+    """
+    low = min(DEFAULT_FORCE_RANGE[0], case.force)
+    high = max(DEFAULT_FORCE_RANGE[1], case.force)
     forces = sorted({low, case.force, high})
     try:
         charges = ChargeSpline.of(ForwardMap.build(sensor, case.probe, case.radius, (low, high)))
@@ -134,17 +153,17 @@ def ambiguities(case: DesignCase, sensor: Sensor) -> str:
     rings = Rings.spread(case.radius)
     folds = np.concatenate([find_folds(charges, rings, force, case.noise).points for force in forces])
     pairs = sum(len(find_ambiguous_pairs(charges, case.noise, force)) for force in forces)
-    found = [f"the map folds {np.hypot(*folds.T).min():.1f} mm from the centre"] if len(folds) else []
+    found = []
+    if len(folds):
+        found.append(f"the map folds {np.hypot(*folds.T).min():.1f} mm from the centre")
     if pairs:
         found.append(f"{pairs} pairs of contacts have the same charges")
     return "; ".join(found) or UNAMBIGUOUS
 
 
 def error_map(case: DesignCase, table: ChargeTable, sensor: Sensor) -> ErrorMap:
-    """Errors of a sensor's electrodes at their nominal places."""
-    rows = table.rows(case.grid, np.empty((0, 2)), 1.0, sensor.electrodes)
-
-    def errors(nuisances: Nuisances) -> Array:
-        return np.sqrt(ErrorModel.of(case.noise, nuisances).squared(rows))
-
-    return ErrorMap(case.grid, errors(KNOWN), errors(case.nuisances))
+    """Compute the errors of the electrodes of a sensor at their nominal positions."""
+    rows = table.rows(case.fine_grid, np.empty((0, 2)), 1.0, sensor.electrodes)
+    noise_alone = np.sqrt(ErrorModel.of(case.noise, NO_NUISANCES).squared(rows))
+    with_nuisances = np.sqrt(ErrorModel.of(case.noise, case.nuisances).squared(rows))
+    return ErrorMap(case.fine_grid, noise_alone, with_nuisances)

@@ -1,11 +1,12 @@
-"""The least position error that a layout allows, with what nobody knows as nuisances.
+"""Lower limit of the position error of a layout, with nuisance parameters.
 
-With A = d(charge) / d(x, y, ln F, nuisances) of all electrodes and W what one reading tells about its charge, the
-information about everything is A' W A + P, P what is known beforehand. The position's part of its inverse is the
-Cramer-Rao limit; that is the Schur complement in which the nuisances are marginalised. Electrodes add up in it, so one
-more changes the inverse B by a product of vectors (Sherman and Morrison 1950): with a = sqrt(w) of its row of A
+Let A = d(charge) / d(x, y, ln F, nuisances) for all electrodes, W the diagonal matrix of the Fisher information that
+one reading provides about its charge, and P the inverse of the prior covariance. The information about all parameters
+is B = A' W A + P, and the block of its inverse that belongs to x and y is the Cramer-Rao limit, in which the nuisances
+are marginalised. Each electrode adds a product of vectors to B. With the row a of sqrt(W) A that belongs to a further
+electrode, the limit changes according to Sherman and Morrison (1950):
 
-    tr_xy (B^-1 + a a')^-1 = tr_xy B - |(B a)_xy|^2 / (1 + a' B a).
+    tr_xy (B + a a')^-1 = tr_xy B^-1 - |(B^-1 a)_xy|^2 / (1 + a' B^-1 a).
 """
 
 from dataclasses import dataclass, replace
@@ -16,59 +17,90 @@ from isocharge.common.arrays import Array
 from isocharge.simulate.layout.case import Nuisances
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
-PRIOR = (50.0, 50.0, 10.0)
-"""Standard deviation of x and y (mm) and ln F before anything is read: errors stay finite where charges say nothing."""
+POSITION_PRIOR_STD = 50.0
+"""Prior standard deviation of x and of y, mm. It keeps the errors finite where the charges provide no information."""
+
+LOG_FORCE_PRIOR_STD = 10.0
+"""Prior standard deviation of ln F, dimensionless."""
 
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """From rows of a `ChargeTable` to squared position errors.
+    """Position errors as a function of the rows of a `ChargeTable`.
 
     Attributes:
-        noise: Noise of the readings, with what is unknown of the gains.
-        scale: Standard deviation of x, y, ln F and the nuisances before anything is read, shape (5,).
+        noise: Noise of the readings, including the uncertainty of the gains.
+        prior_std: Prior standard deviations of x and y (mm), ln F, probe radius (mm) and pretension (MPa), shape (5,).
     """
 
     noise: NoiseModel
-    scale: Array
+    prior_std: Array
 
     @classmethod
     def of(cls, noise: NoiseModel, nuisances: Nuisances) -> "ErrorModel":
-        """Errors with these nuisances."""
+        """Create the model for a noise model and the standard deviations of the nuisances."""
         gain = float(np.hypot(noise.gain, nuisances.gain))
-        return cls(replace(noise, gain=gain), np.array([*PRIOR, nuisances.probe_radius, nuisances.pretension]))
+        prior_std = [
+            POSITION_PRIOR_STD,
+            POSITION_PRIOR_STD,
+            LOG_FORCE_PRIOR_STD,
+            nuisances.probe_radius,
+            nuisances.pretension,
+        ]
+        return cls(replace(noise, gain=gain), np.array(prior_std))
 
     def sensitivity(self, rows: Array) -> Array:
-        """Rows (..., 6) to sqrt(W) A in units of the scale, shape (..., 5): how much each reading tells."""
-        weight = np.sqrt(self.noise.information(rows[..., 0]))
-        return np.asarray(rows[..., 1:] * self.scale * weight[..., None])
+        """Compute sqrt(W) A with the parameters in units of their prior standard deviations.
+
+        Args:
+            rows: Rows of a charge table, shape (..., 6).
+
+        Returns:
+            Sensitivities, dimensionless, shape (..., 5).
+        """
+        charge = rows[..., 0]
+        slopes = rows[..., 1:]
+        return np.asarray(slopes * self.prior_std * np.sqrt(self.noise.information(charge))[..., None])
 
     def squared(self, rows: Array) -> Array:
-        """Squared position errors, shape (n_press,), mm^2, from rows of shape (n_press, n_electrode, 6)."""
+        """Compute the squared position error of each press, shape (n_press,), mm^2.
+
+        Args:
+            rows: Rows of a charge table, shape (n_press, n_electrode, 6).
+        """
         return position_variance(inverse_information(self.sensitivity(rows)))
 
 
 def inverse_information(sensitivity: Array) -> Array:
-    """Inverse of the information of electrodes, (n_press, n_electrode, 5) to (n_press, 5, 5), in units of the scale."""
-    return np.asarray(np.linalg.inv(np.matmul(sensitivity.swapaxes(1, 2), sensitivity) + np.eye(sensitivity.shape[2])))
+    """Invert the information of all electrodes and the prior.
+
+    Args:
+        sensitivity: Sensitivities, shape (n_press, n_electrode, 5).
+
+    Returns:
+        Covariance in units of the prior standard deviations, shape (n_press, 5, 5).
+    """
+    prior_information = np.eye(sensitivity.shape[2])
+    return np.asarray(np.linalg.inv(np.matmul(sensitivity.swapaxes(1, 2), sensitivity) + prior_information))
 
 
 def position_variance(inverse: Array) -> Array:
-    """Squared position error from the inverse information, shape (n_press,), mm^2."""
-    return np.asarray(PRIOR[0] ** 2 * (inverse[:, 0, 0] + inverse[:, 1, 1]))
+    """Compute the squared position error, shape (n_press,), mm^2, from the result of `inverse_information`."""
+    return np.asarray(POSITION_PRIOR_STD**2 * (inverse[:, 0, 0] + inverse[:, 1, 1]))
 
 
 def with_one_more(sensitivity: Array, candidates: Array) -> Array:
-    """Squared errors with each of many candidates beside given electrodes.
+    """Compute the squared errors of a layout with each of many candidates for one further electrode.
 
     Args:
-        sensitivity: Of the electrodes, shape (n_press, n_electrode, 5).
-        candidates: Of one more, shape (n_press, 5, n_candidate).
+        sensitivity: Sensitivities of the electrodes of the layout, shape (n_press, n_electrode, 5).
+        candidates: Sensitivities of the candidates, shape (n_press, 5, n_candidate).
 
     Returns:
-        Shape (n_press, n_candidate), mm^2.
+        Squared position errors, shape (n_press, n_candidate), mm^2.
     """
     inverse = inverse_information(sensitivity)
-    moved = inverse @ candidates
-    gain = (moved[:, :2] ** 2).sum(axis=1) / (1.0 + (moved * candidates).sum(axis=1))
-    return np.asarray(position_variance(inverse)[:, None] - PRIOR[0] ** 2 * gain)
+    inverse_times_candidate = inverse @ candidates
+    position_part = (inverse_times_candidate[:, :2] ** 2).sum(axis=1)
+    reduction = position_part / (1.0 + (inverse_times_candidate * candidates).sum(axis=1))
+    return np.asarray(position_variance(inverse)[:, None] - POSITION_PRIOR_STD**2 * reduction)

@@ -1,22 +1,24 @@
-"""The search: exchange on a grid of places, then the true worst place on a fine grid.
+"""Search of the electrode positions: exchange on a grid, then minimisation of the largest error on a fine grid.
 
-Exchange (Fedorov 1972; Meyer and Nachtsheim 1995): from a random layout, each square in turn goes to the place that is
-best beside the others, until none moves. All places of a grid are compared at once, because one more electrode changes
-the information by a product of vectors. A power mean of the errors is made small there, near the worst one.
+The exchange (Fedorov 1972; Meyer and Nachtsheim 1995) starts from a random layout. Each square in turn is moved to the
+position that gives the smallest error together with the other electrodes, until no square moves. All positions of a
+grid are compared at once, because one further electrode changes the information by a product of vectors. If the goal is
+the largest error, the exchange minimises a power mean of the errors, which is close to the largest error.
 
-A coarse grid hides the worst error, which mostly lies beside an electrode. So the presses that are worst on the fine
-grid become constraints,
+The largest error occurs mostly beside an electrode, where a coarse grid of presses misses it. The refinement therefore
+solves
 
-    make t small with   ln error(press) <= t   at all of them,
+    minimise t   subject to   ln error(press) <= t   for the presses with the largest errors on a fine grid
 
-which sequential quadratic programs solve within a small step; then the worst presses are taken anew.
+by sequential quadratic programming within a small step, and selects the presses again after every step.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy  # loads a part when it is used
+import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import InputError
@@ -27,71 +29,108 @@ from isocharge.simulate.layout.position_error import ErrorModel, with_one_more
 from isocharge.simulate.numerics.disk import square_grid
 
 STARTS = 24
-"""Random layouts that are improved."""
+"""Number of random layouts from which the exchange starts."""
 
-POWERS = {"worst": 12.0, "rms": 2.0}
-"""Power of the errors whose mean the exchange makes small."""
+WORST_POWER = 12.0
+"""Power of the errors in the mean that the exchange minimises if the goal is the largest error, dimensionless."""
 
-SWEEPS, SETTLED = 30, 1e-4
-"""Largest number of exchanges of every square, and the relative gain of all below which they end."""
+RMS_POWER = 2.0
+"""Power of the errors in the mean that the exchange minimises for the other goals, dimensionless."""
 
-GRID, BEYOND = 20, 1.0 / 3.0
-"""Steps of the grid of places from the centre outwards, and how far it reaches beyond the presses, in film radii:
+MAX_SWEEPS = 30
+"""Largest number of sweeps, in each of which every square is exchanged once."""
+
+MIN_SWEEP_GAIN = 1e-4
+"""Relative decrease of the error below which the exchange ends, dimensionless."""
+
+GRID_STEPS = 20
+"""Number of steps of the grid of positions from the centre outwards."""
+
+GRID_EXTENT = 1.0 / 3.0
+"""Distance by which the grid of positions extends beyond the presses, in units of the film radius, dimensionless. The
 charges of electrodes farther out change little."""
 
-FINALISTS, ALIKE = 3, 2e-3
-"""Different layouts that are refined; nearer values, relative, are the same one, turned."""
+MAX_FINALISTS = 3
+"""Largest number of layouts that are refined."""
 
-ROUNDS, STEPS = 8, 25
-"""Largest number of rounds of the refinement, and of quadratic programs in each."""
+MIN_DIFFERENCE = 2e-3
+"""Relative difference of the errors above which two layouts count as different, dimensionless. Layouts that differ less
+are mostly rotations of each other."""
 
-NEARLY, ACTIVE = 0.9, 60
-"""Presses count as worst down to this share of the largest error, and at most so many of them."""
+MAX_ROUNDS = 8
+"""Largest number of rounds of the refinement."""
 
-REACH, LEAST_REACH = 0.2, 0.02
-"""Largest change of a coordinate in the first round over the side, halved after rounds that do not help; the last."""
+MAX_ITERATIONS = 25
+"""Largest number of quadratic programs in a round."""
 
-ENOUGH = 1e-3
-"""Relative gain of a round below which it does not help."""
+ACTIVE_SHARE = 0.9
+"""Error above which a press becomes a constraint, relative to the largest error, dimensionless."""
 
-DIFFERENCE = 1e-2
-"""Step of the optimiser's differences, mm."""
+MAX_ACTIVE = 60
+"""Largest number of presses that become constraints."""
 
-ALL = slice(None)
-"""Every press of the fine grid."""
+FIRST_STEP = 0.2
+"""Largest change of a coordinate in the first round, in units of the side of a square. It is halved after each round
+without improvement."""
+
+LAST_STEP = 0.02
+"""Largest change of a coordinate below which the refinement ends, in units of the side of a square."""
+
+MIN_ROUND_GAIN = 1e-3
+"""Relative decrease of the error below which a round counts as without improvement, dimensionless."""
+
+CLEARANCE_TOLERANCE = 1e-3
+"""Largest violation of a distance rule that a refined layout may have, mm."""
+
+DIFFERENCE_STEP = 1e-2
+"""Step of the finite differences of the optimiser, mm."""
+
+ALL_PRESSES = slice(None)
+"""Selection of all presses of the fine grid."""
 
 
 def random_layouts(case: DesignCase) -> tuple[Array, list[Integers]]:
-    """The grid of places, shape (n, 2), mm, and the numbers of `STARTS` random layouts that keep to the rules.
+    """Choose random layouts on a grid that satisfy the distance rules.
+
+    Args:
+        case: Design case.
+
+    Returns:
+        Positions of the grid, shape (n, 2), mm, and for each of `STARTS` layouts the numbers of its positions, shape
+        (n_new,).
 
     Raises:
         InputError: If the squares do not fit.
     """
-    film = case.sensor.film.radius
-    reach = min(case.radius + BEYOND * film, film - case.rim - 0.5 * case.square_side)
-    places = square_grid(reach, reach / GRID)
-    places = places[case.room(places) >= 0.0]
-    rng, layouts = np.random.default_rng(case.seed), []
-    for _ in range(STARTS):
-        chosen: list[int] = []
-        for number in rng.permutation(len(places)).tolist():
-            if len(chosen) < case.new and (case.apart(places[[number]], places[chosen]) >= 0.0).all():
-                chosen.append(number)
-        layouts.append(np.array(chosen))
-    if min(map(len, layouts)) < case.new:
+    film_radius = case.sensor.film.radius
+    grid_radius = min(case.radius + GRID_EXTENT * film_radius, film_radius - case.rim - 0.5 * case.square_side)
+    grid = square_grid(grid_radius, grid_radius / GRID_STEPS)
+    grid = grid[case.clearance(grid) >= 0.0]
+    rng = np.random.default_rng(case.seed)
+    layouts = [_random_layout(case, grid, rng) for _ in range(STARTS)]
+    if min(map(len, layouts)) < case.new_count:
         raise InputError(
-            f"{case.new} new squares of {case.square_side:g} mm do not fit within {reach:.3g} mm of the centre, with "
-            f"gaps of {case.gap:g} mm; ask for fewer, smaller or nearer electrodes"
+            f"{case.new_count} new squares of {case.square_side:g} mm do not fit within {grid_radius:.3g} mm of the "
+            f"centre, with gaps of {case.gap:g} mm; ask for fewer, smaller or nearer electrodes"
         )
-    return places, layouts
+    return grid, layouts
+
+
+def _random_layout(case: DesignCase, grid: Array, rng: np.random.Generator) -> Integers:
+    """Choose positions of the grid in random order, as many as fit and at most the number of new squares."""
+    chosen: list[int] = []
+    for number in rng.permutation(len(grid)).tolist():
+        if len(chosen) < case.new_count and (case.pair_clearance(grid[[number]], grid[chosen]) >= 0.0).all():
+            chosen.append(number)
+    return np.array(chosen)
 
 
 @dataclass(frozen=True)
 class Search:
-    """The search for one case.
+    """Search of the electrode positions for one design case.
 
     Attributes:
-        case: What is asked.
+        case: Design case.
         table: Charges under the presses of the case.
     """
 
@@ -100,110 +139,180 @@ class Search:
 
     @cached_property
     def model(self) -> ErrorModel:
-        """Errors with the nuisances of the case."""
+        """Error model with the nuisances of the case."""
         return ErrorModel.of(self.case.noise, self.case.nuisances)
 
     @cached_property
-    def fine(self) -> Array:
-        """Presses of the fine grid, shape (n, 2), mm; goals other than the worst error need no finer one."""
-        return self.case.grid if self.case.goal == "worst" else self.case.presses
+    def presses(self) -> Array:
+        """Presses at which layouts are evaluated, shape (n, 2), mm. Only the largest error needs a fine grid."""
+        return self.case.fine_grid if self.case.goal == "worst" else self.case.search_presses
 
     @cached_property
     def weights(self) -> Array:
-        """What the presses of the fine grid count in the goal, shape (n,)."""
-        return self.case.weights(self.fine)
+        """Weight of each press in the goal, shape (n,), dimensionless."""
+        return self.case.weights(self.presses)
 
     @cached_property
-    def staying(self) -> Array:
-        """Rows of the electrodes that stay under the presses of the fine grid."""
-        return self.table.rows(self.fine, np.empty((0, 2)), self.case.square_side, self.case.stay)
+    def kept_rows(self) -> Array:
+        """Rows of the kept electrodes for all presses, shape (n, n_kept, 6)."""
+        return self.table.rows(self.presses, np.empty((0, 2)), self.case.square_side, self.case.kept_electrodes)
 
-    def squared(self, places: Array, which: Integers | slice) -> Array:
-        """Squared errors of a layout under some presses of the fine grid, shape (n_press,), mm^2."""
-        rows = self.table.rows(self.fine[which], places, self.case.square_side)
-        return self.model.squared(np.concatenate([rows, self.staying[which]], axis=1))
+    def squared(self, positions: Array, which: Integers | slice) -> Array:
+        """Compute the squared position errors of a layout.
 
-    def optima(self, places: Array, layouts: list[Integers]) -> list[Array]:
-        """The best different layouts that exchange reaches, each of shape (n_new, 2), mm, the best first."""
-        case, side = self.case, self.case.square_side
-        stay = self.model.sensitivity(self.table.rows(case.presses, places[:0], side, case.stay))
-        squares = self.model.sensitivity(self.table.rows(case.presses, places, side))
-        candidates, apart = np.ascontiguousarray(squares.swapaxes(1, 2)), case.apart(places, places) >= 0.0
-        weight, power = case.weights(case.presses), POWERS["worst" if case.goal == "worst" else "rms"]
+        Args:
+            positions: Centres of the new squares, shape (n_new, 2), mm.
+            which: Selection of presses.
 
-        def errors_with(others: Integers) -> Array:
-            """Power of the mean error with one more square beside others at each place; infinite where too near."""
-            beside = np.concatenate([stay, candidates[:, :, others].swapaxes(1, 2)], axis=1)
-            squared = np.maximum(with_one_more(beside, candidates), 1e-12)
-            errors = np.average(squared ** (0.5 * power), axis=0, weights=weight)
-            errors[~apart[others].all(axis=0)] = np.inf
-            return np.asarray(errors)
+        Returns:
+            Squared errors, shape (n_press,), mm^2.
+        """
+        rows = self.table.rows(self.presses[which], positions, self.case.square_side)
+        return self.model.squared(np.concatenate([rows, self.kept_rows[which]], axis=1))
 
-        def exchanged(start: Integers) -> tuple[float, Integers]:
-            """A layout that no exchange of a single square improves, and its value."""
-            chosen, best = start.copy(), np.inf
-            for _ in range(SWEEPS):
-                for i in range(len(chosen)):
-                    errors = errors_with(np.delete(chosen, i))
-                    chosen[i] = np.argmin(errors)
-                value = float(errors.min() ** (1.0 / power))
-                if value > best * (1.0 - SETTLED):
-                    break
-                best = value
-            return value, chosen
+    def optima(self, grid: Array, layouts: list[Integers]) -> list[Array]:
+        """Improve layouts by exchange and return the best ones that differ.
 
-        optima = sorted((exchanged(start) for start in track(layouts, "exchanging")), key=lambda optimum: optimum[0])
-        different = optima[:1]
-        for value, chosen in optima:
-            if len(different) < FINALISTS and value > different[-1][0] * (1.0 + ALIKE):
-                different.append((value, chosen))
-        return [places[chosen] for _, chosen in different]
+        Args:
+            grid: Positions of the grid, shape (n, 2), mm.
+            layouts: Numbers of the positions of each initial layout, each of shape (n_new,).
 
-    def value(self, places: Array) -> float:
-        """What is made small, mm: the worst error on the fine grid, or the weighted root mean square."""
-        return float(np.exp(self._logs(places, ALL).max()))
+        Returns:
+            Centres of the new squares of each layout, each of shape (n_new, 2), mm, in ascending order of the error.
+        """
+        exchange = _Exchange.of(self, grid)
+        results = [exchange.improve(layout) for layout in track(layouts, "exchanging")]
+        results.sort(key=lambda result: result[0])
+        finalists = results[:1]
+        for value, chosen in results:
+            last_value = finalists[-1][0]
+            if len(finalists) < MAX_FINALISTS and value > last_value * (1.0 + MIN_DIFFERENCE):
+                finalists.append((value, chosen))
+        return [grid[chosen] for _, chosen in finalists]
 
-    def _logs(self, places: Array, which: Integers | slice) -> Array:
-        """Logarithms of the errors that count: of each press, or one of their mean over the fine grid."""
-        squared = self.squared(places, which)
+    def value(self, positions: Array) -> float:
+        """Compute the quantity that the search minimises, mm: the largest error, or the weighted root mean square."""
+        return float(np.exp(self._log_errors(positions, ALL_PRESSES).max()))
+
+    def _log_errors(self, positions: Array, which: Integers | slice) -> Array:
+        """Compute the logarithm of the error of each press, or, for other goals, that of their weighted mean."""
+        squared = self.squared(positions, which)
         if self.case.goal != "worst":
             squared = np.average(squared, weights=self.weights, keepdims=True)
         return np.asarray(0.5 * np.log(squared))
 
-    def refine(self, places: Array) -> Array:
-        """A better layout near one that keeps to the rules: its value, mm, then its coordinates, (1 + 2 n_new,)."""
-        reach, best = REACH, self.value(places)
-        for _ in range(ROUNDS):
-            moved = self._round(places, reach * self.case.square_side)
+    def refine(self, positions: Array) -> Array:
+        """Improve a layout by small steps that satisfy the distance rules.
+
+        Args:
+            positions: Centres of the new squares, shape (n_new, 2), mm.
+
+        Returns:
+            Minimised quantity of the refined layout, mm, followed by its coordinates, mm, shape (1 + 2 n_new,).
+        """
+        step = FIRST_STEP
+        best_value = self.value(positions)
+        for _ in range(MAX_ROUNDS):
+            moved = self._refinement_round(positions, step * self.case.square_side)
             value = self.value(moved)
-            if value < best * (1.0 - ENOUGH) and self.case.spare(moved).min() > -1e-3:
-                places, best = moved, value
-            elif reach > LEAST_REACH:
-                reach *= 0.5
+            satisfies_rules = self.case.all_clearances(moved).min() > -CLEARANCE_TOLERANCE
+            if value < best_value * (1.0 - MIN_ROUND_GAIN) and satisfies_rules:
+                positions = moved
+                best_value = value
+            elif step > LAST_STEP:
+                step *= 0.5
             else:
                 break
-        return np.append(best, places)
+        return np.append(best_value, positions)
 
-    def _round(self, places: Array, reach: float) -> Array:
-        """One sequence of quadratic programs, within `reach` (mm), for the presses that are worst now."""
-        active: Integers | slice = ALL
+    def _refinement_round(self, positions: Array, max_step: float) -> Array:
+        """Run sequential quadratic programming for the presses that have the largest errors.
+
+        Args:
+            positions: Centres of the new squares, shape (n_new, 2), mm.
+            max_step: Largest change of a coordinate, mm.
+
+        Returns:
+            Changed positions, shape (n_new, 2), mm.
+        """
+        active: Integers | slice = ALL_PRESSES
         if self.case.goal == "worst":
-            squared = self.squared(places, ALL)
-            worst = np.argsort(-squared)[:ACTIVE]
-            active = worst[squared[worst] >= NEARLY**2 * squared.max()]
+            squared = self.squared(positions, ALL_PRESSES)
+            largest = np.argsort(-squared)[:MAX_ACTIVE]
+            active = largest[squared[largest] >= ACTIVE_SHARE**2 * squared.max()]
 
-        def spare(variables: Array) -> Array:
+        # The variables are the coordinates, followed by the bound t of the log errors
+        def constraints(variables: Array) -> Array:
             moved = variables[:-1].reshape(-1, 2)
-            return np.concatenate([variables[-1] - self._logs(moved, active), self.case.spare(moved)])
+            bound = variables[-1]
+            return np.concatenate([bound - self._log_errors(moved, active), self.case.all_clearances(moved)])
 
-        only_last = np.append(np.zeros(places.size), 1.0)
-        solved = scipy.optimize.minimize(
+        start = np.append(positions, self._log_errors(positions, active).max())
+        gradient = np.append(np.zeros(positions.size), 1.0)
+        bounds = [*((x - max_step, x + max_step) for x in positions.ravel().tolist()), (None, None)]
+        solution = scipy.optimize.minimize(
             lambda variables: variables[-1],
-            np.append(places, self._logs(places, active).max()),
-            jac=lambda _: only_last,
+            start,
+            jac=lambda _: gradient,
             method="SLSQP",
-            bounds=[*((x - reach, x + reach) for x in places.ravel().tolist()), (None, None)],
-            constraints={"type": "ineq", "fun": spare},
-            options={"maxiter": STEPS, "ftol": 1e-4, "eps": DIFFERENCE},
+            bounds=bounds,
+            constraints={"type": "ineq", "fun": constraints},
+            options={"maxiter": MAX_ITERATIONS, "ftol": 1e-4, "eps": DIFFERENCE_STEP},
         )
-        return np.asarray(solved.x[:-1].reshape(-1, 2))
+        return np.asarray(solution.x[:-1].reshape(-1, 2))
+
+
+@dataclass(frozen=True)
+class _Exchange:
+    """Exchange of single squares on a grid of positions.
+
+    Attributes:
+        mean_error: Function from a layout without one square, as numbers of positions, to the power mean of the errors
+            (before the root) with a further square at each position, shape (n,); infinite where it violates a rule.
+        power: Power of the errors in the mean, dimensionless.
+    """
+
+    mean_error: Callable[[Integers], Array]
+    power: float
+
+    @classmethod
+    def of(cls, search: Search, grid: Array) -> "_Exchange":
+        """Evaluate the sensitivities of a square at every position of the grid, shape (n, 2), mm."""
+        case = search.case
+        presses = case.search_presses
+        kept = search.model.sensitivity(search.table.rows(presses, grid[:0], case.square_side, case.kept_electrodes))
+        squares = search.model.sensitivity(search.table.rows(presses, grid, case.square_side))
+        candidates = np.ascontiguousarray(squares.swapaxes(1, 2))
+        is_allowed = case.pair_clearance(grid, grid) >= 0.0
+        weights = case.weights(presses)
+        power = WORST_POWER if case.goal == "worst" else RMS_POWER
+
+        def mean_error(others: Integers) -> Array:
+            present = np.concatenate([kept, candidates[:, :, others].swapaxes(1, 2)], axis=1)
+            squared = np.maximum(with_one_more(present, candidates), 1e-12)
+            mean = np.average(squared ** (0.5 * power), axis=0, weights=weights)
+            mean[~is_allowed[others].all(axis=0)] = np.inf
+            return np.asarray(mean)
+
+        return cls(mean_error, power)
+
+    def improve(self, layout: Integers) -> tuple[float, Integers]:
+        """Exchange squares until no exchange of a single square improves the layout.
+
+        Args:
+            layout: Numbers of the positions, shape (n_new,).
+
+        Returns:
+            Power mean of the errors, mm, and the numbers of the improved positions, shape (n_new,).
+        """
+        chosen = layout.copy()
+        best_value = np.inf
+        for _ in range(MAX_SWEEPS):
+            for square in range(len(chosen)):
+                mean = self.mean_error(np.delete(chosen, square))
+                chosen[square] = np.argmin(mean)
+            value = float(mean.min() ** (1.0 / self.power))
+            if value > best_value * (1.0 - MIN_SWEEP_GAIN):
+                break
+            best_value = value
+        return value, chosen

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from isocharge.simulate.identifiability.identification import Identification, LimitMap
-from isocharge.simulate.layout.case import KNOWN
+from isocharge.simulate.layout.case import NO_NUISANCES
 from isocharge.simulate.layout.design import Design, ErrorMap
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_circle, draw_electrodes, draw_working_area
@@ -91,7 +91,7 @@ def error_maps_picture(design: Design) -> Figure:
     if design.before:
         layouts.insert(0, (case.sensor, design.before))
     figure = new_figure(6.4 * len(layouts) + 1.0, 6.0)
-    smallest = min(float(errors.unknown.min()) for _, errors in layouts)
+    smallest = min(float(errors.with_nuisances.min()) for _, errors in layouts)
     norm = LogNorm(smallest, MOST_TIMES * smallest)
     electrodes = [electrode for sensor, _ in layouts for electrode in sensor.electrodes]
     corners = np.concatenate([polygon for electrode in electrodes for polygon in electrode.front])
@@ -104,7 +104,7 @@ def error_maps_picture(design: Design) -> Figure:
     bar = figure.colorbar(shown, ax=list(every), label="least position error (rms), mm", shrink=0.85, extend="max")
     bar.ax.yaxis.set_major_formatter(ScalarFormatter())
     bar.ax.yaxis.set_minor_formatter(ScalarFormatter())
-    known = "everything else known" if case.nuisances == KNOWN else "with what nobody knows exactly"
+    known = "everything else known" if case.nuisances == NO_NUISANCES else "with what nobody knows exactly"
     figure.suptitle(f"{case.force:g} N, {case.probe.notation}, noise {case.noise.name}, {known}")
     return figure
 
@@ -112,7 +112,7 @@ def error_maps_picture(design: Design) -> Figure:
 def _draw_errors(axes: Any, sensor: Sensor, errors: ErrorMap, norm: LogNorm) -> Any:
     """Errors as colours, the worst place, and the electrodes."""
     draw_electrodes(axes, sensor)
-    axes.plot(*errors.presses[np.argmax(errors.unknown)], "x", color=FELT, ms=9, mew=2)
-    worst, rms = errors.unknown.max(), np.sqrt(np.mean(errors.unknown**2))
+    axes.plot(*errors.presses[np.argmax(errors.with_nuisances)], "x", color=FELT, ms=9, mew=2)
+    worst, rms = errors.with_nuisances.max(), np.sqrt(np.mean(errors.with_nuisances**2))
     axes.set_title(f"{sensor.name}\nworst {worst:.3g} mm (cross), rms {rms:.3g} mm")
-    return axes.tripcolor(*errors.presses.T, errors.unknown, norm=norm, cmap="viridis", shading="gouraud")
+    return axes.tripcolor(*errors.presses.T, errors.with_nuisances, norm=norm, cmap="viridis", shading="gouraud")
