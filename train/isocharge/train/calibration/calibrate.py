@@ -135,16 +135,6 @@ class CalibrationResult:
         at_C = None if warming is None else warming.at_C
         return cross_validate(self.problem, self.presses, self.posterior, self._network_of, at_C)
 
-    def _network_of(self, film: FilmPosterior) -> Fitted:
-        """Return the network of another film, near this one, with the uncertainty of that film."""
-
-        def factor(contact: Array) -> Array:
-            return self.problem.charges.factor(film.unknowns, contact)
-
-        contact_covariance = self.sensitivity.contact_covariance(film.joint)
-        variance = np.einsum("nii->ni", contact_covariance)
-        return self.problem.fitted(film.parameters, (self.sensitivity.contact, variance), factor, release=False)
-
     def fitted_film(self, parameters: Array, *, release: bool = False) -> Fitted:
         """Return the network of a film near this one, with the same discrepancy and the same uncertainty.
 
@@ -152,10 +142,21 @@ class CalibrationResult:
             parameters: Parameters of the film, shape (n_parameter,).
             release: Whether the network will be released; see `CalibrationProblem.fitted`.
         """
-        contact_covariance = self.sensitivity.contact_covariance(self.posterior.joint)
-        variance = np.einsum("nii->ni", contact_covariance)
-        added_variance = AddedVariance(self.sensitivity.contact, variance)
+        added_variance = self._added_variance(self.posterior)
         return self.problem.fitted(parameters, added_variance, self._factor, release=release)
+
+    def _network_of(self, film: FilmPosterior) -> Fitted:
+        """Return the network of another estimate of the film, with its own discrepancy and uncertainty."""
+
+        def factor(contact: Array) -> Array:
+            return self.problem.charges.factor(film.unknowns, contact)
+
+        return self.problem.fitted(film.parameters, self._added_variance(film), factor, release=False)
+
+    def _added_variance(self, film: FilmPosterior) -> AddedVariance:
+        """Return the variances of contacts by the uncertainty of a film, linearised at this one."""
+        contact_covariance = self.sensitivity.contact_covariance(film.joint)
+        return AddedVariance(self.sensitivity.contact, np.einsum("nii->ni", contact_covariance))
 
     @cached_property
     def _factor(self) -> Callable[[Array], Array]:
