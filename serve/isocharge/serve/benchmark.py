@@ -1,4 +1,7 @@
-"""Durations of calls, measured in turns, so that a machine that slows down slows down all of them."""
+"""Measurement of the duration of calls.
+
+The contenders take turns, so that a machine that becomes slower affects all of them alike.
+"""
 
 import os
 import platform
@@ -17,28 +20,28 @@ from isocharge.common.progress import track
 from isocharge.serve.prediction.predictor import Predictor
 
 Clock = Callable[[], int]
-"""Time in ns."""
+"""Function that returns the time, ns."""
 
 LEAST_CALLS = 3
-"""Calls in a turn, however long they take."""
+"""Smallest number of calls in a turn, however long they take."""
 
 ROUNDS = 10
-"""Turns of every contender; the first one warms up and does not count."""
+"""Number of turns of every contender. The first one is a warm-up and does not count."""
 
 BATCHES = (16, 256, 4096)
-"""Presses in a batch; the last is the largest that a server takes by default."""
+"""Numbers of presses in a batch. The last one is the largest batch that a server accepts by default."""
 
 CHARGES = 4096
-"""Presses that the calls cycle through."""
+"""Number of presses through which the calls cycle."""
 
 
 class Contender(NamedTuple):
     """One way to predict.
 
     Attributes:
-        name: What it is, for tables.
-        presses: Presses that a call predicts.
-        call: Does it once.
+        name: Name of the contender, for tables.
+        presses: Number of presses that one call predicts.
+        call: Function that is timed.
     """
 
     name: str
@@ -47,13 +50,15 @@ class Contender(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """How long the calls of one contender took.
+    """Durations of the calls of one contender.
 
     Attributes:
-        name, presses: As in `Contender`.
-        calls: Number of calls that count.
-        p50_us, p99_us: Median and 99th percentile of their durations, us.
-        presses_per_s: Presses in a second, over all of their time.
+        name: Name of the contender.
+        presses: Number of presses that one call predicts.
+        calls: Number of calls that were timed.
+        p50_us: Median of the durations, us.
+        p99_us: 99th percentile of the durations, us.
+        presses_per_s: Number of presses per second, over the total time of all calls.
     """
 
     name: str
@@ -65,19 +70,19 @@ class Timing(NamedTuple):
 
     @classmethod
     def of(cls, name: str, presses: int, durations_ns: Array) -> "Timing":
-        """From durations, shape (calls,), ns."""
+        """Return the timing for durations of shape (calls,), ns."""
         p50, p99 = np.percentile(durations_ns, (50, 99)) / 1e3
         rate = presses * len(durations_ns) / (float(durations_ns.sum()) / 1e9)
         return cls(name, presses, len(durations_ns), float(p50), float(p99), rate)
 
 
 def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = time.perf_counter_ns) -> list[Timing]:
-    """Time all contenders, one after another in each of ROUNDS.
+    """Time all contenders, one after another in each round.
 
     Args:
-        contenders: What to time.
-        seconds: Time for all of it, s; contenders whose calls take long may take longer.
-        clock: ns.
+        contenders: The contenders.
+        seconds: Total time, s. Contenders with long calls may take longer.
+        clock: Function that returns the time, ns.
 
     Returns:
         A timing for each contender, in their order.
@@ -85,18 +90,18 @@ def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = t
     turn_ns = round(seconds * 1e9 / (ROUNDS * max(len(contenders), 1)))
     durations: list[list[int]] = [[] for _ in contenders]
     for number in track(range(ROUNDS), "measuring", ROUNDS):
-        for contender, of_contender in zip(contenders, durations, strict=True):
-            turn = _turn(contender.call, turn_ns, clock)
-            if number:
-                of_contender += turn
+        for contender, contender_durations in zip(contenders, durations, strict=True):
+            turn_durations = _turn(contender.call, turn_ns, clock)
+            if number > 0:
+                contender_durations += turn_durations
     return [
-        Timing.of(contender.name, contender.presses, np.array(of, float))
-        for contender, of in zip(contenders, durations, strict=True)
+        Timing.of(contender.name, contender.presses, np.array(contender_durations, float))
+        for contender, contender_durations in zip(contenders, durations, strict=True)
     ]
 
 
 def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
-    """Durations of calls for as long as a turn lasts, ns."""
+    """Call a function for the length of a turn, and return the durations of the calls, ns."""
     durations: list[int] = []
     end = clock() + turn_ns
     while len(durations) < LEAST_CALLS or clock() < end:
@@ -107,9 +112,15 @@ def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
 
 
 def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Singles:
-    """Presses drawn from the golden vectors of a model, pC: from those that it takes for presses, without a flag.
+    """Draw presses from the golden vectors of a model that carry no flag.
 
-    Shape (CHARGES, electrodes) from (n, electrodes).
+    Args:
+        predictor: The model.
+        golden_pC: Charges of the golden vectors, shape (n, electrodes), pC.
+        seed: Seed of the draws.
+
+    Returns:
+        Charges of shape (CHARGES, electrodes), pC.
     """
     flags = predictor.validity.batch_flags(predictor.predict_batch(golden_pC))
     sound: Singles = golden_pC[[not words for words in flags]]
@@ -117,13 +128,16 @@ def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Si
 
 
 def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Contender]:
-    """Every method of a predictor.
+    """Return a contender for every method of a predictor.
 
     Args:
         predictor: The model.
-        charge_pC: Shape (n, electrodes), pC; each call of one press takes the next row. Batches above n are left out.
+        charge_pC: Charges of presses, shape (n, electrodes), pC. Each call for one press uses the next row. Batches of
+            more than n presses are left out.
     """
-    rows, lists, out = cycle(charge_pC), cycle(charge_pC.tolist()), np.zeros(7, np.float32)
+    rows = cycle(charge_pC)
+    lists = cycle(charge_pC.tolist())
+    out = np.zeros(7, np.float32)
     contenders = [
         Contender("predict_into, float32 array", 1, lambda: predictor.predict_into(next(rows), out)),
         Contender("predict, list of numbers", 1, lambda: predictor.predict(next(lists))),
@@ -136,7 +150,7 @@ def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Cont
 
 
 def machine(packages: Sequence[str] = ("numpy", "onnxruntime")) -> dict[str, str]:
-    """Where figures were measured: processor, cores, system, Python, and the versions of packages."""
+    """Return a description of this machine: processor, cores, system, Python, and the versions of packages."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text("utf-8").splitlines() if info.exists() else []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))

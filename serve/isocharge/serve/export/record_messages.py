@@ -1,15 +1,16 @@
-"""A prediction record as messages for ROS 2, encoded in CDR: the wrench of the press, its pose, and the record as text.
+"""Conversion of prediction records to ROS 2 messages in CDR: the wrench of the press, its pose, and the record as text.
 
 The frame is `frame_id`, the name of the sensor. Origin, x and y are those of README.md, Coordinates. ROS requires
 right-handed frames, so z points towards the probe, against the push. The wrench is the load of the probe on the film: a
 press of F at (x, y) has the force (0, 0, -F) and the torque (-y F, x F, 0) about the origin. The pose is the point of
 contact in the plane of the unloaded film, without rotation, with the model's standard deviations.
 
-Where contacts are followed, wrench and pose are those of the contact by all frames up to now, as on the live page; what
-the frame alone says is in the record.
+If contacts are tracked, the wrench and the pose describe the tracked contact, as on the live page. The record also has
+the contact that the frame alone gives.
 
-ROS messages are a header and doubles. They are packed here because `mcap-ros2-support` offers its encoder only inside a
-writer of its own, which writes no JSON, and takes 15 times as long; tests read them with it and with rosbags.
+A ROS message consists of a header and numbers of double precision. The messages are encoded here, because
+`mcap-ros2-support` offers its encoder only as a part of its own writer, which writes no JSON and takes 15 times as
+long. The tests decode the messages with `mcap-ros2-support` and with rosbags.
 """
 
 import math
@@ -21,13 +22,13 @@ from typing import Any
 from isocharge.common.errors import InputError
 
 DEFLECTION_STD = 5e-3
-"""Standard deviation of z, m: the model does not say how far the film gives way, a few mm under some newtons."""
+"""Standard deviation of z, m. The model does not estimate the deflection of the film, which is a few millimetres."""
 
 TURN_VARIANCE = math.pi**2 / 3.0
-"""Variance of every rotation, rad^2: that of an angle of which nothing is known."""
+"""Variance of every rotation, rad^2: the variance of an angle that is uniformly distributed over a full turn."""
 
 LATEST_S = 1 << 31
-"""End of the times that a ROS 2 stamp holds, unix seconds: the year 2038."""
+"""Upper limit of the times that a ROS 2 time stamp can hold, unix seconds: the year 2038."""
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
 """First bytes of a CDR message: little endian, no options."""
@@ -78,10 +79,10 @@ STRING_DEFINITION = "string data\n"
 
 
 def time_of(record: Mapping[str, Any]) -> int:
-    """The record's `timestamp` in nanoseconds, exact to the microsecond that its six decimals give.
+    """Return the `timestamp` of a record in nanoseconds, rounded to a microsecond.
 
     Raises:
-        InputError: If ROS 2 has no stamp for it.
+        InputError: If ROS 2 has no time stamp for this time.
     """
     seconds: float | None = record["timestamp"]
     if seconds is None or not 0.0 <= seconds < LATEST_S:
@@ -93,42 +94,62 @@ def time_of(record: Mapping[str, Any]) -> int:
 
 
 def contact_of(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The record with the contact that is followed in the place of the frame's, where the frame says anything."""
+    """Return the values of a record, in which the tracked contact replaces the contact of the frame if there is one."""
     tracked = record.get("tracked")
-    return record if tracked is None or record["force_N"] is None else {**record, **tracked}
+    if tracked is None or record["force_N"] is None:
+        return record
+    return {**record, **tracked}
 
 
 def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
-    """The record as WrenchStamped, N and N m; zeros out of contact, None where the force is unknown."""
-    record = contact_of(record)
-    force = record["force_N"]
-    if force is None:
+    """Return a record as a WrenchStamped, N and N m: zeros out of contact, and None if the force is unknown.
+
+    Args:
+        record: Values of the record by name.
+        time_ns: Time of the record, ns.
+    """
+    contact = contact_of(record)
+    force_N = contact["force_N"]
+    if force_N is None:
         return None
-    x, y = 1e-3 * (record["x_mm"] or 0.0), 1e-3 * (record["y_mm"] or 0.0)
-    return _stamped(record["frame_id"], time_ns, (0.0, 0.0, 0.0 - force, 0.0 - y * force, x * force, 0.0))
+    x_m = 1e-3 * (contact["x_mm"] or 0.0)
+    y_m = 1e-3 * (contact["y_mm"] or 0.0)
+    force = (0.0, 0.0, 0.0 - force_N)
+    torque = (0.0 - y_m * force_N, x_m * force_N, 0.0)
+    return _stamped(contact["frame_id"], time_ns, (*force, *torque))
 
 
 def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
-    """The record as PoseWithCovarianceStamped, m, m^2 and rad^2; None where nothing touches."""
-    record = contact_of(record)
-    x, y, x_std, y_std = (record[name] for name in ("x_mm", "y_mm", "x_std_mm", "y_std_mm"))
-    xy_correlation = record.get("xy_correlation") or 0.0  # a record of an earlier version has none
-    if None in (x, y, x_std, y_std):
+    """Return a record as a PoseWithCovarianceStamped, m, m^2 and rad^2; None if nothing touches.
+
+    Args:
+        record: Values of the record by name.
+        time_ns: Time of the record, ns.
+    """
+    contact = contact_of(record)
+    x_mm, y_mm = contact["x_mm"], contact["y_mm"]
+    x_std_mm, y_std_mm = contact["x_std_mm"], contact["y_std_mm"]
+    if None in (x_mm, y_mm, x_std_mm, y_std_mm):
         return None
-    covariance = [0.0] * 36  # rows and columns x, y, z, and the rotations about them
-    covariance[::7] = (1e-3 * x_std) ** 2, (1e-3 * y_std) ** 2, DEFLECTION_STD**2, *(TURN_VARIANCE,) * 3
-    covariance[1] = covariance[6] = 1e-6 * x_std * y_std * xy_correlation
-    pose = (1e-3 * x, 1e-3 * y, 0.0, 0.0, 0.0, 0.0, 1.0)
-    return _stamped(record["frame_id"], time_ns, (*pose, *covariance))
+    xy_correlation = contact.get("xy_correlation") or 0.0  # a record of an earlier version has none
+    variances = ((1e-3 * x_std_mm) ** 2, (1e-3 * y_std_mm) ** 2, DEFLECTION_STD**2, *[TURN_VARIANCE] * 3)
+    xy_covariance = 1e-6 * x_std_mm * y_std_mm * xy_correlation
+    covariance = [0.0] * 36  # row by row: x, y, z, and the rotations about these axes
+    covariance[::7] = variances
+    covariance[1] = xy_covariance
+    covariance[6] = xy_covariance
+    position = (1e-3 * x_mm, 1e-3 * y_mm, 0.0)
+    orientation = (0.0, 0.0, 0.0, 1.0)
+    return _stamped(contact["frame_id"], time_ns, (*position, *orientation, *covariance))
 
 
 def string_message(text: str) -> bytes:
-    """A text as std_msgs/msg/String."""
+    """Return a text as a std_msgs/msg/String."""
     return ENCAPSULATION + _string(text)
 
 
 def _stamped(frame_id: str, time_ns: int, values: tuple[float, ...]) -> bytes:
-    """A header and doubles, which begin at a multiple of 8 bytes after the encapsulation."""
+    """Return a message of a header and numbers, which begin at a multiple of 8 bytes after the encapsulation."""
     seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
     header = struct.pack("<iI", seconds, nanoseconds) + _string(frame_id)
     padding = bytes(-len(header) % 8)
@@ -136,12 +157,13 @@ def _stamped(frame_id: str, time_ns: int, values: tuple[float, ...]) -> bytes:
 
 
 def _string(text: str) -> bytes:
+    """Return a text as CDR encodes it: its length, its bytes in UTF-8, and a zero."""
     data = text.encode() + b"\0"
     return struct.pack("<I", len(data)) + data
 
 
 class RecordEncoding(StrEnum):
-    """How an MCAP file holds the records themselves: JSON with this schema, or the same text in ROS 2 messages."""
+    """Encoding of the records in an MCAP file: JSON with a schema, or the same text in ROS 2 messages."""
 
     json = "json"
     ros2 = "ros2"
