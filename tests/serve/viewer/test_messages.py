@@ -155,13 +155,13 @@ def samples(force_N, bits=None):
 
 @given(
     force_N=st.lists(st.floats(0, 2, width=32), min_size=1, max_size=400),
-    most=st.integers(1, 50),
+    max_samples=st.integers(1, 50),
     seed=st.integers(0, 1000),
 )
-def test_runs_stand_for_all(force_N, most, seed):
+def test_coalesced_samples_represent_all_records(force_N, max_samples, seed):
     rows = samples(force_N, np.random.default_rng(seed).integers(0, 1 << 12, len(force_N)))
-    shown = coalesce(rows, most)
-    assert len(shown) == min(most, len(rows))
+    shown = coalesce(rows, max_samples)
+    assert len(shown) == min(max_samples, len(rows))
     assert shown["records"].sum() == len(rows)
     assert np.bitwise_or.reduce(shown["flags"]) == np.bitwise_or.reduce(rows["flags"])
     assert shown["latency_us"][-1] == len(rows) - 1
@@ -169,11 +169,11 @@ def test_runs_stand_for_all(force_N, most, seed):
     assert set(shown["force_N"].tolist()) <= set(rows["force_N"].tolist())
 
 
-@given(start=st.integers(0, 90), most=st.integers(1, 30))
-def test_a_tap_is_shown(start, most):
+@given(start=st.integers(0, 90), max_samples=st.integers(1, 30))
+def test_short_tap_is_not_lost_by_coalescing(start, max_samples):
     force_N = np.zeros(100)
     force_N[start : start + 3] = (0.5, 1.0, 0.4)
-    touching = coalesce(samples(force_N), most)
+    touching = coalesce(samples(force_N), max_samples)
     assert (touching["flags"] & CONTACT_BIT).any()
     assert touching["force_N"].max() >= 0.4
 

@@ -21,7 +21,7 @@ from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from isocharge.common.errors import OriginError, TokenError
 from isocharge.serve.network.address import Token
 from isocharge.serve.viewer import server
-from isocharge.serve.viewer.server import BYTES_AT_ONCE, VIEWERS, Access, Budget
+from isocharge.serve.viewer.server import MAX_BURST_BYTES, MAX_VIEWERS, Access, RateLimit
 
 
 def put(page, record, count, **changes):
@@ -29,7 +29,7 @@ def put(page, record, count, **changes):
     end = time.time()
     for k in range(count):
         changed = {"timestamp": end - 0.005 * (count - 1 - k), "seq": k} | changes
-        page.reader.put(page.form.pack(record(**changed)))
+        page.reader.send_sample(page.form.pack(record(**changed)))
 
 
 def test_a_new_viewer_sees_the_last_seconds(page, record, viewer):
@@ -93,9 +93,9 @@ def test_a_stalled_viewer_holds_up_neither_reader_nor_others(page, record, viewe
 
 def test_states_reach_the_viewer(page, viewer):
     async def talk(client):
-        page.reader.tell(counters={"frames": 7}, recording="x.rec")
-        page.reader.tell(marker=[1.0, ""])
-        page.reader.tell(marker=[2.0, "b"])
+        page.reader.send_message(counters={"frames": 7}, recording="x.rec")
+        page.reader.send_message(marker=[1.0, ""])
+        page.reader.send_message(marker=[2.0, "b"])
         while True:
             state = await client.text("state")
             if len(state.get("markers", ())) == 2:
@@ -156,7 +156,7 @@ def followed(place):
 
 def test_who_reads_no_answers_is_not_read_either(start_page, monkeypatch):
     """Pongs that nobody takes would fill the memory."""
-    monkeypatch.setattr(server, "BYTES_AT_ONCE", 1 << 40)
+    monkeypatch.setattr(server, "MAX_BURST_BYTES", 1 << 40)
     with followed(urlsplit(start_page().url)) as hostile:
         hostile.settimeout(1.0)
         with pytest.raises(TimeoutError):
@@ -174,7 +174,7 @@ def test_a_flood_of_any_frame_ends_the_connection(page, record, viewer, kind):
             sent = 0
             with suppress(OSError):
                 hostile.sendall(first)
-                while sent < 100 * BYTES_AT_ONCE:
+                while sent < 100 * MAX_BURST_BYTES:
                     hostile.sendall(FLOODS[kind] * 50)
                     sent += 50 * len(FLOODS[kind])
                 while hostile.recv(1 << 16):
@@ -188,18 +188,18 @@ def test_a_flood_of_any_frame_ends_the_connection(page, record, viewer, kind):
             await client.samples()
         return await flooding
 
-    assert viewer(page, talk) < 100 * BYTES_AT_ONCE
+    assert viewer(page, talk) < 100 * MAX_BURST_BYTES
 
 
-def test_the_budget_comes_back():
-    budget = Budget(10.0, 5.0, 0.0)
-    spends = [budget.spend(size, at_s) for size, at_s in ((5, 0), (5, 0), (5, 0), (4, 2), (10, 100), (11, 200))]
+def test_rate_limit_refills_with_time():
+    limit = RateLimit(10.0, 5.0, 0.0)
+    spends = [limit.allows(size, at_s) for size, at_s in ((5, 0), (5, 0), (5, 0), (4, 2), (10, 100), (11, 200))]
     assert spends == [True, True, False, True, True, False]
 
 
 def test_viewers_are_bounded(page, viewer):
     async def talk(client):
-        others = [await connect(page.live) for _ in range(VIEWERS - 1)]
+        others = [await connect(page.live) for _ in range(MAX_VIEWERS - 1)]
         with pytest.raises(InvalidStatus) as refused:
             await connect(page.live)
         for other in others:

@@ -9,7 +9,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from isocharge.serve.viewer.hub import PIECES, Playhead, RecordedTape, Tape
+from isocharge.serve.viewer.hub import MAX_PIECES, Playhead, RecordedTape, Tape
 from isocharge.serve.viewer.link import make_link
 from isocharge.serve.viewer.messages import Play, SampleFormat
 
@@ -30,7 +30,7 @@ def samples(times, force_N=0.0):
 
 
 def test_a_live_tape_keeps_the_latest():
-    tape = Tape(FORM.dtype, most=10)
+    tape = Tape(FORM.dtype, capacity=10)
     for first in range(0, 35, 7):
         tape.append(samples(np.arange(first, first + 7.0)))
     assert (tape.oldest, tape.total, tape.index(30.5)) == (25, 35, 31)
@@ -63,7 +63,7 @@ def test_overview_has_the_largest_force_of_each_piece(recorded):
         part = force_N[first : first + 777]
         tape.append(samples(1e9 + 1e-3 * np.arange(first, first + len(part)), part))
     overview = tape.overview()
-    assert len(overview) <= PIECES
+    assert len(overview) <= MAX_PIECES
     assert overview.index(1.5) / len(overview) == pytest.approx(0.5, abs=0.01)
     assert sum(force > 0 for force in overview) == 1
 
@@ -74,11 +74,11 @@ SAMPLE = bytes(range(64))
 def test_samples_arrive_whole_and_in_order():
     reader, page = make_link()
     for number in range(100):
-        reader.put(bytes([number]) * 64)
-    assert page.take(64) == b"".join(bytes([number]) * 64 for number in range(100))
+        reader.send_sample(bytes([number]) * 64)
+    assert page.receive_samples(64) == b"".join(bytes([number]) * 64 for number in range(100))
     for piece, whole in ((SAMPLE + SAMPLE[:40], SAMPLE), (b"", b""), (SAMPLE[40:], SAMPLE)):
-        reader.put(piece)
-        assert page.take(64) == whole
+        reader.send_sample(piece)
+        assert page.receive_samples(64) == whole
     assert page.is_open
     reader.close()
     page.close_here()
@@ -88,19 +88,19 @@ def test_a_reader_does_not_wait_for_a_page_that_takes_nothing():
     reader, page = make_link()
     began = time.perf_counter()
     for _ in range(40_000):
-        reader.put(SAMPLE)
-    told = sum(reader.tell(counters={"frames": 1}, note="x" * 500) for _ in range(2000))
+        reader.send_sample(SAMPLE)
+    told = sum(reader.send_message(counters={"frames": 1}, note="x" * 500) for _ in range(2000))
     assert time.perf_counter() - began < 5.0
     assert reader.dropped > 0
     assert told < 2000
-    taken = len(b"".join(iter(lambda: page.take(64), b""))) // 64
+    taken = len(b"".join(iter(lambda: page.receive_samples(64), b""))) // 64
     assert taken + reader.dropped == 40_000
-    assert len(page.replies()) == told
+    assert len(page.receive_messages()) == told
     reader.close()
     page.close_here()
 
 
-def test_a_replay_stops_at_the_end_and_begins_anew():
+def test_replay_stops_at_the_end_and_play_restarts_it():
     """It waits at the end of what is known so far."""
     head, ends = Playhead(speed=4.0), ((10.0, True), (3.0, False), (3.0, True), (3.0, True))
     assert [head.advance(0.5, end_s, is_complete=known) for end_s, known in ends] == [False, False, True, False]

@@ -248,10 +248,10 @@ def replay_command(
             )
             feed = PageFeed(link, path)
             writers.append(feed.write)
-            write_records(played(on_marker=lambda marker: link.tell(marker=[*marker])), writers, latencies)
+            write_records(played(on_marker=lambda marker: link.send_message(marker=[*marker])), writers, latencies)
             outputs.close()  # now, because Ctrl-C, which is the only end of the page, would discard the files
-            link.tell(is_complete=True)
-            while link.request() is not None:  # until the page's process ends, or Ctrl-C
+            link.send_message(is_complete=True)
+            while link.wait_for_request() is not None:  # until the page's process ends, or Ctrl-C
                 pass
     say(summary(path, latencies))
     if outputs.has_incomplete_file:

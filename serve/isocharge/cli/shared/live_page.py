@@ -127,7 +127,7 @@ def live_page(
     page = Page(end, description, address, given_token(token), is_recording)
     with closing(reader), page_process(page) as url, closing(reader):  # the page's process ends when its reader closes
         if is_recording:
-            reader.wait()
+            reader.enable_waiting()
         say(f"{'replay' if is_recording else 'live'} page: {url}")
         yield reader
 
@@ -152,7 +152,7 @@ class PageFeed:
     def write(self, record: PredictionRecord) -> None:
         """Send a record without waiting for the page."""
         was_open = self._link.is_open
-        self._link.put(self._pack(record))
+        self._link.send_sample(self._pack(record))
         self._timestamps_s.append(math.nan if record.timestamp is None else record.timestamp)
         if was_open and not self._link.is_open:
             say("the process of the live page has ended; the stream goes on without it")
@@ -171,7 +171,7 @@ class PageFeed:
     def _send_state(self, record: PredictionRecord) -> None:
         recorder = self._live.recorder if self._live else None
         page_counters = {"reconnects": self._touch.counts.outages, "not_shown": self._link.dropped}
-        self._link.tell(
+        self._link.send_message(
             counters=self._touch.totals()._asdict() | page_counters,
             rate_Hz=self._rate_Hz(),
             model=record.model,
@@ -194,7 +194,7 @@ def answering(link: ReaderEnd, live: RecordedStream, header: tuple[str, Any, str
     """
 
     def answer_requests() -> None:
-        while (request := link.request()) is not None:
+        while (request := link.wait_for_request()) is not None:
             try:
                 _carry_out(request, link, live, header)
             except IsochargeError as error:
@@ -223,14 +223,14 @@ def _carry_out(
         case Marker(text=text):
             marker = recording.Marker(time.time(), text)
             live.request_marker(marker)
-            link.tell(marker=[*marker])
+            link.send_message(marker=[*marker])
         case Record(on=is_on):
             if header is None:
                 raise InputError("the command that runs the stream records it already (--record)")
             label = live.predictor.metadata.label
             path = Path(f"{label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
             live.request_recording(Recorder(path, label, *header) if is_on else None)
-            link.tell(recording=f"{path.name}, which waits for data" if is_on else None)
+            link.send_message(recording=f"{path.name}, which waits for data" if is_on else None)
         case Tare():
             live.request_tare()
         case Back():
@@ -239,4 +239,4 @@ def _carry_out(
 
 def _show_note(link: ReaderEnd, text: str) -> None:
     """Show a message on the page for some seconds."""
-    link.tell(note={"text": text, "at": time.time()})
+    link.send_message(note={"text": text, "at": time.time()})

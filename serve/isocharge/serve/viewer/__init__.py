@@ -1,5 +1,5 @@
-"""The live page: what a sensor sees, in a browser, as it happens or from a recording.
+"""The live page, which shows the contacts of a live stream or a recording in a browser.
 
-The process that reads a port never waits for a page: it writes samples of fixed size into a pipe (`link`), and another
-process answers browsers (`process`, `hub`, `server`). The page itself is the folder `page`.
+The process that reads a port never waits for the page. It writes samples of fixed size into a pipe (`link`), and a
+separate process serves browsers (`process`, `hub`, `server`). The folder `page` contains the files of the page.
 """

@@ -1,8 +1,8 @@
-"""The stream that the page shows and its viewers: takes what the reader sends, and gives each viewer what it can show.
+"""Distribution of the samples of a stream to the viewers of the live page.
 
-The tape has the samples by number: the latest ones of a live stream, or all of a recording. A viewer confirms what it
-has drawn. It gets the next samples only then, coalesced with all that came meanwhile: nothing is queued for a viewer
-that is slow, and a stalled one costs nothing.
+The tape stores the samples by number: the latest samples of a live stream, or all samples of a recording. A viewer
+confirms each message that it has drawn. Only then it receives the next message, in which all samples that arrived in
+the meantime are coalesced. No messages are queued for a slow viewer.
 """
 
 import asyncio
@@ -30,112 +30,127 @@ from isocharge.serve.viewer.messages import (
 )
 
 LIVE_SAMPLES = 1 << 14
-"""Samples that are kept of a live stream: 16 s at 1 kHz; a browser that is farther behind misses some."""
+"""Number of samples of a live stream that are stored: 16 s at 1 kHz. A browser that is farther behind misses some."""
 
-PIECES = 600
+MAX_PIECES = 600
 """Largest number of pieces in the overview of a recording."""
 
 
 class Tape:
-    """The latest samples of a stream without end, in bounded memory.
+    """Ring buffer of the latest samples of a stream.
+
+    Args:
+        dtype: NumPy type of a sample.
+        capacity: Number of samples that are stored.
 
     Attributes:
-        total: Samples that ever came.
+        total: Number of all samples that were appended.
     """
 
-    def __init__(self, dtype: "np.dtype[Any]", most: int = LIVE_SAMPLES) -> None:
+    def __init__(self, dtype: "np.dtype[Any]", capacity: int = LIVE_SAMPLES) -> None:
         self.total = 0
-        self._ring: Samples = np.zeros(most, dtype)
+        self._ring: Samples = np.zeros(capacity, dtype)
 
     @property
     def oldest(self) -> int:
-        """Number of the oldest sample that is still there."""
+        """Number of the oldest stored sample."""
         return max(0, self.total - len(self._ring))
 
     def append(self, samples: Samples) -> None:
-        """Add samples, and forget as many old ones as need be."""
+        """Append samples. They replace the oldest samples if the buffer is full."""
         latest = samples[-len(self._ring) :]
         first = self.total + len(samples) - len(latest)
         self._ring[np.arange(first, first + len(latest)) % len(self._ring)] = latest
         self.total += len(samples)
 
     def samples(self, start: int, stop: int) -> Samples:
-        """Samples by number, those from `start` to before `stop` that are still there."""
+        """Return the stored samples with numbers from `start` to `stop` - 1."""
         return self._ring[np.arange(max(start, self.oldest), stop) % len(self._ring)]
 
     def timestamp(self, number: int) -> float:
-        """Time of a sample, unix seconds."""
+        """Return the Unix time of a sample, s."""
         return float(self._ring[number % len(self._ring)]["timestamp"])
 
     def index(self, timestamp: float) -> int:
-        """Number of the first sample after a time, unix seconds."""
+        """Return the number of the first sample after a Unix time, s."""
         return bisect_right(range(self.total), timestamp, lo=self.oldest, key=self.timestamp)
 
     def span(self) -> tuple[float, float]:
-        """Times of the oldest and the latest sample, unix seconds; zeros if there is none."""
-        return (self.timestamp(self.oldest), self.timestamp(self.total - 1)) if self.total else (0.0, 0.0)
+        """Return the Unix times of the oldest and the latest sample, s; zeros if there are no samples."""
+        if not self.total:
+            return 0.0, 0.0
+        return self.timestamp(self.oldest), self.timestamp(self.total - 1)
 
     def close(self) -> None:
-        """Close the file, if there is one."""
+        """Close the file of the samples, if there is one."""
 
 
 class RecordedTape(Tape):
-    """All samples of a recording, in a nameless file: a day of them needs no memory. Times never go back."""
+    """All samples of a recording, stored in a temporary file. Times that go back are replaced by the latest time.
+
+    Args:
+        dtype: NumPy type of a sample.
+    """
 
     def __init__(self, dtype: "np.dtype[Any]") -> None:
         super().__init__(dtype)
         self._file = tempfile.TemporaryFile()  # noqa: SIM115
         self._piece_s = 0.01
-        self._force_N: list[float] = []
+        self._max_force_N: list[float] = []
         self._map(LIVE_SAMPLES)
 
     def append(self, samples: Samples) -> None:
-        """Add samples."""
+        """Append samples, and update the overview."""
         if not len(samples):
             return
         samples = samples.copy()
-        times = np.maximum.accumulate(np.nan_to_num(samples["timestamp"], nan=0.0))
-        samples["timestamp"] = np.maximum(times, self.span()[1])
+        _, latest_s = self.span()
+        rising_s = np.maximum.accumulate(np.nan_to_num(samples["timestamp"], nan=0.0))
+        samples["timestamp"] = np.maximum(rising_s, latest_s)
         while self.total + len(samples) > len(self._ring):
             self._map(2 * len(self._ring))
         super().append(samples)
-        self._note_forces(samples)
+        self._update_overview(samples)
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file of the samples."""
         self._file.close()
 
-    def _map(self, most: int) -> None:
-        """Make room for so many samples."""
-        self._ring = np.memmap(self._file, self._ring.dtype, "r+", shape=(most,))
+    def _map(self, capacity: int) -> None:
+        """Map the file to memory with room for a number of samples."""
+        self._ring = np.memmap(self._file, self._ring.dtype, "r+", shape=(capacity,))
 
     def overview(self) -> list[float]:
-        """Largest force in each of the equal pieces of the recording, N."""
-        return [round(force, 3) for force in self._force_N]
+        """Return the largest force in each piece of the recording, N. All pieces have the same length."""
+        return [round(force_N, 3) for force_N in self._max_force_N]
 
-    def _note_forces(self, samples: Samples) -> None:
-        """Keep the largest force of each piece; two pieces become one where there would be too many."""
+    def _update_overview(self, samples: Samples) -> None:
+        """Update the largest force of each piece. If there are too many pieces, join them in pairs."""
         elapsed_s = samples["timestamp"] - self.timestamp(0)
-        while elapsed_s[-1] >= PIECES * self._piece_s:
-            self._force_N = [max(self._force_N[k : k + 2]) for k in range(0, len(self._force_N), 2)]
+        while elapsed_s[-1] >= MAX_PIECES * self._piece_s:
+            pairs = [self._max_force_N[k : k + 2] for k in range(0, len(self._max_force_N), 2)]
+            self._max_force_N = [max(pair) for pair in pairs]
             self._piece_s *= 2.0
         piece = (elapsed_s / self._piece_s).astype(int)
-        self._force_N += [0.0] * (int(piece[-1]) + 1 - len(self._force_N))
+        new_pieces = int(piece[-1]) + 1 - len(self._max_force_N)
+        self._max_force_N += [0.0] * new_pieces
+
         force_N = np.nan_to_num(samples["force_N"], nan=0.0)
         starts = np.flatnonzero(np.diff(piece, prepend=-1))
-        for number, force in zip(piece[starts].tolist(), np.maximum.reduceat(force_N, starts).tolist(), strict=True):
-            self._force_N[number] = max(self._force_N[number], force)
+        largest_N = np.maximum.reduceat(force_N, starts)
+        for number, largest in zip(piece[starts].tolist(), largest_N.tolist(), strict=True):
+            self._max_force_N[number] = max(self._max_force_N[number], largest)
 
 
 @dataclass
 class Playhead:
-    """Where a viewer is in a recording.
+    """Position of a viewer in a recording.
 
     Attributes:
         at_s: Time since the start of the recording, s.
-        speed: Times the recorded pace.
-        is_playing: Whether time goes on.
-        has_jumped: Whether the viewer sought another place, and has nothing of it yet.
+        speed: Speed relative to the recorded speed.
+        is_playing: Whether the position advances.
+        has_jumped: Whether the viewer has selected another position and not yet received samples of it.
     """
 
     at_s: float = 0.0
@@ -144,15 +159,15 @@ class Playhead:
     has_jumped: bool = True
 
     def advance(self, step_s: float, end_s: float, *, is_complete: bool) -> bool:
-        """Let time go on.
+        """Advance the position.
 
         Args:
-            step_s: Time that has passed, s.
-            end_s: How far the recording is known, s.
-            is_complete: Whether that is all of it.
+            step_s: Time since the latest call, s.
+            end_s: Length of the part of the recording that has been read, s.
+            is_complete: Whether the whole recording has been read.
 
         Returns:
-            Whether the end has just been reached.
+            Whether the position has just reached the end of the recording.
         """
         if not self.is_playing:
             return False
@@ -161,62 +176,81 @@ class Playhead:
         return not self.is_playing
 
     def apply(self, request: ReplayRequest, end_s: float) -> None:
-        """Do what the page asks for; at the end, playing begins anew."""
+        """Carry out a request of the page. Playing at the end of the recording begins at its start.
+
+        Args:
+            request: The request.
+            end_s: Length of the part of the recording that has been read, s.
+        """
         match request:
             case Speed(value=value):
                 self.speed = value
             case Seek(value=value):
-                self.at_s, self.has_jumped = min(value, end_s), True
+                self._jump(min(value, end_s))
             case Pause():
                 self.is_playing = False
             case Play():
                 self.is_playing = True
                 if self.at_s >= end_s:
-                    self.at_s, self.has_jumped = 0.0, True
+                    self._jump(0.0)
+
+    def _jump(self, at_s: float) -> None:
+        self.at_s = at_s
+        self.has_jumped = True
 
     def to_json(self) -> dict[str, float | bool]:
-        """For the page."""
+        """Return the position for the page."""
         return {"at_s": round(self.at_s, 3), "speed": self.speed, "is_playing": self.is_playing}
 
 
-TICK_S, IDLE_S = 1 / 120, 0.05
-"""Time between two looks at the reader, s: with viewers, and without."""
+POLL_INTERVAL_S = 1 / 120
+"""Time between two checks for new samples while there are viewers, s."""
 
-IN_FLIGHT = 2
-"""Messages of samples that a viewer may have without having drawn them."""
+IDLE_POLL_INTERVAL_S = 0.05
+"""Time between two checks for new samples while there are no viewers, s."""
 
-SHOWN_HZ = 240.0
-"""Samples of a second that a viewer gets at most, Hz: four for each picture."""
+MAX_UNCONFIRMED_MESSAGES = 2
+"""Number of messages with samples that are sent to a viewer before it confirms that it has drawn them."""
 
-FEWEST, MOST = 8, 600
-"""Bounds of the samples in one message."""
+MAX_SAMPLE_RATE_HZ = 240.0
+"""Largest rate of the samples that are sent to a viewer, Hz: four samples for each frame of a display."""
 
-BACKFILL_S = 10.0
-"""How far back a new viewer sees, s: the length of the traces."""
+MIN_MESSAGE_SAMPLES = 8
+"""Smallest limit of the number of samples in one message."""
 
-MARKERS = 200
-"""Markers that the page shows, the latest."""
+MAX_MESSAGE_SAMPLES = 600
+"""Largest number of samples in one message."""
 
-STATE_S = 0.5
-"""Time between two looks at how far a recording is known, s."""
+HISTORY_S = 10.0
+"""Time span of the earlier samples that a new viewer receives, s. The traces of the page have this length."""
+
+MAX_MARKERS = 200
+"""Number of the latest markers that the page shows."""
+
+PROGRESS_INTERVAL_S = 0.5
+"""Time between two updates of the part of a recording that has been read, s."""
 
 
 class Hub:
-    """The stream and its viewers; belongs to one event loop.
+    """The stream and its viewers. All methods must be called in the same event loop.
+
+    Args:
+        link: Link to the process that reads the stream.
+        description: Description of the film, as `describe_film` returns it.
+        is_recording: Whether the stream is a recording.
 
     Attributes:
         is_replay: Whether the stream is a recording.
-        requests: The type of the requests that this page takes.
+        requests: Type of the requests that the page may send.
         tape: The samples.
-        description: Of the film, for the page, see `describe_film`.
-        state: What changes seldom: counters, recording, notes; for the page.
-        version: Counts the changes of `state`.
-        viewers: Those that are there.
+        description: Description of the film for the page.
+        state: Values for the page that change rarely: counters, recording, notes.
+        version: Number of changes of `state`.
+        viewers: The connected viewers.
         has_ended: Whether the reader has ended.
     """
 
     def __init__(self, link: PageEnd, description: dict[str, Any], *, is_recording: bool) -> None:
-        """Show a live stream or a recording, of which nothing has come yet."""
         self.description = description
         self.state: dict[str, Any] = {}
         self.version = 0
@@ -233,131 +267,155 @@ class Hub:
         self._link.close_here()
         self.tape.close()
 
-    def do(self, request: LiveRequest | ReplayRequest, viewer: "Viewer") -> bool:
-        """Do what a page asks for; False if the reader takes no requests any more."""
+    def handle(self, request: LiveRequest | ReplayRequest, viewer: "Viewer") -> bool:
+        """Carry out a request of a page, and return whether it was carried out or passed to the reader."""
         if isinstance(request, ReplayRequest):
             viewer.apply(request)
             return True
-        return self._link.ask(request)
+        return self._link.send_request(request)
 
     async def run(self) -> None:
-        """Take what comes, and wake the viewers, until the reader has ended."""
-        looked_s = 0.0
+        """Receive samples and messages, and wake the viewers, until the reader has ended."""
+        progress_update_s = 0.0
         while self._link.is_open:
-            self._drain()
-            if time.time() - looked_s > STATE_S:
-                looked_s = time.time()
-                self._show_progress()
-            self._wake()
-            await asyncio.sleep(TICK_S if self.viewers else IDLE_S)
+            self._receive()
+            if time.time() - progress_update_s > PROGRESS_INTERVAL_S:
+                progress_update_s = time.time()
+                self._update_progress()
+            self._wake_viewers()
+            await asyncio.sleep(POLL_INTERVAL_S if self.viewers else IDLE_POLL_INTERVAL_S)
         self.has_ended = True
-        self._wake()
+        self._wake_viewers()
 
-    def _wake(self) -> None:
+    def _wake_viewers(self) -> None:
         for viewer in self.viewers:
             viewer.wake.set()
 
-    def _drain(self) -> None:
-        """Take what the reader has sent."""
-        if data := self._link.take(self._dtype.itemsize):
+    def _receive(self) -> None:
+        """Receive the samples and messages that the reader has sent."""
+        data = self._link.receive_samples(self._dtype.itemsize)
+        if data:
             self.tape.append(np.frombuffer(data, self._dtype))
-        for message in self._link.replies():
-            self._note(message)
+        for message in self._link.receive_messages():
+            self._update_state(message)
         if not self._link.is_open:
-            self._note({"has_ended": True})
+            self._update_state({"has_ended": True})
 
-    def _show_progress(self) -> None:
-        """Bring the state of a recording up to date."""
+    def _update_progress(self) -> None:
+        """Update the state with the part of a recording that has been read."""
         if isinstance(self.tape, RecordedTape) and self.state.get("samples") != self.tape.total:
-            self._note({"samples": self.tape.total, "span": self.tape.span(), "overview": self.tape.overview()})
+            self._update_state({"samples": self.tape.total, "span": self.tape.span(), "overview": self.tape.overview()})
 
-    def _note(self, message: dict[str, Any]) -> None:
+    def _update_state(self, message: dict[str, Any]) -> None:
+        """Update the state with the content of a message. A marker is appended to the list of markers."""
         marker = message.pop("marker", None)
         if marker is not None:
-            self.state["markers"] = [*self.state.get("markers", ()), marker][-MARKERS:]
+            markers = [*self.state.get("markers", ()), marker]
+            self.state["markers"] = markers[-MAX_MARKERS:]
         self.state.update(message)
         self.version += 1
 
 
 class Viewer:
-    """One browser: what it has of the stream.
+    """One browser, and the part of the stream that it has received.
+
+    Args:
+        hub: The stream.
 
     Attributes:
-        wake: Set when there may be something to send.
+        wake: Event that is set when there may be something to send.
     """
 
     def __init__(self, hub: Hub) -> None:
         now_s = time.time()
         self.wake = asyncio.Event()
-        self._hub, self._playhead = hub, Playhead() if hub.is_replay else None
-        self._next = hub.tape.index(now_s - BACKFILL_S)
-        self._begins, self._missed, self._version = True, 0, -1
-        self._sent = self._confirmed = 0
-        self._served_s = self._played_s = now_s
-        self._shows_playhead = True
+        self._hub = hub
+        self._playhead = Playhead() if hub.is_replay else None
+        self._next_sample = hub.tape.index(now_s - HISTORY_S)
+        self._begins_anew = True  # whether the next message replaces everything that the page shows
+        self._missed_samples = 0
+        self._state_version = -1
+        self._sent_messages = 0
+        self._confirmed_messages = 0
+        self._latest_message_s = now_s
+        self._latest_advance_s = now_s
+        self._must_send_playhead = True
 
     def confirm(self, number: int) -> None:
-        """The page has drawn a message."""
-        self._confirmed = max(self._confirmed, min(number, self._sent))
+        """Note that the page has drawn the message with this number."""
+        self._confirmed_messages = max(self._confirmed_messages, min(number, self._sent_messages))
         self.wake.set()
 
     def apply(self, request: ReplayRequest) -> None:
-        """Do what the page asks for with its place in the recording."""
+        """Carry out a request that changes the position in the recording."""
         if self._playhead is not None:
             self._playhead.apply(request, self._length_s())
-            self._shows_playhead = True
+            self._must_send_playhead = True
 
     def messages(self, now_s: float) -> list[bytes | str]:
-        """What to send now; nothing as long as the viewer has not drawn what it has.
+        """Return the messages to send now; none if the viewer has not confirmed the earlier ones.
 
         Args:
-            now_s: Unix seconds.
+            now_s: Unix time, s.
         """
         if self._playhead is not None:
-            self._play(self._playhead, now_s)
-        if self._sent - self._confirmed >= IN_FLIGHT:
+            self._advance(self._playhead, now_s)
+        if self._sent_messages - self._confirmed_messages >= MAX_UNCONFIRMED_MESSAGES:
             return []
-        elapsed_s, self._served_s = now_s - self._served_s, now_s
+        elapsed_s = now_s - self._latest_message_s
+        self._latest_message_s = now_s
+        max_samples = int(min(max(MAX_SAMPLE_RATE_HZ * elapsed_s, MIN_MESSAGE_SAMPLES), MAX_MESSAGE_SAMPLES))
+
         messages: list[bytes | str] = []
-        if self._version != self._hub.version:
-            self._version = self._hub.version
+        if self._state_version != self._hub.version:
+            self._state_version = self._hub.version
             messages.append(json.dumps({"state": self._hub.state}))
-        if (samples := self._samples(int(min(max(SHOWN_HZ * elapsed_s, FEWEST), MOST)), now_s)) is not None:
+        samples = self._next_samples_message(max_samples, now_s)
+        if samples is not None:
             messages.append(samples)
-        if self._playhead is not None and self._shows_playhead:
+        if self._playhead is not None and self._must_send_playhead:
             messages.append(json.dumps({"play": self._playhead.to_json()}))
-            self._shows_playhead = False
+            self._must_send_playhead = False
         return messages
 
-    def _samples(self, most: int, now_s: float) -> bytes | None:
-        """The next samples, or None if there is nothing new."""
+    def _next_samples_message(self, max_samples: int, now_s: float) -> bytes | None:
+        """Return a message with the next samples; None if there are no new samples."""
         tape = self._hub.tape
-        stop, start = self._stop(), max(self._next, tape.oldest)
-        begins, self._begins = self._begins, False
-        if stop <= start and not begins:
+        stop = self._first_hidden_sample()
+        start = max(self._next_sample, tape.oldest)
+        begins_anew = self._begins_anew
+        self._begins_anew = False
+        if stop <= start and not begins_anew:
             return None
-        self._missed += start - self._next
-        self._next = stop
-        self._sent += 1
-        shown = coalesce(tape.samples(start, stop), MOST if begins else most)
-        return samples_message(self._sent, now_s, shown, self._missed, begin_anew=begins)
+        self._missed_samples += start - self._next_sample
+        self._next_sample = stop
+        self._sent_messages += 1
+        limit = MAX_MESSAGE_SAMPLES if begins_anew else max_samples
+        samples = coalesce(tape.samples(start, stop), limit)
+        return samples_message(self._sent_messages, now_s, samples, self._missed_samples, begin_anew=begins_anew)
 
-    def _stop(self) -> int:
-        """Number of the first sample that is not to be shown yet."""
-        tape, playhead = self._hub.tape, self._playhead
+    def _first_hidden_sample(self) -> int:
+        """Return the number of the first sample after the position in the recording; for a live stream, after all."""
+        tape = self._hub.tape
+        playhead = self._playhead
         if playhead is None or not tape.total:
             return tape.total
-        at_s = tape.span()[0] + playhead.at_s
+        start_s, _ = tape.span()
+        position_s = start_s + playhead.at_s
         if playhead.has_jumped:
-            playhead.has_jumped, self._begins = False, True
-            self._next = tape.index(at_s - BACKFILL_S)
-        return tape.index(at_s)
+            playhead.has_jumped = False
+            self._begins_anew = True
+            self._next_sample = tape.index(position_s - HISTORY_S)
+        return tape.index(position_s)
 
-    def _play(self, playhead: Playhead, now_s: float) -> None:
-        step_s, self._played_s = now_s - self._played_s, now_s
+    def _advance(self, playhead: Playhead, now_s: float) -> None:
+        """Advance the position in the recording by the time since the latest call."""
+        step_s = max(now_s - self._latest_advance_s, 0.0)
+        self._latest_advance_s = now_s
         is_complete = self._hub.state.get("is_complete", False)
-        self._shows_playhead |= playhead.advance(max(step_s, 0.0), self._length_s(), is_complete=is_complete)
+        if playhead.advance(step_s, self._length_s(), is_complete=is_complete):
+            self._must_send_playhead = True
 
     def _length_s(self) -> float:
-        start, end = self._hub.tape.span()
-        return end - start
+        start_s, end_s = self._hub.tape.span()
+        return end_s - start_s

@@ -1,7 +1,8 @@
-"""The link between the process that reads a port and the process of the page: samples one way, messages both ways.
+"""Link between the process that reads a port and the process that serves the live page.
 
-The reader never waits: a sample or a message for which there is no room is dropped and counted. Samples go through a
-pipe, where writes of this size are whole or not at all; messages are JSON, one a datagram of a socket pair.
+Samples are sent through a pipe, in which the operating system never splits a write of this size. Messages in both
+directions are JSON, one datagram of a socket pair each. The reader never waits: if the pipe is full, a sample is
+discarded and counted.
 """
 
 import fcntl
@@ -18,22 +19,24 @@ import msgspec
 from isocharge.serve.viewer.messages import LiveRequest
 
 PIPE_BYTES = 1 << 20
-"""Room for samples that the page's process has not taken yet: some 10 s at 1 kHz."""
+"""Size of the pipe with the samples that the page's process has not read yet, bytes: about 10 s at 1 kHz."""
 
-MOST_BYTES = 1 << 16
-"""Largest message."""
+MAX_MESSAGE_BYTES = 1 << 16
+"""Largest size of a message, bytes."""
 
 Message = dict[str, Any]
 
-REQUESTS: msgspec.json.Decoder[LiveRequest] = msgspec.json.Decoder(LiveRequest)
+REQUEST_DECODER: msgspec.json.Decoder[LiveRequest] = msgspec.json.Decoder(LiveRequest)
 
 
 @dataclass
 class LinkEnd:
-    """One end.
+    """One end of the link.
 
     Attributes:
-        is_open: Whether the other process was there at the last attempt.
+        samples: End of the pipe.
+        messages: End of the socket pair.
+        is_open: Whether the other process was running at the latest attempt to send or receive samples.
     """
 
     samples: Connection
@@ -41,12 +44,12 @@ class LinkEnd:
     is_open: bool = True
 
     def close_here(self) -> None:
-        """Close this process's copy of the end, which another process may have."""
+        """Close this process's copy of the end. Another process may have a copy of its own."""
         self.messages.close()
         self.samples.close()
 
     def _send(self, message: bytes, flags: int) -> bool:
-        """Send a message; False where there was no room for it."""
+        """Send a message, and return whether it was sent."""
         try:
             self.messages.send(message, flags)
         except OSError:
@@ -59,15 +62,15 @@ class ReaderEnd(LinkEnd):
     """The end in the process that reads the port.
 
     Attributes:
-        dropped: Samples for which there was no room.
-        waits: Whether to wait for room.
+        dropped: Number of samples that were discarded because the pipe was full.
+        waits: Whether sending waits while the pipe is full.
     """
 
     dropped: int = 0
     waits: bool = False
 
-    def put(self, sample: bytes) -> None:
-        """Hand over a sample, or drop it: does not wait, unless `wait` was called."""
+    def send_sample(self, sample: bytes) -> None:
+        """Send a sample. If the pipe is full, discard the sample, or wait if `enable_waiting` was called."""
         try:
             os.write(self.samples.fileno(), sample)
         except BlockingIOError:
@@ -75,25 +78,26 @@ class ReaderEnd(LinkEnd):
         except OSError:
             self.is_open = False
 
-    def wait(self) -> None:
-        """Wait for room from now on: for a recording, of which nothing must be missing."""
+    def enable_waiting(self) -> None:
+        """Let sending wait while the pipe is full. A recording needs this, so that all its samples are shown."""
         os.set_blocking(self.samples.fileno(), True)
         self.waits = True
 
-    def tell(self, **content: Any) -> bool:
-        """Send a message; False where there was no room for it."""
-        return self._send(json.dumps(content).encode(), 0 if self.waits else socket.MSG_DONTWAIT)
+    def send_message(self, **content: Any) -> bool:
+        """Send a message, and return whether it was sent."""
+        flags = 0 if self.waits else socket.MSG_DONTWAIT
+        return self._send(json.dumps(content).encode(), flags)
 
-    def request(self) -> LiveRequest | None:
-        """Wait for what the page asks for; None once its process has ended."""
+    def wait_for_request(self) -> LiveRequest | None:
+        """Wait for a request of the page, and return it; return None after the page's process has ended."""
         try:
-            data = self.messages.recv(MOST_BYTES)
+            data = self.messages.recv(MAX_MESSAGE_BYTES)
         except OSError:
             return None
-        return REQUESTS.decode(data) if data else None
+        return REQUEST_DECODER.decode(data) if data else None
 
     def close(self) -> None:
-        """Close this end, and wake who waits in `request`."""
+        """Close this end, and let a thread that waits in `wait_for_request` continue."""
         self.is_open = False
         with suppress(OSError):
             self.messages.shutdown(socket.SHUT_RDWR)
@@ -104,11 +108,15 @@ class ReaderEnd(LinkEnd):
 class PageEnd(LinkEnd):
     """The end in the page's process."""
 
-    _partial: bytes = b""
+    _incomplete: bytes = b""
 
-    def take(self, size: int) -> bytes:
-        """The samples that have come, each of `size` bytes; does not wait."""
-        data, self._partial = self._partial, b""
+    def receive_samples(self, size: int) -> bytes:
+        """Return the samples that have arrived, without waiting.
+
+        Args:
+            size: Size of a sample, bytes. An incomplete sample is kept for the next call.
+        """
+        data = self._incomplete
         try:
             data += os.read(self.samples.fileno(), PIPE_BYTES)
         except BlockingIOError:
@@ -117,29 +125,29 @@ class PageEnd(LinkEnd):
             self.is_open = False
         else:
             self.is_open = bool(data)
-        whole = len(data) - len(data) % size
-        self._partial = data[whole:]
-        return data[:whole]
+        complete_bytes = len(data) - len(data) % size
+        self._incomplete = data[complete_bytes:]
+        return data[:complete_bytes]
 
-    def replies(self) -> list[Message]:
-        """The messages that have come; does not wait."""
+    def receive_messages(self) -> list[Message]:
+        """Return the messages that have arrived, without waiting."""
         messages: list[Message] = []
         with suppress(OSError):
-            while data := self.messages.recv(MOST_BYTES, socket.MSG_DONTWAIT):
+            while data := self.messages.recv(MAX_MESSAGE_BYTES, socket.MSG_DONTWAIT):
                 messages.append(json.loads(data))
         return messages
 
-    def ask(self, request: LiveRequest) -> bool:
-        """Send a request to the reader; False where it has ended, or takes none."""
+    def send_request(self, request: LiveRequest) -> bool:
+        """Send a request to the reader, and return whether it was sent."""
         return self._send(msgspec.json.encode(request), socket.MSG_DONTWAIT)
 
 
 def make_link() -> tuple[ReaderEnd, PageEnd]:
-    """Both ends; each may be handed to a process that is started by `spawn`."""
-    reading, writing = Pipe(duplex=False)
-    for end in (reading, writing):
-        os.set_blocking(end.fileno(), False)
-    with suppress(OSError):  # the system allows no more: a smaller pipe will do
-        fcntl.fcntl(writing.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    return ReaderEnd(writing, ours), PageEnd(reading, theirs)
+    """Create both ends of a link. Each end may be passed to a process that is started by `spawn`."""
+    page_pipe, reader_pipe = Pipe(duplex=False)
+    for pipe_end in (page_pipe, reader_pipe):
+        os.set_blocking(pipe_end.fileno(), False)
+    with suppress(OSError):  # a smaller pipe is sufficient if the system does not allow this size
+        fcntl.fcntl(reader_pipe.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+    reader_socket, page_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    return ReaderEnd(reader_pipe, reader_socket), PageEnd(page_pipe, page_socket)

@@ -1,22 +1,24 @@
-"""What goes to the page and comes from it: the description of the film, samples in binary, requests.
+"""Messages between the server and the live page: the description of the film, binary samples, and requests.
 
-The description is what the page has to know before the first sample: geometry, electrodes, model, deflection field. A
-model carries its sensor whole, as the simulator wrote it; what is missing there is not drawn. The field lies beside the
-model, or is shipped for the films of the released ones.
+The page reads the description before the first sample. It contains the geometry, the electrodes, the model and the
+deflection field. The geometry is taken from the sensor in the model's metadata; parts that are missing there are not
+drawn. The deflection field lies beside the model, or is shipped with isocharge for the films of the released models.
 
-A binary message to the page, little-endian: kind (u8, 1), zero (u8), number of samples (u16), number of the message
-(u32), time of sending (unix seconds, f64), records that this page has missed for good (u32), options (u32, bit 0:
-forget what was shown before); then the samples. The page confirms what it has drawn: the number of the message (u32),
-as a binary message of its own.
+A binary message to the page is little-endian: kind (u8, 1), zero (u8), number of samples (u16), number of the message
+(u32), time of sending (Unix time in seconds, f64), number of records that this page has missed (u32), options (u32, bit
+0: discard what was shown before), and the samples. The page confirms each message that it has drawn by a binary message
+with the number of the message (u32).
 
-A sample is a prediction record of fixed size, with the tracked contact in place of the frame's where contacts are
-tracked; many are coalesced to as few as a browser can show. It contains, little-endian: the timestamp (unix seconds,
-f64); the numbers that the declaration of the record marks for the live page (f32 each), then those of the other
-contact; the flags (u32, a bit for each word of `isocharge.serve.flags`, the highest bit for contact); the number of
-records that the sample stands for (u32); and the touch charges (pC, f32 for each electrode). Zeros fill it up to a
-multiple of eight bytes. An unknown number is NaN. The description of the film tells the page the offset of each number.
+A sample is a prediction record of fixed size. If contacts are tracked, it contains the tracked contact instead of the
+contact of the frame. Several records are coalesced to one sample if there are more than a browser can show. A sample is
+little-endian: the timestamp (Unix time in seconds, f64); the numbers that the declaration of the record marks for the
+live page (f32 each); the numbers of the other contact (f32 each); the flags (u32, one bit for each word of
+`isocharge.serve.flags`, and the highest bit for a contact); the number of coalesced records (u32); and the touch
+charges (pC, f32 for each electrode). Zeros fill the sample up to a multiple of eight bytes. An unknown number is NaN.
+The description of the film contains the offset of each number.
 
-A request of the page is JSON, as {"do": "marker", "text": "here"}: the classes below by their names in lower case.
+A request of the page is a JSON object such as {"do": "marker", "text": "here"}. The value of `do` is the name of one of
+the request classes below in lower case.
 """
 
 import math
@@ -40,15 +42,16 @@ from isocharge.serve.record.fields import Field
 from isocharge.serve.record.record import RECORD_FIELDS, PredictionRecord
 
 FLAG_BITS = {word: 1 << position for position, word in enumerate(MEANINGS)}
-"""The bit of each word."""
+"""Bit of each flag in a sample."""
 
 CONTACT_BIT = 1 << 31
+"""Bit that is set if the sample is a contact."""
 
-LARGEST = float(np.finfo(np.float32).max)
+MAX_FLOAT32 = float(np.finfo(np.float32).max)
+"""Largest number of the type float32."""
 
 Samples = np.ndarray[Any, np.dtype[np.void]]
-"""Samples in their order, shape (n,), of a `SampleFormat`."""
-
+"""Samples in the order of their times, shape (n,), with the type of a `SampleFormat`."""
 
 OTHER_PREFIX = "other_"
 """Beginning of the names of the values of the other contact in a sample."""
@@ -114,144 +117,173 @@ class SampleFormat:
         values += [None if other is None else getattr(other, name) for name in OTHER_NUMBERS]
         numbers = [math.nan if value is None else value for value in values]
         charges = record.charge_pC or {}
-        charge_pC = [math.nan if (q := charges.get(name)) is None else q for name in self.electrodes]
+        known_charges = [charges.get(name) for name in self.electrodes]
+        charge_pC = [math.nan if charge is None else charge for charge in known_charges]
         timestamp = math.nan if record.timestamp is None else record.timestamp
         try:
             return self._struct.pack(timestamp, *numbers, bits, 1, *charge_pC)
-        except OverflowError:  # a number that no float32 can hold
-            clipped = [[min(max(value, -LARGEST), LARGEST) for value in part] for part in (numbers, charge_pC)]
-            return self._struct.pack(timestamp, *clipped[0], bits, 1, *clipped[1])
+        except OverflowError:  # a number is beyond the range of float32
+            return self._struct.pack(timestamp, *_clip(numbers), bits, 1, *_clip(charge_pC))
 
 
-def coalesce(samples: Samples, most: int) -> Samples:
-    """At most `most` samples that stand for all: each for a run of neighbours.
+def _clip(values: Sequence[float]) -> list[float]:
+    """Return numbers that are limited to the range of float32."""
+    return [min(max(value, -MAX_FLOAT32), MAX_FLOAT32) for value in values]
 
-    Of a run, the newest sample counts if it is a contact, else the hardest press: a tap between two pictures is shown.
-    Flags are those of the whole run, the latency its largest, and `records` add up.
+
+def coalesce(samples: Samples, max_samples: int) -> Samples:
+    """Coalesce samples, each of which then stands for a run of neighbouring samples.
+
+    The latest sample of a run is shown. If it is no contact, the sample with the largest force of the run is shown
+    instead, so that a short tap is not lost. The flags are those of all samples of the run, the latency is the largest
+    one, and the numbers of records are added.
 
     Args:
         samples: Shape (n,).
-        most: At least 1.
+        max_samples: Largest number of samples to return, at least 1.
+
+    Returns:
+        Shape (max_samples,), or the unchanged samples if there are no more than that.
     """
-    if len(samples) <= most:
+    if len(samples) <= max_samples:
         return samples
-    edges = np.linspace(0, len(samples), most + 1).astype(int)
-    shown: Samples = samples[_shown_of_runs(samples, edges)]
+    edges = np.linspace(0, len(samples), max_samples + 1).astype(int)
     starts = edges[:-1]
-    contact = shown["flags"] & CONTACT_BIT
-    shown["flags"] = np.bitwise_or.reduceat(samples["flags"], starts) & ~np.uint32(CONTACT_BIT) | contact
+    shown: Samples = samples[_shown_positions(samples, edges)]
+    contact_bit = shown["flags"] & CONTACT_BIT
+    run_flags = np.bitwise_or.reduceat(samples["flags"], starts) & ~np.uint32(CONTACT_BIT)
+    shown["flags"] = run_flags | contact_bit
     shown["records"] = np.add.reduceat(samples["records"], starts)
     shown["latency_us"] = np.fmax.reduceat(samples["latency_us"], starts)
     return shown
 
 
-def _shown_of_runs(samples: Samples, edges: np.ndarray) -> np.ndarray:
-    """The position of the sample that is shown of each run, shape (runs,)."""
-    touching = (samples["flags"] & CONTACT_BIT) != 0
-    force = np.where(touching, np.nan_to_num(samples["force_N"], nan=0.0), -1.0)
+def _shown_positions(samples: Samples, edges: np.ndarray) -> np.ndarray:
+    """Return the position of the sample that is shown of each run, shape (n_run,).
+
+    Args:
+        samples: Shape (n,).
+        edges: Start of each run, and the end of the last run, shape (n_run + 1,).
+    """
+    is_contact = (samples["flags"] & CONTACT_BIT) != 0
+    force_N = np.where(is_contact, np.nan_to_num(samples["force_N"], nan=0.0), -1.0)
     last = edges[1:] - 1
-    hardest = np.array([start + int(force[start:stop].argmax()) for start, stop in pairwise(edges)])
-    missed_tap = ~touching[last] & touching[hardest]
-    return np.where(missed_tap, hardest, last)
+    largest_force = np.array([start + int(force_N[start:stop].argmax()) for start, stop in pairwise(edges)])
+    contact_has_ended = ~is_contact[last] & is_contact[largest_force]
+    return np.where(contact_has_ended, largest_force, last)
 
 
 HEADER = struct.Struct("<BBHIdII")
+"""Header of a binary message to the page, as the description of this module lists it."""
 
-SAMPLES, BEGIN_ANEW = 1, 1
-"""Kind of the message; option bit."""
+SAMPLES_KIND = 1
+"""Kind of a binary message with samples."""
 
-LONGEST_MARKER = 80
-"""Characters of a marker's text."""
+BEGIN_ANEW_OPTION = 1
+"""Option bit of a message after which the page discards what was shown before."""
+
+MAX_MARKER_CHARACTERS = 80
+"""Largest number of characters of a marker's text."""
 
 
 class PageRequest(Struct, forbid_unknown_fields=True, tag_field="do", tag=str.lower):
-    """What a page asks for."""
+    """Request of a page."""
 
 
 class Tare(PageRequest):
-    """Take the charges at rest again."""
+    """Request to measure the tare again."""
 
 
 class Back(PageRequest):
-    """Go back to the film as it was calibrated."""
+    """Request to reset the followed film to its calibration."""
 
 
 class Record(PageRequest):
-    """Begin or end a recording."""
+    """Request to begin or end a recording."""
 
     on: bool
 
 
 class Marker(PageRequest):
-    """Note this moment."""
+    """Request to add a marker at the present time."""
 
     text: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what does not fit on a line."""
-        if len(self.text) > LONGEST_MARKER or not is_printable(self.text):
-            raise WrongKey("text", f"at most {LONGEST_MARKER} printable characters", self.text)
+        if len(self.text) > MAX_MARKER_CHARACTERS or not is_printable(self.text):
+            raise WrongKey("text", f"at most {MAX_MARKER_CHARACTERS} printable characters", self.text)
 
 
 class Play(PageRequest):
-    """Go on with the recording."""
+    """Request to play the recording."""
 
 
 class Pause(PageRequest):
-    """Stop at this place of the recording."""
+    """Request to pause the recording."""
 
 
 class Seek(PageRequest):
-    """Go to a place of the recording, s from its start."""
+    """Request to go to a position in the recording, s from its start."""
 
     value: Annotated[float, Meta(ge=0.0, le=1e12)]
 
 
 class Speed(PageRequest):
-    """Play this many times as fast as it was recorded."""
+    """Request to change the speed, relative to the recorded speed."""
 
     value: Annotated[float, Meta(ge=0.01, le=100.0)]
 
 
 LiveRequest = Tare | Back | Record | Marker
+"""Request of the page of a live stream."""
 
 ReplayRequest = Play | Pause | Seek | Speed
+"""Request of the page of a recording."""
 
 
 def samples_message(number: int, sent_s: float, samples: Samples, missed: int, *, begin_anew: bool = False) -> bytes:
-    """Samples for the page; at most 65535."""
-    options = BEGIN_ANEW if begin_anew else 0
-    header = HEADER.pack(SAMPLES, 0, len(samples), number & 0xFFFFFFFF, sent_s, missed & 0xFFFFFFFF, options)
+    """Return a binary message with samples for the page.
+
+    Args:
+        number: Number of the message.
+        sent_s: Unix time of sending, s.
+        samples: At most 65535 samples.
+        missed: Number of records that the page has missed.
+        begin_anew: Whether the page discards what was shown before.
+    """
+    options = BEGIN_ANEW_OPTION if begin_anew else 0
+    header = HEADER.pack(SAMPLES_KIND, 0, len(samples), number & 0xFFFFFFFF, sent_s, missed & 0xFFFFFFFF, options)
     return header + samples.tobytes()
 
 
 def confirmed_number(data: bytes) -> int:
-    """The number of the message that a page has drawn.
+    """Return the number of the message that a page confirms.
 
     Raises:
-        RequestError: If the data are of another length.
+        RequestError: If the confirmation does not have four bytes.
     """
     if len(data) != 4:
         raise RequestError(f"expected the number of a message in four bytes, got {len(data)} bytes")
     return int.from_bytes(data, "little")
 
 
-FILE = "deflection.json"
-"""Name of the field in a model's version folder."""
+DEFLECTION_FILE = "deflection.json"
+"""Name of the file with the deflection field in a version folder."""
 
 
 def find_field(model: Path, metadata: ModelMetadata) -> DeflectionField | None:
-    """The field of the film for which a model was trained; None if there is none.
+    """Return the deflection field of the film for which a model was trained; None if there is none.
 
     Args:
         model: Version folder.
-        metadata: Of the model.
+        metadata: Metadata of the model.
 
     Raises:
-        InputError: If the file in the model's folder is damaged.
+        InputError: If the file in the version folder is damaged.
     """
-    if (model / FILE).is_file():
-        return read_deflection_field(model / FILE)
+    path = model / DEFLECTION_FILE
+    if path.is_file():
+        return read_deflection_field(path)
     film = metadata.sensor.get("film")
     with as_file(files("isocharge.serve.viewer") / "fields") as folder:
         fields = map(read_deflection_field, sorted(folder.glob("*.json")))
@@ -259,39 +291,49 @@ def find_field(model: Path, metadata: ModelMetadata) -> DeflectionField | None:
 
 
 def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | None) -> dict[str, Any]:
-    """A film for the page, as JSON.
+    """Return the description of a film for the page as a JSON object.
 
     Args:
-        name: Of the stream, for people.
-        metadata: Of the model that answers.
-        field: How the film deflects; None if nobody computed it.
+        name: Name of the stream.
+        metadata: Metadata of the model.
+        field: Deflection field of the film; None if there is none.
     """
     sensor = metadata.sensor
-    film, shapes = sensor.get("film"), _shapes_mm(sensor, metadata.electrodes)
-    more = {electrode: polygons[1:] for electrode, polygons in shapes.items() if polygons[1:]}
-    return {
+    film = sensor.get("film")
+    electrode_polygons = _electrode_polygons(sensor, metadata.electrodes)
+    description = {
         "name": name,
         "model": metadata.label,
         "sensor": metadata.frame_id,
         "electrodes": list(metadata.electrodes),
-        "outlines_mm": {electrode: polygons[0] for electrode, polygons in shapes.items()},
+        "outlines_mm": {electrode: pad for electrode, (pad, *_) in electrode_polygons.items()},
         "radius_mm": film.get("radius_mm") if isinstance(film, dict) else None,
         "working_area_mm": [[float(x), float(y)] for x, y in metadata.working_area_mm],
         "force_range_N": list(metadata.force_range_N),
         "probes": list(metadata.probes),
         "deflection": None if field is None else field.to_json(),
         "sample": SampleFormat(metadata.electrodes).describe(),
-        **({"more_mm": more} if more else {}),
     }
+    more = {electrode: leads for electrode, (_, *leads) in electrode_polygons.items() if leads}
+    if more:
+        description["more_mm"] = more
+    return description
 
 
-def _shapes_mm(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[list[float]]]]:
-    """Corners of each electrode's pad and of its further metal, on the real film; none for a sensor of another form."""
+def _electrode_polygons(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[list[float]]]]:
+    """Return the polygons of each electrode on the real film: its pad, then further metal such as leads.
+
+    Returns:
+        Polygons by electrode, each a list of corners (x, y), mm; empty if the sensor has an unknown form.
+    """
     try:
-        # not `Positive`: msgspec 0.22 crashes on a tuple of fixed length beside a number with bounds
+        # The type is not `Positive`, because msgspec 0.22 crashes on a union of a fixed tuple and a bounded number.
         parts = convert(sensor["electrodes"], dict[str, Point | float | _Polygon], "sensor", InputError)
         calibration = sensor.get("calibration") or {}
-        return {name: [_placed(polygon, calibration) for polygon in _polygons(parts, name)] for name in electrodes}
+        return {
+            name: [_calibrated_corners(polygon, calibration) for polygon in _designed_polygons(parts, name)]
+            for name in electrodes
+        }
     except (InputError, TypeError, ValueError, KeyError):
         return {}
 
@@ -300,20 +342,31 @@ Point = tuple[Finite, Finite]
 
 
 class _Polygon(Struct):
+    """Electrode of a sensor that is described by polygons.
+
+    Attributes:
+        polygon_mm: Corners of the pad, mm.
+        more_mm: Corners of further polygons, such as leads, mm.
+    """
+
     polygon_mm: list[Point]
     more_mm: list[list[Point]] = []
 
 
-def _polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]:
-    if isinstance(part := parts[name], _Polygon):
+def _designed_polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]:
+    """Return the polygons of an electrode in the design. An electrode without polygons is a square around a point."""
+    part = parts[name]
+    if isinstance(part, _Polygon):
         return [part.polygon_mm, *part.more_mm]
-    (x, y), half = part, 0.5 * parts["side_mm"]
+    x, y = part
+    half = 0.5 * parts["side_mm"]
     return [[(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]]
 
 
-def _placed(corners: list[tuple[float, float]], calibration: Any) -> list[list[float]]:
-    """Corners after the calibration's turn and shift."""
+def _calibrated_corners(corners: list[Point], calibration: Any) -> list[list[float]]:
+    """Return corners that are rotated and shifted by the result of a calibration."""
     shift_x, shift_y = calibration.get("shift_mm", (0.0, 0.0))
     angle = math.radians(calibration.get("rotation_deg", 0.0))
-    c, s = math.cos(angle), math.sin(angle)
-    return [[c * x - s * y + shift_x, s * x + c * y + shift_y] for x, y in corners]
+    cosine = math.cos(angle)
+    sine = math.sin(angle)
+    return [[cosine * x - sine * y + shift_x, sine * x + cosine * y + shift_y] for x, y in corners]

@@ -1,4 +1,4 @@
-"""The process of the page: a server of its own, beside the process that reads the port."""
+"""The process that serves the live page, separate from the process that reads the port."""
 
 import asyncio
 import os
@@ -20,24 +20,27 @@ from isocharge.serve.viewer.link import PageEnd
 from isocharge.serve.viewer.server import Access, PageServer
 
 NICE = 10
-"""How much later than the reader the page's process gets its turn where both want the same core."""
+"""Increase of the nice value of the page's process, so that the reader has priority on a busy core."""
 
-START_S, STOP_S = 60.0, 5.0
-"""Time to start and to stop, s."""
+START_TIMEOUT_S = 60.0
+"""Longest time until the page's process listens, s."""
+
+STOP_TIMEOUT_S = 5.0
+"""Time after which the page's process is terminated if it has not ended, s."""
 
 BACKLOG = 128
-"""Connections that may wait to be accepted."""
+"""Largest number of connections that wait to be accepted."""
 
 
 @dataclass(frozen=True)
 class Page:
-    """What the page shows, where, and to whom.
+    """Settings of the live page.
 
     Attributes:
-        link: To the process that reads the port or the recording.
-        description: Of the film, see `describe_film`.
-        address: Where to listen.
-        token: The secret that viewers must know; None for none.
+        link: Link to the process that reads the port or the recording.
+        description: Description of the film, as `describe_film` returns it.
+        address: Address on which the page listens.
+        token: Secret that viewers must send; None if no token is required.
         is_recording: Whether the stream is a recording.
     """
 
@@ -50,37 +53,41 @@ class Page:
 
 @contextmanager
 def page_process(page: Page) -> Iterator[str]:
-    """Run the page in a process of its own; yields its URL. It ends when the reader closes its end of the link.
+    """Run the page in its own process. The process ends when the reader closes its end of the link.
+
+    Yields:
+        The URL of the page.
 
     Raises:
         InputError: If the token cannot be used.
-        ListenError: If the address is taken or impossible.
+        ListenError: If the address is in use or cannot be used.
     """
     context = get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_run, args=(page, theirs), name="page", daemon=True)
+    url_receiver, url_sender = context.Pipe(duplex=False)
+    process = context.Process(target=_run, args=(page, url_sender), name="page", daemon=True)
     with _interrupts_ignored():
         process.start()
-    theirs.close()
+    url_sender.close()
     page.link.close_here()
     try:
-        yield _url(ours)
+        yield _receive_url(url_receiver)
     finally:
-        process.join(STOP_S)
+        process.join(STOP_TIMEOUT_S)
         if process.is_alive():
             process.terminate()
             process.join()
 
 
 def run_page(page: Page, announce: Callable[[str], object]) -> None:
-    """Answer browsers in this process until the reader has ended.
+    """Serve the page in this process until the reader has ended.
 
     Args:
-        page: What to show.
-        announce: Called with the URL once the server listens.
+        page: Settings of the page.
+        announce: Function that is called with the URL when the server listens.
 
     Raises:
-        As `page_process`.
+        InputError: If the token cannot be used.
+        ListenError: If the address is in use or cannot be used.
     """
     access = Access(None if page.token is None else Token(page.token), page.address.host)
     hub = Hub(page.link, page.description, is_recording=page.is_recording)
@@ -95,42 +102,45 @@ def run_page(page: Page, announce: Callable[[str], object]) -> None:
             runner.run(serve())
 
 
-def _run(page: Page, ready: Connection) -> None:
-    """The page's process: says the URL, or what is wrong."""
+def _run(page: Page, url_sender: Connection) -> None:
+    """Run the page's process, and send its URL or the error that prevents it from starting."""
     with suppress(OSError):
         os.nice(NICE)
     try:
-        run_page(page, ready.send)
+        run_page(page, url_sender.send)
     except IsochargeError as error:
-        ready.send(error)
+        url_sender.send(error)
 
 
-def _url(ready: Connection) -> str:
-    """The URL that the page's process says.
+def _receive_url(url_receiver: Connection) -> str:
+    """Wait for the URL of the page's process.
 
     Raises:
-        IsochargeError: What it raised.
-        ListenError: If it says nothing.
+        IsochargeError: The error that the process raised.
+        ListenError: If the process ends or sends nothing in time.
     """
     try:
-        answer = ready.recv() if ready.poll(START_S) else None
+        result = url_receiver.recv() if url_receiver.poll(START_TIMEOUT_S) else None
     except EOFError:
-        answer = None
-    if isinstance(answer, IsochargeError):
-        raise answer
-    if answer is None:
+        result = None
+    if isinstance(result, IsochargeError):
+        raise result
+    if result is None:
         raise ListenError("the process of the live page did not start; run again without --live, and report this")
-    return str(answer)
+    return str(result)
 
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """A process that is started here does not see Ctrl-C: it ends with its reader."""
+    """Ignore Ctrl-C during the block, which a process that is started in the block inherits.
+
+    The page's process ends when its reader ends.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    previous_handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous_handler)

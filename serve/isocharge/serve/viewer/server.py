@@ -1,12 +1,13 @@
-"""The page's server: its files and the description of the film over HTTP, samples by WebSocket, to those who may.
+"""Server of the live page: files and the description of the film over HTTP, samples over WebSocket.
 
-The server is that of the package `websockets`, one request of HTTP for each connection. It bounds the head of a request
-(8 KiB a line, 128 lines), the time for it, the size of a message, and asks each viewer for a sign of life. The rest is
-bounded here: how many viewers there are, how much they send, and how long they take nothing.
+The server is based on the package `websockets`, which answers one HTTP request for each connection. The package limits
+the size of the request line and headers (8 KiB for each line, 128 lines), the time for a request and the size of a
+message, and sends pings to each viewer. This module limits the number of viewers, the rate at which they send data, and
+the time for which they read nothing.
 
-A browser sends no Authorization header with a WebSocket, so the page sends its token as a subprotocol, `bearer.TOKEN`
-in base64url; other clients send the header. Any page in the world may try to open a WebSocket to this machine;
-`isocharge.serve.network.browser_check` refuses pages of other sites.
+A browser sends no Authorization header with a WebSocket. The page therefore sends its token as a subprotocol,
+`bearer.TOKEN` in base64url; other clients send the header. Requests from pages of other sites are refused by
+`isocharge.serve.network.browser_check`.
 """
 
 import asyncio
@@ -40,9 +41,10 @@ from isocharge.serve.viewer.hub import Hub, Viewer
 from isocharge.serve.viewer.messages import FLAG_BITS, confirmed_number
 
 PROTOCOL = "isocharge.live.1"
-"""The subprotocol of the page."""
+"""Subprotocol of the page."""
 
 BEARER = "bearer."
+"""Beginning of the subprotocol that contains the token."""
 
 
 class Access:
@@ -66,7 +68,7 @@ class Access:
 
         Raises:
             OriginError: If a page of another site sent the request.
-            TokenError: If it does not carry the token.
+            TokenError: If the request does not contain the token.
         """
         self._browser_check.check("GET", headers)
         if self._token is not None:
@@ -74,77 +76,106 @@ class Access:
 
 
 def _bearer(subprotocols: Iterable[str]) -> bytes:
-    """The Authorization header that a subprotocol stands for."""
-    for offered in subprotocols:
-        if offered.startswith(BEARER):
-            text = offered.removeprefix(BEARER)
+    """Return the Authorization header that corresponds to the subprotocol with the token; empty if there is none."""
+    for subprotocol in subprotocols:
+        if subprotocol.startswith(BEARER):
+            text = subprotocol.removeprefix(BEARER)
+            padding = "=" * (-len(text) % 4)
             try:
-                return b"Bearer " + base64.b64decode(text + "=" * (-len(text) % 4), altchars=b"-_", validate=True)
+                return b"Bearer " + base64.b64decode(text + padding, altchars=b"-_", validate=True)
             except (binascii.Error, ValueError):
                 return b"Bearer"
     return b""
 
 
-SESSION, LIVE = "/session.json", "/live"
-"""Paths of the description and of the WebSocket."""
+SESSION_PATH = "/session.json"
+"""Path of the description of the film."""
 
-VIEWERS = 32
-"""Browsers at a time."""
+LIVE_PATH = "/live"
+"""Path of the WebSocket."""
 
-BYTES_AT_ONCE, BYTES_PER_S = 1 << 16, 1 << 14
-"""What a connection may send at once and in the long run, 1/s: the page sends 1 kB/s, and no request is larger."""
+MAX_VIEWERS = 32
+"""Largest number of viewers."""
 
-MESSAGE_BYTES = 1 << 12
-"""Largest message of a viewer."""
+MAX_BURST_BYTES = 1 << 16
+"""Largest amount of data that a connection may send at once, bytes. No request of the page is larger."""
 
-REQUEST_S, SIGN_OF_LIFE_S, TAKE_S, CLOSE_S = 10.0, 20.0, 30.0, 2.0
-"""Time for a request; between signs of life, and for one; to take what was sent; to say goodbye, s."""
+MAX_BYTES_PER_S = 1 << 14
+"""Largest mean rate at which a connection may send data, bytes/s. The page sends about 1 kB/s."""
 
-TYPES = {
+MAX_MESSAGE_BYTES = 1 << 12
+"""Largest size of a message from a viewer, bytes."""
+
+REQUEST_TIMEOUT_S = 10.0
+"""Longest time for an HTTP request, s."""
+
+PING_INTERVAL_S = 20.0
+"""Time between two pings, and longest time until the response to a ping, s."""
+
+SEND_TIMEOUT_S = 30.0
+"""Longest time for which a viewer may read nothing, s."""
+
+CLOSE_TIMEOUT_S = 2.0
+"""Longest time for closing a connection, s."""
+
+CONTENT_TYPES = {
     ".html": b"text/html; charset=utf-8",
     ".css": b"text/css; charset=utf-8",
     ".js": b"text/javascript; charset=utf-8",
     ".svg": b"image/svg+xml",
     ".LICENSE": b"text/plain; charset=utf-8",
 }
-"""Content type by the end of a file's name."""
+"""Content type by the suffix of a file name."""
 
-POLICY = (
+CONTENT_SECURITY_POLICY = (
     b"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
     b"base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""What a browser may load: our own files, and nothing from anywhere else."""
+"""Content security policy: a browser may load only the files of this server."""
 
-SILENT = logging.getLogger("isocharge.serve.viewer.websockets")
-"""Mistakes of clients are answered, not logged."""
-SILENT.setLevel(logging.CRITICAL)
+SILENT_LOGGER = logging.getLogger("isocharge.serve.viewer.websockets")
+"""Logger for the package `websockets`. Errors of clients are sent to the clients and not logged."""
+SILENT_LOGGER.setLevel(logging.CRITICAL)
 
 
-class Budget:
-    """How many bytes a client may still send: `at_once`, and `per_s` more each second."""
+class RateLimit:
+    """Limit of the data that a client may send (token bucket).
 
-    def __init__(self, at_once: float, per_s: float, now_s: float) -> None:
-        self._most = self._left = at_once
-        self._per_s, self._counted_s = per_s, now_s
+    Args:
+        burst_bytes: Largest amount of data at once, bytes.
+        bytes_per_s: Largest mean rate, bytes/s.
+        now_s: Present time on a clock that does not jump, s.
+    """
 
-    def spend(self, count: int, now_s: float) -> bool:
-        """Count bytes; False if they are too many."""
-        self._left = min(self._most, self._left + max(now_s - self._counted_s, 0.0) * self._per_s) - count
-        self._counted_s = now_s
-        return self._left >= 0.0
+    def __init__(self, burst_bytes: float, bytes_per_s: float, now_s: float) -> None:
+        self._burst_bytes = burst_bytes
+        self._bytes_per_s = bytes_per_s
+        self._available_bytes = burst_bytes
+        self._latest_s = now_s
+
+    def allows(self, count: int, now_s: float) -> bool:
+        """Count received data, bytes, and return whether they are within the limit."""
+        elapsed_s = max(now_s - self._latest_s, 0.0)
+        refilled_bytes = min(self._burst_bytes, self._available_bytes + elapsed_s * self._bytes_per_s)
+        self._available_bytes = refilled_bytes - count
+        self._latest_s = now_s
+        return self._available_bytes >= 0.0
 
 
 class PageConnection(ServerConnection):
-    """A connection that ends when its client sends too much: of every frame each byte counts, also of a ping."""
+    """A connection that is ended if its client sends too much data. The data include control frames such as pings."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begin to count."""
-        self._budget = Budget(BYTES_AT_ONCE, BYTES_PER_S, time.monotonic())
+        """Start the limit of the data with the connection."""
+        self._rate_limit = RateLimit(MAX_BURST_BYTES, MAX_BYTES_PER_S, time.monotonic())
         super().connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        """Count, and take; no more from a client that does not read what it is sent, which would fill the memory."""
-        if not self._budget.spend(len(data), time.monotonic()):
+        """Process received data.
+
+        Reading is paused while the client does not read, because responses would otherwise fill the memory.
+        """
+        if not self._rate_limit.allows(len(data), time.monotonic()):
             self.transport.abort()
             return
         super().data_received(data)
@@ -152,60 +183,70 @@ class PageConnection(ServerConnection):
             self.transport.pause_reading()
 
     def resume_writing(self) -> None:
-        """The client reads again."""
+        """Resume reading when the client reads again."""
         super().resume_writing()
         self.transport.resume_reading()
 
 
 class PageServer:
-    """Answers browsers."""
+    """Serves the files of the page, the description of the film, and the samples.
+
+    Args:
+        hub: The stream.
+        access: Checks the requests for the description and the samples.
+    """
 
     def __init__(self, hub: Hub, access: Access) -> None:
-        self._hub, self._access = hub, access
+        self._hub = hub
+        self._access = access
         self._files = page_files()
         self._id = secrets.token_hex(8)
 
     @contextlib.asynccontextmanager
     async def listening(self, listening: socket.socket) -> AsyncIterator[None]:
-        """Answer while the block runs."""
+        """Answer requests on a listening socket while the block runs."""
         async with serve(
-            self._follow,
+            self._serve_viewer,
             sock=listening,
             process_request=self._answer,
-            select_subprotocol=_our_protocol,
+            select_subprotocol=_select_subprotocol,
             compression=None,
             server_header=None,
-            open_timeout=REQUEST_S,
-            ping_interval=SIGN_OF_LIFE_S,
-            ping_timeout=SIGN_OF_LIFE_S,
-            close_timeout=CLOSE_S,
-            max_size=MESSAGE_BYTES,
-            logger=SILENT,
+            open_timeout=REQUEST_TIMEOUT_S,
+            ping_interval=PING_INTERVAL_S,
+            ping_timeout=PING_INTERVAL_S,
+            close_timeout=CLOSE_TIMEOUT_S,
+            max_size=MAX_MESSAGE_BYTES,
+            logger=SILENT_LOGGER,
             create_connection=PageConnection,
         ):
             yield
 
     def _answer(self, _connection: ServerConnection, request: http11.Request) -> http11.Response | None:
-        """A file of the page, which everybody may have, or the description of the film; None lets a viewer in."""
+        """Return the response to an HTTP request; None if the request opens a WebSocket.
+
+        The files of the page need no token.
+        """
         try:
             path = request.path.partition("?")[0]
             if path in self._files:
-                return _to_send(self._files[path])
-            if path not in (SESSION, LIVE):
+                return _last_response(self._files[path])
+            if path not in (SESSION_PATH, LIVE_PATH):
                 raise UnknownPath(f"nothing is served under {path[:200]!r}; the page is /")
             items = request.headers.raw_items()
             headers = {name.lower().encode(): value.encode("ascii", "surrogateescape") for name, value in items}
-            offered = ",".join(request.headers.get_all("Sec-WebSocket-Protocol")).split(",")
-            self._access.check(headers, map(str.strip, offered))
-            if path == SESSION:
-                return _to_send(self._session())
-            if len(self._hub.viewers) >= VIEWERS:
-                raise TooMany(f"all {VIEWERS} places for viewers are taken; close a page that nobody looks at")
+            subprotocols = ",".join(request.headers.get_all("Sec-WebSocket-Protocol")).split(",")
+            self._access.check(headers, map(str.strip, subprotocols))
+            if path == SESSION_PATH:
+                return _last_response(self._session())
+            if len(self._hub.viewers) >= MAX_VIEWERS:
+                raise TooMany(f"all {MAX_VIEWERS} places for viewers are taken; close a page that nobody looks at")
             return None
-        except Exception as error:  # whatever it is, one request fails and the log says why
-            return _to_send(error_response(error))
+        except Exception as error:  # every error is sent to the client; unexpected errors are also logged
+            return _last_response(error_response(error))
 
     def _session(self) -> Response:
+        """Return the description of the stream, which the page reads before the first sample."""
         response = json_response(
             {
                 "id": self._id,
@@ -217,14 +258,14 @@ class PageServer:
         response.headers.append((b"cache-control", b"no-store"))
         return response
 
-    async def _follow(self, connection: ServerConnection) -> None:
-        """Send samples to a viewer and take its requests until it goes."""
+    async def _serve_viewer(self, connection: ServerConnection) -> None:
+        """Send samples to a viewer and carry out its requests until it disconnects."""
         viewer = Viewer(self._hub)
         self._hub.viewers.add(viewer)
         sender = asyncio.create_task(self._send(viewer, connection))
         try:
             async for message in connection:
-                await self._take(viewer, connection, message)
+                await self._handle_message(viewer, connection, message)
         except ConnectionClosed:
             pass
         finally:
@@ -232,12 +273,12 @@ class PageServer:
             sender.cancel()
 
     async def _send(self, viewer: Viewer, connection: ServerConnection) -> None:
-        """Send what there is; a viewer that does not take it is left."""
+        """Send messages to a viewer until the stream ends. A viewer that does not read is disconnected."""
         try:
             while not self._hub.has_ended:
                 await viewer.wake.wait()
                 viewer.wake.clear()
-                async with asyncio.timeout(TAKE_S):
+                async with asyncio.timeout(SEND_TIMEOUT_S):
                     for message in viewer.messages(time.time()):
                         await connection.send(message)
             await connection.close(1012, "the stream has ended")
@@ -246,40 +287,42 @@ class PageServer:
         except ConnectionClosed:
             pass
 
-    async def _take(self, viewer: Viewer, connection: ServerConnection, message: str | bytes) -> None:
-        """Do what the page says; what is no request is answered with the reason."""
+    async def _handle_message(self, viewer: Viewer, connection: ServerConnection, message: str | bytes) -> None:
+        """Handle a confirmation or a request of the page. The response to an invalid message is the error."""
         try:
             if isinstance(message, bytes):
                 viewer.confirm(confirmed_number(message))
                 return
             request = parse_json(message, "", RequestError, self._hub.requests)
-            if not self._hub.do(request, viewer):
+            if not self._hub.handle(request, viewer):
                 raise RequestError("the stream has ended, or does not answer")
         except RequestError as error:
             await connection.send(json.dumps({"error": str(error)}))
 
 
-def _our_protocol(_connection: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+def _select_subprotocol(_connection: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
     return Subprotocol(PROTOCOL) if PROTOCOL in offered else None
 
 
-def _to_send(response: Response) -> http11.Response:
-    """A response as `websockets` sends it, the last one of its connection."""
+def _last_response(response: Response) -> http11.Response:
+    """Convert a response for `websockets`. The connection is closed after it."""
     headers = Headers([(name.decode(), value.decode()) for name, value in response.headers])
     headers["Connection"] = "close"
     return http11.Response(response.status, HTTPStatus(response.status).phrase, headers, response.body)
 
 
 def page_files() -> dict[str, Response]:
-    """The answer to each path; `/` is the page."""
+    """Return the response to each path of the page. The path `/` is the page itself."""
     folder = Path(__file__).with_name("page")
     paths = [path for path in folder.rglob("*") if path.is_file()]
-    answers = {f"/{path.relative_to(folder).as_posix()}": _file_response(path) for path in paths}
-    return answers | {"/": answers["/index.html"]}
+    responses = {f"/{path.relative_to(folder).as_posix()}": _file_response(path) for path in paths}
+    responses["/"] = responses["/index.html"]
+    return responses
 
 
 def _file_response(path: Path) -> Response:
-    response = response_of(200, TYPES[path.suffix], path.read_bytes())
-    others = [header for header in PAGE_HEADERS if header[0] != b"content-security-policy"]
-    response.headers.extend([(b"content-security-policy", POLICY), (b"cache-control", b"no-cache"), *others])
+    response = response_of(200, CONTENT_TYPES[path.suffix], path.read_bytes())
+    response.headers.append((b"content-security-policy", CONTENT_SECURITY_POLICY))
+    response.headers.append((b"cache-control", b"no-cache"))
+    response.headers.extend(header for header in PAGE_HEADERS if header[0] != b"content-security-policy")
     return response
