@@ -16,7 +16,7 @@ from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.train.bayes.limit import BayesLimit, BayesProblem, bayes_estimate
 from isocharge.train.model_release.evaluate import alarm_threshold
-from isocharge.train.report.measures import coverage
+from isocharge.train.report.measures import interval_coverage
 
 RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
 MARGIN_mm = 0.01
@@ -72,8 +72,8 @@ def intervals(bench: Bench, count: int) -> dict[str, Any]:
     contact, std, _ = bench.answers(NOISE.add(bench.film.charges(truth), bench.rng))
     orders = (np.argsort(np.hypot(truth[:, 0], truth[:, 1])), np.argsort(truth[:, 2]))
     thirds = [rows for order in orders for rows in np.array_split(order, 3)]
-    shares = np.stack([coverage(contact[rows], std[rows], truth[rows], LEVELS) for rows in thirds])
-    of_all = coverage(contact, std, truth, LEVELS)
+    shares = np.stack([interval_coverage(contact[rows], std[rows], truth[rows], LEVELS) for rows in thirds])
+    of_all = interval_coverage(contact, std, truth, LEVELS)
     found: dict[str, Any] = {"draws": count}
     for k, level in enumerate(LEVELS):
         found[f"{level:.0%} of all"] = [float(of_all[k].min()), float(of_all[k].max())]

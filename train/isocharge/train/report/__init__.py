@@ -1,8 +1,10 @@
-"""The report on speed against error: every method on the same presses, with the limits drawn in.
+"""The report on speed against error. Every method is tested on the same presses and compared with theoretical limits.
 
-from isocharge.train.report import write_report
+The report of the released model of a sensor on the presses of a dataset is written by these lines:
 
-write_report(Path("report"), [(read_dataset(Path("presses")), find_model("three-25um-biaxial"))])
+    from isocharge.train.report import write_report
+
+    write_report(Path("report"), [(read_dataset(Path("presses")), find_model("three-25um-biaxial"))])
 """
 
 from isocharge.common.extras import require

@@ -1,7 +1,8 @@
-"""How much work a report is, the presses that every method is measured on, and what the noise allows on them.
+"""Settings of a report, the test presses of a dataset, and the theoretical limits of the error on these presses.
 
-Test charges come from solves that training never saw: the forward map of the test reaches a little further than the
-dataset's, so that its distances and forces, hence all its solves, are others. The limits are Bayes' and Cramér-Rao's.
+The test charges come from solves of the film that are not part of the training data: the forward map of the test covers
+a slightly larger range of distances and forces than the forward map of the dataset, so that its nodes lie at other
+distances and forces. The theoretical limits are the Bayes limit and the Cramér-Rao limit.
 """
 
 from concurrent.futures import Executor
@@ -33,28 +34,30 @@ from isocharge.simulate.mechanics.theory import ACCURACY
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
 from isocharge.train.data.presses import LabelledPresses, domain_of
-from isocharge.train.report.measures import Errors, rounded
+from isocharge.train.report.measures import ContactErrors, round_significant
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Sizes of a report.
+    """Settings of a report: numbers of presses, sizes of networks, and durations.
+
+    The names of the attributes are keys of `report.json`.
 
     Attributes:
-        presses: Test presses.
-        hold_out: Share of the dataset's positions that hyperparameters are chosen by.
-        learn_from: Presses of the dataset that are used at most.
-        sizes: Hidden layers of the networks.
-        steps: Their optimiser steps.
-        seconds: Time in which single predictions of a method are timed, and the same for batches, s.
-        batch: Presses in a batch.
-        draws: Draws of the noise for maps and coverage of the released model.
-        limited: Test presses that the Bayes limit is integrated for.
-        accuracy: Relative error of a charge in the films that are solved.
-        shapes: Probes that the models do not expect, as notations.
-        mismatch_cases: Whether another pretension is tried, which takes solves.
-        seed: Of everything random.
-        quick: Whether methods are fitted small.
+        presses: Number of simulated test presses.
+        hold_out: Fraction of the training positions that is used for validation, 0 to 1.
+        learn_from: Largest number of presses of the dataset that is used.
+        sizes: Widths of the hidden layers of each network that is trained for the comparison.
+        steps: Number of optimiser steps of these networks.
+        seconds: Time for which the single predictions of a method are timed, and again for its batches, s.
+        batch: Number of presses in a batch.
+        draws: Number of noise draws on the test presses, for the error maps and the coverage of the released model.
+        limited: Number of test presses for which the Bayes limit is computed.
+        accuracy: Relative accuracy of the charges in the solves of the film.
+        shapes: Probes for which the models were not trained, in the notation of `parse_probe`.
+        mismatch_cases: Whether the methods are also tested on a film with another pretension, which has to be solved.
+        seed: Seed of all random numbers.
+        quick: Whether the methods are fitted with reduced effort.
     """
 
     presses: int = 4096
@@ -87,145 +90,194 @@ QUICK = Settings(
     mismatch_cases=False,
     quick=True,
 )
-"""Everything once, small: seconds, to try it out. Its figures mean nothing."""
+"""Settings for a trial run, which takes less than a minute. Its results are not meaningful."""
 
+TEST_RANGE_FACTOR = 1.03
+"""Factor by which the forward map of the test exceeds the distances and forces of the dataset."""
 
-FURTHER = 1.03
-"""How much further than the dataset the test's solves reach, in distance and force."""
+TEST_PRESSES_SEED = 7919
+"""Seed of the positions and forces of the test presses, relative to the seed of the case."""
 
 
 @dataclass(frozen=True)
 class EvaluationCase:
-    """What a dataset is about.
+    """Conditions under which all methods are evaluated, taken from a dataset.
 
     Attributes:
-        sensor: Its sensor.
-        probes: Its probes.
-        domain: Its contacts.
-        rotated: Whether its probes are rotated at random.
-        noise: What is on the charges.
-        seed: Of test presses and noise.
-        presses: How many test presses.
+        sensor: The sensor of the dataset.
+        probes: The probes of the dataset.
+        domain: The working area and the range of forces of the dataset.
+        is_rotated: Whether the probes are rotated by random angles.
+        noise: The noise of the charges.
+        seed: Seed of the test presses and of the noise.
+        press_count: Number of test presses.
     """
 
     sensor: Sensor
     probes: tuple[Probe, ...]
     domain: Domain
-    rotated: bool
+    is_rotated: bool
     noise: NoiseModel
     seed: int
-    presses: int
+    press_count: int
 
     @classmethod
-    def of(cls, dataset: Dataset, presses: int, seed: int) -> "EvaluationCase":
-        """From a dataset's columns and manifest, with the reference noise.
+    def of(cls, dataset: Dataset, max_presses: int, seed: int) -> "EvaluationCase":
+        """Create the case of a dataset, with the reference noise.
+
+        Args:
+            dataset: The dataset with its sensor, its presses and its manifest.
+            max_presses: Largest number of test presses; it is rounded down to a multiple of the number of probes.
+            seed: Seed of the test presses and of the noise.
 
         Raises:
-            DatasetError: If a probe of the dataset is no probe's notation.
+            DatasetError: If the dataset names a probe that is not in the notation of `parse_probe`.
         """
-        probes, rotated = _probes_of(dataset.samples)
-        count = presses - presses % len(probes)
-        return cls(dataset.sensor, probes, domain_of(dataset), rotated, noise_model("reference"), seed, count)
+        probes, is_rotated = _probes_of(dataset.samples)
+        press_count = max_presses - max_presses % len(probes)
+        noise = noise_model("reference")
+        return cls(dataset.sensor, probes, domain_of(dataset), is_rotated, noise, seed, press_count)
 
-    def sweep(self, further: float = 1.0) -> Sweep:
-        """Presses spread like the dataset's, of another seed."""
-        low, high = self.domain.force_range
+    def test_sweep(self, range_factor: float = 1.0) -> Sweep:
+        """Return the sweep of the test presses, distributed as in the dataset, but with another seed.
+
+        Args:
+            range_factor: Factor by which the largest distance and the largest force are multiplied, and by which the
+                smallest force is divided.
+        """
+        min_force, max_force = self.domain.force_range
         return Sweep(
-            radius=self.domain.radius * further,
-            force_range=(low / further, high * further),
-            samples=self.presses,
-            seed=self.seed + 7919,
-            orientation="random" if self.rotated else "fixed",
+            radius=self.domain.radius * range_factor,
+            force_range=(min_force / range_factor, max_force * range_factor),
+            samples=self.press_count,
+            seed=self.seed + TEST_PRESSES_SEED,
+            orientation="random" if self.is_rotated else "fixed",
         )
 
     def forward_maps(
         self,
         *,
-        further: float = FURTHER,
+        range_factor: float = TEST_RANGE_FACTOR,
         accuracy: float = ACCURACY,
         executor: Executor | None = None,
     ) -> tuple[ForwardMap, ...]:
-        """Forward maps of the sensor under its probes, solved so much further than the dataset reaches."""
-        return solve_maps(
-            self.sensor, self.probes, self.sweep(further), SolveSettings(accuracy=accuracy), executor=executor
-        )
+        """Solve the film and return the forward map of the sensor for each probe.
+
+        Args:
+            range_factor: Factor by which the maps exceed the distances and forces of the dataset.
+            accuracy: Relative accuracy of the charges.
+            executor: Executor of the solves; None to solve in this process.
+        """
+        sweep = self.test_sweep(range_factor)
+        return solve_maps(self.sensor, self.probes, sweep, SolveSettings(accuracy=accuracy), executor=executor)
 
 
 def _probes_of(samples: Samples) -> tuple[tuple[Probe, ...], bool]:
-    """The probes, and whether they are rotated at random; one that is rotated by one angle carries it."""
-    probes, rotated = [], False
+    """Return the probes of a dataset, and whether they are rotated by random angles.
+
+    A probe that pressed at a single angle is returned with this rotation.
+    """
+    probes = []
+    is_rotated = False
     for name in np.unique(samples.probe):
-        angles = samples.orientation_deg[samples.probe == name]
+        angles_deg = samples.orientation_deg[samples.probe == name]
         try:
             probe = parse_probe(str(name))
         except ValueError as error:
-            raise DatasetError(f"the dataset's probe {str(name)!r}: {error}") from error
-        rotated = rotated or (np.ptp(angles) > 0.0 and probe.period > 0.0)
-        probes.append(probe if np.ptp(angles) > 0.0 else probe.rotated(float(np.deg2rad(angles[0]))))
-    return tuple(probes), bool(rotated)
+            raise DatasetError(f"the probe {str(name)!r} of the dataset: {error}") from error
+        has_several_angles = bool(np.ptp(angles_deg) > 0.0)
+        if not has_several_angles:
+            probe = probe.rotated(float(np.deg2rad(angles_deg[0])))
+        elif probe.period > 0.0:
+            is_rotated = True
+        probes.append(probe)
+    return tuple(probes), is_rotated
 
 
-def press_on(forward_maps: tuple[ForwardMap, ...], sweep: Sweep) -> LabelledPresses:
-    """Clean charges of a sweep's presses from these forward maps, one for each probe."""
+def simulate_presses(forward_maps: tuple[ForwardMap, ...], sweep: Sweep) -> LabelledPresses:
+    """Simulate the presses of a sweep without noise.
+
+    Args:
+        forward_maps: The forward map of each probe.
+        sweep: The positions, forces and orientations of the presses.
+
+    Returns:
+        The contacts and charges of all presses.
+    """
     presses = sweep.over([forward_map.probe for forward_map in forward_maps])
     charge = np.empty((len(presses), len(forward_maps[0].electrodes)))
-    for number, forward_map in enumerate(forward_maps):
-        rows = np.flatnonzero(presses.probe == number)
+    for probe_index, forward_map in enumerate(forward_maps):
+        rows = np.flatnonzero(presses.probe == probe_index)
         charge[rows] = forward_map.charges(presses.contact[rows], presses.rotation[rows])
     return LabelledPresses(presses.contact, charge)
 
 
-BAYES, CRAMER_RAO = "Bayes limit", "Cramér-Rao"
-"""Their names in pictures."""
+BAYES = "Bayes limit"
+"""Name of the Bayes limit in pictures and tables."""
+
+CRAMER_RAO = "Cramér-Rao"
+"""Name of the Cramér-Rao limit in pictures and tables."""
 
 
 @dataclass(frozen=True)
 class ErrorBounds:
-    """Both limits on the same presses.
+    """Theoretical limits of the error on the test presses.
 
     Attributes:
-        bayes: Posterior means for the first of the noisy test presses, (x, y, F), shape (m, 3), mm and N; None where
-            the probe is not known to the sensor, and the posterior would be one over probes, too.
-        cramer_rao: Of every press, for unbiased estimates; with several probes as if the first one pressed.
+        posterior_mean: Posterior means (x, y, F) of the first m test presses with noise, shape (m, 3), mm and N. Their
+            error is the Bayes limit. None if there are several probes or random rotations, because the posterior would
+            then have to include the unknown probe.
+        cramer_rao: Cramér-Rao limit of each test press, for unbiased estimators. With several probes it is the limit
+            for the first probe.
     """
 
-    bayes: Array | None
+    posterior_mean: Array | None
     cramer_rao: CramerRao
 
     @classmethod
     def of(
         cls,
         case: EvaluationCase,
-        charges: ChargeSpline,
+        charge_map: ChargeSpline,
         clean: LabelledPresses,
-        noisy: Array,
+        noisy_charge: Array,
         executor: Executor | None = None,
     ) -> "ErrorBounds":
-        """Both limits.
+        """Compute both limits.
 
         Args:
-            case: Sensor, probe, prior and noise.
-            charges: Of the case's first probe, over exactly its contacts.
-            clean: Test presses.
-            noisy: Charges of the first of them with noise, shape (m, n_electrode), pC: for the Bayes limit.
-            executor: Integrates.
+            case: The case, with sensor, probes, working area, forces and noise.
+            charge_map: Charges of the first probe of the case, over exactly the contacts of the case.
+            clean: The test presses without noise.
+            noisy_charge: Charges of the first m test presses with noise, for the Bayes limit, shape (m, n_electrode),
+                pC.
+            executor: Executor of the integrals of the Bayes limit; None to compute them in this process.
+        """
+        posterior_mean = None
+        if len(case.probes) == 1 and not case.is_rotated:
+            problem = BayesProblem(case.sensor, case.probes[0], case.domain.radius, case.domain.force_range, case.noise)
+            posterior_mean, _ = bayes_estimate(problem, noisy_charge, charge_map=charge_map, executor=executor)
+        return cls(posterior_mean, limits_at(charge_map, clean.contact, case.noise))
+
+    def to_dict(self, truth: Array) -> dict[str, Any]:
+        """Return the limits as `report.json` contains them.
+
+        Args:
+            truth: True contacts (x, y, F) of all test presses, shape (n, 3), mm and N.
+
+        Returns:
+            The entries "bayes" (None if it was not computed) and "cramer_rao", each with the errors in mm and %.
         """
         bayes = None
-        if len(case.probes) == 1 and not case.rotated:
-            problem = BayesProblem(case.sensor, case.probes[0], case.domain.radius, case.domain.force_range, case.noise)
-            bayes, _ = bayes_estimate(problem, noisy, charge_map=charges, executor=executor)
-        return cls(bayes, limits_at(charges, clean.contact, case.noise))
-
-    def record(self, truth: Array) -> dict[str, Any]:
-        """Root-mean-square errors for the record; Cramér-Rao's holds for unbiased estimates only."""
-        bayes, position = None, self.cramer_rao.position
-        if self.bayes is not None:
-            bayes = {**asdict(Errors.of(self.bayes, truth[: len(self.bayes)])), "presses": len(self.bayes)}
-        return {
-            "bayes": bayes,
-            "cramer_rao": {
-                "position_rms_mm": rounded(rms(position)),
-                "position_median_mm": rounded(float(np.median(position))),
-                "force_rms_percent": rounded(100.0 * rms(self.cramer_rao.force)),
-            },
+        if self.posterior_mean is not None:
+            count = len(self.posterior_mean)
+            errors = ContactErrors.of(self.posterior_mean, truth[:count])
+            bayes = {**asdict(errors), "presses": count}
+        position_mm = self.cramer_rao.position
+        force_percent = 100.0 * rms(self.cramer_rao.force)
+        cramer_rao = {
+            "position_rms_mm": round_significant(rms(position_mm)),
+            "position_median_mm": round_significant(float(np.median(position_mm))),
+            "force_rms_percent": round_significant(force_percent),
         }
+        return {"bayes": bayes, "cramer_rao": cramer_rao}

@@ -1,32 +1,52 @@
-"""Figures of merit: errors of contacts, which methods nothing beats, and a sentence on the released model."""
+"""Figures of merit of the compared methods: errors, costs, Pareto fronts, and the comparison with the released model.
+
+Each method has one error (the root-mean-square position error) and three costs (the time of one prediction, the
+throughput of batches and the memory). A method is on the Pareto front of a cost if no other method is at least as good
+in both error and cost and better in one of them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-import scipy  # loads a part when it is used
+import scipy  # scipy imports its submodules at their first use
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.benchmark import Timing
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines.compared_methods import ComparedMethod
 from isocharge.train.data.presses import position_error
 
 
-def rounded(value: float | None, digits: int = 4) -> float | None:
-    """To significant digits, for the record; None if there is no such number."""
-    return None if value is None or not np.isfinite(value) else float(f"{value:.{digits}g}")
+def round_significant(value: float | None, digits: int = 4) -> float | None:
+    """Round a number to significant digits for the report.
+
+    Args:
+        value: The number, or None if there is none.
+        digits: Number of significant digits.
+
+    Returns:
+        The rounded number; None if `value` is None, NaN or infinite, because JSON has no such numbers.
+    """
+    if value is None or not np.isfinite(value):
+        return None
+    return float(f"{value:.{digits}g}")
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Errors of contacts over the presses that were answered; None for what no press gives.
+class ContactErrors:
+    """Errors of estimated contacts over the presses for which a method returned an estimate.
+
+    A figure is None if the method returned no estimate at all. The names of the attributes are keys of `report.json`.
 
     Attributes:
-        position_rms_mm, position_median_mm, position_p95_mm: Of the distance from the true position.
-        force_rms_percent, force_median_percent: Of the relative error of the force.
-        answered: Share of the presses, 0 to 1.
+        position_rms_mm: Root mean square of the distance from the true position, mm.
+        position_median_mm: Median of this distance, mm.
+        position_p95_mm: 95th percentile of this distance, mm.
+        force_rms_percent: Root mean square of the relative error of the force, %.
+        force_median_percent: Median of the absolute relative error of the force, %.
+        answered: Fraction of the presses for which the method returned an estimate, 0 to 1.
     """
 
     position_rms_mm: float | None
@@ -37,173 +57,238 @@ class Errors:
     answered: float
 
     @classmethod
-    def of(cls, contact: Array, truth: Array) -> "Errors":
-        """From contacts (x_mm, y_mm, force_N), NaN where a method gave no answer, and the presses; both (n, 3)."""
-        answered = np.isfinite(contact[:, :2]).all(axis=1)
-        if not answered.any():
+    def of(cls, estimate: Array, truth: Array) -> "ContactErrors":
+        """Compute the errors of estimated contacts.
+
+        Args:
+            estimate: Estimated contacts (x, y, F), shape (n, 3), mm and N; NaN where there is no estimate.
+            truth: True contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            The errors, rounded to four significant digits.
+        """
+        is_answered = np.isfinite(estimate[:, :2]).all(axis=1)
+        if not is_answered.any():
             return cls(None, None, None, None, None, 0.0)
-        position = position_error(contact[answered], truth[answered])
-        force = 100.0 * np.abs(contact[answered, 2] / truth[answered, 2] - 1.0)
+        answered_estimate = estimate[is_answered]
+        answered_truth = truth[is_answered]
+        position_mm = position_error(answered_estimate, answered_truth)
+        force_percent = 100.0 * np.abs(answered_estimate[:, 2] / answered_truth[:, 2] - 1.0)
         return cls(
-            position_rms_mm=rounded(rms(position)),
-            position_median_mm=rounded(float(np.median(position))),
-            position_p95_mm=rounded(float(np.percentile(position, 95))),
-            force_rms_percent=rounded(rms(force)),
-            force_median_percent=rounded(float(np.median(force))),
-            answered=rounded(float(np.mean(answered))) or 0.0,
+            position_rms_mm=round_significant(rms(position_mm)),
+            position_median_mm=round_significant(float(np.median(position_mm))),
+            position_p95_mm=round_significant(float(np.percentile(position_mm, 95))),
+            force_rms_percent=round_significant(rms(force_percent)),
+            force_median_percent=round_significant(float(np.median(force_percent))),
+            answered=round_significant(float(np.mean(is_answered))) or 0.0,
         )
 
 
-Plot = Literal["latency", "throughput", "memory"]
-"""A plot of the error against a cost."""
+Cost = Literal["latency", "throughput", "memory"]
+"""Name of a cost of a method. For each cost the report has a plot of the error against the cost."""
 
-COST_SIGNS: dict[Plot, float] = {"latency": 1.0, "throughput": -1.0, "memory": 1.0}
-"""1 where less of the plot's cost is better, -1 where more of it is."""
+COST_SIGNS: dict[Cost, float] = {"latency": 1.0, "throughput": -1.0, "memory": 1.0}
+"""Sign of each cost: 1 if a smaller value is better, -1 if a larger value is better."""
 
 
 @dataclass(frozen=True)
 class MethodRecord:
-    """What the report says about a method.
+    """Results of the report for one method.
 
     Attributes:
-        compared: The method, fitted.
-        errors: On all test presses.
-        over_bayes: Position error over the Bayes limit's on the same presses; None where there is no limit.
-        one: Durations of single predictions.
-        many: Durations of batches.
-        memory_bytes: Serialised size.
-        fit_seconds: Duration of fitting.
-        best_on: Plots on which no method is better in both error and cost.
+        method: The fitted method.
+        errors: Errors of the method on all test presses.
+        bayes_ratio: Position error of the method, divided by the Bayes limit on the same presses; None if the Bayes
+            limit was not computed.
+        single_timing: Durations of predictions of one press.
+        batch_timing: Durations of predictions of a batch of presses.
+        memory_bytes: Size of the serialised method, bytes.
+        fit_seconds: Duration of fitting, s.
+        pareto_costs: Costs for which the method is on the Pareto front.
     """
 
-    compared: ComparedMethod
-    errors: Errors
-    over_bayes: float | None
-    one: Timing
-    many: Timing
+    method: ComparedMethod
+    errors: ContactErrors
+    bayes_ratio: float | None
+    single_timing: Timing
+    batch_timing: Timing
     memory_bytes: int
     fit_seconds: float
-    best_on: tuple[Plot, ...] = ()
+    pareto_costs: tuple[Cost, ...] = ()
 
     @property
     def label(self) -> str:
-        """Name, and what computes it."""
-        return f"{self.compared.name} ({self.compared.computed_by})"
+        """The name of the method with the library that computes it."""
+        return f"{self.method.name} ({self.method.computed_by})"
 
     @property
-    def competes(self) -> bool:
-        """Whether it answers what the others answer: all presses, from the charges alone."""
-        return not self.compared.given_force and self.errors.answered == 1.0
+    def is_comparable(self) -> bool:
+        """Whether the method solves the same task as the others: it answers all presses, from the charges alone."""
+        return not self.method.given_force and self.errors.answered == 1.0
 
     @property
     def error_mm(self) -> float:
-        """Root-mean-square position error, mm; NaN without answers."""
-        return float("nan") if self.errors.position_rms_mm is None else self.errors.position_rms_mm
+        """The root-mean-square position error, mm; NaN if the method returned no estimate."""
+        if self.errors.position_rms_mm is None:
+            return float("nan")
+        return self.errors.position_rms_mm
 
-    def cost(self, plot: Plot) -> float:
-        """The figure along the plot's axis: us, predictions per second or bytes."""
-        memory = float(self.memory_bytes)
-        return {"latency": self.one.p50_us, "throughput": self.many.presses_per_s, "memory": memory}[plot]
+    def cost(self, cost: Cost) -> float:
+        """Return the value of a cost.
+
+        Args:
+            cost: Name of the cost.
+
+        Returns:
+            The median duration of one prediction in us, the predictions per second in batches, or the memory in bytes.
+        """
+        if cost == "latency":
+            return self.single_timing.p50_us
+        if cost == "throughput":
+            return self.batch_timing.presses_per_s
+        return float(self.memory_bytes)
 
     def to_dict(self) -> dict[str, Any]:
-        """As in `report.json`."""
+        """Return the results as `report.json` contains them."""
         return {
             "label": self.label,
-            "name": self.compared.name,
-            "form": self.compared.computed_by,
-            "kind": self.compared.kind,
-            "choice": self.compared.choice,
-            "force_given": self.compared.given_force,
+            "name": self.method.name,
+            "form": self.method.computed_by,
+            "kind": self.method.kind,
+            "choice": self.method.choice,
+            "force_given": self.method.given_force,
             "errors": asdict(self.errors),
-            "over_bayes": self.over_bayes,
-            "p50_us": rounded(self.one.p50_us),
-            "p99_us": rounded(self.one.p99_us),
-            "per_second": rounded(self.many.presses_per_s),
+            "over_bayes": self.bayes_ratio,
+            "p50_us": round_significant(self.single_timing.p50_us),
+            "p99_us": round_significant(self.single_timing.p99_us),
+            "per_second": round_significant(self.batch_timing.presses_per_s),
             "memory_bytes": self.memory_bytes,
-            "fit_seconds": rounded(self.fit_seconds),
-            "best_on": self.best_on,
+            "fit_seconds": round_significant(self.fit_seconds),
+            "best_on": self.pareto_costs,
         }
 
 
-def mark_fronts(records: Sequence[MethodRecord]) -> list[MethodRecord]:
-    """The records with the plots on which nothing beats them; methods that do not compete are on none."""
-    error = np.array([record.error_mm if record.competes else np.nan for record in records])
-    fronts = {
-        plot: pareto(sign * np.array([record.cost(plot) for record in records]), error)
-        for plot, sign in COST_SIGNS.items()
-    }
-    return [
-        replace(record, best_on=tuple(plot for plot, front in fronts.items() if front[number]))
-        for number, record in enumerate(records)
-    ]
+def with_pareto_fronts(records: Sequence[MethodRecord]) -> list[MethodRecord]:
+    """Return the records with `pareto_costs` filled in.
+
+    Methods that are not comparable are on no Pareto front, and do not exclude other methods from a front.
+    """
+    error_mm = np.array([record.error_mm if record.is_comparable else np.nan for record in records])
+    is_on_front = {}
+    for cost, sign in COST_SIGNS.items():
+        signed_cost = sign * np.array([record.cost(cost) for record in records])
+        is_on_front[cost] = pareto_front(signed_cost, error_mm)
+
+    marked_records = []
+    for index, record in enumerate(records):
+        pareto_costs = tuple(cost for cost in COST_SIGNS if is_on_front[cost][index])
+        marked_records.append(replace(record, pareto_costs=pareto_costs))
+    return marked_records
 
 
-def pareto(cost: Array, error: Array) -> np.ndarray:
-    """Which methods no other beats in both: none has a lower cost and error, nor one equal and the other lower.
+def pareto_front(cost: Array, error: Array) -> Booleans:
+    """Determine which methods are on the Pareto front of cost and error.
+
+    A method is on the front unless another method has a lower or equal cost and a lower or equal error, and at least
+    one of the two is lower.
 
     Args:
-        cost: Shape (n,).
-        error: Shape (n,); NaN is never on the front.
+        cost: Costs of the methods, shape (n,); smaller is better.
+        error: Errors of the methods, shape (n,). A method with the error NaN is not on the front.
 
     Returns:
-        Shape (n,), bool.
+        Whether each method is on the front, shape (n,).
     """
-    lower = (cost[None] <= cost[:, None]) & (error[None] <= error[:, None])
-    strictly = (cost[None] < cost[:, None]) | (error[None] < error[:, None])
-    return np.asarray(~(lower & strictly).any(axis=1) & np.isfinite(cost) & np.isfinite(error))
+    # The entry (i, j) of each matrix compares method j with method i.
+    is_no_worse = (cost[None] <= cost[:, None]) & (error[None] <= error[:, None])
+    is_better_in_one = (cost[None] < cost[:, None]) | (error[None] < error[:, None])
+    is_dominated = (is_no_worse & is_better_in_one).any(axis=1)
+    return np.asarray(~is_dominated & np.isfinite(cost) & np.isfinite(error))
 
 
-def coverage(contact: Array, std: Array, truth: Array, levels: Array) -> Array:
-    """Share of truths within the central interval of each nominal level, Gaussian; shape (n_level, 3) for x, y, F."""
-    deviation = np.abs(contact - truth) / std
-    return np.asarray(np.mean(deviation[None] <= scipy.stats.norm.ppf(0.5 + 0.5 * levels)[:, None, None], axis=1))
-
-
-WORDS: dict[Plot, str] = {"latency": "single predictions", "throughput": "batches"}
-"""The plots that are compared, and their names in a sentence."""
-
-
-def verdict(records: Sequence[MethodRecord]) -> dict[str, Any]:
-    """Which methods beat the released model, in sentences and as labels.
+def interval_coverage(estimate: Array, std: Array, truth: Array, levels: Array) -> Array:
+    """Compute the fraction of true values that lie in the central intervals of a normal distribution.
 
     Args:
-        records: Of all methods, the released one first.
+        estimate: Estimated contacts (x, y, F), shape (n, 3), mm and N: the means of the distribution.
+        std: Standard deviations of the estimates, shape (n, 3), mm and N.
+        truth: True contacts (x, y, F), shape (n, 3), mm and N.
+        levels: Nominal probabilities of the intervals, shape (n_level,), 0 to 1.
 
     Returns:
-        "sentences", and "both": for latency and throughput the labels of methods that are faster and more accurate.
+        Fractions for x, y and F, shape (n_level, 3). They equal the levels if the standard deviations are correct.
     """
-    released, others = records[0], [record for record in records[1:] if record.competes]
-    both = {
-        plot: [
-            record.label
-            for record in others
-            if record.error_mm < released.error_mm and _speed(record, released, plot) > 1.0
-        ]
-        for plot in WORDS
-    }
-    groups = {
-        "other methods": [record for record in others if record.compared.kind != "network"],
-        "networks that give the contact alone": [record for record in others if record.compared.kind == "network"],
-    }
-    sentences = [_sentence(plot, released, group, kind) for kind, group in groups.items() if group for plot in WORDS]
-    return {"both": both, "sentences": sentences}
+    standardised_error = np.abs(estimate - truth) / std
+    half_width = scipy.stats.norm.ppf(0.5 + 0.5 * levels)
+    is_inside = standardised_error[None] <= half_width[:, None, None]
+    return np.asarray(np.mean(is_inside, axis=1))
 
 
-def _speed(record: MethodRecord, released: MethodRecord, plot: Plot) -> float:
-    """How many times as fast as the released model a method is."""
-    return float((released.cost(plot) / record.cost(plot)) ** COST_SIGNS[plot])
+SPEED_NAMES: dict[Cost, str] = {"latency": "single predictions", "throughput": "batches"}
+"""The two costs that are speeds, with their names in the sentences of the report."""
 
 
-def _sentence(plot: Plot, released: MethodRecord, others: Sequence[MethodRecord], kind: str) -> str:
-    faster = [record for record in others if _speed(record, released, plot) > 1.0]
+def compare_with_released(records: Sequence[MethodRecord]) -> dict[str, Any]:
+    """Compare the speed and the error of all comparable methods with those of the released model.
+
+    Args:
+        records: Records of all methods; the first one is the record of the released model.
+
+    Returns:
+        The entry "verdict" of `report.json`. Its entry "sentences" is a list of sentences, and its entry "both"
+        contains, for "latency" and "throughput", the labels of the methods that are faster and more accurate.
+    """
+    released = records[0]
+    comparable = [record for record in records[1:] if record.is_comparable]
+    labels = {}
+    for cost in SPEED_NAMES:
+        faster = _faster_records(comparable, released, cost)
+        labels[cost] = [record.label for record in faster if record.error_mm < released.error_mm]
+
+    other_methods = [record for record in comparable if record.method.kind != "network"]
+    networks = [record for record in comparable if record.method.kind == "network"]
+    sentences = []
+    for group_name, group in (
+        ("other methods", other_methods),
+        ("networks that estimate only the contact", networks),
+    ):
+        if group:
+            sentences += [_comparison_sentence(cost, released, group, group_name) for cost in SPEED_NAMES]
+    return {"both": labels, "sentences": sentences}
+
+
+def _speed_ratio(record: MethodRecord, released: MethodRecord, cost: Cost) -> float:
+    """Return the speed of a method divided by the speed of the released model."""
+    cost_ratio = released.cost(cost) / record.cost(cost)
+    return float(cost_ratio ** COST_SIGNS[cost])
+
+
+def _faster_records(records: Sequence[MethodRecord], released: MethodRecord, cost: Cost) -> list[MethodRecord]:
+    """Return the records of the methods that are faster than the released model."""
+    return [record for record in records if _speed_ratio(record, released, cost) > 1.0]
+
+
+def _comparison_sentence(cost: Cost, released: MethodRecord, group: Sequence[MethodRecord], group_name: str) -> str:
+    """Return a sentence on how many methods of a group are faster and more accurate than the released model.
+
+    Args:
+        cost: The kind of speed: "latency" or "throughput".
+        released: Record of the released model.
+        group: Records of the methods of the group; at least one.
+        group_name: Name of the group in the sentence, in the plural.
+    """
+    faster = _faster_records(group, released, cost)
     if not faster:
-        return f"In {WORDS[plot]}, none of {len(others)} {kind} is faster than the released model."
-    nearest = min(faster, key=lambda record: record.error_mm)
-    both = sum(record.error_mm < released.error_mm for record in faster)
-    error = 100.0 * (nearest.error_mm / released.error_mm - 1.0)
-    more = f"{abs(error):.2g} % {'less' if error < 0.0 else 'more'} error"
+        return f"In {SPEED_NAMES[cost]}, none of {len(group)} {group_name} is faster than the released model."
+    more_accurate_count = sum(record.error_mm < released.error_mm for record in faster)
+    verb = "are" if more_accurate_count > 1 else "is"
+
+    best = min(faster, key=lambda record: record.error_mm)
+    speed_ratio = _speed_ratio(best, released, cost)
+    error_change_percent = 100.0 * (best.error_mm / released.error_mm - 1.0)
+    comparative = "less" if error_change_percent < 0.0 else "more"
     return (
-        f"In {WORDS[plot]}, {both or 'none'} of {len(others)} {kind} {'are' if both > 1 else 'is'} both faster and "
-        f"more accurate than the released model. Of those that are faster the most accurate is {nearest.label} "
-        f"({_speed(nearest, released, plot):.3g} times as fast, {more})."
+        f"In {SPEED_NAMES[cost]}, {more_accurate_count or 'none'} of {len(group)} {group_name} {verb} both faster and "
+        f"more accurate than the released model. The most accurate of the faster methods is {best.label} "
+        f"({speed_ratio:.3g} times as fast, {abs(error_change_percent):.2g} % {comparative} error)."
     )

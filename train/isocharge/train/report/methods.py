@@ -1,4 +1,4 @@
-"""Every method, fitted and measured on the same presses."""
+"""Fitting of the compared methods, and the measurement of their errors and durations on the same presses."""
 
 import pickle
 import time
@@ -17,110 +17,191 @@ from isocharge.train.baselines.compared_methods import ComparedMethod, FittingTa
 from isocharge.train.baselines.networks import OnnxContact, ReleasedModel
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.report.case import Settings
-from isocharge.train.report.measures import Errors, MethodRecord, mark_fronts, rounded
+from isocharge.train.report.measures import ContactErrors, MethodRecord, round_significant, with_pareto_fronts
 
-TIMED = 64
-"""Presses that single predictions go through in turn."""
+SINGLE_PRESSES = 64
+"""Number of presses that the timed predictions of one press cycle through."""
 
-LONGEST_S = 0.1
-"""Where a batch takes longer than this, a 64th of it is timed, s."""
+MAX_BATCH_SECONDS = 0.1
+"""Estimated duration of a batch, s, above which a smaller batch is timed."""
+
+BATCH_REDUCTION = 64
+"""Factor by which a batch is made smaller if its prediction would take longer than `MAX_BATCH_SECONDS`."""
 
 
 @dataclass(frozen=True)
-class Method:
-    """A fitted method, and its answers to the test presses.
+class FittedMethod:
+    """A fitted method with its estimates for the test presses.
 
     Attributes:
-        compared: The method.
-        contact: Its answers, shape (n, 3).
-        fit_seconds: What fitting took.
+        method: The fitted method.
+        estimate: Estimated contacts (x, y, F) of the test presses, shape (n, 3), mm and N; NaN where the method has no
+            estimate.
+        fit_seconds: Duration of fitting, s.
     """
 
-    compared: ComparedMethod
-    contact: Array
+    method: ComparedMethod
+    estimate: Array
     fit_seconds: float
 
 
 def fit_all(
-    compared_methods: Sequence[ComparedMethod], task: FittingTask, test: LabelledPresses
-) -> tuple[list[Method], dict[str, str]]:
-    """Fit every method and let it answer the test presses.
+    methods: Sequence[ComparedMethod], task: FittingTask, test: LabelledPresses
+) -> tuple[list[FittedMethod], dict[str, str]]:
+    """Fit all methods and predict the test presses with each of them.
 
     Args:
-        compared_methods: The methods.
-        task: What they are fitted for.
-        test: Test presses as they are measured: with noise.
+        methods: The methods to fit.
+        task: The presses and conditions to which the methods are fitted.
+        test: The test presses, with the noise in their charges.
 
     Returns:
-        The methods, and those that few measured presses cannot teach, by name with the reason.
+        The fitted methods, and the reasons of the methods that cannot be fitted to so few measured presses, by the name
+        of the method.
+
+    Raises:
+        DatasetError: If a method cannot be fitted to simulated presses.
+        TrainingError: If the training of a network on simulated presses fails.
     """
-    methods, refused = [], {}
-    for compared in track(compared_methods, "fitting methods"):
-        begin = time.perf_counter()
+    fitted_methods = []
+    failure_reasons = {}
+    for method in track(methods, "fitting methods"):
+        start = time.perf_counter()
         try:
-            fitted = compared.fit(task)
+            fitted = method.fit(task)
         except (DatasetError, TrainingError) as error:
             if not task.train.measured:
                 raise
-            refused[compared.name] = str(error)
+            failure_reasons[method.name] = str(error)
             continue
-        seconds = time.perf_counter() - begin
-        contact = fitted.regressor.predict(fitted.inputs(test.charge, test.contact[:, 2]))
-        methods.append(Method(fitted, contact, seconds))
-    return methods, refused
+        fit_seconds = time.perf_counter() - start
+        estimate = fitted.regressor.predict(_test_inputs(fitted, test))
+        fitted_methods.append(FittedMethod(fitted, estimate, fit_seconds))
+    return fitted_methods, failure_reasons
 
 
-def records_of(
-    methods: Sequence[Method], test: LabelledPresses, settings: Settings, bayes: Array | None = None
+def measure_methods(
+    fitted_methods: Sequence[FittedMethod],
+    test: LabelledPresses,
+    settings: Settings,
+    posterior_mean: Array | None = None,
 ) -> list[MethodRecord]:
-    """A record for each method, timed when all of them are fitted; errors over the limit where `bayes` has contacts."""
-    compared_methods = [method.compared for method in methods]
-    singles = [Contender(compared.name, 1, _single(compared, test)) for compared in compared_methods]
-    batches = [_batch(compared, test, settings.batch) for compared in compared_methods]
-    timings = take_turns([*singles, *batches], settings.seconds * 2 * len(methods))
-    per_method = zip(methods, timings[: len(methods)], timings[len(methods) :], strict=True)
-    return mark_fronts([_record(method, test.contact, bayes, *timing) for method, *timing in per_method])
+    """Measure the errors, durations and sizes of all methods.
+
+    The durations are measured in turns after all methods are fitted, so that a change of the machine's speed affects
+    all methods alike.
+
+    Args:
+        fitted_methods: The fitted methods with their estimates.
+        test: The test presses, with the noise in their charges.
+        settings: Settings of the report: the time for timing and the size of a batch.
+        posterior_mean: Posterior means (x, y, F) of the first m test presses, shape (m, 3), mm and N, whose error is
+            the Bayes limit; None if the limit was not computed.
+
+    Returns:
+        The records of the methods, in the order of `fitted_methods`.
+    """
+    methods = [fitted.method for fitted in fitted_methods]
+    single_contenders = [Contender(method.name, 1, _single_press_call(method, test)) for method in methods]
+    batch_contenders = [_batch_contender(method, test, settings.batch) for method in methods]
+    total_seconds = 2 * len(methods) * settings.seconds
+    timings = take_turns([*single_contenders, *batch_contenders], total_seconds)
+    single_timings = timings[: len(methods)]
+    batch_timings = timings[len(methods) :]
+
+    records = []
+    for fitted, single_timing, batch_timing in zip(fitted_methods, single_timings, batch_timings, strict=True):
+        records.append(_method_record(fitted, test.contact, posterior_mean, single_timing, batch_timing))
+    return with_pareto_fronts(records)
 
 
-def _single(compared: ComparedMethod, test: LabelledPresses) -> Callable[[], object]:
-    """A call for one press, each time another; networks by the calls that bind their arrays once."""
-    rows, regressor = compared.inputs(test.charge, test.contact[:, 2])[:TIMED], compared.regressor
+def _test_inputs(method: ComparedMethod, test: LabelledPresses) -> Array:
+    """Return the inputs of a method for the test presses, shape (n, n_input)."""
+    return method.inputs(test.charge, test.contact[:, 2])
+
+
+def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callable[[], object]:
+    """Return a function that predicts one press, and the next press at each call.
+
+    ONNX networks are called as `Predictor` calls them, with arrays that are bound once.
+    """
+    inputs = _test_inputs(method, test)[:SINGLE_PRESSES]
+    regressor = method.regressor
+    calls: list[Callable[[], object]]
     if isinstance(regressor, OnnxContact | ReleasedModel):
-        calls = cycle([regressor.single(row) for row in rows])
+        calls = [regressor.single(press_input) for press_input in inputs]
     else:
-        calls = cycle([partial(regressor.predict, row[None]) for row in rows])
-    return lambda: next(calls)()
+        calls = [partial(regressor.predict, press_input[None]) for press_input in inputs]
+    cyclic_calls = cycle(calls)
+    return lambda: next(cyclic_calls)()
 
 
-def _batch(compared: ComparedMethod, test: LabelledPresses, count: int) -> Contender:
-    """A call for a batch, presses over and over; for few where a first try says that all would take too long."""
-    rows = compared.inputs(test.charge, test.contact[:, 2])
-    batch = rows[np.arange(count) % len(rows)]
-    few = batch[: max(1, count // 64)]
-    begin = time.perf_counter()
-    compared.regressor.predict(few)
-    if (time.perf_counter() - begin) * count / len(few) > LONGEST_S:
-        batch = few
-    return Contender(compared.name, len(batch), partial(compared.regressor.predict, batch))
+def _batch_contender(method: ComparedMethod, test: LabelledPresses, batch_size: int) -> Contender:
+    """Return the timed prediction of a batch.
+
+    A small batch is predicted first. If its duration shows that the whole batch would take longer than
+    `MAX_BATCH_SECONDS`, the small batch is timed instead.
+
+    Args:
+        method: The fitted method.
+        test: The test presses; they are repeated if the batch is larger.
+        batch_size: Number of presses in the whole batch.
+    """
+    inputs = _test_inputs(method, test)
+    batch = inputs[np.arange(batch_size) % len(inputs)]
+    small_batch = batch[: max(1, batch_size // BATCH_REDUCTION)]
+    start = time.perf_counter()
+    method.regressor.predict(small_batch)
+    small_batch_seconds = time.perf_counter() - start
+    batch_seconds = small_batch_seconds * batch_size / len(small_batch)
+    if batch_seconds > MAX_BATCH_SECONDS:
+        batch = small_batch
+    return Contender(method.name, len(batch), partial(method.regressor.predict, batch))
 
 
-def _record(method: Method, truth: Array, bayes: Array | None, one: Timing, many: Timing) -> MethodRecord:
-    compared, figures = method.compared, Errors.of(method.contact, truth)
-    if compared.given_force:
-        figures = replace(figures, force_rms_percent=None, force_median_percent=None)
-    over_limit = None if bayes is None else over_bayes(method.contact, bayes, truth)
-    return MethodRecord(compared, figures, over_limit, one, many, _memory(compared), method.fit_seconds)
+def _method_record(
+    fitted: FittedMethod, truth: Array, posterior_mean: Array | None, single_timing: Timing, batch_timing: Timing
+) -> MethodRecord:
+    """Return the record of a method. A method that is given the true force has no force error."""
+    errors = ContactErrors.of(fitted.estimate, truth)
+    if fitted.method.given_force:
+        errors = replace(errors, force_rms_percent=None, force_median_percent=None)
+    ratio = None
+    if posterior_mean is not None:
+        ratio = bayes_ratio(fitted.estimate, posterior_mean, truth)
+    return MethodRecord(
+        method=fitted.method,
+        errors=errors,
+        bayes_ratio=ratio,
+        single_timing=single_timing,
+        batch_timing=batch_timing,
+        memory_bytes=_serialised_bytes(fitted.method),
+        fit_seconds=fitted.fit_seconds,
+    )
 
 
-def over_bayes(contact: Array, bayes: Array, truth: Array) -> float | None:
-    """Position error over the Bayes limit's, whose contacts are those of the first presses."""
-    mine, limit = (Errors.of(each[: len(bayes)], truth[: len(bayes)]).position_rms_mm for each in (contact, bayes))
-    return None if mine is None or limit is None else rounded(mine / limit)
+def bayes_ratio(estimate: Array, posterior_mean: Array, truth: Array) -> float | None:
+    """Compute the position error of a method divided by the Bayes limit on the same presses.
+
+    Args:
+        estimate: Contacts (x, y, F) estimated by the method, shape (n, 3), mm and N.
+        posterior_mean: Posterior means of the first m presses, shape (m, 3), mm and N.
+        truth: True contacts, shape (n, 3), mm and N.
+
+    Returns:
+        The ratio of the root-mean-square position errors over the first m presses; None if there is no estimate.
+    """
+    count = len(posterior_mean)
+    method_error = ContactErrors.of(estimate[:count], truth[:count]).position_rms_mm
+    bayes_error = ContactErrors.of(posterior_mean, truth[:count]).position_rms_mm
+    if method_error is None or bayes_error is None:
+        return None
+    return round_significant(method_error / bayes_error)
 
 
-def _memory(compared: ComparedMethod) -> int:
-    """Serialised size of what a prediction needs, bytes; of networks the ONNX file."""
-    regressor = compared.regressor
+def _serialised_bytes(method: ComparedMethod) -> int:
+    """Return the serialised size of a fitted method, bytes: the ONNX file of a network, the pickle of the others."""
+    regressor = method.regressor
     if isinstance(regressor, OnnxContact | ReleasedModel):
         return len(regressor.graph)
     return len(pickle.dumps(regressor, protocol=pickle.HIGHEST_PROTOCOL))

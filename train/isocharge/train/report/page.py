@@ -1,6 +1,6 @@
-"""The page: summary, one table, pictures with captions; Markdown from the record alone.
+"""The page of the report in Markdown: a summary, a table of all methods, and pictures with captions.
 
-The record is that of `report.json`, but for the methods, each a `MethodRecord`.
+The page is written from the content of `report.json` alone, in which each method is a `MethodRecord` here.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -8,184 +8,290 @@ from typing import Any
 
 from isocharge.train.model_release.evaluate import FALSE_ALARM_RATE
 from isocharge.train.report.measures import MethodRecord
-from isocharge.train.report.studies import FARTHEST, GAIN_OFF, PRETENSION_OFF
+from isocharge.train.report.studies import CLIP_LIMIT, GAIN_STD, PRETENSION_ERROR_MPa
 
 Section = Mapping[str, Any]
+"""Section of the report: the results of one dataset."""
 
 
-def page(record: Mapping[str, Any]) -> str:
-    """The whole page of a report."""
-    quick = "**A quick report: everything small, to try it out. Its figures mean nothing.**"
-    parts = ["# Speed against error", *([quick] if record["settings"]["quick"] else [])]
-    parts += ["\n".join(_summary(section)) for section in record["datasets"]]
+def report_page(record: Mapping[str, Any]) -> str:
+    """Return the page of a report in Markdown.
+
+    Args:
+        record: The content of `report.json`, with the methods as `MethodRecord` objects.
+    """
+    blocks = ["# Speed against error"]
+    if record["settings"]["quick"]:
+        blocks.append("**This is a quick report for a trial run. Its results are not meaningful.**")
+    blocks += ["\n".join(_summary_lines(section)) for section in record["datasets"]]
     for section in record["datasets"]:
-        parts += _measured(section) if section["measured"] else _simulated(section)
-    return "\n\n".join([*parts, *_how(record)]) + "\n"
+        if section["measured"]:
+            blocks += _measured_section(section)
+        else:
+            blocks += _simulated_section(section)
+    blocks += _conditions(record)
+    return "\n\n".join(blocks) + "\n"
 
 
-def _summary(section: Section) -> Iterator[str]:
+def _summary_lines(section: Section) -> Iterator[str]:
+    """Yield the lines of the summary of a section: the errors of the released model and the comparison."""
     released: MethodRecord = section["methods"][0]
-    errors, limits = released.errors, section["limits"]
+    errors = released.errors
     yield f"**{section['sensor']}**, released model `{section['model']['label']}`:\n"
     yield (
-        f"- It errs by {errors.position_rms_mm:.3g} mm rms ({errors.position_median_mm:.3g} mm median) and by "
-        f"{errors.force_rms_percent:.3g} % of the force, and takes {released.one.p50_us:.3g} us for one press."
+        f"- The position error is {errors.position_rms_mm:.3g} mm rms ({errors.position_median_mm:.3g} mm median), the "
+        f"force error is {errors.force_rms_percent:.3g} % rms, and the prediction of one press takes "
+        f"{released.single_timing.p50_us:.3g} us."
     )
-    if released.over_bayes:
-        bayes = limits["bayes"]
+    if released.bayes_ratio:
+        bayes = section["limits"]["bayes"]
         yield (
-            f"- That is {released.over_bayes:.3f} times the Bayes limit, {bayes['position_rms_mm']:.3g} mm and "
-            f"{bayes['force_rms_percent']:.3g} % of the force on the same charges: no method can do better on average."
+            f"- The position error is {released.bayes_ratio:.3f} times the Bayes limit. The Bayes limit on the same "
+            f"charges is {bayes['position_rms_mm']:.3g} mm and {bayes['force_rms_percent']:.3g} % of the force. No "
+            "method has a smaller mean squared error."
         )
-    yield from (f"- {sentence}" for sentence in section["verdict"]["sentences"])
+    for sentence in section["verdict"]["sentences"]:
+        yield f"- {sentence}"
 
 
-def _simulated(section: Section) -> Iterator[str]:
-    low, high = section["force_N"]
-    presses, noise = section["presses"], section["noise"]
+def _simulated_section(section: Section) -> Iterator[str]:
+    """Yield the blocks of the section of a simulated dataset."""
+    min_force, max_force = section["force_N"]
+    presses = section["presses"]
+    noise = section["noise"]
     yield f"## {section['sensor']}"
     yield (
-        f"Presses of {', '.join(section['probes'])} within {section['radius_mm']:g} mm, {low:g} to {high:g} N (uniform "
-        f"over the disk, log-uniform in force), noise `{noise['name']}` ({noise['white_pC']:g} pC and "
-        f"{100 * noise['gain']:g} %). Every method learnt from the same {presses['train']} presses, chose its "
-        f"hyperparameters by {presses['validation']} others, and is measured on {presses['test']} more, from solves "
-        "that no method has seen. One process, one thread."
+        f"The presses are simulated: {', '.join(section['probes'])} within {section['radius_mm']:g} mm, {min_force:g} "
+        f"to {max_force:g} N (positions uniform over the disk, forces log-uniform). The noise is `{noise['name']}` "
+        f"({noise['white_pC']:g} pC and {100 * noise['gain']:g} % of the charge). All methods are fitted to the same "
+        f"{presses['train']} presses, and their hyperparameters are chosen with {presses['validation']} other presses. "
+        f"The errors are measured on {presses['test']} test presses, which come from separate solves of the film. All "
+        "methods run in one process with one thread."
     )
-    yield from _methods(section)
-    yield "### Where the errors are"
+    yield from _method_comparison(section)
+    yield "### Errors over the film and the force"
     yield _picture(section, "maps")
     yield _picture(section, "force")
-    yield "### Whether the deviations are true"
+    yield "### Coverage of the reported standard deviations"
     yield _picture(section, "calibration")
-    yield from _effects(section)
-    yield from _choices(section["methods"])
+    yield from _mismatch_effects(section)
+    yield from _chosen_parameters(section["methods"])
 
 
-def _measured(section: Section) -> Iterator[str]:
-    low, high = section["force_N"]
+def _measured_section(section: Section) -> Iterator[str]:
+    """Yield the blocks of the section of a measured dataset."""
+    min_force, max_force = section["force_N"]
     presses = section["presses"]
     yield f"## {section['sensor']}"
     yield (
-        f"Measured presses of {', '.join(section['probes'])} within {section['radius_mm']:.3g} mm, {low:.3g} to "
-        f"{high:.3g} N. The methods learnt from {presses['train']} of them, chose their hyperparameters by "
-        f"{presses['validation']} others, and are measured on {presses['test']} more, as they were measured: no noise "
-        "is added, no simulator says what would be right, and the errors hold what the rig does not know of places and "
-        "forces. One process, one thread."
+        f"The presses were measured: {', '.join(section['probes'])} within {section['radius_mm']:.3g} mm, "
+        f"{min_force:.3g} to {max_force:.3g} N. The methods are fitted to {presses['train']} of the presses, and their "
+        f"hyperparameters are chosen with {presses['validation']} others. The errors are measured on "
+        f"{presses['test']} held-out presses. No noise is added to the charges. The errors contain the uncertainty of "
+        "the positions and forces that the test rig reports. All methods run in one process with one thread."
     )
     yield (
-        "Left out, because it needs a simulator of this very film: the least possible error (Bayes, Cramér-Rao), "
-        "triangulation, and films, probes and noise other than those of the presses."
+        "The following parts are left out, because they need a simulation of exactly this film: the Bayes limit, the "
+        "Cramér-Rao limit, triangulation, and the tests with other films, probes and noise."
     )
-    yield from _methods(section)
-    yield "\n".join(f"- {name}: left out; {reason}." for name, reason in section["left_out"].items())
-    yield from _choices(section["methods"])
+    yield from _method_comparison(section)
+    yield "\n".join(f"- {name} is left out: {reason}." for name, reason in section["left_out"].items())
+    yield from _chosen_parameters(section["methods"])
 
 
-def _methods(section: Section) -> Iterator[str]:
-    """The table, and its pictures."""
-    head = ["method", "computed by", "position rms, mm", "median", "95 %", "over Bayes", "force rms, %"]
-    head += ["one, us", "99 %", "per second", "bytes"]
-    rows = []
-    for name, key, ratio in (("*Bayes limit*", "bayes", "1"), ("*Cramér-Rao, unbiased*", "cramer_rao", "")):
-        if limit := section["limits"][key]:
-            positions = [_number(limit.get(f"position_{figure}_mm")) for figure in ("rms", "median", "p95")]
-            rows.append([name, "", *positions, ratio, _number(limit["force_rms_percent"]), "", "", "", ""])
+METHOD_TABLE_HEADER = (
+    "method",
+    "computed by",
+    "position rms, mm",
+    "median, mm",
+    "95 %, mm",
+    "ratio to Bayes limit",
+    "force rms, %",
+    "one press, median, us",
+    "one press, 99 %, us",
+    "presses per second",
+    "bytes",
+)
+"""Headers of the columns in the table of methods."""
+
+TEXT_COLUMNS = 2
+"""Number of columns with text at the left of a table; the other columns contain numbers."""
+
+
+def _method_comparison(section: Section) -> Iterator[str]:
+    """Yield the table of limits and methods, an explanation, and the plots of the error against each cost."""
     records: Sequence[MethodRecord] = section["methods"]
-    rows += [
-        _cells(record) for record in sorted(records, key=lambda r: (r.errors.position_rms_mm or 1e9, r.one.p50_us))
-    ]
-    yield table(head, rows, left=2)
+    sorted_records = sorted(records, key=_error_and_latency)
+    rows = [*_limit_rows(section["limits"]), *(_method_row(record) for record in sorted_records)]
+    yield markdown_table(METHOD_TABLE_HEADER, rows, TEXT_COLUMNS)
     yield (
-        "Bold: nothing is both faster (one prediction) and more accurate. *Force given*: by the true force, which no "
-        "sensor knows. A share answered below 100 %: errors are of those presses only."
+        "A method is printed in bold if no other method is both faster for one press and more accurate. Methods with "
+        "*force given* use the true force, which no sensor measures. If a method answered less than 100 % of the "
+        "presses, its errors are those of the answered presses."
     )
-    yield from (_picture(section, name) for name in ("latency", "throughput", "memory"))
+    for picture_name in ("latency", "throughput", "memory"):
+        yield _picture(section, picture_name)
 
 
-def _cells(record: MethodRecord) -> list[str]:
+def _error_and_latency(record: MethodRecord) -> tuple[float, float]:
+    """Return the key by which methods are sorted: the error, then the latency; methods without an error come last."""
+    error_mm = record.errors.position_rms_mm or float("inf")
+    return error_mm, record.single_timing.p50_us
+
+
+def _limit_rows(limits: Mapping[str, Any]) -> Iterator[list[str]]:
+    """Yield the rows of the limits that were computed, for the table of methods."""
+    for name, key, bayes_ratio in (("*Bayes limit*", "bayes", "1"), ("*Cramér-Rao limit, unbiased*", "cramer_rao", "")):
+        limit = limits[key]
+        if limit:
+            yield [
+                name,
+                "",
+                _number_text(limit["position_rms_mm"]),
+                _number_text(limit["position_median_mm"]),
+                _number_text(limit.get("position_p95_mm")),
+                bayes_ratio,
+                _number_text(limit["force_rms_percent"]),
+                "",
+                "",
+                "",
+                "",
+            ]
+
+
+def _method_row(record: MethodRecord) -> list[str]:
+    """Return the row of a method for the table of methods, in bold if the method is on the front of the latency."""
     errors = record.errors
+    name = record.method.name
+    if errors.answered < 1.0:
+        name += f" ({100 * errors.answered:.3g} % answered)"
     cells = [
-        record.compared.name + (f" ({100 * errors.answered:.3g} % answered)" if errors.answered < 1.0 else ""),
-        record.compared.computed_by,
-        *(_number(value) for value in (errors.position_rms_mm, errors.position_median_mm, errors.position_p95_mm)),
-        _number(record.over_bayes),
-        _number(errors.force_rms_percent),
-        _number(record.one.p50_us),
-        _number(record.one.p99_us),
-        f"{record.many.presses_per_s:,.0f}",
+        name,
+        record.method.computed_by,
+        _number_text(errors.position_rms_mm),
+        _number_text(errors.position_median_mm),
+        _number_text(errors.position_p95_mm),
+        _number_text(record.bayes_ratio),
+        _number_text(errors.force_rms_percent),
+        _number_text(record.single_timing.p50_us),
+        _number_text(record.single_timing.p99_us),
+        f"{record.batch_timing.presses_per_s:,.0f}",
         f"{record.memory_bytes:,}",
     ]
-    return [f"**{cell}**" if cell else "" for cell in cells] if "latency" in record.best_on else cells
+    if "latency" not in record.pareto_costs:
+        return cells
+    return [f"**{cell}**" if cell else "" for cell in cells]
 
 
-def _effects(section: Section) -> Iterator[str]:
-    yield "### When the film, the probe or the chain differ from the model"
+def _mismatch_effects(section: Section) -> Iterator[str]:
+    """Yield the blocks on the errors if the film, the probe or the electronics differ from the models' assumptions."""
+    yield "### Errors if the film, the probe or the electronics differ from the assumptions"
     yield _picture(section, "noise")
     yield _picture(section, "effects")
-    threshold = _number(section["alarm_threshold"])
-    yield f"Position error rms, mm, and alarms of the released model (misfit above {threshold}):"
-    names = list(section["cases"][0]["errors"])
-    head = ["what is different", *names, "force rms, %", "68 % intervals hold, %", "alarms, %"]
-    yield table(head, (_case_cells(case, names) for case in section["cases"]))
     yield (
-        f"Gains: every electrode off by {100 * GAIN_OFF:g} % rms, another draw for every press. Pretension: "
-        f"{PRETENSION_OFF:g} MPa more than the models assume. Force and intervals are the released model's."
+        "The table shows the root-mean-square position errors in mm, and the alarms of the released model (misfit "
+        f"above {_number_text(section['alarm_threshold'])})."
+    )
+    method_names = list(section["cases"][0]["errors"])
+    header = ["difference", *method_names, "force rms, %", "coverage of the 68 % intervals, %", "alarms, %"]
+    rows = [_mismatch_row(result, method_names) for result in section["cases"]]
+    yield markdown_table(header, rows)
+    yield (
+        f"Wrong gains have independent errors of {100 * GAIN_STD:g} % rms for every electrode and every press. The "
+        f"other pretension is {PRETENSION_ERROR_MPa:g} MPa larger than the models assume. The force errors and the "
+        "coverage are those of the released model."
     )
 
 
-def _case_cells(case: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    positions = [_number(case["errors"][name]["position_rms_mm"]) for name in names]
-    force, inside = _number(case["errors"][names[0]]["force_rms_percent"]), f"{100 * case['coverage_68']:.1f}"
-    return [f"{case['group']}: {case['case']}", *positions, force, inside, _number(case["alarms_percent"])]
+def _mismatch_row(result: Mapping[str, Any], method_names: Sequence[str]) -> list[str]:
+    """Return the row of a mismatch.
+
+    Args:
+        result: Result of `studies.measure_mismatch`.
+        method_names: Names of the methods in the order of the columns; the first one is the released model.
+    """
+    errors = result["errors"]
+    released_errors = errors[method_names[0]]
+    return [
+        f"{result['group']}: {result['case']}",
+        *(_number_text(errors[name]["position_rms_mm"]) for name in method_names),
+        _number_text(released_errors["force_rms_percent"]),
+        f"{100 * result['coverage_68']:.1f}",
+        _number_text(result["alarms_percent"]),
+    ]
 
 
-def _choices(records: Sequence[MethodRecord]) -> Iterator[str]:
-    yield "### Choices"
-    rows = [[record.compared.name, record.compared.choice, _number(record.fit_seconds)] for record in records]
-    yield table(["method", "chosen", "fitting, s"], rows, left=2)
+def _chosen_parameters(records: Sequence[MethodRecord]) -> Iterator[str]:
+    """Yield the table of the hyperparameters that were chosen for each method, and the durations of fitting."""
+    yield "### Hyperparameters"
+    rows = [[record.method.name, record.method.choice, _number_text(record.fit_seconds)] for record in records]
+    yield markdown_table(["method", "chosen", "fitting, s"], rows, TEXT_COLUMNS)
 
 
-def _how(record: Mapping[str, Any]) -> Iterator[str]:
-    settings = record["settings"]
-    yield "## How it was measured"
+def _conditions(record: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the blocks on how the durations were measured, on which machine, and with which command."""
+    batch_size = record["settings"]["batch"]
+    yield "## How the report was measured"
     yield (
-        f"One prediction and a batch of {settings['batch']} by every method, in turns, after a turn to warm up: median "
-        "and 99th percentile of all calls, presses over time. A method that takes longer than 0.1 s for a batch has a "
-        "smaller one. Memory: serialised size. "
-        "Test charges, noise, splits and subsets follow from the seed."
+        f"Every method predicts single presses and batches of {batch_size} presses. The methods take turns, and the "
+        "first turn of each is not counted. The report states the median and the 99th percentile of the durations of "
+        "all calls, and the number of presses divided by the total time. If a method needs more than 0.1 s for a "
+        "batch, a smaller batch is measured. The memory is the serialised size of the method. The test charges, the "
+        "noise, the splits and the subsets are determined by the seed."
     )
-    yield f"Machine: {', '.join(f'{name} {value}' for name, value in record['machine'].items())}."
+    machine = ", ".join(f"{name} {value}" for name, value in record["machine"].items())
+    yield f"Machine: {machine}."
     if record["command"]:
         yield f"```sh\n{record['command']}\n```"
 
 
 CAPTIONS = {
-    "latency": "Position error (rms, mm) against the time of one prediction (median, us). Dashed: the front that "
-    "nothing beats. Hollow: the true force given, or not all presses answered.",
-    "throughput": "The same against predictions per second in batches (more to the left).",
-    "memory": "The same against the bytes a method needs to predict.",
-    "maps": "Errors of the released model over the film: rms over forces and several draws of the noise. Squares: "
-    "electrodes; dotted: working area.",
-    "force": "Position error (rms, mm) against force (N).",
-    "calibration": "Share of true contacts inside the released model's central intervals, less the nominal level; "
-    "shaded: 2 percentage points.",
-    "noise": "Position error (rms, mm) when the noise is not the one that the methods were fitted for.",
-    "effects": "Left: position error (rms, mm) when the probe, the pretension or gains are not as the methods "
-    f"assume; answers beyond {FARTHEST:g} mm or N are cut there. Right: share of presses whose misfit gives an alarm, "
-    f"at {100.0 * FALSE_ALARM_RATE:g} % false alarms (dashed).",
+    "latency": "Position error (rms, mm) against the duration of one prediction (median, us). The dashed line is the "
+    "Pareto front: no method is better in both. Hollow markers: the method is given the true force, or did not answer "
+    "all presses.",
+    "throughput": "Position error (rms, mm) against the predictions per second in batches. The axis is reversed, so "
+    "that faster methods are on the left.",
+    "memory": "Position error (rms, mm) against the size of the serialised method (bytes).",
+    "maps": "Root-mean-square errors of the released model over the film, for all forces and several draws of the "
+    "noise. Squares: electrodes. Dotted line: edge of the working area.",
+    "force": "Position error (rms, mm) against the force (N).",
+    "calibration": "Coverage of the central intervals of the released model (fraction of the true values inside an "
+    "interval) minus the nominal level. Shaded area: 2 percentage points.",
+    "noise": "Position error (rms, mm) against the noise, relative to the noise for which the methods were fitted.",
+    "effects": "Left: position error (rms, mm) if the probe, the pretension or the gains differ from what the methods "
+    f"assume. Estimates above {CLIP_LIMIT:g} mm or N are clipped. Right: percentage of presses whose misfit exceeds "
+    f"the threshold for an alarm; the dashed line is the false alarm rate of {100.0 * FALSE_ALARM_RATE:g} %.",
 }
+"""Caption of each picture, by the name of the picture."""
 
 
 def _picture(section: Section, name: str) -> str:
-    return f"![{name}]({section['pictures'][name][0]})\n\n*{CAPTIONS[name]}*"
+    """Return the Markdown of a picture with its caption."""
+    files = section["pictures"][name]
+    return f"![{name}]({files[0]})\n\n*{CAPTIONS[name]}*"
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
-    """A table in Markdown; columns behind the first `left` are aligned to the right."""
-    rule = "|" + "---|" * left + "--:|" * (len(head) - left)
-    first, *others = (f"| {' | '.join(row)} |" for row in (head, *rows))
-    return "\n".join([first, rule, *others])
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int = 1) -> str:
+    """Return a table in Markdown.
+
+    Args:
+        header: The headers of the columns.
+        rows: The cells of each row.
+        text_columns: Number of columns at the left that are aligned to the left; the others are aligned to the right.
+    """
+    number_columns = len(header) - text_columns
+    lines = [
+        f"| {' | '.join(header)} |",
+        "|" + "---|" * text_columns + "--:|" * number_columns,
+    ]
+    lines += [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join(lines)
 
 
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
+def _number_text(value: float | None) -> str:
+    """Return a number with three significant digits, or with all digits before the decimal point; empty for None."""
+    if value is None:
+        return ""
+    if abs(value) < 1000:
+        return f"{value:.3g}"
+    return f"{value:,.0f}"

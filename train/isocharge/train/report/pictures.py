@@ -1,10 +1,11 @@
-"""The report's pictures: error against time, throughput and memory, film and force; calibration; effects."""
+"""Pictures of the report: the error against cost, film and force, the coverage, and the effects of mismatches."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import LogLocator, NullFormatter
@@ -17,148 +18,212 @@ from isocharge.train.baselines.networks import RELEASED
 from isocharge.train.data.presses import position_error
 from isocharge.train.model_release.evaluate import FALSE_ALARM_RATE
 from isocharge.train.report.case import BAYES, CRAMER_RAO
-from isocharge.train.report.measures import MethodRecord, Plot
-from isocharge.train.report.studies import COORDINATES, Draws
+from isocharge.train.report.measures import Cost, MethodRecord
+from isocharge.train.report.studies import COORDINATES, NoiseDraws
 
 GREY = "#8a95a5"
-"""Colour of secondary lines."""
+"""Colour of shaded areas."""
 
-KINDS = {"paper": "#7a5195", "learnt": "#2f7f6f", "fitted map": "#c47f17", "network": "#2b6cb0"}
-"""Colours of the kinds of methods."""
+KIND_COLOURS = {"paper": "#7a5195", "learnt": "#2f7f6f", "fitted map": "#c47f17", "network": "#2b6cb0"}
+"""Colour of each kind of method."""
 
 MARKERS = "osv^DPX<>h"
-"""Markers of the methods of one kind."""
+"""Markers that the methods of one kind use in turn."""
 
-OWN_STYLES: dict[str, dict[str, Any]] = {
+LINE_STYLES: dict[str, dict[str, Any]] = {
     RELEASED: {"color": FELT, "marker": "*", "ms": 10, "lw": 2.0, "zorder": 3},
     BAYES: {"color": INK, "marker": "", "ls": "-", "lw": 2.0},
     CRAMER_RAO: {"color": INK, "marker": "", "ls": ":", "lw": 2.0},
 }
-"""How the released model and the limits are drawn; other methods take matplotlib's colours in turn."""
+"""Matplotlib styles of the released model and of the limits, by name. Other methods have the style
+`DEFAULT_LINE_STYLE`."""
 
-AXES: dict[Plot, str] = {
+DEFAULT_LINE_STYLE: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 1.3}
+"""Matplotlib style of a method that is not in `LINE_STYLES`; its colour is the next of Matplotlib's colour cycle."""
+
+COST_LABELS: dict[Cost, str] = {
     "latency": "time of one prediction, median, us",
     "throughput": "predictions per second in batches",
     "memory": "memory of the method, bytes",
 }
-"""Label of each plot's horizontal axis."""
+"""Label of the horizontal axis of each plot of the error against a cost."""
+
+POSITION_ERROR_LABEL = "position error, rms, mm"
+"""Label of the axis of the position error."""
+
+COVERAGE_TOLERANCE = 2.0
+"""Half width of the shaded band in the plot of the coverage, percentage points."""
 
 
-def speed_plot(records: Sequence[MethodRecord], plot: Plot, limits: Mapping[str, float]) -> Figure:
-    """Position error against latency, throughput or memory, one point for each method.
+def cost_plot(records: Sequence[MethodRecord], cost: Cost, limits: Mapping[str, float]) -> Figure:
+    """Draw the position error against a cost, with one point for each method.
 
     Args:
-        records: Of the methods.
-        plot: Which of AXES.
-        limits: Name to position error, mm, of what is drawn as a line, unless every method is below it.
+        records: Records of the methods.
+        cost: Name of the cost.
+        limits: Theoretical limits of the position error, mm, by name. A limit is drawn as a horizontal line. It is left
+            out if it is larger than all errors, as the limit for unbiased estimators can be.
     """
     figure, axes = new_axes(10.5, 6.0)
-    shown = [record for record in records if record.errors.position_rms_mm]
-    markers = {kind: cycle(MARKERS) for kind in KINDS}
-    for record in sorted(shown, key=lambda record: record.error_mm):
-        colour, hollow = KINDS[record.compared.kind], not record.competes
-        marker, fill = next(markers[record.compared.kind]), "white" if hollow else colour
-        style: dict[str, Any] = {"color": colour, "mfc": fill, "marker": marker, "ms": 7}
-        if record.compared.name == RELEASED:
-            style = {"color": FELT, "marker": "*", "ms": 14}
-        axes.plot(
-            record.cost(plot),
-            record.error_mm,
-            ls="",
-            label=f"{record.compared.name}, {record.error_mm:.3g} mm",
-            **style,
-        )
-    front = sorted((record.cost(plot), record.error_mm) for record in shown if plot in record.best_on)
-    step = "steps-pre" if plot == "throughput" else "steps-post"
-    axes.plot(*zip(*front, strict=True), ls="--", color=INK, lw=1.0, drawstyle=step, zorder=1, label="unbeaten")
-    highest = max(record.error_mm for record in shown if not record.compared.given_force)
-    for name, value in limits.items():
-        if value <= highest:  # unbiased near a fold: centimetres
-            axes.axhline(value, color=INK, ls=OWN_STYLES[name]["ls"], zorder=1, label=f"{name}, {value:.3g} mm")
-    _logarithmic(axes, AXES[plot], "position error, rms, mm")
+    answering = [record for record in records if record.errors.position_rms_mm]
+    answering.sort(key=lambda record: record.error_mm)
+    _draw_methods(axes, answering, cost)
+    _draw_pareto_front(axes, answering, cost)
+    largest_error_mm = max(record.error_mm for record in answering if not record.method.given_force)
+    for name, limit_mm in limits.items():
+        if limit_mm <= largest_error_mm:
+            line_style = LINE_STYLES[name]["ls"]
+            axes.axhline(limit_mm, color=INK, ls=line_style, zorder=1, label=f"{name}, {limit_mm:.3g} mm")
+    _set_logarithmic_axes(axes, COST_LABELS[cost], POSITION_ERROR_LABEL)
     axes.xaxis.set_major_formatter("{x:,g}")
-    if plot == "throughput":
+    if cost == "throughput":
         axes.invert_xaxis()
     figure.legend(loc="outside right center", fontsize=8, frameon=False)
     return figure
 
 
-def _logarithmic(axes: Any, x: str, y: str) -> None:
-    """Logarithmic axes with plain numbers."""
-    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
+def _draw_methods(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> None:
+    """Draw one point for each method; points of methods that are not comparable are hollow."""
+    markers = {kind: cycle(MARKERS) for kind in KIND_COLOURS}
+    for record in records:
+        colour = KIND_COLOURS[record.method.kind]
+        fill_colour = colour if record.is_comparable else "white"
+        marker = next(markers[record.method.kind])
+        style: dict[str, Any] = {"color": colour, "mfc": fill_colour, "marker": marker, "ms": 7}
+        if record.method.name == RELEASED:
+            style = {"color": FELT, "marker": "*", "ms": 14}
+        label = f"{record.method.name}, {record.error_mm:.3g} mm"
+        axes.plot(record.cost(cost), record.error_mm, ls="", label=label, **style)
+
+
+def _draw_pareto_front(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> None:
+    """Draw the Pareto front as steps.
+
+    Between two methods of the front, the error is that of the method with the lower cost. A higher throughput is a
+    lower cost, so the steps of the throughput go the other way.
+    """
+    front = sorted((record.cost(cost), record.error_mm) for record in records if cost in record.pareto_costs)
+    costs, errors_mm = zip(*front, strict=True)
+    draw_style = "steps-pre" if cost == "throughput" else "steps-post"
+    axes.plot(costs, errors_mm, ls="--", color=INK, lw=1.0, drawstyle=draw_style, zorder=1, label="Pareto front")
+
+
+def _set_logarithmic_axes(axes: Axes, x_label: str, y_label: str) -> None:
+    """Set both axes to logarithmic scales with plain numbers."""
+    axes.set(xscale="log", yscale="log", xlabel=x_label, ylabel=y_label)
     for axis in (axes.xaxis, axes.yaxis):
-        low, high = axis.get_view_interval()
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
+        lower, upper = axis.get_view_interval()
+        is_short = upper < 1e3 * lower
+        multiples = (1.0, 2.0, 5.0) if is_short else (1.0,)
+        axis.set_major_locator(LogLocator(subs=multiples))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.25, which="both", lw=0.5)
 
 
-def error_maps(sensor: Sensor, domain: Domain, draws: Draws) -> Figure:
-    """Root-mean-square errors of the released model over the film."""
+def error_maps(sensor: Sensor, domain: Domain, draws: NoiseDraws) -> Figure:
+    """Draw maps of the root-mean-square errors of the released model over the film.
+
+    The left map shows the position error in mm, the right map the relative error of the force in %.
+
+    Args:
+        sensor: The sensor, whose electrodes are drawn.
+        domain: The working area, whose edge is drawn.
+        draws: Estimates of the released model under several noise draws.
+    """
     figure = new_figure(11.5, 5.0)
-    labels = {
-        "position error, rms, mm": position_error(draws.contact, draws.truth),
-        "relative force error, rms, %": 100.0 * (draws.contact[:, 2] / draws.truth[:, 2] - 1.0),
+    force_error_percent = 100.0 * (draws.estimate[:, 2] / draws.truth[:, 2] - 1.0)
+    errors_by_label = {
+        POSITION_ERROR_LABEL: position_error(draws.estimate, draws.truth),
+        "relative force error, rms, %": force_error_percent,
     }
-    for axes, (label, values) in zip(figure.subplots(1, 2), labels.items(), strict=True):
-        cells = axes.hexbin(*draws.truth[:, :2].T, values, gridsize=22, reduce_C_function=rms, cmap="viridis", lw=0.1)
+    x_mm = draws.truth[:, 0]
+    y_mm = draws.truth[:, 1]
+    for axes, (label, errors) in zip(figure.subplots(1, 2), errors_by_label.items(), strict=True):
+        cells = axes.hexbin(x_mm, y_mm, errors, gridsize=22, reduce_C_function=rms, cmap="viridis", lw=0.1)
         cells.set_clip_path(Circle((0, 0), domain.radius, transform=axes.transData))
-        cells.set_clim(*np.percentile(np.ma.compressed(cells.get_array()), (0.5, 99.5)))
+        cell_errors = np.ma.compressed(cells.get_array())
+        cells.set_clim(*np.percentile(cell_errors, (0.5, 99.5)))
         figure.colorbar(cells, ax=axes, shrink=0.85, label=label)
         draw_layout(axes, sensor, domain.radius)
     return figure
 
 
-def error_lines(x: Sequence[float], lines: Mapping[str, Sequence[float | None]], label: str) -> Figure:
-    """Position errors of several methods, and the limits, against what `label` says."""
+def error_lines(x: Sequence[float], lines: Mapping[str, Sequence[float | None]], x_label: str) -> Figure:
+    """Draw the position errors of several methods and limits as lines.
+
+    Args:
+        x: Values on the horizontal axis.
+        lines: Position errors at these values, mm, by the name of the method or limit; None for no value.
+        x_label: Label of the horizontal axis, with its unit.
+    """
     figure, axes = new_axes(8.0, 5.0)
-    for name, values in lines.items():
-        axes.plot(x, np.array(values, dtype=float), label=name, **_style(name))
-    _logarithmic(axes, label, "position error, rms, mm")
+    for name, errors_mm in lines.items():
+        axes.plot(x, np.array(errors_mm, dtype=float), label=name, **_line_style(name))
+    _set_logarithmic_axes(axes, x_label, POSITION_ERROR_LABEL)
     axes.legend(fontsize=8)
     return figure
 
 
-def _style(name: str) -> dict[str, Any]:
-    return {"marker": "o", "ms": 4, "lw": 1.3} | OWN_STYLES.get(name, {})
+def _line_style(name: str) -> dict[str, Any]:
+    """Return the Matplotlib style of a method or limit."""
+    return DEFAULT_LINE_STYLE | LINE_STYLES.get(name, {})
 
 
-def calibration(record: Mapping[str, Any]) -> Figure:
-    """Coverage of the released model's intervals less their nominal level."""
+def coverage_plot(record: Mapping[str, Any]) -> Figure:
+    """Draw the coverage of the released model's intervals minus the nominal level, in percentage points.
+
+    Args:
+        record: Result of `studies.coverage_by_level`.
+    """
     figure, axes = new_axes(6.5, 4.4)
-    level = 100.0 * np.array(record["levels"])
-    axes.axhspan(-2.0, 2.0, color=GREY, alpha=0.15, lw=0)
+    level_percent = 100.0 * np.array(record["levels"])
+    axes.axhspan(-COVERAGE_TOLERANCE, COVERAGE_TOLERANCE, color=GREY, alpha=0.15, lw=0)
     for name in COORDINATES:
-        axes.plot(level, 100.0 * np.array(record["coverage"][name]) - level, ".-", label=name)
-    axes.set(xlabel="nominal level, %", ylabel="truths inside minus nominal, percentage points", xlim=(0, 100))
+        coverage_percent = 100.0 * np.array(record["coverage"][name])
+        axes.plot(level_percent, coverage_percent - level_percent, ".-", label=name)
+    axes.set(xlabel="nominal level, %", ylabel="coverage minus nominal level, percentage points", xlim=(0, 100))
     axes.grid(alpha=0.25, lw=0.5)
     axes.legend()
     return figure
 
 
-def mismatch_effect(cases: Sequence[Mapping[str, Any]], nominal: float | None) -> Figure:
-    """Errors and alarms where the film, probe or chain is not as the models assume."""
-    some = {f"{case['group']}: {case['case']}": case for case in cases if case["group"] != "noise"}
-    figure = new_figure(11.5, 1.9 + 0.36 * len(some))
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1.0))
-    for name in cases[0]["errors"]:
-        errors = [case["errors"][name]["position_rms_mm"] for case in some.values()]
-        left.plot(errors, [*some], **{**_style(name), "ls": ""}, label=name)
-    left.axvline(nominal or np.nan, color=FELT, lw=0.9, ls="--", label="as assumed")
-    bars = right.barh([*some], [case["alarms_percent"] for case in some.values()], color=FELT, alpha=0.8, height=0.6)
-    right.bar_label(bars, fmt="{:g}", padding=3, fontsize=8)
-    right.axvline(100.0 * FALSE_ALARM_RATE, color=INK, lw=0.9, ls="--")
-    left.set(xlabel="position error, rms, mm", xscale="log")
-    left.invert_yaxis()
-    right.set(xlabel="presses with an alarm from the misfit, %", xlim=(0, 112))
-    left.xaxis.set_major_formatter("{x:g}")
-    left.grid(alpha=0.25, lw=0.5)
+def mismatch_plot(results: Sequence[Mapping[str, Any]], nominal_error_mm: float | None) -> Figure:
+    """Draw the position errors and the alarms for all mismatches except those of the noise.
+
+    Args:
+        results: Results of `studies.measure_mismatch`.
+        nominal_error_mm: Position error of the released model without a mismatch, mm; None if it is unknown.
+    """
+    drawn = [result for result in results if result["group"] != "noise"]
+    labels = [f"{result['group']}: {result['case']}" for result in drawn]
+    figure = new_figure(11.5, 1.9 + 0.36 * len(drawn))
+    error_axes, alarm_axes = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1.0))
+
+    for name in results[0]["errors"]:
+        errors_mm = [result["errors"][name]["position_rms_mm"] for result in drawn]
+        style = _line_style(name) | {"ls": ""}
+        error_axes.plot(errors_mm, labels, **style, label=name)
+    error_axes.axvline(nominal_error_mm or np.nan, color=FELT, lw=0.9, ls="--", label="without mismatch")
+    error_axes.set(xlabel=POSITION_ERROR_LABEL, xscale="log")
+    error_axes.invert_yaxis()
+    error_axes.xaxis.set_major_formatter("{x:g}")
+    error_axes.grid(alpha=0.25, lw=0.5)
+
+    alarms_percent = [result["alarms_percent"] for result in drawn]
+    bars = alarm_axes.barh(labels, alarms_percent, color=FELT, alpha=0.8, height=0.6)
+    alarm_axes.bar_label(bars, fmt="{:g}", padding=3, fontsize=8)
+    alarm_axes.axvline(100.0 * FALSE_ALARM_RATE, color=INK, lw=0.9, ls="--")
+    alarm_axes.set(xlabel="presses with an alarm from the misfit, %", xlim=(0, 112))
     figure.legend(loc="outside lower center", fontsize=8, ncol=6, frameon=False)
     return figure
 
 
-def limit_lines(limits: Mapping[str, Any]) -> dict[str, float]:
-    """Names of the limits in a section's record, and their position errors, mm."""
-    known = {BAYES: limits["bayes"], CRAMER_RAO: limits["cramer_rao"]}
-    return {name: limit["position_rms_mm"] for name, limit in known.items() if limit}
+def limit_errors(limits: Mapping[str, Any]) -> dict[str, float]:
+    """Return the position errors of the limits that were computed, mm, by the name of the limit.
+
+    Args:
+        limits: Entry "limits" of a section of the report.
+    """
+    limits_by_name = {BAYES: limits["bayes"], CRAMER_RAO: limits["cramer_rao"]}
+    return {name: limit["position_rms_mm"] for name, limit in limits_by_name.items() if limit}

@@ -1,5 +1,7 @@
-"""Studies of the released model: errors over film and force, whether its deviations hold, and what it does where noise,
-probe, pretension, gains or an electrode are not as it assumes.
+"""Studies of the released model beyond its mean error.
+
+The studies cover the errors over the film and the force, the coverage of the reported standard deviations, and the
+errors if the noise, the probe, the pretension, the gains or an electrode differ from what the model was trained for.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,104 +11,150 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Integers
 from isocharge.simulate import Domain, NoiseModel, parse_probe
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines.compared_methods import ComparedMethod
 from isocharge.train.baselines.networks import ReleasedModel
 from isocharge.train.data.presses import LabelledPresses, position_error
-from isocharge.train.report.case import CRAMER_RAO, EvaluationCase, Settings, press_on
-from isocharge.train.report.measures import Errors, coverage, rounded
+from isocharge.train.report.case import CRAMER_RAO, EvaluationCase, Settings, simulate_presses
+from isocharge.train.report.measures import ContactErrors, interval_coverage, round_significant
 
-DRAW_SEED = 90_000
-"""Seed of the noise draws, relative to the case's seed."""
+NOISE_DRAWS_SEED = 90_000
+"""Seed of the first noise draw of `NoiseDraws`, relative to the seed of the case."""
 
-NOMINAL = np.array([0.05, *np.arange(0.1, 0.95, 0.1), 0.95, 0.99])
-"""Nominal levels of the calibration plot."""
+NOMINAL_LEVELS = np.array([0.05, *np.arange(0.1, 0.95, 0.1), 0.95, 0.99])
+"""Nominal probabilities of the central intervals whose coverage is measured."""
 
 FORCE_BINS = 12
-"""Bins of the error against force."""
+"""Number of force bins in which the position error is computed."""
 
 COORDINATES = ("x", "y", "force")
+"""Names of the three estimated quantities, in the order of the columns of a contact."""
 
 
 @dataclass(frozen=True)
-class Draws:
-    """The released model's answers to the test presses under several draws of the noise.
+class NoiseDraws:
+    """Estimates of the released model for all test presses under several draws of the noise.
 
     Attributes:
-        truth: Presses, repeated, shape (n draws, 3).
-        contact: Answers, of the same shape.
-        std: Their standard deviations.
-        misfit: Shape (n draws,).
+        truth: True contacts (x, y, F), repeated for each draw, shape (n_press * n_draw, 3), mm and N.
+        estimate: Estimated contacts, shape (n_press * n_draw, 3), mm and N.
+        std: Standard deviations reported by the model, shape (n_press * n_draw, 3), mm and N.
+        misfit: Misfits reported by the model, shape (n_press * n_draw,), in standard deviations of the noise.
     """
 
     truth: Array
-    contact: Array
+    estimate: Array
     std: Array
     misfit: Array
 
     @classmethod
-    def of(cls, released: ReleasedModel, clean: LabelledPresses, case: EvaluationCase, draws: int) -> "Draws":
-        """So many draws of the case's noise."""
-        seeds = range(case.seed + DRAW_SEED, case.seed + DRAW_SEED + draws)
-        contact, std, misfit = released.answer(np.concatenate([clean.noisy(case.noise, seed) for seed in seeds]))
-        return cls(np.tile(clean.contact, (draws, 1)), contact, std, misfit[:, 0])
+    def of(cls, released: ReleasedModel, clean: LabelledPresses, case: EvaluationCase, draw_count: int) -> "NoiseDraws":
+        """Draw the noise of the case several times and predict all presses each time.
+
+        Args:
+            released: The released model.
+            clean: The test presses without noise.
+            case: The case, with noise and seed.
+            draw_count: Number of noise draws for each press.
+        """
+        first_seed = case.seed + NOISE_DRAWS_SEED
+        noisy_charges = [clean.noisy(case.noise, first_seed + draw) for draw in range(draw_count)]
+        estimate, std, misfit = released.answer(np.concatenate(noisy_charges))
+        truth = np.tile(clean.contact, (draw_count, 1))
+        return cls(truth, estimate, std, misfit[:, 0])
 
 
-def by_force(domain: Domain, truth: Array, contacts: Mapping[str, Array], cramer_rao: Array) -> dict[str, Any]:
-    """Root-mean-square position error, mm, of several methods and Cramér-Rao's in bins of equal steps of log force."""
+def errors_by_force(
+    domain: Domain, truth: Array, estimates: Mapping[str, Array], cramer_rao_mm: Array
+) -> dict[str, Any]:
+    """Compute the root-mean-square position error of several methods in logarithmic bins of the force.
+
+    Args:
+        domain: The range of forces.
+        truth: True contacts (x, y, F), shape (n, 3), mm and N.
+        estimates: Estimated contacts of the first m presses, shape (m, 3), mm and N, by the name of the method; NaN
+            where there is no estimate.
+        cramer_rao_mm: Cramér-Rao limit of the position, shape (n,), mm.
+
+    Returns:
+        The geometric centres of the bins ("force_N"), and the errors in the bins by the name of the method
+        ("position_rms_mm"). An error is None if a bin contains no estimate.
+    """
     edges = np.geomspace(*domain.force_range, FORCE_BINS + 1)
-    number = np.digitize(truth[:, 2], edges[1:-1])
-    errors = {name: position_error(contact, truth[: len(contact)]) for name, contact in contacts.items()}
-    lines = {
-        name: [_rms_of(error[(number[: len(error)] == k) & np.isfinite(error)]) for k in range(FORCE_BINS)]
-        for name, error in {**errors, CRAMER_RAO: cramer_rao}.items()
-    }
-    return {"force_N": [rounded(value) for value in np.sqrt(edges[:-1] * edges[1:])], "position_rms_mm": lines}
-
-
-def _rms_of(errors: Array) -> float | None:
-    return rounded(rms(errors)) if errors.size else None
-
-
-def calibration(draws: Draws) -> dict[str, Any]:
-    """Coverage of the central intervals at many levels."""
-    covered = coverage(draws.contact, draws.std, draws.truth, NOMINAL)
+    bin_index = np.digitize(truth[:, 2], edges[1:-1])
+    position_errors = {}
+    for name, estimate in estimates.items():
+        position_errors[name] = position_error(estimate, truth[: len(estimate)])
+    position_errors[CRAMER_RAO] = cramer_rao_mm
+    centres = np.sqrt(edges[:-1] * edges[1:])
     return {
-        "levels": [rounded(level, 3) for level in NOMINAL],
-        "coverage": {name: [rounded(share) for share in covered[:, k]] for k, name in enumerate(COORDINATES)},
+        "force_N": [round_significant(force) for force in centres],
+        "position_rms_mm": {
+            name: _rms_in_bins(errors, bin_index[: len(errors)]) for name, errors in position_errors.items()
+        },
     }
 
 
-LEVELS = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Factors on the noise, dimensionless."""
+def _rms_in_bins(errors: Array, bin_index: Integers) -> list[float | None]:
+    """Return the root mean square of the finite errors in each force bin; None for a bin without finite errors."""
+    values: list[float | None] = []
+    for index in range(FORCE_BINS):
+        errors_in_bin = errors[(bin_index == index) & np.isfinite(errors)]
+        values.append(round_significant(rms(errors_in_bin)) if errors_in_bin.size else None)
+    return values
 
-PRETENSION_OFF = 0.2
-"""Pretension that the models do not know of, MPa."""
 
-GAIN_OFF, GAIN_WRONG = 0.01, 0.2
-"""Standard deviation of unknown gains, and the gain that is plainly wrong."""
+def coverage_by_level(draws: NoiseDraws) -> dict[str, Any]:
+    """Compute the coverage of the central intervals at many nominal levels.
 
-ROUGH = 2e-3
-"""Accuracy of charges under other probes and pretensions: far below what they change."""
+    Returns:
+        The nominal levels ("levels"), and for x, y and the force the fractions of true values inside the intervals
+        ("coverage").
+    """
+    coverage = interval_coverage(draws.estimate, draws.std, draws.truth, NOMINAL_LEVELS)
+    return {
+        "levels": [round_significant(level, 3) for level in NOMINAL_LEVELS],
+        "coverage": {
+            name: [round_significant(fraction) for fraction in fractions]
+            for name, fractions in zip(COORDINATES, coverage.T, strict=True)
+        },
+    }
 
-FARTHEST = 50.0
-"""Answers farther from zero, mm or N, are cut to this: polynomials explode outside of what they know."""
 
-NOISE_SEED = 515
-"""Seed of the noise on every deviation's charges, relative to the case's."""
+NOISE_FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0)
+"""Factors by which the noise is multiplied to test the methods with less and more noise, dimensionless."""
+
+PRETENSION_ERROR_MPa = 0.2
+"""Difference between the pretension of the tested film and the pretension that the models assume, MPa."""
+
+GAIN_STD = 0.01
+"""Relative standard deviation of the gains if all of them are wrong."""
+
+SINGLE_GAIN_ERROR = 0.2
+"""Relative error of the gain if only one of them is wrong."""
+
+MISMATCH_ACCURACY = 2e-3
+"""Relative accuracy of the simulated charges for other probes and pretensions. It is small compared with the changes
+of the charges that these cause."""
+
+CLIP_LIMIT = 50.0
+"""Magnitude, mm or N, to which estimates are clipped, because polynomials diverge outside their training range."""
+
+MISMATCH_NOISE_SEED = 515
+"""Seed of the noise on the charges of a mismatch, relative to the seed of the case."""
 
 
 @dataclass(frozen=True)
-class Deviation:
-    """Presses that differ from what the models assume.
+class Mismatch:
+    """Presses under conditions that differ from what the models assume.
 
     Attributes:
-        group: "noise", "probe", "pretension", "gain" or "dead electrode".
-        name: What is different.
-        truth: Contacts, shape (n, 3), mm and N.
-        charge: What is measured, shape (n, n_electrode), pC.
+        group: Kind of the difference: "noise", "probe", "pretension", "gain" or "dead electrode".
+        name: Description of the difference.
+        truth: True contacts (x, y, F), shape (n, 3), mm and N.
+        charge: Measured charges with noise, shape (n, n_electrode), pC.
     """
 
     group: str
@@ -115,59 +163,109 @@ class Deviation:
     charge: Array
 
 
-def deviations(
+def mismatches(
     case: EvaluationCase, clean: LabelledPresses, settings: Settings, executor: Executor | None = None
-) -> Iterator[Deviation]:
-    """Every deviation, from clean test presses of the case."""
-    seed, truth, rough = case.seed + NOISE_SEED, clean.contact, max(ROUGH, settings.accuracy)
-    for level in LEVELS:
-        louder = NoiseModel(f"x {level:g}", level * case.noise.white, level * case.noise.gain)
-        yield Deviation("noise", louder.name, truth, clean.noisy(louder, seed))
-    others = [("probe", each, replace(case, probes=(parse_probe(each),)), rough) for each in settings.shapes]
+) -> Iterator[Mismatch]:
+    """Yield the presses of all mismatches.
+
+    Args:
+        case: The conditions that the models assume.
+        clean: The test presses of the case without noise.
+        settings: Settings of the report: the other probes, the accuracy, and whether the pretension is changed.
+        executor: Executor of the solves; None to solve in this process.
+    """
+    noise_seed = case.seed + MISMATCH_NOISE_SEED
+    for factor in NOISE_FACTORS:
+        noise = NoiseModel(f"x {factor:g}", factor * case.noise.white, factor * case.noise.gain)
+        yield Mismatch("noise", noise.name, clean.contact, clean.noisy(noise, noise_seed))
+
+    probe_accuracy = max(MISMATCH_ACCURACY, settings.accuracy)
+    for notation in settings.shapes:
+        other_probe = replace(case, probes=(parse_probe(notation),))
+        yield _solved_mismatch("probe", notation, other_probe, probe_accuracy, executor)
+
     if settings.mismatch_cases:
-        film = replace(case.sensor.film, pretension=case.sensor.film.pretension + PRETENSION_OFF)
-        taut = replace(case, sensor=replace(case.sensor, film=film))
-        others.append(("pretension", f"+{PRETENSION_OFF:g} MPa", taut, ROUGH))
-    for group, name, other, accuracy in others:
-        presses = press_on(other.forward_maps(accuracy=accuracy, executor=executor), case.sweep())
-        yield Deviation(group, name, presses.contact, presses.noisy(case.noise, seed))
-    yield from _wrong_gains(case, truth, clean.noisy(case.noise, seed))
+        film = replace(case.sensor.film, pretension=case.sensor.film.pretension + PRETENSION_ERROR_MPa)
+        other_film = replace(case, sensor=replace(case.sensor, film=film))
+        name = f"+{PRETENSION_ERROR_MPa:g} MPa"
+        yield _solved_mismatch("pretension", name, other_film, MISMATCH_ACCURACY, executor)
+
+    noisy_charge = clean.noisy(case.noise, noise_seed)
+    rng = np.random.default_rng(noise_seed)
+    yield from _gain_mismatches(case, clean.contact, noisy_charge, rng)
+    yield from _dead_electrodes(case, clean.contact, noisy_charge, rng)
 
 
-def _wrong_gains(case: EvaluationCase, truth: Array, noisy: Array) -> Iterator[Deviation]:
-    """Gains off by some 1 %, each sensor differently; one off by 20 %; one dead."""
-    rng, names = np.random.default_rng(case.seed + NOISE_SEED), case.sensor.electrode_names
-    gains = 1.0 + GAIN_OFF * rng.standard_normal(noisy.shape)
-    yield Deviation("gain", f"each off by {100 * GAIN_OFF:g} % rms", truth, gains * noisy)
-    silence = case.noise.white * rng.standard_normal(noisy.shape)
-    affected = np.eye(len(names), dtype=bool)
-    for name, electrode in zip(names, affected, strict=True):
-        charge = np.where(electrode, (1.0 + GAIN_WRONG) * noisy, noisy)
-        yield Deviation("gain", f"{name} off by {100 * GAIN_WRONG:g} %", truth, charge)
-    for name, electrode in zip(names, affected, strict=True):
-        yield Deviation("dead electrode", f"{name} dead", truth, np.where(electrode, silence, noisy))
+def _solved_mismatch(
+    group: str, name: str, other_case: EvaluationCase, accuracy: float, executor: Executor | None
+) -> Mismatch:
+    """Return presses that are simulated with the sensor and the probes of another case."""
+    forward_maps = other_case.forward_maps(accuracy=accuracy, executor=executor)
+    presses = simulate_presses(forward_maps, other_case.test_sweep())
+    charge = presses.noisy(other_case.noise, other_case.seed + MISMATCH_NOISE_SEED)
+    return Mismatch(group, name, presses.contact, charge)
 
 
-def measured(
-    deviation: Deviation,
-    name: str,
+def _gain_mismatches(
+    case: EvaluationCase, truth: Array, noisy_charge: Array, rng: np.random.Generator
+) -> Iterator[Mismatch]:
+    """Yield presses with random errors of all gains, and then presses with one wrong gain for each electrode.
+
+    The random errors are drawn anew for each press.
+    """
+    gains = 1.0 + GAIN_STD * rng.standard_normal(noisy_charge.shape)
+    yield Mismatch("gain", f"each off by {100 * GAIN_STD:g} % rms", truth, gains * noisy_charge)
+    for electrode, name in enumerate(case.sensor.electrode_names):
+        charge = noisy_charge.copy()
+        charge[:, electrode] *= 1.0 + SINGLE_GAIN_ERROR
+        yield Mismatch("gain", f"{name} off by {100 * SINGLE_GAIN_ERROR:g} %", truth, charge)
+
+
+def _dead_electrodes(
+    case: EvaluationCase, truth: Array, noisy_charge: Array, rng: np.random.Generator
+) -> Iterator[Mismatch]:
+    """Yield, for each electrode, presses in which this electrode measures only the white noise."""
+    noise_charge = case.noise.white * rng.standard_normal(noisy_charge.shape)
+    for electrode, name in enumerate(case.sensor.electrode_names):
+        charge = noisy_charge.copy()
+        charge[:, electrode] = noise_charge[:, electrode]
+        yield Mismatch("dead electrode", f"{name} dead", truth, charge)
+
+
+def measure_mismatch(
+    mismatch: Mismatch,
+    released_name: str,
     released: ReleasedModel,
-    compared_methods: Sequence[ComparedMethod],
-    threshold: float,
+    other_methods: Sequence[ComparedMethod],
+    alarm_threshold: float,
 ) -> dict[str, Any]:
-    """Errors of the released model, by its name, and of others, and how often its misfit gives the alarm."""
-    contact, std, misfit = released.answer(deviation.charge)
-    with np.errstate(over="ignore"):
-        answers = {compared.name: compared.regressor.predict(deviation.charge) for compared in compared_methods}
-    clipped = {compared: np.clip(answer, -FARTHEST, FARTHEST) for compared, answer in answers.items()}
+    """Measure the errors of the released model and of other methods under a mismatch.
+
+    Args:
+        mismatch: The presses with their charges.
+        released_name: Name of the released model in the results.
+        released: The released model.
+        other_methods: Other fitted methods.
+        alarm_threshold: Misfit above which the released model gives an alarm, in standard deviations of the noise.
+
+    Returns:
+        One entry of "cases" in `report.json`: the errors of each method, and of the released model the percentage of
+        presses with an alarm and the fraction of true values inside plus or minus one standard deviation.
+    """
+    estimate, std, misfit = released.answer(mismatch.charge)
+    errors = {released_name: asdict(ContactErrors.of(estimate, mismatch.truth))}
+    for method in other_methods:
+        with np.errstate(over="ignore"):
+            other_estimate = method.regressor.predict(mismatch.charge)
+        clipped_estimate = np.clip(other_estimate, -CLIP_LIMIT, CLIP_LIMIT)
+        errors[method.name] = asdict(ContactErrors.of(clipped_estimate, mismatch.truth))
+    alarm_fraction = float(np.mean(misfit[:, 0] > alarm_threshold))
+    inside_fraction = float(np.mean(np.abs(estimate - mismatch.truth) < std))
     return {
-        "group": deviation.group,
-        "case": deviation.name,
-        "presses": len(deviation.truth),
-        "alarms_percent": rounded(100.0 * float(np.mean(misfit[:, 0] > threshold)), 3),
-        "coverage_68": rounded(float(np.mean(np.abs(contact - deviation.truth) < std)), 3),
-        "errors": {
-            compared: asdict(Errors.of(answer, deviation.truth))
-            for compared, answer in {name: contact, **clipped}.items()
-        },
+        "group": mismatch.group,
+        "case": mismatch.name,
+        "presses": len(mismatch.truth),
+        "alarms_percent": round_significant(100.0 * alarm_fraction, 3),
+        "coverage_68": round_significant(inside_fraction, 3),
+        "errors": errors,
     }

@@ -1,0 +1,342 @@
+"""Evaluation of a released model and all other methods on one dataset."""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from isocharge.common.progress import track
+from isocharge.serve import Predictor
+from isocharge.simulate import ChargeSpline, Dataset, ForwardMap
+from isocharge.simulate.plots.figure import save_picture
+from isocharge.train.baselines.compared_methods import (
+    BOOSTING,
+    GAUSS_NEWTON,
+    LINEAR_BAND,
+    POLYNOMIAL,
+    TABLE,
+    ComparedMethod,
+    FittingTask,
+    compared_methods,
+)
+from isocharge.train.baselines.networks import RELEASED, ReleasedModel, TrainedNetwork
+from isocharge.train.data.presses import LabelledPresses, held_out, is_measured, presses_of, split_by_position
+from isocharge.train.model_release.evaluate import alarm_threshold
+from isocharge.train.report import pictures, studies
+from isocharge.train.report.case import BAYES, ErrorBounds, EvaluationCase, Settings, simulate_presses
+from isocharge.train.report.measures import compare_with_released, round_significant
+from isocharge.train.report.methods import FittedMethod, fit_all, measure_methods
+from isocharge.train.report.press_selection import measured_presses_for, select_presses, simulated_presses_for
+from isocharge.train.training.source import TrainingData
+
+STUDIED_METHODS = (GAUSS_NEWTON, POLYNOMIAL, TABLE, BOOSTING, LINEAR_BAND)
+"""Methods that are studied in more detail, beside the released model."""
+
+TEST_NOISE_SEED = 4242
+"""Seed of the noise on the test presses, relative to the seed of the case."""
+
+MIN_TRAINING_PRESSES = 30
+"""Smallest number of measured presses that must remain for fitting after the test presses are held out."""
+
+PICTURE_FORMATS = ("png", "svg")
+"""File formats of each picture. The page shows the first one."""
+
+DrawPicture = Callable[[], Figure]
+"""Function that draws a picture."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """Results of one dataset.
+
+    Attributes:
+        content: Section of the report: the entries of `report.json`, with the methods as `MethodRecord` objects.
+        drawings: Functions that draw the pictures of the section, by the name of the picture.
+    """
+
+    content: dict[str, Any]
+    drawings: dict[str, DrawPicture]
+
+
+@dataclass(frozen=True)
+class DatasetEvaluation:
+    """One dataset, prepared for the evaluation of its released model and all other methods.
+
+    Attributes:
+        dataset: The presses for fitting and validation.
+        released: The released model.
+        students: Version folders of the small models of the same sensor.
+        task: The presses and conditions to which the methods are fitted.
+        case: The conditions of the test.
+        settings: Settings of the report.
+        held_out_presses: The test presses of a measured dataset; None if the test presses are simulated.
+    """
+
+    dataset: Dataset
+    released: ReleasedModel
+    students: tuple[Path, ...]
+    task: FittingTask
+    case: EvaluationCase
+    settings: Settings
+    held_out_presses: LabelledPresses | None = None
+
+    @classmethod
+    def prepare(
+        cls, dataset: Dataset, model_folder: Path, students: Sequence[Path], settings: Settings
+    ) -> "DatasetEvaluation":
+        """Select the presses on which the model can be evaluated, and split them.
+
+        Args:
+            dataset: The dataset.
+            model_folder: Version folder of the released model.
+            students: Version folders of small models; models of other sensors are ignored.
+            settings: Settings of the report.
+
+        Raises:
+            DatasetError: If the methods cannot be fitted to the dataset.
+            ModelError: If the model is for another sensor or for a smaller range of forces than the dataset.
+            PressError: If there are too few measured presses.
+        """
+        model = Predictor(model_folder).metadata
+        held_out_presses = None
+        if is_measured(dataset):
+            dataset = measured_presses_for(model, dataset)
+            case = EvaluationCase.of(dataset, settings.presses, settings.seed)
+            all_presses = LabelledPresses.of(dataset)
+            is_held_out = held_out(all_presses.contact)
+            held_out_presses = all_presses[is_held_out]
+            dataset = _first_presses(select_presses(dataset, ~is_held_out), settings.learn_from)
+            fitting_presses = presses_of(dataset, MIN_TRAINING_PRESSES)
+        else:
+            dataset = simulated_presses_for(model, dataset)
+            case = EvaluationCase.of(dataset, settings.presses, settings.seed)
+            dataset = _first_presses(dataset, settings.learn_from)
+            fitting_presses = presses_of(dataset)
+        train, validation = split_by_position(fitting_presses, settings.hold_out, settings.seed)
+        task = FittingTask(train, validation, case.domain, case.noise, settings.seed, settings.quick)
+        unique_students = dict.fromkeys(students)
+        own_students = tuple(path for path in unique_students if Predictor(path).metadata.sensor == model.sensor)
+        return cls(dataset, ReleasedModel(model_folder), own_students, task, case, settings, held_out_presses)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what identifies the inputs: the checksum of the dataset and the folders of the models."""
+        folders = [self.released.folder, *self.students]
+        return {"dataset_sha256": self.dataset.sha256, "models": [str(folder) for folder in folders]}
+
+    def measure(self, executor: Executor) -> Section:
+        """Fit and measure all methods.
+
+        Args:
+            executor: Executor of the solves and of the integrals of the Bayes limit.
+
+        Returns:
+            The section of the report, whose entry "pictures" is still missing, and the functions that draw its
+            pictures.
+        """
+        if self.held_out_presses is None:
+            section = self._measure_on_simulated_presses(executor)
+        else:
+            section = self._measure_on_measured_presses(self.held_out_presses)
+        limits = pictures.limit_errors(section.content["limits"])
+        drawings = dict(section.drawings)
+        for cost in pictures.COST_LABELS:
+            drawings[cost] = partial(pictures.cost_plot, section.content["methods"], cost, limits)
+        return Section(section.content, drawings)
+
+    def draw_pictures(self, section: Section, folder: Path, file_stem: str) -> None:
+        """Draw and save the pictures of a section, and add the names of their files to it as the entry "pictures".
+
+        Args:
+            section: The section.
+            folder: Folder of the pictures.
+            file_stem: First part of the file names.
+        """
+        files_by_picture = {}
+        for name, draw in track(section.drawings.items(), "drawing"):
+            files = [f"{file_stem}-{name}.{extension}" for extension in PICTURE_FORMATS]
+            figure = draw()
+            for file in files:
+                save_picture(figure, folder / file)
+            files_by_picture[name] = files
+        section.content["pictures"] = files_by_picture
+
+    def _measure_on_simulated_presses(self, executor: Executor) -> Section:
+        """Return the section of a simulated dataset, whose test presses are simulated."""
+        case = self.case
+        settings = self.settings
+        forward_maps = case.forward_maps(range_factor=1.0, accuracy=settings.accuracy, executor=executor)
+        clean = simulate_presses(self._test_maps(forward_maps, executor), case.test_sweep())
+        test = replace(clean, charge=clean.noisy(case.noise, case.seed + TEST_NOISE_SEED))
+        charge_map = ChargeSpline.of(forward_maps[0])
+        limits = ErrorBounds.of(case, charge_map, clean, test.charge[: settings.limited], executor)
+
+        methods = [*self._released_models(), *compared_methods(self.task, charge_map), *self._new_networks()]
+        fitted_methods, _ = fit_all(methods, self.task, test)
+        fitted_by_name = {fitted.method.name: fitted for fitted in fitted_methods}
+        records = measure_methods(fitted_methods, test, settings, limits.posterior_mean)
+        draws = studies.NoiseDraws.of(self.released, clean, case, settings.draws)
+        threshold = alarm_threshold(draws.misfit)
+        content = {
+            **self._description(len(test)),
+            "limits": limits.to_dict(test.contact),
+            "methods": records,
+            "verdict": compare_with_released(records),
+            "by_force": self._errors_by_force(fitted_by_name, limits, test),
+            "calibration": studies.coverage_by_level(draws),
+            "alarm_threshold": round_significant(threshold),
+            "cases": self._mismatch_results(fitted_by_name, clean, threshold, executor),
+        }
+        return Section(content, _study_drawings(content, case, draws))
+
+    def _test_maps(self, forward_maps: tuple[ForwardMap, ...], executor: Executor) -> tuple[ForwardMap, ...]:
+        """Return the forward maps for the test presses.
+
+        They are solved separately, except in a quick report, which uses the maps that are passed to this method.
+        """
+        if self.settings.quick:
+            return forward_maps
+        return self.case.forward_maps(executor=executor)
+
+    def _errors_by_force(
+        self, fitted_by_name: Mapping[str, FittedMethod], limits: ErrorBounds, test: LabelledPresses
+    ) -> dict[str, Any]:
+        """Return the position errors of the Bayes limit, the released model and the studied methods by force."""
+        estimates = {}
+        if limits.posterior_mean is not None:
+            estimates[BAYES] = limits.posterior_mean
+        for name in (RELEASED, *STUDIED_METHODS):
+            estimates[name] = fitted_by_name[name].estimate
+        return studies.errors_by_force(self.case.domain, test.contact, estimates, limits.cramer_rao.position)
+
+    def _mismatch_results(
+        self,
+        fitted_by_name: Mapping[str, FittedMethod],
+        clean: LabelledPresses,
+        threshold: float,
+        executor: Executor,
+    ) -> list[dict[str, Any]]:
+        """Return the results of the released model and the studied methods for all mismatches."""
+        methods = [fitted_by_name[name].method for name in STUDIED_METHODS]
+        return [
+            studies.measure_mismatch(mismatch, RELEASED, self.released, methods, threshold)
+            for mismatch in studies.mismatches(self.case, clean, self.settings, executor)
+        ]
+
+    def _measure_on_measured_presses(self, test: LabelledPresses) -> Section:
+        """Return the section of a measured dataset, without the parts that need a simulation of the film."""
+        methods = [*self._released_models(), *compared_methods(self.task), *self._new_networks()]
+        fitted_methods, failure_reasons = fit_all(methods, self.task, test)
+        records = measure_methods(fitted_methods, test, self.settings)
+        content = {
+            **self._description(len(test)),
+            "limits": {"bayes": None, "cramer_rao": None},
+            "methods": records,
+            "verdict": compare_with_released(records),
+            "left_out": failure_reasons,
+        }
+        return Section(content, {})
+
+    def _released_models(self) -> list[ComparedMethod]:
+        """Return the models that are not fitted again: the released model first, then its students.
+
+        Each model is listed twice: with all outputs, and reduced to the contact.
+        """
+        models = {RELEASED: self.released}
+        for path in self.students:
+            models[Predictor(path).metadata.name] = ReleasedModel(path)
+        methods = []
+        for name, model in models.items():
+            methods.append(ComparedMethod(name, "network", "Predictor", model, choice="as released"))
+            reduced_model = ComparedMethod(
+                f"{name}, contact only",
+                "network",
+                "ONNX Runtime, bound",
+                model.contact_only(),
+                choice="as released, only the contact",
+            )
+            methods.append(reduced_model)
+        return methods
+
+    def _new_networks(self) -> list[ComparedMethod]:
+        """Return networks of several sizes, which are trained for the comparison."""
+        case = self.case
+        steps = self.settings.steps
+        data = TrainingData(
+            sensor=case.sensor,
+            probes=tuple(probe.notation for probe in case.probes),
+            domain=case.domain,
+            presses=self.task.train,
+            sha256=self.dataset.sha256,
+        )
+        methods = []
+        for widths in self.settings.sizes:
+            name = f"network {'-'.join(str(width) for width in widths)}"
+            network = TrainedNetwork(data, widths, steps, case.noise, self.settings.seed)
+            methods.append(ComparedMethod(name, "network", "ONNX Runtime, bound", network, choice=f"{steps} steps"))
+        return methods
+
+    def _description(self, test_count: int) -> dict[str, Any]:
+        """Return the first entries of the section: sensor, contacts, noise, numbers of presses, and the model.
+
+        Args:
+            test_count: Number of test presses.
+        """
+        case = self.case
+        model = self.released.predictor.metadata
+        return {
+            "sensor": case.sensor.name,
+            "measured": self.held_out_presses is not None,
+            "electrodes": list(case.sensor.electrode_names),
+            "probes": [probe.notation for probe in case.probes],
+            "radius_mm": case.domain.radius,
+            "force_N": list(case.domain.force_range),
+            "noise": case.noise.to_dict(),
+            "dataset_sha256": self.dataset.sha256,
+            "presses": {"train": len(self.task.train), "validation": len(self.task.validation), "test": test_count},
+            "model": {
+                "label": model.label,
+                "probes": list(model.probes),
+                "noise": model.noise.name,
+                "dataset_sha256": model.dataset_sha256,
+                "card_errors": dict(model.errors),
+            },
+        }
+
+
+def _first_presses(dataset: Dataset, max_presses: int) -> Dataset:
+    """Return the dataset with at most its first `max_presses` presses."""
+    return select_presses(dataset, np.arange(len(dataset.samples)) < max_presses)
+
+
+def _study_drawings(
+    content: Mapping[str, Any], case: EvaluationCase, draws: studies.NoiseDraws
+) -> dict[str, DrawPicture]:
+    """Return the functions that draw the pictures of the studies, by the name of the picture.
+
+    Args:
+        content: Section of the report of a simulated dataset.
+        case: The conditions of the test.
+        draws: Estimates of the released model under several noise draws.
+    """
+    by_force = content["by_force"]
+    mismatch_results = content["cases"]
+    nominal_error_mm = content["methods"][0].errors.position_rms_mm
+
+    noise_results = [result for result in mismatch_results if result["group"] == "noise"]
+    errors_by_noise = {}
+    for name in noise_results[0]["errors"]:
+        errors_by_noise[name] = [result["errors"][name]["position_rms_mm"] for result in noise_results]
+    return {
+        "maps": partial(pictures.error_maps, case.sensor, case.domain, draws),
+        "force": partial(pictures.error_lines, by_force["force_N"], by_force["position_rms_mm"], "force, N"),
+        "calibration": partial(pictures.coverage_plot, content["calibration"]),
+        "noise": partial(
+            pictures.error_lines, studies.NOISE_FACTORS, errors_by_noise, "noise, relative to the reference noise"
+        ),
+        "effects": partial(pictures.mismatch_plot, mismatch_results, nominal_error_mm),
+    }
