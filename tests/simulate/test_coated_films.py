@@ -71,7 +71,7 @@ def test_a_coat_on_both_sides_is_one_that_is_twice_as_stiff():
     )
 
 
-def test_what_is_pressed_and_what_is_read_must_be_the_same_film():
+def test_pressed_film_and_read_film_must_be_equal():
     with pytest.raises(SensorError, match=r"another film: expected .*Coat"):
         touch_charge(INK, press(INK.film, PROBE, AT, FORCE))
     with pytest.raises(SceneError, match=r"axisymmetric film, got .*coat"):

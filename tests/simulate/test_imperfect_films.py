@@ -33,7 +33,7 @@ BY_SCIKIT_FEM = {
 
 
 @pytest.mark.parametrize(("film", "expected"), BY_SCIKIT_FEM.values(), ids=BY_SCIKIT_FEM.keys())
-def test_charges_agree_with_another_code(film, expected):
+def test_charges_of_imperfect_films_agree_with_scikit_fem(film, expected):
     charge = touch_charge(replace(SENSOR, film=film), press(film, PROBE, AT, FORCE))
     np.testing.assert_allclose(charge, expected, rtol=8e-4)
 
@@ -57,7 +57,7 @@ def test_an_oval_film_that_is_tauter_along_it_sinks_as_a_round_one_stretched():
     np.testing.assert_allclose(deflection(solved, points), expected, rtol=3.0 * e**2)
 
 
-def test_the_sensor_file_holds_all_of_it():
+def test_sensor_file_stores_all_imperfections():
     sensor = replace(SENSOR, film=replace(ALL, shear=1000.0), piezo=replace(SENSOR.piezo, d12=0.5), coating=22.5)
     sensor = replace(sensor, calibration=replace(sensor.calibration, crosstalk=0.01))
     table = sensor_to_dict(sensor)
@@ -74,6 +74,6 @@ def test_crosstalk_adds_a_share_of_the_others():
 
 
 @pytest.mark.parametrize("changes", [{"oval": 0.01}, {"deviator": (0.1, 0.0)}])
-def test_maps_refuse_what_is_not_alike_all_round(changes):
+def test_forward_maps_reject_films_that_are_not_axisymmetric(changes):
     with pytest.raises(SceneError, match=f"axisymmetric film, got .*{next(iter(changes))}"):
         ForwardMap.build(replace(SENSOR, film=replace(SENSOR.film, **changes)), PROBE)

@@ -140,7 +140,7 @@ def worst_errors(case) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-def test_accuracy_table_is_what_the_solver_gives():
+def test_accuracy_table_equals_the_errors_of_the_solver():
     """Every figure of simulate/docs/accuracy.md, to a digit: figures this small differ between libraries."""
     rows = re.findall(r"^\| (.+) \| (\d+) um \| (\d+) \| ([\d.]+) % \| ([\d.]+) % \|$", ACCURACY, re.MULTILINE)
     assert len(rows) == 9

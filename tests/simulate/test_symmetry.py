@@ -63,7 +63,7 @@ def test_quarter_turn_of_an_uniaxial_film_swaps_the_coefficients(probe):
     np.testing.assert_allclose(second, np.roll(charges(sensor, probe, AT), 1), **EXACT)
 
 
-def test_turning_press_and_layout_turns_nothing(probe):
+def test_rotation_of_press_and_layout_keeps_the_charges(probe):
     """Any angle, with polygonal electrodes that turn along; biaxial, so that the film's axes do not show."""
     sensor, angle = sensor_of("four-25um-biaxial"), -2.5
     still = tuple(replace(e, square=False) for e in sensor.electrodes)
@@ -76,7 +76,7 @@ def test_turning_press_and_layout_turns_nothing(probe):
 
 @pytest.mark.first_cases(3)
 @pytest.mark.parametrize("film", FILMS)
-def test_mirror(probe, film):
+def test_mirrored_press_has_mirrored_charges(probe, film):
     """About the y axis."""
     sensor, order = sensor_of("three-25um-uniaxial", film), [0, 2, 1]
     second = charges(sensor, mirrored(probe), (-AT[0], AT[1]))
@@ -90,7 +90,7 @@ SCALES = {
 
 
 @pytest.mark.parametrize(("length", "modulus"), SCALES.values(), ids=SCALES.keys())
-def test_same_dimensionless_scene_gives_the_same_digits(probe, length, modulus):
+def test_scaled_press_with_equal_dimensionless_groups_has_scaled_charges(probe, length, modulus):
     """All lengths and the modulus scaled, pretension and force with them, F ~ E h a."""
     sensor = sensor_of("four-25um-uniaxial", "taut 110 um")
     film = sensor.film

@@ -41,7 +41,7 @@ def contacts(domain: Domain, count: int = 60, share: float = 0.97) -> np.ndarray
 
 
 @pytest.mark.parametrize("charge_map", [*CHECKED, "within", "function"], indirect=True)
-def test_a_map_keeps_the_protocol(charge_map):
+def test_maps_implement_the_charge_map_protocol(charge_map):
     """Derivatives are those of the charges, over another step.
 
     On the mesh that `press` chooses they agree within 2e-4 of the largest; at order 4 the kinks between the elements of
@@ -59,7 +59,7 @@ def test_a_map_keeps_the_protocol(charge_map):
 
 
 @pytest.mark.parametrize("charge_map", CHECKED, indirect=True)
-def test_outside_is_refused_with_the_limits(charge_map):
+def test_contacts_outside_the_domain_raise_error_with_the_limits(charge_map):
     radius, (low, high) = charge_map.domain.radius, charge_map.domain.force_range
     inside, limits = [0.0, 0.0, low], rf"at most {radius:g} mm from the centre and {low:g} to {high:g} N"
     for outside in ([1.01 * radius, 0.0, low], [0.0, 0.0, 1.01 * high], [0.0, 0.0, 0.99 * low], [np.nan, 0.0, low]):
@@ -70,7 +70,7 @@ def test_outside_is_refused_with_the_limits(charge_map):
                 ask(inside)
 
 
-def test_differences_are_exact_for_second_order():
+def test_central_differences_are_exact_for_quadratic_functions():
     contact = contacts(DOMAIN)
     slope = differences(linear, contact)
     np.testing.assert_allclose(slope[:, 0], np.tile([1.0, 2.0, 3.0], (60, 1)), rtol=1e-9)
@@ -78,7 +78,7 @@ def test_differences_are_exact_for_second_order():
     np.testing.assert_allclose(slope[:, 1], np.stack([y, x, 0.0 * x], axis=1), atol=1e-10)
 
 
-def test_a_domain_scales_to_the_unit_ball_and_back_and_takes_its_own_edge():
+def test_domain_to_unit_and_to_contact_are_inverse_and_accept_the_edge():
     contact = contacts(DOMAIN, share=1.0)
     unit = DOMAIN.to_unit(contact)
     assert np.abs(unit[:, 2]).max() <= 1.0 + 1e-12
@@ -98,10 +98,10 @@ def test_a_domain_scales_to_the_unit_ball_and_back_and_takes_its_own_edge():
         (lambda: as_charges(np.array([[1, np.nan]]), ("A", "B")), "charge of 'B' in press 0: expected a finite number"),
     ],
 )
-def test_what_a_user_gives_is_refused_by_name(check, message):
+def test_invalid_arguments_raise_error_with_their_names(check, message):
     with pytest.raises((SceneError, ChargeError), match=message):
         check()
 
 
-def test_charges_are_doubles():
+def test_as_charges_converts_to_float64():
     assert as_charges(np.ones((2, 3), dtype=np.float32), ("A", "B", "C")).dtype == np.float64

@@ -19,7 +19,7 @@ def spread(count: int) -> np.ndarray:
     return np.stack([at.real, at.imag, force], axis=1)
 
 
-def test_charges_are_the_maps(near_map, near_spline):
+def test_spline_charges_equal_those_of_the_forward_map(near_map, near_spline):
     contact = spread(300)
     expected = near_map.charges(contact)
     assert np.abs(near_spline.charges(contact) - expected).max() < 6e-4 * np.abs(expected).max()
@@ -27,7 +27,7 @@ def test_charges_are_the_maps(near_map, near_spline):
     assert ChargeSpline.of(near_map, spacing=0.6).error > 2.0 * near_spline.error
 
 
-def test_contact_pressure_on_electrodes_is_in(near_map):
+def test_spline_includes_the_charge_of_contact_pressure(near_map):
     """d33 adds charges that go with the force itself, not with the amplitude's square.
 
     Their slope has a kink where the footprint's edge meets an electrode's corner: of them knots that are 0.5 mm apart
@@ -41,7 +41,7 @@ def test_contact_pressure_on_electrodes_is_in(near_map):
     np.testing.assert_allclose(with_d33 - without, extra, atol=0.015 * np.abs(extra).max())
 
 
-def test_first_order_is_charges_and_derivatives_and_beyond_the_edge_those_of_the_edge(near_spline):
+def test_first_order_equals_charges_and_derivatives_and_clamps_to_the_edge(near_spline):
     contact = spread(100)
     value, slope, by_force = near_spline.first_order(contact[:, :2], contact[:, 2])
     np.testing.assert_allclose(value, near_spline.charges(contact), rtol=1e-13)
@@ -52,6 +52,6 @@ def test_first_order_is_charges_and_derivatives_and_beyond_the_edge_those_of_the
 
 
 @pytest.mark.parametrize("radius", [0.0, 5.1, np.nan])
-def test_impossible_radius_is_refused(near_map, radius):
+def test_invalid_radius_raises_error(near_map, radius):
     with pytest.raises(SceneError, match=r"radius: expected up to the forward map's 5 mm"):
         ChargeSpline.of(near_map, radius)

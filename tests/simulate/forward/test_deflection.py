@@ -35,7 +35,7 @@ def interpolated(field, x_mm, y_mm, distance_mm, force_N):
 
 
 @pytest.mark.parametrize(("distance_mm", "force_N"), [(0.0, 0.5), (5.0, 0.2), (11.0, 1.0)])
-def test_it_is_the_film_between_its_entries(field, distance_mm, force_N):
+def test_deflection_table_interpolates_direct_solves(field, distance_mm, force_N):
     solved = press(FILM, PROBE, (distance_mm, 0.0), force_N)
     rng = np.random.default_rng(1)
     x_mm, y_mm = rng.uniform(-30, 30, 300), rng.uniform(-30, 30, 300)
@@ -46,7 +46,7 @@ def test_it_is_the_film_between_its_entries(field, distance_mm, force_N):
     assert error.max() < 0.02 * expected.max()
 
 
-def test_the_file_says_the_same(field, tmp_path):
+def test_deflection_file_round_trip(field, tmp_path):
     path = tmp_path / "deflection.json"
     path.write_text(json.dumps(field.to_json()))
     read = read_deflection_field(path)
@@ -66,7 +66,7 @@ def test_the_file_says_the_same(field, tmp_path):
         ({"scale_mm": -1.0}, "scale_mm"),
     ],
 )
-def test_a_damaged_file_says_why(field, tmp_path, changes, reason):
+def test_damaged_deflection_file_raises_error(field, tmp_path, changes, reason):
     path = tmp_path / "deflection.json"
     path.write_text(json.dumps(field.to_json() | changes))
     with pytest.raises(InputError, match=reason):

@@ -28,7 +28,7 @@ def charges(family, sensor, probe, *contact):
     return family.forward_map(sensor, probe).charges(np.array([contact]))[0]
 
 
-def test_maps_agree_with_direct_solves_on_films_that_were_not_solved(prior, family):
+def test_family_maps_agree_with_direct_solves_between_the_grid_nodes(prior, family):
     rng = np.random.default_rng(7)
     for parameters in prior.draw(rng, 4):
         sensor, probe = prior.film(parameters)
@@ -37,7 +37,7 @@ def test_maps_agree_with_direct_solves_on_films_that_were_not_solved(prior, fami
         np.testing.assert_allclose(charges(family, sensor, probe, x, y, force), direct, rtol=1.5e-3)
 
 
-def test_a_family_is_checked_over_all_its_forces_and_places(prior, family, monkeypatch):
+def test_family_check_covers_all_forces_and_distances(prior, family, monkeypatch):
     checked = []
     monkeypatch.setattr(film_family, "relative_error", lambda _, *press: checked.append(press) or 1e-4 * len(checked))
     assert film_family._check_against_solves(family, prior, Domain(3.0, (0.2, 1.2))) == 1e-4 * film_family.CHECK_COUNT
@@ -55,7 +55,7 @@ def test_modulus_and_loads_scale_exactly(prior, family):
     np.testing.assert_allclose(charges(family, twice, probe, 2.0, 1.0, 1.8), 2.0 * single, rtol=1e-12)
 
 
-def test_arrays_give_the_family_back(prior, family):
+def test_family_arrays_round_trip(prior, family):
     again = FilmFamily.from_arrays(family.to_arrays())
     film = prior.film(prior.mean)
     for x in (0.0, 2.5):
@@ -65,7 +65,7 @@ def test_arrays_give_the_family_back(prior, family):
 
 
 @pytest.mark.parametrize("path", RELEASED, ids=lambda path: path.parts[-3])
-def test_released_families_are_read_and_right(path):
+def test_released_families_agree_with_direct_solves(path):
     """Files of earlier versions; dimensionless, so that no unit can change them."""
     with np.load(path) as file:
         arrays = {name.removeprefix("family."): file[name] for name in file.files if name.startswith("family.")}
@@ -79,7 +79,7 @@ def test_released_families_are_read_and_right(path):
 
 
 @pytest.mark.parametrize("name", ["coefficients", "grid", "modes", "limits", "surface", "resolution"])
-def test_missing_or_cut_arrays_are_refused(family, name):
+def test_missing_or_truncated_arrays_raise_input_error(family, name):
     arrays = family.to_arrays()
     with pytest.raises(InputError, match="film family"):
         FilmFamily.from_arrays({key: value for key, value in arrays.items() if key != name})
@@ -92,7 +92,7 @@ def test_missing_or_cut_arrays_are_refused(family, name):
     ("change", "name"),
     [({"pretension": 5.0}, "tension"), ({"thickness": 0.05}, "thickness"), ({"poisson": 0.3}, "Poisson")],
 )
-def test_a_film_or_probe_outside_is_refused(prior, family, change, name):
+def test_film_or_probe_outside_the_family_raises_scene_error(prior, family, change, name):
     sensor = replace(prior.sensor, film=replace(prior.sensor.film, **change))
     with pytest.raises(SceneError, match=name):
         family.forward_map(sensor, prior.probe)

@@ -62,7 +62,7 @@ def draw(forward_map: ForwardMap, count: int, seed: int) -> tuple[np.ndarray, np
     return np.column_stack([z.real, z.imag, force]), rng.uniform(-np.pi, np.pi, count)
 
 
-def test_presses_between_the_nodes_and_over_electrodes(three_map, near_map):
+def test_forward_map_agrees_with_direct_solves_between_the_nodes(three_map, near_map):
     """All terms out to 8 mm, and a membrane with half of the presses on an electrode."""
     contact, _ = draw(near_map, 8, seed=1)
     contact[:4, :2] = [(4.9, 0.3), (0.2, 4.5), (-4.2, 0.0), (1.2, -4.5)]
@@ -70,7 +70,7 @@ def test_presses_between_the_nodes_and_over_electrodes(three_map, near_map):
         assert error.max() < 1e-3
 
 
-def test_random_orientations(oriented_map):
+def test_forward_map_agrees_with_direct_solves_for_random_orientations(oriented_map):
     """Over electrodes and beside them; the charges have the probe's period, and no shorter one."""
     error = errors(oriented_map, *draw(oriented_map, 10, seed=10))
     assert np.quantile(error, 0.95) < 1e-3
@@ -81,7 +81,7 @@ def test_random_orientations(oriented_map):
     assert np.abs(oriented_map.charges(contact, rotation + 0.5 * period) / charge - 1.0).max() > 1e-2
 
 
-def test_ends_of_the_domain_and_the_error_that_the_map_states(near_map):
+def test_forward_map_error_at_the_ends_of_the_domain(near_map):
     radius, (low, high) = near_map.domain.radius, near_map.domain.force_range
     ends = np.array([[radius, 0.0, low], [-radius, 0.0, high], [0.0, 0.0, low], [0.0, 0.0, high]])
     assert errors(near_map, ends).max() < 1e-3
@@ -124,7 +124,7 @@ FILMS = {
 
 
 @pytest.mark.parametrize(("film", "surface", "theory"), FILMS.values(), ids=FILMS.keys())
-def test_other_films(near_electrodes, film, surface, theory):
+def test_forward_map_of_other_films(near_electrodes, film, surface, theory):
     """Read at the surface, bending is in though nobody asked for it."""
     sensor = replace(near_electrodes, film=replace(near_electrodes.film, **film), surface=surface)
     forward_map = kept(ForwardMap.build, sensor, Circle(1.0), 2.0, (0.8, 1.0), SolveSettings(theory=theory))
@@ -132,12 +132,12 @@ def test_other_films(near_electrodes, film, surface, theory):
     assert errors(forward_map, draw(forward_map, 4, seed=7)[0]).max() < 1e-3
 
 
-def test_one_force():
+def test_forward_map_with_one_force():
     forward_map = ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(2.0), 4.0, (0.7, 0.7), QUICK_SETTINGS)
     assert errors(forward_map, np.array([[1.0, 2.0, 0.7], [0.0, -3.0, 0.7]])).max() < 1e-3
 
 
-def test_zero_force_is_no_charge_anywhere(three_map):
+def test_zero_force_gives_zero_charges(three_map):
     """An untouched film has no position; it counts among the presses of a message all the same."""
     contact = np.array([[1.0, 0.0, 0.0], [50.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [2.0, 0.0, 1.0]])
     charge = three_map.charges(contact)
@@ -147,7 +147,7 @@ def test_zero_force_is_no_charge_anywhere(three_map):
         three_map.charges(np.concatenate([contact[:3], [[8.1, 0.0, 1.0]]]))
 
 
-def test_many_presses_are_each_of_them(three_map, oriented_map):
+def test_charges_of_many_presses_equal_those_of_single_presses(three_map, oriented_map):
     """More than a chunk, and the order kept; untouched rows among them; also none."""
     for forward_map in (three_map, oriented_map):
         contact, rotation = draw(forward_map, 300, seed=8)
@@ -172,12 +172,12 @@ def test_many_presses_are_each_of_them(three_map, oriented_map):
         ),
     ],
 )
-def test_impossible_domains_are_refused(arguments, message):
+def test_invalid_domains_raise_error(arguments, message):
     with pytest.raises(SceneError, match=message):
         ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0), **arguments)
 
 
-def test_an_error_that_cannot_be_reached_is_not_passed_over(monkeypatch):
+def test_unreachable_interpolation_error_raises_solve_error(monkeypatch):
     monkeypatch.setattr("isocharge.simulate.forward.forward_map.INTERPOLATION_ERROR", 1e-13)
     settings = replace(QUICK_SETTINGS, resolution=Resolution(3, 8, 2))
     with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to .* only, expected 1e-13"):
@@ -198,7 +198,7 @@ def test_orientations_are_spread_evenly_and_solved_once_each(folds, rotations):
 
 
 @pytest.mark.parametrize("period", [2 * np.pi, np.pi, 2 * np.pi / 3])
-def test_nodes_interpolate_what_charges_look_like(period):
+def test_family_weights_interpolate_smooth_functions(period):
     """A power of the force, a smooth function of the distance, the first harmonics of the orientation."""
     rng = np.random.default_rng(9)
     distance, force = 8.0 * np.sqrt(rng.random(200)), np.exp(rng.uniform(np.log(0.05), np.log(2.0), 200))
@@ -214,7 +214,7 @@ def test_nodes_interpolate_what_charges_look_like(period):
         np.testing.assert_allclose(found, smooth(distance, force, rotation), rtol=expected)
 
 
-def test_presses_between_have_forces_of_the_whole_range():
+def test_probes_between_cover_the_range_of_forces():
     force = np.array([force for _, _, force, _ in Family.spread(DOMAIN, (3, 2), 0.0).probes_between(7)])
     assert len(set(force)) == 7
     assert (0.05 <= force.min() < 0.1, 1.0 < force.max() <= 2.0) == (True, True)

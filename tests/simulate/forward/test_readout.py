@@ -51,7 +51,7 @@ def test_linear_stress_is_read_at_the_centre(sensor, per_side):
     np.testing.assert_allclose(charge, expected, rtol=1e-12, atol=1e-9)
 
 
-def test_edges_are_the_papers():
+def test_edge_readout_equals_equation_3_of_the_paper():
     """Quadratic stresses tell the edges apart: s11 over left and right, s22 over lower and upper (eq. 3)."""
     square = Electrode.of_square("A", (5.0, -2.0), 3.0)
     sensor = replace(load_sensor("four-25um-uniaxial"), electrodes=(square,), readout="edge")
@@ -82,7 +82,7 @@ def test_polygon_integrates_polynomials_exactly():
     assert charge[0] == pytest.approx(9.0 * (D31 * 36.0 / 6 + D32 * 18.0 / 12), rel=1e-12)
 
 
-def test_charge_is_that_of_each_electrode_and_of_each_coefficient(solved):
+def test_charge_is_linear_in_gains_and_coefficients(solved):
     """A square and a triangle have different numbers of points; padding must not add charge."""
     sensor = load_sensor("four-25um-uniaxial")
     both = (sensor.electrodes[0], TRIANGLE)
@@ -117,7 +117,7 @@ def test_a_trace_collects_the_stress_under_it(film, at):
     assert charge[0] == pytest.approx(expected, rel=1e-4)
 
 
-def test_an_electrode_with_a_dent_is_its_two_rectangles(solved):
+def test_concave_electrode_equals_the_sum_of_two_rectangles(solved):
     dented = Electrode("A", ((8.0, 0.0), (12.0, 0.0), (12.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0)))
     lying = Electrode("A", ((8.0, 0.0), (12.0, 0.0), (12.0, 1.0), (8.0, 1.0)))
     standing = Electrode("B", ((8.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0)))
@@ -137,7 +137,7 @@ def test_an_electrode_with_a_dent_is_its_two_rectangles(solved):
     assert whole[0] == pytest.approx(parts.sum(), rel=1e-12)
 
 
-def test_only_what_lies_over_the_back_is_pressed_and_warmed():
+def test_pressure_and_thermal_charge_only_where_front_and_back_overlap():
     """A back that is the square: its trace collects nothing."""
     square = Electrode.of_square("A", (10.0, 0.0), 3.0)
     traced = replace(square.with_trace(((10.0, 0.0), (20.0, 0.0)), 0.5), back=(square.corners,))
@@ -166,7 +166,7 @@ def test_fine_and_coarse_rules_agree_away_from_the_probe(solved):
     np.testing.assert_allclose(coarse, fine, rtol=3e-5)
 
 
-def test_another_film_is_refused(solved):
+def test_touch_charge_with_another_film_raises_error(solved):
     other = replace(solved, film=replace(solved.film, young=2500.0))
     with pytest.raises(SensorError, match=r"another film: expected Film\(.*young=3000.*got .*young=2500"):
         touch_charge(load_sensor("three-25um-biaxial"), other)
@@ -192,7 +192,7 @@ def with_d33(d33: float = -30.0, **changes) -> Sensor:
         (Polygon.triangle(1.0), (10.0, 1.5), 5 / 9 * np.sqrt(3.0) / 4),  # all below the centroid
     ],
 )
-def test_contact_pressure_counts_where_it_lies_on_the_electrode(probe, at, covered):
+def test_contact_charge_is_proportional_to_the_covered_area(probe, at, covered):
     """Positive for PVDF's negative d33; nothing on the others.
 
     Balance through a film whose other face is free, s33(z) = -p (1/2 + z / h), has the mean -p / 2. So
@@ -223,7 +223,7 @@ def test_thermal_charge():
     np.testing.assert_allclose(thermal_charge(sensor, -0.2), [54.0, 24.0], rtol=1e-12)
 
 
-def test_signs_of_stretching_pressing_and_warming_are_those_of_one_thickness():
+def test_signs_of_tension_pressure_and_warming_follow_the_thickness():
     """A film of fixed dipoles, P the charge of one face over its area: dQ / Q = -dh / h, whatever changes h.
 
     Tension s in both directions thins by 2 nu s / E, pressure p on a free film by p / (2 E), warming thickens by a dT.

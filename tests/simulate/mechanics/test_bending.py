@@ -18,7 +18,7 @@ def fine(request, mesh_of):
     return mesh_of(request.param, (0.3, 0.0), FINE)
 
 
-def test_tilt_is_felt_at_the_clamped_rim_only(fine):
+def test_tilt_has_bending_energy_at_the_clamped_rim_only(fine):
     """A plane has no curvature inside; against the clamp it is a kink. Bending knows nothing of the mean of W."""
     bent = Bending(fine.geometry, 1.0).laplacian(fine.points @ [0.5, 0.0])
     assert np.abs(bent[fine.inside]).max() < 1e-7

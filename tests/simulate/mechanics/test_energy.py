@@ -36,14 +36,14 @@ def condensed(mesh, matrix: np.ndarray) -> np.ndarray:
     return first - coupling.T @ np.linalg.solve(whole[:, 3, :, 3], coupling)
 
 
-def test_residual_is_the_slope_of_the_energy(elastic, mesh):
+def test_residual_is_the_gradient_of_the_energy(elastic, mesh):
     field, direction = mesh.random_field(0), mesh.random_field(100)
     slope = sum(share * elastic.energy(field + step * direction) for step, share in STENCIL)
     scale = sum(abs(share * elastic.energy(field + step * direction)) for step, share in STENCIL)
     assert np.sum(elastic.residual(field) * direction) == pytest.approx(slope, abs=1e-12 * scale)
 
 
-def test_tangent_is_the_slope_of_the_residual(elastic, mesh):
+def test_tangent_is_the_derivative_of_the_residual(elastic, mesh):
     """Of the condensed matrix where bending carries a fourth unknown."""
     field, direction = mesh.random_field(0), mesh.random_field(100)
     slope = sum(share * elastic.residual(field + step * direction) for step, share in STENCIL)
@@ -53,7 +53,7 @@ def test_tangent_is_the_slope_of_the_residual(elastic, mesh):
     np.testing.assert_allclose(product.reshape(-1, 3), slope, atol=1e-9 * np.abs(slope).max())
 
 
-def test_guard_is_tension_in_the_tangent_only(elastic, mesh):
+def test_guard_tension_is_added_to_the_tangent_only(elastic, mesh):
     """It adds the Laplacian of every component, weighted as tension is, and nothing to force or energy."""
     field = mesh.random_field(3)
     change = elastic.tangent(field, 0.7) - elastic.tangent(field)

@@ -52,7 +52,7 @@ MOTIONS = {
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
 @pytest.mark.parametrize("amplitude2", [1e-3, 0.5])
-def test_rigid_motion_costs_nothing(mesh, motion, amplitude2):
+def test_rigid_motion_has_no_energy(mesh, motion, amplitude2):
     rotation, shift = motion
     membrane = Membrane(mesh.geometry, groups(amplitude2, 0.0))
     field = moved(mesh.points, rotation.as_matrix(), shift, amplitude2)

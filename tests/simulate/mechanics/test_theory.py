@@ -37,7 +37,7 @@ NAMES = {
 
 
 @pytest.mark.parametrize(("terms", "name"), NAMES.items(), ids=str)
-def test_theory_has_the_name_of_its_terms_and_is_found_by_it(film, terms, name):
+def test_theory_by_name_finds_the_theory_with_this_name(film, terms, name):
     film = thick(film, 0.025, 1.0 if terms[2] else 0.0)
     assert Theory(*terms).name == name
     if terms == (False, False, False):
@@ -75,7 +75,7 @@ def test_choose_theory_gives_the_fewest_terms(film, thickness, pretension, force
     accuracy=st.floats(1e-6, 0.1),
 )
 @settings(derandomize=True)
-def test_choice_is_within_the_accuracy_or_everything(thickness, pretension, force, accuracy):
+def test_chosen_theory_is_accurate_or_the_full_theory(thickness, pretension, force, accuracy):
     """And asking for more never takes a term away."""
     film = Film(45.0, thickness, 3000.0, 0.34, pretension)
     theory, finer = choose_theory(film, PROBE, force, accuracy), choose_theory(film, PROBE, force, 0.1 * accuracy)
@@ -91,7 +91,7 @@ def test_choice_is_within_the_accuracy_or_everything(thickness, pretension, forc
     poisson=st.floats(0.0, 0.49),
 )
 @settings(derandomize=True)
-def test_amplitude_solves_its_cubic(thickness, pretension, force, poisson):
+def test_amplitude_solves_the_cubic_equation(thickness, pretension, force, poisson):
     """A^3 + (1.6 pretension / E + 16 pi b) A = F / (E h a): so height is one, and the load is what the cubic says."""
     film = Film(45.0, thickness, 3000.0, poisson, pretension)
     a = np.sqrt(amplitude_squared(film, force))
@@ -103,7 +103,7 @@ def test_amplitude_solves_its_cubic(thickness, pretension, force, poisson):
     assert 0.0 <= groups.induced <= 1.0 + 1e-6
 
 
-def test_theory_for_a_sensor_serves_all_forces_and_the_surface(film):
+def test_theory_for_a_sensor_suffices_for_all_forces_and_the_surface(film):
     """Linear at the small end, nonlinear at the other: nonlinear; a surface needs bending."""
     sensor = replace(load_sensor("three-25um-biaxial"), film=thick(film, 0.3))
     assert theory_for(sensor, PROBE, (1e-4, 1e-4)).name == "linear plate"
@@ -127,7 +127,7 @@ def draw(rng: np.random.Generator) -> tuple[Film, Circle | Polygon, tuple[float,
     return film, probe, (float(z.real), float(z.imag)), between(1e-5, 5.0)
 
 
-def test_modelling_error_bounds_the_real_difference():
+def test_modelling_error_is_an_upper_bound_of_the_difference_of_theories():
     """Of the worst charge, over the press's largest, for drawn presses that get a simpler theory, on the same mesh.
 
     A hundredth of the accuracy is for the digits of Newton's method.

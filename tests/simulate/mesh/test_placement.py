@@ -75,7 +75,7 @@ def accuracy(film: np.ndarray, placement: Placement) -> np.ndarray:
 
 @given(scene=presses(), seed=st.integers(0, 2**32 - 1))
 @COMMON
-def test_locate_finds_any_point_where_it_was(scene, seed):
+def test_locate_is_the_inverse_of_the_element_map(scene, seed):
     """All over the film, on the rim, and on every seam: the nodes, the hub, the footprint's edge."""
     probe, at, resolution, layer = scene
     placement, mesh = place(FILM, probe, at, resolution, layer).placement, template_for(probe, resolution)
@@ -103,7 +103,7 @@ def test_accepted_presses_have_no_folded_elements(scene):
 
 @given(scene=presses())
 @COMMON
-def test_footprint_is_the_probes(scene):
+def test_footprint_elements_have_the_area_centroid_and_load_of_the_probe(scene):
     """Its area, centroid and share of the load: exact for polygons, to the mesh's accuracy for circles."""
     probe, at, resolution, layer = scene
     mesh, distance = template_for(probe, resolution), float(np.hypot(*at)) / RADIUS

@@ -13,7 +13,7 @@ from isocharge.simulate.sensor.film_prior import FilmSpread
 PRIOR = FilmPrior(load_sensor("four-25um-uniaxial"), Circle(1.0))
 
 
-def test_draws_have_the_spread_and_stay_within_the_bounds():
+def test_drawn_films_have_the_prior_distribution_within_the_bounds():
     drawn = PRIOR.draw(np.random.default_rng(0), 20_000)
     low, high = PRIOR.bounds
     assert ((drawn >= low) & (drawn <= high)).all()
@@ -23,14 +23,14 @@ def test_draws_have_the_spread_and_stay_within_the_bounds():
     np.testing.assert_allclose((drawn.mean(axis=0) - PRIOR.mean) / PRIOR.std, 0.0, atol=0.03)
 
 
-def test_parameters_are_those_of_the_film_they_describe():
+def test_parameters_of_is_the_inverse_of_film():
     for parameters in PRIOR.draw(np.random.default_rng(1), 20):
         back = PRIOR.parameters_of(*PRIOR.film(parameters))
         np.testing.assert_allclose(back, parameters, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(PRIOR.parameters_of(PRIOR.sensor, PRIOR.probe), PRIOR.described, atol=1e-15)
 
 
-def test_a_parameter_changes_what_its_name_says():
+def test_each_parameter_changes_its_attribute():
     parameters = PRIOR.described
     for name, value in (("young", np.log(1.1)), ("gain C", np.log(0.9)), ("shift_y", 0.2), ("probe_radius", 0.1)):
         parameters[PRIOR.names.index(name)] = value
@@ -49,7 +49,7 @@ def test_a_parameter_changes_what_its_name_says():
         (replace(PRIOR.sensor, piezo=replace(PRIOR.sensor.piezo, d31=-20.0)), "signs"),
     ],
 )
-def test_a_sensor_that_differs_otherwise_is_refused(sensor, reason):
+def test_parameters_of_rejects_sensors_with_other_differences(sensor, reason):
     with pytest.raises(SensorError, match=reason):
         PRIOR.parameters_of(sensor, PRIOR.probe)
 
@@ -67,6 +67,6 @@ AT_THE_RIM = Electrode.of_square("A", (43.0, 0.0), 3.0)
         (lambda: FilmSpread(young=-0.1), r"spread of young: expected a positive number, got -0\.1"),
     ],
 )
-def test_an_impossible_prior_is_refused(make, message):
+def test_invalid_prior_raises_error(make, message):
     with pytest.raises((SensorError, SceneError), match=message):
         make()

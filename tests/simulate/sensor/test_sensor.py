@@ -37,7 +37,7 @@ def three() -> Sensor:
         ({"coat": Coat(376.0, ())}, r"film coat: .* up to 5 times the film's, 375 N/mm, got 376 N/mm"),
     ],
 )
-def test_impossible_films(film, changes, message):
+def test_invalid_film_raises_error(film, changes, message):
     """Sizes in metres and pascals among them: the message names the likely value."""
     with pytest.raises(SensorError, match=message):
         replace(film, **changes)
@@ -54,7 +54,7 @@ def test_impossible_films(film, changes, message):
         ({"d33": -30e-12}, r"piezo d33: expected pC/N, .* are -30 pC/N"),
     ],
 )
-def test_impossible_coefficients(coefficients, message):
+def test_invalid_piezo_coefficients_raise_error(coefficients, message):
     with pytest.raises(SensorError, match=message):
         Piezo(**({"d31": 1.0, "d32": 1.0} | coefficients))
 
@@ -82,7 +82,7 @@ THREE = "electrode 'A': expected 3 to 256 corners"
         (((0, 0), (3e-3, 0), (0, 3e-3)), r"electrode 'A': expected at least 0\.02 mm, .* 0\.003 m are 3 mm"),
     ],
 )
-def test_impossible_electrodes(three, corners, message):
+def test_invalid_electrodes_raise_error(three, corners, message):
     with pytest.raises(SensorError, match=message):
         replace(three, electrodes=(Electrode("A", tuple((float(x), float(y)) for x, y in corners)),))
 
@@ -102,7 +102,7 @@ def test_impossible_electrodes(three, corners, message):
         ({"electrodes": ()}, r"electrodes: expected 1 to 64 different names, got 0: \(\)"),
         ({"electrodes": (SQUARE, SQUARE)}, "expected 1 to 64 different names, got 2: .*'D'"),
         *(
-            ({"electrodes": (replace(SQUARE, name=name),)}, "something else in files")
+            ({"electrodes": (replace(SQUARE, name=name),)}, "reserved for another column")
             for name in ("side_mm", "force_N")
         ),
         *(
@@ -136,7 +136,7 @@ def test_impossible_electrodes(three, corners, message):
         ({"surface": "inside"}, r"expected one of \(.*\), got 'inside'"),
     ],
 )
-def test_impossible_sensors(three, changes, message):
+def test_invalid_sensor_raises_error(three, changes, message):
     with pytest.raises(SensorError, match=message):
         replace(three, **changes)
 
@@ -163,7 +163,7 @@ def test_only_electrodes_that_share_area_overlap(three):
         (((0, 0), (9, 0), (9, 5), (5, -5)), 0.5, "does not cross itself"),
     ],
 )
-def test_impossible_traces(path, width, message):
+def test_invalid_trace_raises_error(path, width, message):
     with pytest.raises(SensorError, match=message):
         SQUARE.with_trace(path, width)
 
@@ -184,7 +184,7 @@ def test_area_of_a_union_counts_overlaps_once():
         (((-3.0, 0.0), (0.0, -3.0), (3.0, 0.0), (0.0, 3.0)), 9.0 + 0.5 * 1.5 - 0.25**2),  # a diamond
     ],
 )
-def test_what_front_and_back_have_in_common_collects(back, area):
+def test_electrode_collects_where_front_and_back_overlap(back, area):
     assert replace(TRACED, back=(back,)).area == pytest.approx(area, rel=1e-12)
 
 
@@ -204,7 +204,7 @@ def test_place_rotates_then_shifts():
     np.testing.assert_allclose(placed, [[0.5, 1.0], [-1.5, 0.0]], atol=1e-15)
 
 
-def test_rotation_by_the_layouts_own_angle_permutes():
+def test_rotation_by_the_symmetry_angle_of_the_layout_permutes_the_charges():
     """The four squares rotated onto each other: A stands where B was (+90), and so on."""
     sensor = load_sensor("four-25um-biaxial")
     solved = press(sensor.film, Circle(1.0), (3.0, 1.0), 1.0)

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import OutputExists, SensorError
+from isocharge.common.printable_text import printable
 from isocharge.simulate import (
     Calibration,
     Electrode,
@@ -95,13 +96,13 @@ LAYOUTS = {
 
 @pytest.mark.parametrize("layout", ["three", "four"])
 @pytest.mark.parametrize(("kind", "d31", "d32"), [("biaxial", 8.0, 8.0), ("uniaxial", 20.0, 2.0)])
-def test_built_in_sensor(layout, kind, d31, d32):
+def test_built_in_sensors_can_be_loaded(layout, kind, d31, d32):
     name = f"{layout}-25um-{kind}"
     electrodes = tuple(Electrode.of_square(*place, 3.0) for place in LAYOUTS[layout].items())
     assert load_sensor(name) == Sensor(name, Film(45.0, 0.025, 3000.0, 0.34), Piezo(d31, d32), electrodes)
 
 
-def test_every_key_arrives(tmp_path):
+def test_sensor_file_keys_are_converted_to_attributes(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(WHOLE)
     assert load_sensor(path) == Sensor(
@@ -115,7 +116,7 @@ def test_every_key_arrives(tmp_path):
     )
 
 
-def test_optional_keys_may_be_left_out():
+def test_optional_keys_have_defaults():
     table = whole()
     for path in KEYS:
         if path[-1] in OPTIONAL - set("AB") and path[0] in table:
@@ -125,7 +126,7 @@ def test_optional_keys_may_be_left_out():
     assert (sensor.piezo.d33, sensor.piezo.pyro, sensor.calibration) == (0.0, 0.0, Calibration())
 
 
-def test_traces_and_metal_of_the_back_arrive():
+def test_traces_and_back_metal_are_read():
     """A trace is written as the polygon that it is."""
     pad, back = ((8.0, 0.0), (12.0, 0.0), (10.0, 4.0)), (((0.0, -9.0), (9.0, -9.0), (9.0, 9.0), (0.0, 9.0)),)
     table = {"polygon_mm": pad, "trace_mm": [[10, 0], [10, -5]], "width_mm": 0.5, "back_mm": back}
@@ -139,18 +140,19 @@ def test_traces_and_metal_of_the_back_arrive():
 
 @given(path=st.sampled_from(CLOSED), key=st.text(min_size=1, max_size=12))
 @settings(derandomize=True, max_examples=30)
-def test_unknown_key_is_named(path, key):
+def test_error_message_names_the_unknown_key(path, key):
     table = whole()
     if key in at(table, path):
         return
     at(table, path)[key] = 1.0
     with pytest.raises(SensorError) as caught:
         sensor_from_dict(table, "mine.toml")
-    assert str(caught.value).startswith(f"mine.toml: unknown key {'.'.join((*path, key))!r}; ")
+    shown_key = printable(".".join((*path, key)))
+    assert str(caught.value).startswith(f"mine.toml: unknown key {shown_key!r}; ")
 
 
 @pytest.mark.parametrize("path", [p for p in KEYS if p[-1] not in OPTIONAL], ids=".".join)
-def test_missing_key_is_named(path):
+def test_error_message_names_the_missing_key(path):
     table = whole()
     del at(table, path[:-1])[path[-1]]
     with pytest.raises(SensorError, match=rf"^mine\.toml: key '{'.'.join(path)}' is missing$"):
@@ -161,7 +163,7 @@ WRONG = (None, "3.0", True, [1.0], [1.0, "2"], {}, {"x": 1.0}, float("nan"), flo
 
 
 @pytest.mark.parametrize("path", KEYS, ids=".".join)
-def test_wrong_type_is_named(path):
+def test_error_message_names_the_key_of_the_wrong_type(path):
     """Every key with every kind of wrong value: a SensorError that names the key, never another exception."""
     for value in WRONG:
         if (path[-1] in ("calibration", "gain") and value == {}) or (path == ("name",) and value == "3.0"):
@@ -212,14 +214,14 @@ def test_wrong_type_is_named(path):
         ),
     ],
 )
-def test_impossible_values(path, value, message):
+def test_invalid_values_raise_error(path, value, message):
     table = whole()
     at(table, path[:-1])[path[-1]] = value
     with pytest.raises(SensorError, match=rf"^mine\.toml: {message}"):
         sensor_from_dict(table, "mine.toml")
 
 
-def test_one_electrode_gets_a_warning(tmp_path, command, caplog):
+def test_sensor_with_one_electrode_logs_a_warning(tmp_path, command, caplog):
     path = tmp_path / "mine.toml"
     path.write_text(WHOLE.replace("B = [8.660254, 5.0]\n", ""))
     load_sensor(path)
@@ -232,7 +234,7 @@ def test_one_electrode_gets_a_warning(tmp_path, command, caplog):
 
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("count", [65, 200_000])
-def test_too_many_electrodes_are_refused_at_once(tmp_path, count):
+def test_too_many_electrodes_raise_error_quickly(tmp_path, count):
     path = tmp_path / "sensor.toml"
     good = (resources.files("isocharge.simulate") / "sensors/three-25um-biaxial.toml").read_text("utf-8")
     head, tail = good.split("side_mm = 3.0\n")
@@ -245,7 +247,7 @@ def test_too_many_electrodes_are_refused_at_once(tmp_path, count):
 # Writing
 
 
-def test_a_written_file_reads_as_the_design_has_it():
+def test_written_sensor_file_reads_as_the_designed_sensor():
     assert sensor_to_dict(sensor_from_dict(whole())) == whole()
     sections = sensor_to_toml(sensor_from_dict(whole())).split("\n\n")
     assert [section.splitlines()[0] for section in sections] == [
@@ -256,7 +258,7 @@ def test_a_written_file_reads_as_the_design_has_it():
 
 
 @pytest.mark.parametrize("name", built_in_sensors())
-def test_a_written_file_is_the_built_in_sensor(name, tmp_path):
+def test_written_sensor_file_reads_as_the_built_in_sensor(name, tmp_path):
     path = tmp_path / "mine.toml"
     write_sensor(load_sensor(name), path, ["as delivered", "", "pretension\nunknown"])
     assert path.read_text("utf-8").startswith("# as delivered\n#\n# pretension\n# unknown\n\nname = ")
@@ -265,7 +267,7 @@ def test_a_written_file_is_the_built_in_sensor(name, tmp_path):
         write_sensor(load_sensor(name), path)
 
 
-def test_squares_of_two_sizes_survive_as_polygons():
+def test_squares_of_a_second_size_are_written_as_polygons():
     """The file has one side for all squares."""
     base = load_sensor("three-25um-biaxial")
     squares = (Electrode.of_square("A", (0.0, 0.0), 3.0), Electrode.of_square("B", (6.0, 0.0), 2.0))
@@ -275,16 +277,14 @@ def test_squares_of_two_sizes_survive_as_polygons():
         sensor_to_dict(replace(base, electrodes=squares, readout="edge"))
 
 
-@pytest.mark.parametrize(
-    ("name", "message"), [("", "name: expected a text"), ("\ud800", "no text that UTF-8 can hold")]
-)
-def test_a_sensor_that_no_file_can_hold(tmp_path, name, message):
+@pytest.mark.parametrize(("name", "message"), [("", "name: expected a text"), ("\ud800", "cannot be encoded in UTF-8")])
+def test_sensor_that_cannot_be_written_raises_error(tmp_path, name, message):
     with pytest.raises(SensorError, match=message):
         write_sensor(replace(load_sensor("three-25um-biaxial"), name=name), tmp_path / "mine.toml")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_written_is_loaded(tmp_path):
+def test_write_and_load_round_trip(tmp_path):
     """Names that TOML has to quote, a polygon with a trace and metal of the back, a calibration."""
     pad = ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0))
     traced = replace(Electrode("a.b", pad).with_trace(((-10.0, 5.0), (-10.0, 20.0)), 0.5), back=(pad,))

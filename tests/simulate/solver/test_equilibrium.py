@@ -48,19 +48,19 @@ MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
         (Circle(1.0), (0.0, 0.0), np.inf, "force: expected a positive number of newtons .* got inf"),
     ],
 )
-def test_impossible_presses_are_refused(film, probe, at, force, message):
+def test_invalid_press_raises_scene_error(film, probe, at, force, message):
     with pytest.raises(SceneError, match=message):
         press(film, probe, at, force)
 
 
-def test_a_probe_below_what_the_grading_resolves_is_refused(film):
+def test_too_small_probe_raises_scene_error(film):
     message = r"expected a reach of at least 1e-05 of the film's radius \(4500 mm\), got 0\.03"
     with pytest.raises(SceneError, match=message):
         press(replace(film, radius=4500.0), Circle(0.03), (0.0, 0.0), 1.0)
 
 
 @pytest.mark.parametrize("read", [deflection, touch_stress])
-def test_points_off_the_film_are_refused(made_up, read):
+def test_points_off_the_film_raise_scene_error(made_up, read):
     solved = made_up(lambda x: np.zeros((len(x), 3)))
     for point in ((-40.0, 30.0), (np.nan, 0.0)):
         with pytest.raises(SceneError, match=rf"point \({point[0]:.4g}, .*\) mm is off the film of radius 45 mm"):
@@ -106,7 +106,7 @@ def test_vertical_forces_balance_round_the_probe(film):
     assert pull == pytest.approx(1.0, rel=1e-5)
 
 
-def test_compression_near_the_rim_is_a_caution(film):
+def test_compression_near_the_rim_gives_a_warning(film):
     """No wrinkles where the forward map works."""
     for distance, taut in ((0.5, True), (0.75, False)):
         settings = SolveSettings(theory=MEMBRANE, resolution=Resolution(5, 8, 5))
@@ -115,7 +115,7 @@ def test_compression_near_the_rim_is_a_caution(film):
         assert (principal_stress(solved)[0] > 0.0) == taut == (not wrinkles)
 
 
-def test_stress_beyond_what_pvdf_bears_is_a_caution(film):
+def test_stress_above_the_yield_stress_of_pvdf_gives_a_warning(film):
     """Pretension counts in the largest stress."""
     light, heavy = (press(film, Circle(1.0), (2.0, 0.0), force) for force in (0.01, 5.0))
     taut = press(replace(film, pretension=44.99), Circle(1.0), (2.0, 0.0), 0.01)
@@ -140,7 +140,7 @@ def test_principal_stress_is_that_of_the_points(film):
         assert surface != "middle" or (mean - radius).min() >= smallest - 0.02 * largest
 
 
-def test_accuracy_is_reached(film):
+def test_press_reaches_the_required_accuracy(film):
     """And costs: a finer mesh for more digits."""
     sensor, scene = load_sensor("four-25um-uniaxial"), (film, Circle(1.0), (9.0, 1.0), 1.0)
     exact = touch_charge(sensor, press(*scene, SolveSettings(theory=FULL, resolution=Resolution(8, 8, 7, 2))))
@@ -152,7 +152,7 @@ def test_accuracy_is_reached(film):
     assert sizes[0] < sizes[1]
 
 
-def test_estimates_where_they_are_singular(film):
+def test_error_estimates_of_singular_cases(film):
     """A field whose highest modes hold nothing but round-off, and a theory that is wrong by factors."""
     taut, linear = replace(film, pretension=10.0), Theory(stretching=False, bending=False, pretensioned=True)
     settings = SolveSettings(theory=linear, resolution=Resolution(12, 8, 3))

@@ -80,12 +80,12 @@ def test_mesh_error_bounds_the_difference_from_a_finer_mesh(scene):
         (Circle(1.0), 9.0, 5e-4, True),  # more digits
     ],
 )
-def test_where_a_second_mesh_is_needed(probe, distance, accuracy, needed):
+def test_needs_second_mesh_near_the_rim_and_for_large_probes(probe, distance, accuracy, needed):
     case = LoadCase.of(FILM, probe, (distance, 0.0), 1.0, SolveSettings(accuracy=accuracy), None)
     assert needs_second_mesh(case) == needed
 
 
-def test_press_on_two_meshes_starts_its_neighbour():
+def test_equilibrium_on_two_meshes_can_start_a_neighbouring_press():
     """Although its mesh is of a higher order than the neighbour's first."""
     probe, at, force = NEAR_THE_RIM
     first = press(FILM, probe, at, force)
@@ -96,7 +96,7 @@ def test_press_on_two_meshes_starts_its_neighbour():
     assert worst_error(FILM, warm, cold) < 1e-5
 
 
-def test_meshes_with_different_equilibria_are_an_error(monkeypatch):
+def test_meshes_with_different_equilibria_raise_solve_error(monkeypatch):
     """Meshes that differ by a tenth are not two views of one film; by less, the difference is the estimate."""
     scene = FILM, *NEAR_THE_RIM
     monkeypatch.setattr("isocharge.simulate.solver.press.MAX_EXTRA_ORDERS", 1)

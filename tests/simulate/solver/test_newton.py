@@ -27,7 +27,7 @@ FAILING = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 3), toleran
     ],
     ids=str,
 )
-def test_every_force_converges_from_flat(film, changes, theory, probe):
+def test_newton_converges_from_the_flat_film_for_every_force(film, changes, theory, probe):
     """No help from the user: no force steps, no tension, no start."""
     for force in FORCES:
         solved = press(replace(film, **changes), PROBES[probe], (5.0, 3.0), force, SolveSettings(theory=theory))
@@ -47,7 +47,7 @@ def test_presses_near_the_rim_and_of_large_probes_converge(film, probe, at, forc
 
 
 @pytest.mark.parametrize("theory", [MEMBRANE, FULL], ids=["membrane", "full"])
-def test_newton_ends_quadratically(film, theory):
+def test_newton_converges_quadratically(film, theory):
     """The last step nearly squares the residual: the tangent is the true one at the end."""
     residuals = [
         press(film, Circle(1.0), (3.0, 0.0), 1.0, SolveSettings(theory=theory, tolerance=tolerance)).residual
@@ -57,7 +57,7 @@ def test_newton_ends_quadratically(film, theory):
 
 
 @pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES.keys())
-def test_start_from_a_neighbour_saves_steps(film, probe):
+def test_starting_equilibrium_saves_newton_steps(film, probe):
     first = press(film, probe, (5.0, 0.0), 1.0)
     same = SolveSettings(resolution=first.mesh.resolution, layer=first.mesh.layer)
     near, cold = (press(film, probe, (5.2, 1.0), 1.1, same, start=start) for start in (first, None))
@@ -66,7 +66,7 @@ def test_start_from_a_neighbour_saves_steps(film, probe):
     np.testing.assert_allclose(touch_charge(sensor, near), touch_charge(sensor, cold), rtol=1e-6)
 
 
-def test_start_of_another_mesh_is_not_used(film):
+def test_starting_equilibrium_on_another_mesh_is_not_used(film):
     scene = film, Circle(1.0), (5.0, 0.0), 1.0
     coarse = press(*scene, SolveSettings(resolution=Resolution(3, 8, 4)))
     other, cold = press(film, PROBES["rectangle"], (5.0, 0.0), 1.0), press(*scene)
@@ -75,7 +75,7 @@ def test_start_of_another_mesh_is_not_used(film):
         np.testing.assert_array_equal(solved.field, cold.field)
 
 
-def test_a_failure_raises_a_full_sentence_or_is_a_status(film, monkeypatch):
+def test_failed_solve_raises_solve_error_or_returns_status(film, monkeypatch):
     scene = film, Circle(1.0), (2.0, -3.0), 1.5, FAILING
     message = r"no equilibrium at 1\.5 N, position \(2, -3\) mm: .*; residual .* \(expected 1e-30\) after \d+ steps"
     solved = press(*scene)  # a tolerance that no arithmetic reaches: as good as it gets is no failure
@@ -88,7 +88,7 @@ def test_a_failure_raises_a_full_sentence_or_is_a_status(film, monkeypatch):
     assert 0.0 < failed.residual < 1e-9
 
 
-def test_start_that_is_not_finite_fails(film):
+def test_start_with_nan_fails(film):
     """The press is solved from a small force up instead, and is none the worse."""
     good, bad = (press(film, Circle(1.0), (0.0, 0.0), 1.0) for _ in range(2))
     bad.field[0, 2] = np.nan
@@ -100,7 +100,7 @@ def test_start_that_is_not_finite_fails(film):
 WRINKLES = r"no equilibrium at .* N, position \(.*\) mm: .* it wrinkles, which has many solutions; press farther"
 
 
-def test_wrinkling_film_is_an_error(film, monkeypatch):
+def test_wrinkling_film_raises_solve_error(film, monkeypatch):
     """Stopped early, beside the rim, where it is compressed: the message says so. In the middle it does not."""
     monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 3)
     mesh = SolveSettings(theory=FULL, resolution=Resolution(5, 8, 6, 1))
@@ -111,7 +111,7 @@ def test_wrinkling_film_is_an_error(film, monkeypatch):
 
 
 @pytest.mark.parametrize(("factor", "converges"), [(1.001, True), (3.0, False)])
-def test_linear_solve_is_corrected_and_says_so(film, monkeypatch, factor, converges):
+def test_linear_solve_is_refined_and_reports_the_correction(film, monkeypatch, factor, converges):
     """By its residual, which the solver has no part in: what is far off is no answer."""
     scene = replace(film, thickness=2.0, pretension=1.0), Circle(1.0), (5.0, 0.0), 1e-3
     exact, solve = press(*scene), Factor.solve

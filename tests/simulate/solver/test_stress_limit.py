@@ -28,13 +28,13 @@ def test_stress_of_a_plate():
 
 
 @pytest.mark.parametrize(("force", "stress"), [(1.0, 49.0), (1.65, 66.0), (2.0, 74.0)])
-def test_a_tip_of_1_mm_makes_pvdf_yield(force, stress):
+def test_probe_of_1_mm_exceeds_the_yield_stress_of_pvdf(force, stress):
     assert largest_stress(FILM, TIP, force) == pytest.approx(stress, rel=0.05)
     assert f"{force:g} N under circle:1.0 stress the film to {stress:.0f}" in stress_caution(FILM, TIP, force)
     assert not stress_caution(FILM, TIP, force, 80.0)
 
 
-def test_a_press_shows_its_stress():
+def test_repr_of_an_equilibrium_contains_the_largest_stress():
     hard, soft = (repr(press(FILM, TIP, (3.0, -2.0), force)) for force in (1.0, 0.5))
     assert re.fullmatch(
         r"Equilibrium\(1 N under circle:1.0 at \(3, -2\) mm: converged, deflection 2\.8\d* mm, "
@@ -44,7 +44,7 @@ def test_a_press_shows_its_stress():
     assert re.search(r"stress up to 3[23]\.?\d* MPa\)$", soft)
 
 
-def test_force_within_a_stress():
+def test_force_within_stress_reaches_the_stress_limit():
     force = force_within_stress(FILM, TIP, 45.0, (0.05, 2.0))
     assert largest_stress(FILM, TIP, force) == pytest.approx(45.0, rel=2e-3)
     assert force_within_stress(FILM, TIP, 80.0, (0.05, 2.0)) == 2.0

@@ -65,7 +65,7 @@ def test_bending_stress_outside_the_footprint(thick, share):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.9])
-def test_bending_stress_under_the_middle(thick, share):
+def test_bending_stress_under_the_centre_of_the_probe(thick, share):
     """M = F (1 + nu) / 4 pi (ln(a / c) + c^2 / 4 a^2) compresses the touched side (Timoshenko, art. 19), 6 M / h^2."""
     c = share * thick.radius
     solved = press(thick, Circle(c), (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
@@ -74,7 +74,7 @@ def test_bending_stress_under_the_middle(thick, share):
     np.testing.assert_allclose(found[:2], -6.0 * moment / thick.thickness**2, rtol=1e-3)
 
 
-def test_sides_are_opposite(thick):
+def test_bending_stress_has_opposite_signs_at_both_surfaces(thick):
     """The touched side is compressed under the probe and stretched at the rim; the other the other way round."""
     solved = press(thick, Polygon.rectangle(4.0, 2.0, 0.5), (6.0, 4.0), FORCE)
     points = np.array([(6.0, 4.0), (0.0, -44.9), (10.0, 10.0)])
@@ -96,7 +96,7 @@ def test_charge_of_a_surface_is_the_integral_of_its_stress(thick):
         assert charge[0] == pytest.approx(sign * 0.01 * (20.0 * radial + 2.0 * hoop), rel=5e-3)
 
 
-def test_surface_needs_bending(film):
+def test_surface_readout_without_bending_raises_error(film):
     sensor = replace(load_sensor("three-25um-biaxial"), surface="bottom")
     solved = press(film, Circle(1.0), (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE))
     message = (

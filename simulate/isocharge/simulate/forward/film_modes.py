@@ -358,20 +358,22 @@ class FilmModes:
         """
         try:
             shape = tuple(arrays["grid_shape"])
+            coefficients = arrays["coefficients"]
             parts = arrays["parts"]
             scale = arrays["part_scale"]
-            if arrays["coefficients"].shape != (*shape, len(parts)) or scale.shape != (len(parts), 1):
-                raise ValueError(f"coefficients {arrays['coefficients'].shape} and parts {parts.shape} do not match")
+            if coefficients.shape != (*shape, len(parts)) or scale.shape != (len(parts), 1):
+                raise ValueError(f"coefficients {coefficients.shape} and parts {parts.shape} do not match")
             if parts.shape[1] != IS_ODD.size * field_size:
                 raise ValueError(
                     f"a part has {parts.shape[1]} values, expected those of the {IS_ODD.size} fields of "
                     f"{', '.join(FIELDS)}; train the network for all films again"
                 )
-            n_node_size = arrays["node_size"].size
-            if 3 * n_node_size != parts.shape[1]:
-                raise ValueError(f"{n_node_size} node sizes do not match {parts.shape[1]} values of a part")
-            grid = FilmGrid(*np.split(np.asarray(arrays["grid"], dtype=float), np.cumsum(shape)[:-1]))
-            size = np.repeat(np.asarray(arrays["node_size"], dtype=float), 3)
-            return cls(grid, arrays["coefficients"].astype(float), parts * np.asarray(scale, dtype=float) * size)
+            node_size = np.asarray(arrays["node_size"], dtype=float)
+            if 3 * node_size.size != parts.shape[1]:
+                raise ValueError(f"{node_size.size} node sizes do not match {parts.shape[1]} values of a part")
+            axis_ends = np.cumsum(shape)[:-1]
+            grid = FilmGrid(*np.split(np.asarray(arrays["grid"], dtype=float), axis_ends))
+            value_size = np.repeat(node_size, 3)  # each node has three components of the stress
+            return cls(grid, coefficients.astype(float), parts * np.asarray(scale, dtype=float) * value_size)
         except (KeyError, ValueError, TypeError, AttributeError, IndexError) as error:
             raise InputError(f"film modes: expected the arrays that to_arrays gives ({error})") from error

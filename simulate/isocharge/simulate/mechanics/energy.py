@@ -183,19 +183,19 @@ class Membrane:
         gradient = geometry.gradient
         slope = self._slope(field)
         stretch = self._stretch(slope)
-        total = self._stress(strain(slope, self.groups.amplitude2))
-        total[..., :2] += self.groups.tension
+        total_stress = self._stress(strain(slope, self.groups.amplitude2))
+        total_stress[..., :2] += self.groups.tension
         if self.groups.anisotropy is not None:
-            total += self.groups.anisotropy.tension
-        weighted = _tensor(total * geometry.weights[..., None])
+            total_stress += self.groups.anisotropy.tension
+        weighted_stress = _tensor(total_stress * geometry.weights[..., None])
         n_element, _, _, n_local = gradient.shape
-        left = np.ascontiguousarray(geometry.stacked.transpose(0, 2, 1))
+        transposed_gradient = np.ascontiguousarray(geometry.stacked.transpose(0, 2, 1))
         matrix = np.empty((n_element, 3, n_local, 3, n_local))
         for i, j in COMPONENT_PAIRS:
             block = self._moduli(stretch, i, j) * geometry.weights[..., None, None]
             if i == j:
-                block += self._scale[i] * weighted
-            matrix[:, i, :, j] = left @ (block @ gradient).reshape(n_element, -1, n_local)
+                block += self._scale[i] * weighted_stress
+            matrix[:, i, :, j] = transposed_gradient @ (block @ gradient).reshape(n_element, -1, n_local)
             if i != j:
                 matrix[:, j, :, i] = matrix[:, i, :, j].transpose(0, 2, 1)
         return matrix.transpose(0, 2, 1, 4, 3)

@@ -114,6 +114,16 @@ class Blocks:
         return slice(0, self.n_quad)
 
     @property
+    def first_layer(self) -> slice:
+        """Elements of the layer next to the core polygon."""
+        return slice(self.n_quad, self.n_quad + self.n_sector)
+
+    @property
+    def last_layer(self) -> slice:
+        """Elements of the layer next to the innermost circle, which is the first layer if there is only one."""
+        return slice(self.n_inner - self.n_sector, self.n_inner)
+
+    @property
     def copies(self) -> int:
         """Number of copies of the mesh that cover the whole film."""
         return 2 if self.half else 1

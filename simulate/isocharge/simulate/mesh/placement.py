@@ -100,8 +100,8 @@ class Placement:
         centroid = np.asarray(distance, dtype=float) / film_radius
         if probe.is_axisymmetric:
             rotation = 0.0
-        turn: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
-        core = centroid[..., None] + probe.core(film_radius) * turn[..., None]
+        rotation_factor: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
+        core = centroid[..., None] + probe.core(film_radius) * rotation_factor[..., None]
         corners = np.concatenate([core, centroid[..., None]], axis=-1)
         stops: Complexes = np.asarray(corners @ blocks.boundary[:: blocks.split].T)
         if probe.topology.fills_circle:
@@ -109,16 +109,18 @@ class Placement:
             radius = np.full(centroid.shape, probe.reach / film_radius)
             reach = np.abs(corners - centre[..., None]).max(axis=-1)
         else:
-            outline = centroid[..., None] + probe.outline / film_radius * turn[..., None]
+            outline = centroid[..., None] + probe.outline / film_radius * rotation_factor[..., None]
             centre, radius = enclosing_circle(outline, centroid)
             reach = np.abs(outline - centre[..., None]).max(axis=-1)
             if probe.topology.is_curved:
                 boundary = probe.boundary(blocks.boundary_parameter[:: blocks.split])
-                stops = np.asarray(centroid[..., None] + boundary / film_radius * turn[..., None])
+                stops = np.asarray(centroid[..., None] + boundary / film_radius * rotation_factor[..., None])
         c, rho = automorphism_onto(centre, radius)
         start = sector_angles(blocks, stops, reach, centroid, centre, radius, c * rho)
         depth = ring_edges(blocks.resolution, rho, layer * (1.0 + c) / (1.0 - c))
-        return cls(c, rho, corners, start, rim_angles(start, c, rho), depth, np.asarray(turn / film_radius), probe)
+        return cls(
+            c, rho, corners, start, rim_angles(start, c, rho), depth, np.asarray(rotation_factor / film_radius), probe
+        )
 
     def __getitem__(self, which: Integers) -> "Placement":
         """Return the placements with the indices `which` along the first axis."""
@@ -168,12 +170,12 @@ class Placement:
         a, b, c, d = (blocks.straight @ self.corners).T[:, :, None]
         inside = (1.0 - v) * (a + t * (b - a)) + v * (c + t * (d - c))
         innermost_circle = self.to_film(self.rho * np.exp(1j * start_angle))
-        inside[blocks.n_inner - blocks.n_sector :] += v * innermost_circle
+        inside[blocks.last_layer] += v * innermost_circle
         if blocks.n_layer == 2:
             parameter = blocks.boundary_parameter
             boundary = self.boundary(parameter[sector] + t * (parameter[sector + 1] - parameter[sector]))
-            inside[blocks.n_quad : blocks.n_quad + blocks.n_sector] += v * boundary
-            inside[blocks.n_quad + blocks.n_sector :] += (1.0 - v) * boundary
+            inside[blocks.first_layer] += v * boundary
+            inside[blocks.last_layer] += (1.0 - v) * boundary
 
         depth = (self.depth[:-1, None] + v * np.diff(self.depth)[:, None])[:, None]
         end_angle = self.end[sector] + t * np.diff(self.end)[:, None]
@@ -224,8 +226,9 @@ class Placement:
         if not blocks.half:
             first = side_angle(np.zeros_like(ring))
             angle = first + np.mod(angle - first, 2.0 * np.pi)
-        turn = (self.end - self.start)[:, None, 1:-1]
-        sector = np.sum(self.start[:, None, 1:-1] + depth[..., None] * turn <= angle[..., None], axis=-1)
+        inner_sides = self.start[:, None, 1:-1]
+        side_change = (self.end - self.start)[:, None, 1:-1]
+        sector = np.sum(inner_sides + depth[..., None] * side_change <= angle[..., None], axis=-1)
         before = side_angle(sector)
         after = side_angle(sector + 1)
         return (
@@ -246,34 +249,40 @@ class Placement:
         """
         corners = self._inner_corners(blocks)
         at = points[:, None]
-        before = _distance_to_left(corners.a, corners.c, at)
-        after = _distance_to_left(corners.d, corners.b, at)
-        inner = _distance_to_left(corners.b, corners.a, at)
-        outer = _distance_to_left(corners.c, corners.d, at)
-        outer[:, blocks.n_quad :] = np.inf
+        distance_from_first_side = _distance_to_left(corners.a, corners.c, at)
+        distance_from_last_side = _distance_to_left(corners.d, corners.b, at)
+        distance_from_inner_side = _distance_to_left(corners.b, corners.a, at)
+        distance_from_outer_side = _distance_to_left(corners.c, corners.d, at)
+        distance_from_outer_side[:, blocks.n_quad :] = np.inf  # the outer side is curved
         if blocks.n_layer == 2:
-            outside = ~self.probe.contains((points - self.corners[:, -1]) / self.rotation_and_scale)
-            second_layer = blocks.n_quad + blocks.n_sector
-            inner[:, second_layer:] = np.inf
-            outer[outside, :second_layer] = -np.inf
-            outer[~outside, second_layer:] = -np.inf
-        element = np.argmax(np.min([before, after, inner, outer], axis=0), axis=1)
-        pick = np.arange(points.size), element
-        v, t = self._invert_blend(blocks, points, element, QuadCorners(*(corner[pick] for corner in corners)))
+            centroid = self.corners[:, -1]
+            in_footprint = self.probe.contains((points - centroid) / self.rotation_and_scale)
+            distance_from_inner_side[:, blocks.last_layer] = np.inf  # the inner side is curved, too
+            distance_from_outer_side[~in_footprint, blocks.footprint] = -np.inf
+            distance_from_outer_side[in_footprint, blocks.last_layer] = -np.inf
+        distances = [
+            distance_from_first_side,
+            distance_from_last_side,
+            distance_from_inner_side,
+            distance_from_outer_side,
+        ]
+        element = np.argmax(np.min(distances, axis=0), axis=1)
+        corners_of_element = QuadCorners(*(corner[np.arange(points.size), element] for corner in corners))
+        v, t = self._invert_blend(blocks, points, element, corners_of_element)
         return element, v, t
 
     def _inner_corners(self, blocks: Blocks) -> QuadCorners:
         """Return the corners of all elements inside the innermost circle, each of shape (n_placement, n_inner)."""
         a, b, c, d = np.moveaxis(np.einsum("ekn,pn->pek", blocks.straight, self.corners), -1, 0)
         circle = self.to_film(self.rho[:, None] * np.exp(1j * self.start))
-        outermost = slice(blocks.n_inner - blocks.n_sector, blocks.n_inner)
-        c[:, outermost] = circle[:, :-1]
-        d[:, outermost] = circle[:, 1:]
+        c[:, blocks.last_layer] = circle[:, :-1]
+        d[:, blocks.last_layer] = circle[:, 1:]
         if blocks.n_layer == 2:
             boundary = self.boundary(blocks.boundary_parameter)
-            first_layer = slice(blocks.n_quad, blocks.n_quad + blocks.n_sector)
-            c[:, first_layer] = a[:, outermost] = boundary[:, :-1]
-            d[:, first_layer] = b[:, outermost] = boundary[:, 1:]
+            c[:, blocks.first_layer] = boundary[:, :-1]
+            d[:, blocks.first_layer] = boundary[:, 1:]
+            a[:, blocks.last_layer] = boundary[:, :-1]
+            b[:, blocks.last_layer] = boundary[:, 1:]
         return QuadCorners(a, b, c, d)
 
     def _invert_blend(
@@ -291,7 +300,7 @@ class Placement:
             Coordinates v and t from 0 to 1, each of shape (n,).
         """
         a, b, c, d = corners
-        in_outermost = element >= blocks.n_inner - blocks.n_sector
+        in_last_layer = element >= blocks.last_layer.start
         in_sector = element >= blocks.n_quad
         sector = np.where(in_sector, (element - blocks.n_quad) % blocks.n_sector, 0)
         low = np.take_along_axis(self.start, sector[:, None], axis=1)[:, 0]
@@ -304,17 +313,17 @@ class Placement:
             z = self.rho * np.exp(1j * (low + t * (high - low)))
             circle = (z + self.c) / (1.0 + self.c * z)
             circle_by_t = 1j * (high - low) * z * (1.0 - self.c**2) / (1.0 + self.c * z) ** 2
-            outer = np.where(in_outermost, circle, c + t * straight_outer_by_t)
-            outer_by_t = np.where(in_outermost, circle_by_t, straight_outer_by_t)
+            outer = np.where(in_last_layer, circle, c + t * straight_outer_by_t)
+            outer_by_t = np.where(in_last_layer, circle_by_t, straight_outer_by_t)
             inner = a + t * inner_by_t
             by_t = (1.0 - v) * inner_by_t + v * outer_by_t
             if blocks.n_layer == 2:
                 boundary, boundary_by_t = self._boundary_in_sector(blocks, sector, t)
-                in_first_layer = in_sector & ~in_outermost
+                in_first_layer = in_sector & ~in_last_layer
                 outer = np.where(in_first_layer, boundary, outer)
                 outer_by_t = np.where(in_first_layer, boundary_by_t, outer_by_t)
-                inner = np.where(in_outermost, boundary, inner)
-                by_t = (1.0 - v) * np.where(in_outermost, boundary_by_t, inner_by_t) + v * outer_by_t
+                inner = np.where(in_last_layer, boundary, inner)
+                by_t = (1.0 - v) * np.where(in_last_layer, boundary_by_t, inner_by_t) + v * outer_by_t
             by_v = outer - inner
             residual = inner + v * by_v - points
             determinant = (np.conj(by_v) * by_t).imag

@@ -366,10 +366,12 @@ def _check_name(name: str) -> None:
     if not (has_valid_length and is_printable(name) and name == name.strip() and "," not in name):
         raise SensorError(
             f"electrode {shown(name)}: expected a name of 1 to {MAX_NAME_LENGTH} printable characters, without commas "
-            "and without blanks at its ends: it heads a column of CSV files"
+            "and without blanks at its ends, because it is the header of a column in CSV files"
         )
     if name in RESERVED_NAMES:
-        raise SensorError(f"electrode {name!r}: this name means something else in files of charges; choose another one")
+        raise SensorError(
+            f"electrode {name!r}: this name is reserved for another column in files of charges; choose another one"
+        )
 
 
 @lru_cache(maxsize=64)

@@ -253,7 +253,7 @@ def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
     try:
         text.encode()
     except UnicodeEncodeError as error:
-        raise SensorError(f"sensor {sensor.name!r}: a name is no text that UTF-8 can hold ({error})") from error
+        raise SensorError(f"sensor {sensor.name!r}: a name cannot be encoded in UTF-8 ({error})") from error
     where = f"sensor {sensor.name!r}"
     sensor_from_dict(parse_toml(text, where, SensorError, dict[str, Any]), where)
     return text

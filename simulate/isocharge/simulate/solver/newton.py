@@ -48,6 +48,12 @@ CHORD_CONTINUE = 0.3
 ROUND_OFF = 1e-9
 """Size of a Newton step, in the energy norm relative to the work of the load, that is caused by round-off only."""
 
+FIRST_DESCENT_TENSION = 0.05
+"""Smallest tension that is added to the tangent to obtain a descent direction, over the guard tension."""
+
+MAX_DESCENT_TRIALS = 12
+"""Largest number of tensions that are tried to obtain a descent direction. Each is twice the one before."""
+
 MAX_HALVINGS = 30
 """Largest number of step lengths that the line search tries."""
 
@@ -286,9 +292,10 @@ def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
     If the given step is not one, return the step with the smallest added tension in the tangent that makes it one.
     """
     elastic = iterate.elastic
-    tension = 0.05 * GUARD_TENSION * float(np.cbrt(elastic.groups.load)) ** 2
-    for _ in range(12):
-        if np.isfinite(step).all() and float(np.sum(step * iterate.residual)) < 0.0:
+    tension = FIRST_DESCENT_TENSION * GUARD_TENSION * float(np.cbrt(elastic.groups.load)) ** 2
+    for _ in range(MAX_DESCENT_TRIALS):
+        is_descent_step = np.isfinite(step).all() and float(np.sum(step * iterate.residual)) < 0.0
+        if is_descent_step:
             break
         step = assembly.factor(elastic.tangent(iterate.field, tension)).solve(-iterate.residual)
         tension *= 2.0

@@ -146,7 +146,10 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
         raise too_near_the_rim(case, mesh.resolution)
     solver = assembly(mesh.template, 4 if case.theory.bending else 3)
     elastic = _elastic(case, mesh.geometry, case.force)
-    result = _newton(case, elastic, solver, mesh, start) if case.theory.stretching else solve_linear(elastic, solver)
+    if case.theory.stretching:
+        result = _solve_nonlinear(case, elastic, solver, mesh, start)
+    else:
+        result = solve_linear(elastic, solver)
     return Equilibrium(
         film=case.film,
         probe=case.probe,
@@ -170,7 +173,7 @@ def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
     return ElasticFilm(geometry, DimensionlessGroups.of(case.film, force, bending=case.theory.bending, angle=angle))
 
 
-def _newton(
+def _solve_nonlinear(
     case: LoadCase, elastic: ElasticFilm, solver: Assembly, mesh: PlacedMesh, start: Equilibrium | None
 ) -> NewtonResult:
     """Solve with Newton's method.

@@ -53,8 +53,8 @@ def _tension(direction: tuple[float, float, float]) -> Change:
         direction: Components (T11, T22, T12) of one unit.
     """
 
-    def change(solved: Equilibrium, share: float) -> Equilibrium:
-        tension = share * (1.0 + solved.groups.tension) * np.array(direction)
+    def change(solved: Equilibrium, value: float) -> Equilibrium:
+        tension = value * (1.0 + solved.groups.tension) * np.array(direction)
         return replace(solved, groups=replace(solved.groups, anisotropy=Anisotropy(np.zeros((3, 3)), tension)))
 
     return change
@@ -63,19 +63,19 @@ def _tension(direction: tuple[float, float, float]) -> Change:
 def _stiffness(angle: float) -> Change:
     """Return the function for ln(E1 / E2) of an orthotropic film whose axis 1 lies at an angle (rad)."""
 
-    def change(solved: Equilibrium, share: float) -> Equilibrium:
+    def change(solved: Equilibrium, value: float) -> Equilibrium:
         rotation = stress_rotation(angle)
         plane = 1.0 / (1.0 - solved.groups.poisson**2)
-        moduli = rotation @ np.diag([0.5 * share * plane, -0.5 * share * plane, 0.0]) @ rotation.T
+        moduli = rotation @ np.diag([0.5 * value * plane, -0.5 * value * plane, 0.0]) @ rotation.T
         return replace(solved, groups=replace(solved.groups, anisotropy=Anisotropy(moduli, np.zeros(3))))
 
     return change
 
 
-def _poisson(solved: Equilibrium, share: float) -> Equilibrium:
+def _poisson(solved: Equilibrium, value: float) -> Equilibrium:
     """Add a value to Poisson's ratio."""
     before = solved.groups.poisson
-    after = before + share
+    after = before + value
     bending = solved.groups.bending * (1.0 - before**2) / (1.0 - after**2)
     return replace(solved, groups=replace(solved.groups, poisson=after, bending=bending))
 
@@ -83,8 +83,8 @@ def _poisson(solved: Equilibrium, share: float) -> Equilibrium:
 def _oval(direction: complex) -> Change:
     """Return the function for an oval clamp; `direction` is exp(2 i alpha) for a long axis at the angle alpha."""
 
-    def change(solved: Equilibrium, share: float) -> Equilibrium:
-        return replace(solved, mesh=replace(solved.mesh, oval=share * direction))
+    def change(solved: Equilibrium, value: float) -> Equilibrium:
+        return replace(solved, mesh=replace(solved.mesh, oval=value * direction))
 
     return change
 

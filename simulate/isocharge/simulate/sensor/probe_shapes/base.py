@@ -222,7 +222,10 @@ class CurvedProbe(Probe):
         return float(np.abs(complex(*at) + self._boundary_points(FINE_OUTLINE_POINTS)).max())
 
     def covered_area(self, corners: Array, at: complex) -> float:
-        """Return the area of a convex polygon under the footprint, whose boundary is replaced by a polygon, mm^2."""
+        """Return the area of a convex polygon that lies under the footprint, mm^2.
+
+        The curved boundary of the footprint is approximated by a polygon with `FINE_OUTLINE_POINTS` corners.
+        """
         return shared_area(to_complex(corners), at + self._boundary_points(FINE_OUTLINE_POINTS))
 
     def _boundary_points(self, count: int) -> Complexes:
