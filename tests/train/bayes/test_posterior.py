@@ -1,4 +1,4 @@
-"""The posterior against closed forms, brute force, and itself; the Bayes limit from it."""
+"""The posterior against closed forms and against summation over a grid, and the Bayes limit."""
 
 from dataclasses import dataclass, replace
 
@@ -12,17 +12,20 @@ from isocharge.train import BayesLimit, BayesProblem, bayes_estimate, bayes_limi
 from isocharge.train.bayes.posterior import Cells, Posterior
 from isocharge.train.data.presses import draw_contacts
 
-REFERENCE, UNIT = noise_model("reference"), Domain(1.0, (1.0, 1.0 + 1e-9))
+REFERENCE = noise_model("reference")
+
+UNIT_DISK = Domain(1.0, (1.0, 1.0 + 1e-9))
+"""Disk with a radius of 1 mm and practically one force."""
 
 
 @dataclass(frozen=True)
-class Straight:
-    """Charges that are a quadratic function of place, at a force that is known all but exactly."""
+class QuadraticCharges:
+    """Map whose charges are a quadratic function of the position, for practically one force."""
 
     offset: np.ndarray
     linear: np.ndarray
     quadratic: np.ndarray
-    domain: Domain = UNIT
+    domain: Domain = UNIT_DISK
 
     @property
     def electrodes(self):
@@ -39,65 +42,74 @@ class Straight:
         return moved[:, None]
 
 
-def straight(seed: int, electrodes: int = 4) -> Straight:
+def linear_charges(seed: int, electrodes: int = 4) -> QuadraticCharges:
     rng = np.random.default_rng(seed)
-    return Straight(100.0 + rng.random(electrodes), rng.normal(size=(2, electrodes)), np.zeros((2, electrodes)))
+    return QuadraticCharges(100.0 + rng.random(electrodes), rng.normal(size=(2, electrodes)), np.zeros((2, electrodes)))
 
 
-def spread(charges, count, seed):
-    """Presses from the prior and their noisy charges."""
+def draw_presses(charges, count, seed):
+    """Draw contacts from the prior, and their charges with noise."""
     rng = np.random.default_rng(seed)
     contact = draw_contacts(rng, charges.domain, count)
     return contact, REFERENCE.add(charges.charges(contact), rng)
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_linear_charges_in_white_noise_give_the_textbook_gaussian(seed):
-    made, white = straight(seed), 0.01
-    noisy = made.scaled_charges(np.array([[0.2, -0.3]]))[:, 0] + white * np.random.default_rng(seed).normal(size=(1, 4))
-    mean, std = Posterior(made, NoiseModel("white", white, 0.0), 1.0).mean_and_std(noisy)
-    covariance = white**2 * np.linalg.inv(made.linear @ made.linear.T)
-    best = np.linalg.lstsq(made.linear.T, (noisy - made.offset)[0], rcond=None)[0]
-    assert (np.abs(mean[0, :2] - best) < 0.01 * std[0, :2]).all()
+def test_the_posterior_of_linear_charges_with_white_noise_is_a_gaussian(seed):
+    charges = linear_charges(seed)
+    white_pC = 0.01
+    noise = white_pC * np.random.default_rng(seed).normal(size=(1, 4))
+    noisy = charges.scaled_charges(np.array([[0.2, -0.3]]))[:, 0] + noise
+    mean, std = Posterior(charges, NoiseModel("white", white_pC, 0.0), 1.0).mean_and_std(noisy)
+    covariance = white_pC**2 * np.linalg.inv(charges.linear @ charges.linear.T)
+    expected, *_ = np.linalg.lstsq(charges.linear.T, (noisy - charges.offset)[0], rcond=None)
+    assert (np.abs(mean[0, :2] - expected) < 0.01 * std[0, :2]).all()
     assert std[0, :2] == pytest.approx(np.sqrt(np.diag(covariance)), rel=5e-3)
 
 
-def test_at_the_edge_of_the_disk_the_gaussian_is_cut_off():
-    made = Straight(np.array([100.0, 100.0]), np.eye(2), np.zeros((2, 2)), domain=Domain(1000.0, (1.0, 1.0 + 1e-9)))
-    noisy = np.array([[1100.0, 100.0]])  # x is 1000, y is 0: on an edge that is all but straight
-    mean, std = Posterior(made, NoiseModel("white", 1.0, 0.0), 1000.0).mean_and_std(noisy)
-    half = stats.halfnorm()
-    assert mean[0, :2] == pytest.approx([1000.0 - half.mean(), 0.0], abs=0.003)
-    assert std[0, :2] == pytest.approx([half.std(), 1.0], rel=0.01)
+def test_at_the_edge_of_the_disk_the_gaussian_is_truncated():
+    """The disk is so large that its edge is practically a straight line."""
+    charges = QuadraticCharges(
+        np.array([100.0, 100.0]), np.eye(2), np.zeros((2, 2)), domain=Domain(1000.0, (1.0, 1.0 + 1e-9))
+    )
+    noisy = np.array([[1100.0, 100.0]])  # of the position (1000, 0) mm
+    mean, std = Posterior(charges, NoiseModel("white", 1.0, 0.0), 1000.0).mean_and_std(noisy)
+    half_normal = stats.halfnorm()
+    assert mean[0, :2] == pytest.approx([1000.0 - half_normal.mean(), 0.0], abs=0.003)
+    assert std[0, :2] == pytest.approx([half_normal.std(), 1.0], rel=0.01)
 
 
-def test_two_places_with_the_same_charges_are_both_found():
-    """Charges even in x: the mean is in the middle, where the contact certainly is not, and the deviation says so."""
-    made = Straight(np.array([100.0, 100.0]), np.array([[0.0, 0.0], [0.0, 1.0]]), np.array([[1.0, 0.0], [0.0, 0.0]]))
-    noisy = made.scaled_charges(np.array([[0.6, 0.1]]))[:, 0]
-    mean, std = Posterior(made, NoiseModel("white", 0.001, 0.0), 1.0).mean_and_std(noisy)
+def test_two_positions_with_the_same_charges_are_both_found():
+    """The charges are even in x, so the posterior has two maxima, and its mean lies between them."""
+    charges = QuadraticCharges(
+        np.array([100.0, 100.0]), np.array([[0.0, 0.0], [0.0, 1.0]]), np.array([[1.0, 0.0], [0.0, 0.0]])
+    )
+    noisy = charges.scaled_charges(np.array([[0.6, 0.1]]))[:, 0]
+    mean, std = Posterior(charges, NoiseModel("white", 0.001, 0.0), 1.0).mean_and_std(noisy)
     assert mean[0, :2] == pytest.approx([0.0, 0.1], abs=1e-4)
     assert std[0, 0] == pytest.approx(0.6, rel=1e-3)
 
 
-def brute_force(charges, noise, charge, centre, reach, count):
-    """Mean and deviation of (x, y, F) by a plain sum over a box, cut off at the prior's edges."""
-    low, high = centre - reach, centre + reach
-    low[2], high[2] = (
-        np.maximum(low[2], np.log(charges.domain.force_range[0])),
-        np.minimum(high[2], np.log(charges.domain.force_range[1])),
-    )
+def sum_over_grid(charges, noise, charge, centre, half_width, count):
+    """Compute mean and standard deviation of (x, y, F) by a sum over a grid in a box, within the prior.
+
+    The centre, the half width and the number of grid points are given for x, y and ln F.
+    """
+    smallest, largest = np.log(charges.domain.force_range)
+    low = np.maximum(centre - half_width, [-np.inf, -np.inf, smallest])
+    high = np.minimum(centre + half_width, [np.inf, np.inf, largest])
     axes = [a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, count, strict=True)]
-    x, y, logs = (axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
-    inside = np.hypot(x, y) <= charges.domain.radius
-    contact = np.stack([x, y, np.exp(logs)], axis=1)[inside]
-    known = charges.charges(contact)
-    likelihood = stats.norm.logpdf(charge, known, noise.sigma(known)).sum(axis=1)
-    mass = np.exp(likelihood - likelihood.max())
-    mass /= mass.sum()
-    mean = mass @ contact
-    std = np.sqrt(mass @ (contact - mean) ** 2)
-    mean[2] = (mass @ (1.0 / contact[:, 2])) / (mass @ (1.0 / contact[:, 2] ** 2))
+    x, y, log_force = (axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
+    is_inside = np.hypot(x, y) <= charges.domain.radius
+    contact = np.stack([x, y, np.exp(log_force)], axis=1)[is_inside]
+    expected = charges.charges(contact)
+    log_likelihood = stats.norm.logpdf(charge, expected, noise.sigma(expected)).sum(axis=1)
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight /= weight.sum()
+    mean = weight @ contact
+    std = np.sqrt(weight @ (contact - mean) ** 2)
+    force = contact[:, 2]
+    mean[2] = (weight @ (1.0 / force)) / (weight @ (1.0 / force**2))
     return mean, std
 
 
@@ -106,28 +118,35 @@ def brute_force(charges, noise, charge, centre, reach, count):
     [
         (REFERENCE, (7.2, 3.4, 0.0503)),
         (REFERENCE, (0.1, 0.0, 1.995)),
-        (NoiseModel("loud", 1.0, 0.05), (1.0, 2.0, 0.4)),  # the likelihood's 1 / sigma moves the mean by a tenth
+        (
+            NoiseModel("loud", 1.0, 0.05),
+            (1.0, 2.0, 0.4),
+        ),  # the factor 1 / sigma shifts the mean
     ],
 )
-def test_as_brute_force(spline, noise, contact):
-    charge = spline.charges(np.array([contact])) + (noise is REFERENCE) * np.array([[0.5, -1.0, 0.3]])
+def test_the_integrals_are_sums_over_a_grid(spline, noise, contact):
+    charge = spline.charges(np.array([contact]))
+    if noise is REFERENCE:
+        charge += np.array([[0.5, -1.0, 0.3]])
     mean, std = Posterior(spline, noise, spline.domain.radius).mean_and_std(charge)
-    centre, reach = np.append(mean[0, :2], np.log(mean[0, 2])), 6.5 * np.append(std[0, :2], std[0, 2] / mean[0, 2])
-    expected_mean, expected_std = brute_force(spline, noise, charge[0], centre, reach, (100, 100, 20))
+    x, y, force = mean[0]
+    x_std, y_std, force_std = std[0]
+    centre = np.array([x, y, np.log(force)])
+    half_width = 6.5 * np.array([x_std, y_std, force_std / force])
+    expected_mean, expected_std = sum_over_grid(spline, noise, charge[0], centre, half_width, (100, 100, 20))
     assert std[0] == pytest.approx(expected_std, rel=0.01)
     assert (np.abs(mean[0] - expected_mean) < 0.01 * expected_std).all()
 
 
-def test_deviations_are_as_large_as_errors(spline):
-    """Simulated presses and their noise: the squares of error over deviation are one on average."""
-    contact, charge = spread(spline, 120, seed=3)
+def test_the_standard_deviations_are_those_of_the_errors(spline):
+    """On simulated presses with noise, the mean square of error over standard deviation is one."""
+    contact, charge = draw_presses(spline, 120, seed=3)
     mean, std = Posterior(spline, REFERENCE, spline.domain.radius).mean_and_std(charge)
     squares = np.mean(((mean - contact) / std) ** 2, axis=0)
     assert squares == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 120))
 
 
-def test_charges_of_nothing_still_give_an_answer(spline):
-    """What no press gives: the nearest that the prior knows, finite."""
+def test_charges_of_no_contact_give_a_finite_answer_in_the_disk(spline):
     mean, std = Posterior(spline, REFERENCE, spline.domain.radius).mean_and_std(np.array([[0.0, -5.0, 1e6]]))
     assert np.isfinite([mean, std]).all()
     assert np.hypot(*mean[0, :2]) <= spline.domain.radius * (1.0 + 1e-12)
@@ -152,14 +171,14 @@ def problem(sensor):
     return BayesProblem(sensor, Circle(1.0))
 
 
-def test_the_limit_is_what_the_estimates_give(problem, spline, monkeypatch):
+def test_the_limit_is_computed_without_a_new_map(problem, spline, monkeypatch):
     monkeypatch.setattr(ForwardMap, "build", None)  # the map is given
     limit = bayes_limit(problem, 40, seed=5, charge_map=spline)
     assert 0.05 < limit.position_median_mm < limit.position_rms_mm < 0.4
     assert limit.presses == 40
 
 
-def test_errors_by_hand():
+def test_errors_of_two_contacts():
     truth = np.array([[0.0, 0.0, 1.0], [1.0, 1.0, 2.0]])
     limit = BayesLimit.of(truth + np.array([[0.3, 0.4, 0.01], [0.0, 0.0, 0.0]]), truth)
     position = limit.position_rms_mm, limit.position_median_mm, limit.position_p95_mm
@@ -174,10 +193,15 @@ def test_a_map_of_other_forces_is_refused(sensor, spline):
 
 @pytest.mark.parametrize("radius", [0.4, 30.0])
 def test_cells_cover_the_disk_once(radius):
-    """Those of the first round, and the finer ones in their place."""
-    cells = Cells.roots(radius)
-    for parts in ([cells], [*cells.finer(radius)]):
-        insides = [(part.side**2 * share[:, None], centre) for part in parts for share, centre in [part.inside(radius)]]
-        area = sum(areas.sum() for areas, _ in insides)
-        assert area == pytest.approx(np.pi * radius**2, rel=2e-4)
-        assert np.abs(sum((areas * centre).sum(axis=0) for areas, centre in insides)).max() < 1e-6 * radius * area
+    """The first cells, and the finer cells that replace them, have the area and the centroid of the disk."""
+    first_cells = Cells.roots(radius)
+    for levels in ([first_cells], list(first_cells.finer(radius))):
+        total_area = 0.0
+        first_moment = np.zeros(2)
+        for cells in levels:
+            fraction, centroid = cells.inside(radius)
+            area = cells.side**2 * fraction
+            total_area += area.sum()
+            first_moment += area @ centroid
+        assert total_area == pytest.approx(np.pi * radius**2, rel=2e-4)
+        assert np.abs(first_moment).max() < 1e-6 * radius * total_area
