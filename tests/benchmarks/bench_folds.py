@@ -18,7 +18,7 @@ import numpy as np
 from shared import options, print_results
 
 from isocharge.serve import Contact, Predictor
-from isocharge.serve.tracking.branches import branches_of
+from isocharge.serve.tracking.contact_mixture import contact_mixture
 from isocharge.serve.tracking.tracker import Tracker
 from isocharge.simulate import Circle, ForwardMap, noise_model
 from isocharge.simulate.forward.charge_map import ChargeMap
@@ -60,10 +60,13 @@ def counted(t: np.ndarray, side: np.ndarray) -> np.ndarray:
 def main() -> None:
     asked = options(__doc__, slides=1000, rate_hz=1000.0, force=1.0, noise="reference", gain=0.0)
     touch, rng, noise = Predictor(asked.model), np.random.default_rng(asked.seed), noise_model(asked.noise)
-    about, tracker = touch.metadata, Tracker(branches=(branches := branches_of(touch)))
-    if branches is None:
+    about = touch.metadata
+    mixture = contact_mixture(touch)
+    if mixture is None:
         raise SystemExit(f"{asked.model}: no charges.npz: its map does not fold; give the model of the lines above")
-    radius, forces = branches.charges.radius_mm, about.force_range_N
+    tracker = Tracker(mixture=mixture)
+    radius = mixture.charges.radius_mm
+    forces = about.force_range_N
     sensor = sensor_from_dict(dict(about.sensor))
     film = with_fast_derivatives(ForwardMap.build(sensor, Circle(1.0), radius + BEYOND_MM, forces))
     rows, steps_s, frames = [], 0.0, 0
@@ -72,7 +75,7 @@ def main() -> None:
         gains = np.exp(asked.gain * rng.standard_normal(len(about.electrodes)))
         charge, found = noise.add(film.charges(contact) * gains, rng), []
         answers = [Contact(*row) for row in np.asarray(touch.predict_batch(charge)).tolist()]
-        tracker.forget()
+        tracker.reset()
         began = time.thread_time()
         for answer, t_s, row in zip(answers, t.tolist(), charge, strict=True):
             found.append((tracker.update(answer, t_s, (), row)[0], tracker.other))

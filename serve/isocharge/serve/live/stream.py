@@ -25,7 +25,7 @@ from isocharge.serve.record.record import (
     Tracking,
 )
 from isocharge.serve.signal_chain.chain import Chain, Reading
-from isocharge.serve.tracking.branches import branches_of
+from isocharge.serve.tracking.contact_mixture import contact_mixture
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.serve.tracking.tracker import Tracker
 
@@ -175,10 +175,10 @@ class TouchStream:
         self._validity = predictor.validity
         if self._tracker is not None:
             # The file of charges describes the calibrated film, and would contradict a model that follows the film.
-            branches = branches_of(predictor) if follower is None else None
-            self._tracker.branches = branches
-            if branches is not None:
-                self._tracked_validity = replace(self._validity, corners_mm=branches.charges.corners_mm)
+            mixture = contact_mixture(predictor) if follower is None else None
+            self._tracker.mixture = mixture
+            if mixture is not None:
+                self._tracked_validity = replace(self._validity, corners_mm=mixture.charges.corners_mm)
         self._electrodes = predictor.metadata.electrodes
         self._label = predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
@@ -231,7 +231,7 @@ class TouchStream:
         if self._follower is not None:
             self._follower.discard_touch()
         if self._tracker is not None:
-            self._tracker.forget()
+            self._tracker.reset()
 
     def restart(self) -> None:
         """Begin as a new stream does, so that its records can be repeated from its bytes alone; `totals` continue."""
@@ -304,8 +304,8 @@ class TouchStream:
         if self._tracker is not None:
             tracked, event = self._tracker.update(contact, when.clock_s, flags, reading.charge_pC)
             other = self._tracker.other
-            if self._tracker.answer is not None:
-                contact = self._tracker.answer
+            if self._tracker.mixture_contact is not None:
+                contact = self._tracker.mixture_contact
                 flags = reading.flags + self._tracked_validity.flags(contact)
         shift = self._charge_scale_error(contact, reading)
         if contact is not None and shift is not None:
@@ -368,7 +368,7 @@ class TouchStream:
         charge_pC = reading.charge_pC
         if contact is None:
             return None
-        if self._tracker is not None and self._tracker.answer is not None:
+        if self._tracker is not None and self._tracker.mixture_contact is not None:
             return 0.0, 0.0, LARGEST_FORCE_EXPONENT * reading.doubt * contact.force_N
         if reading.doubt <= 0.0 or charge_pC is None:
             return None

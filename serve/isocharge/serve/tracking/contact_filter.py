@@ -1,0 +1,157 @@
+"""Filter that smooths the contacts predicted by a model from frame to frame.
+
+One `TwoModeFilter` estimates the position and another one the logarithm of the force. Some errors of a model are the
+same in every frame of a held contact, such as its approximation error and the errors of the gains. The filters only
+process the rest of the variance. The variance of the constant errors is added to the results, so that the reported
+standard deviations remain correct.
+"""
+
+import math
+from typing import NamedTuple
+
+from isocharge.serve.flags import BEYOND, MISFIT, SATURATED
+from isocharge.serve.prediction.contact import Contact
+from isocharge.serve.record.record import TrackedContact
+from isocharge.serve.tracking.measurement_noise import SCALAR_SHAPE, CovarianceShape
+from isocharge.serve.tracking.motion import FORCE_MOTION, POSITION_MOTION, MAX_GAP_s
+from isocharge.serve.tracking.two_mode_filter import Estimate, TwoModeFilter
+
+FLAG_VARIANCE_FACTORS = {SATURATED: 100.0, BEYOND: 100.0, MISFIT: 10.0}
+"""Factor by which the variance of a frame with a flag is multiplied, by the flag."""
+
+MAX_OUTLIERS = 1
+"""Number of successive frames that are ignored because they do not belong to the contact. The next one starts anew."""
+
+MAX_SPEED_mm_per_s = 300.0
+"""Speed up to which a sudden movement belongs to the contact, mm/s. A faster frame is an outlier."""
+
+MIN_FORCE_N = 1e-6
+"""Smallest force whose logarithm is computed, N."""
+
+
+class MeasuredContact(NamedTuple):
+    """A contact predicted by a model, in the form in which the filters process it.
+
+    Attributes:
+        position: Position x + iy, mm.
+        shape: Shape of the covariance of the position.
+        position_variance: Square root of the determinant of the covariance of the position, mm^2.
+        log_force: Logarithm of the force in N.
+        log_force_std: Standard deviation of the logarithm of the force.
+        white_share: Factor by which the variances are multiplied for the part that is independent from frame to frame.
+    """
+
+    position: complex
+    shape: CovarianceShape
+    position_variance: float
+    log_force: float
+    log_force_std: float
+    white_share: float
+
+
+class ContactFilter:
+    """Smooths the position and the force of one contact."""
+
+    def __init__(self, constant_variance_share: float) -> None:
+        """Begin without a contact.
+
+        Args:
+            constant_variance_share: Share of the variance stated by the model that is the same in every frame of a
+                held contact, 0 to 1.
+        """
+        self._constant_share = constant_variance_share
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard the contact."""
+        self._position_filter = TwoModeFilter.start(0j, 1.0, POSITION_MOTION)
+        self._force_filter = TwoModeFilter.start(0.0, 1.0, FORCE_MOTION)
+        self._tracked: TrackedContact | None = None
+        self._outliers = 0
+        self._t_s = 0.0
+
+    def step(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> TrackedContact:
+        """Process the next frame.
+
+        Args:
+            contact: Contact predicted by the model.
+            t_s: Time of the frame on any clock, s.
+            flags: Flags of the frame.
+
+        Returns:
+            The smoothed contact. If the frame is an outlier, it is the smoothed contact of the previous frame.
+        """
+        measured = self._measured(contact, flags)
+        position_noise = measured.white_share * measured.position_variance
+        force_noise = measured.white_share * measured.log_force_std * measured.log_force_std
+        position = None
+        log_force = None
+
+        dt_s = t_s - self._t_s
+        if self._tracked is not None and 0.0 < dt_s <= MAX_GAP_s:
+            position = self._position_filter.step(measured.position, dt_s, measured.shape, position_noise)
+            if position is not None:
+                log_force = self._force_filter.step(measured.log_force, dt_s, SCALAR_SHAPE, force_noise)
+            elif self._is_outlier(measured.position, self._tracked, dt_s):
+                return self._tracked
+
+        if position is None:
+            self._position_filter = TwoModeFilter.start(measured.position, position_noise, POSITION_MOTION)
+            position = Estimate(measured.position, position_noise)
+        if log_force is None:  # A force that jumps restarts only its own filter.
+            self._force_filter = TwoModeFilter.start(measured.log_force, force_noise, FORCE_MOTION)
+            log_force = Estimate(measured.log_force, force_noise)
+        self._outliers = 0
+        self._t_s = t_s
+        self._tracked = self._tracked_contact(contact, measured, position, log_force)
+        return self._tracked
+
+    def _measured(self, contact: Contact, flags: tuple[str, ...]) -> MeasuredContact:
+        """Return the contact in the form in which the filters process it."""
+        correlation = contact.xy_correlation
+        if math.isnan(correlation):  # The model provides no correlations.
+            correlation = 0.0
+        shape, position_variance = CovarianceShape.of_position(contact.x_std_mm, contact.y_std_mm, correlation)
+        force_N = max(MIN_FORCE_N, contact.force_N)
+        white_share = 1.0 - self._constant_share
+        for flag in flags:
+            white_share *= FLAG_VARIANCE_FACTORS.get(flag, 1.0)
+        return MeasuredContact(
+            complex(contact.x_mm, contact.y_mm),
+            shape,
+            position_variance,
+            math.log(force_N),
+            contact.force_std_N / force_N,
+            white_share,
+        )
+
+    def _is_outlier(self, position: complex, previous: TrackedContact, dt_s: float) -> bool:
+        """Return whether to ignore a frame that is far from the contact, and count such frames."""
+        distance_mm = abs(position - complex(previous.x_mm, previous.y_mm))
+        if distance_mm < MAX_SPEED_mm_per_s * dt_s:
+            return False
+        self._outliers += 1
+        return self._outliers <= MAX_OUTLIERS
+
+    def _tracked_contact(
+        self, contact: Contact, measured: MeasuredContact, position: Estimate, log_force: Estimate
+    ) -> TrackedContact:
+        """Return the smoothed contact, whose standard deviations include the constant errors of the model."""
+        constant_share = self._constant_share
+        std_ratio = math.sqrt(position.variance / measured.position_variance + constant_share)
+        log_force_std = measured.log_force_std
+        log_force_variance = log_force.variance + log_force_std * log_force_std * constant_share
+        force_N = math.exp(log_force.value.real)
+        moving_probability = self._position_filter.moving_probability
+        velocity = moving_probability * self._position_filter.velocity
+        return TrackedContact(
+            x_mm=position.value.real,
+            y_mm=position.value.imag,
+            force_N=force_N,
+            x_std_mm=contact.x_std_mm * std_ratio,
+            y_std_mm=contact.y_std_mm * std_ratio,
+            force_std_N=force_N * math.sqrt(log_force_variance),
+            vx_mm_s=velocity.real,
+            vy_mm_s=velocity.imag,
+            moving=moving_probability,
+        )

@@ -1,0 +1,437 @@
+"""Gaussian mixture that follows a contact on a film whose map from contacts to charges folds.
+
+Where the map folds, several contacts have the same charges, and a single frame cannot distinguish them. A sequence of
+frames can: a contact that keeps moving crosses the fold, whereas a contact that stays on its side turns back there.
+
+The state of a component is the position, the logarithm of the force, the rates of these three, and the logarithms of
+the electrode gains. The distribution of the state is a sum of Gaussians (Alspach and Sorenson 1972). Each component is
+updated with the measured charges by an iterated extended Kalman filter (Bell and Cathey 1993).
+
+Components are added in four cases:
+
+- When a touch begins, components are placed all over the film. Those that do not explain the charges are removed.
+- If the most probable component extends across a fold, two components are added, one towards each side.
+- If the innovation of the most probable component exceeds the gate, a component with an uncertain velocity is added.
+- If the most probable component is fast, a component with zero velocity is added, because the contact may have stopped.
+
+Charges are averaged over `STEP_s` before an update. Shorter steps are hardly more accurate.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.serve.model.charge_series import ChargeSeries, read_charges
+from isocharge.serve.model.metadata import ModelNoise
+from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.tracking.mixture_components import (
+    CONTACT,
+    GAINS,
+    LOG_FORCE,
+    LOG_FORCE_RATE,
+    MAX_COMPONENTS,
+    N_MOTION,
+    POSITION,
+    RATES,
+    VELOCITY,
+    X_RATE,
+    Y_RATE,
+    Components,
+    ContactHypothesis,
+    X,
+    Y,
+    combine_components,
+    predict_components,
+    prune_components,
+)
+from isocharge.serve.tracking.motion import FORCE_RATE_STD, SPEED_STD, MAX_GAP_s
+
+STEP_s = 0.005
+"""Time over which charges are averaged, s."""
+
+CLOCK_TOLERANCE_s = 1e-5
+"""Amount by which a step may be shorter than `STEP_s`, because clocks are not exact, s."""
+
+GAIN_STD = 0.01
+"""Standard deviation of an electrode gain about its calibrated value, dimensionless."""
+
+SLOW_NOISE_STD = 0.003
+"""Standard deviation, relative to the charge, of noise that lasts for several frames and does not average out."""
+
+INITIAL_LOG_FORCE_STD = 2.0
+"""Standard deviation of ln F when a touch begins, dimensionless."""
+
+NEW_SPEED_STD = 80.0
+"""Standard deviation of the change of the velocity when a contact starts, stops or turns, mm/s."""
+
+SUDDEN_CHANGE_RATE = 2.0
+"""Mean number of movements that start or stop in a second, 1/s."""
+
+SQUARED_GATE = 8.0
+"""Squared Mahalanobis distance of the innovation above which the velocity has probably changed, dimensionless."""
+
+SEARCH_INTERVAL_s = 0.05
+"""Shortest time between two searches over the whole film, each of which takes milliseconds, s."""
+
+MAX_SQUARE = 60.0
+"""Squared distance of the charges and of the state from their predictions above which a component does not explain the
+charges, dimensionless."""
+
+MAX_RELATIVE_RADIUS = 1.1
+"""Distance from the centre, relative to the radius of the film, beyond which components are removed."""
+
+FOLD_DISTANCE = 4.0
+"""Distance, in standard deviations, within which a fold causes two components to be added.
+
+The distance is large because a gain error displaces the fold, and the contact then seems to stop in front of it.
+"""
+
+SPLIT_DISTANCE = 2.5
+"""Distance of an added component from the component that extends across a fold, in standard deviations."""
+
+SPLIT_STD_RATIO = 0.5
+"""Standard deviation of such an added component along the axis of the split, relative to the original component."""
+
+MIN_SPLIT_STD_mm = 0.05
+"""Standard deviation of the position below which a component is not split, mm."""
+
+SEPARATE_DISTANCE = 3.0
+"""Distance, in standard deviations, above which components on the same side of a fold are different contacts."""
+
+N_INITIAL_COMPONENTS = 121
+"""Number of components all over the film when a touch begins."""
+
+UPDATE_ITERATIONS = 3
+"""Number of iterations of the Kalman filter in each update."""
+
+INITIAL_ITERATIONS = 20
+"""Number of iterations of the Kalman filter when a touch begins."""
+
+MAX_ITERATION_STEP_mm = 0.5
+"""Largest change of the position in one iteration, mm. The linearisation is not accurate beyond it."""
+
+MAX_ITERATION_LOG_STEP = 0.2
+"""Largest change of ln F in one iteration. The linearisation is not accurate beyond it."""
+
+GOLDEN_ANGLE = 2.399963
+"""Angle between successive points of a spiral that covers a disk evenly, rad (Vogel 1979)."""
+
+
+class Measurement(NamedTuple):
+    """Charges averaged over a step.
+
+    Attributes:
+        charge_pC: Touch charges, shape (n_electrode,), pC.
+        variance: Variances of the charges, shape (n_electrode,), pC^2.
+    """
+
+    charge_pC: Array
+    variance: Array
+
+
+class LinearisedUpdate(NamedTuple):
+    """Quantities of a Kalman update, linearised about a state of each component.
+
+    Attributes:
+        charge_pC: Charges of the state, shape (n, n_electrode), pC.
+        cross_covariance: Covariance of the charges and the state, shape (n, n_electrode, 6 + n_electrode).
+        charge_covariance: Covariance of the charges that the uncertain state causes, shape
+            (n, n_electrode, n_electrode), pC^2.
+        innovation_covariance: The same with the noise of the measurement.
+        weighted_innovation: Innovation multiplied by the inverse of its covariance, shape (n, n_electrode, 1), 1/pC.
+    """
+
+    charge_pC: Array
+    cross_covariance: Array
+    charge_covariance: Array
+    innovation_covariance: Array
+    weighted_innovation: Array
+
+
+class ContactMixture:
+    """Follows one contact by its charges; belongs to one thread. The same frames give the same results, bit for bit."""
+
+    def __init__(self, charges: ChargeSeries, noise: ModelNoise) -> None:
+        """Begin without a contact.
+
+        Args:
+            charges: Charges of every contact.
+            noise: Noise of a frame, as in the training of the model.
+        """
+        self.charges = charges
+        self._noise = noise
+        self._initial_contacts = _evenly_distributed_contacts(charges)
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard the contact."""
+        self._components: Components | None = None
+        self._hypotheses: list[ContactHypothesis] = []
+        self._step_frames: list[tuple[Array, float]] = []
+        self._step_begin_s = -math.inf
+        self._t_s = -math.inf
+        self._next_search_s = -math.inf
+
+    def update(self, charge_pC: Array, t_s: float) -> list[ContactHypothesis]:
+        """Process the next frame.
+
+        Args:
+            charge_pC: Touch charges, shape (n_electrode,), pC.
+            t_s: Time of the frame on any clock, s.
+
+        Returns:
+            The contacts that explain the charges, in descending order of their probability; empty if there is none.
+        """
+        self._step_frames.append((charge_pC, t_s))
+        is_within_step = 0.0 <= t_s - self._step_begin_s < STEP_s - CLOCK_TOLERANCE_s
+        if not is_within_step:
+            self._process_step(t_s)
+        return [hypothesis.extrapolated(t_s - self._t_s) for hypothesis in self._hypotheses]
+
+    def _process_step(self, t_s: float) -> None:
+        """Update the mixture with the average of the frames of a step, which ends at time `t_s`."""
+        charges, times_s = zip(*self._step_frames, strict=True)
+        count = len(times_s)
+        mean_s = sum(times_s) / count
+        dt_s = mean_s - self._t_s
+        self._step_frames = []
+        self._step_begin_s = t_s
+        self._t_s = mean_s
+
+        charge_pC = np.mean(charges, axis=0)
+        variance = self._noise.variance(charge_pC) / count + (SLOW_NOISE_STD * charge_pC) ** 2
+        measurement = Measurement(charge_pC, variance)
+
+        components = None
+        if self._components is not None and 0.0 < dt_s < MAX_GAP_s:
+            components = self._advance(self._components, measurement, dt_s)
+        if components is None and t_s >= self._next_search_s:
+            self._next_search_s = t_s + SEARCH_INTERVAL_s
+            components = self._search(measurement)
+        self._components = components
+        self._hypotheses = [] if components is None else self._group(components)
+
+    def _search(self, measurement: Measurement) -> Components | None:
+        """Search the whole film for contacts that explain the charges; return None if there is none."""
+        n_electrode = measurement.charge_pC.size
+        mean = np.zeros((N_INITIAL_COMPONENTS, N_MOTION + n_electrode))
+        mean[:, CONTACT] = self._initial_contacts
+
+        std = np.empty(N_MOTION + n_electrode)
+        std[POSITION] = self.charges.radius_mm / math.sqrt(N_INITIAL_COMPONENTS)
+        std[LOG_FORCE] = INITIAL_LOG_FORCE_STD
+        std[VELOCITY] = SPEED_STD
+        std[LOG_FORCE_RATE] = FORCE_RATE_STD
+        std[GAINS] = GAIN_STD
+        covariance = np.tile(np.diag(std**2.0), (N_INITIAL_COMPONENTS, 1, 1))
+
+        components = Components(mean, covariance, np.zeros(N_INITIAL_COMPONENTS))
+        return self._update(components, measurement, INITIAL_ITERATIONS)
+
+    def _advance(self, components: Components, measurement: Measurement, dt_s: float) -> Components | None:
+        """Predict the components, and update them; return None if no component explains the charges.
+
+        Args:
+            components: Components after the previous step.
+            measurement: Charges of this step.
+            dt_s: Time since the previous step, s.
+        """
+        predicted = predict_components(components, dt_s)
+        best = predicted.best
+        mean = predicted.mean[best].copy()
+        covariance = predicted.covariance[best].copy()
+        log_weight = predicted.log_weight[best] + math.log(SUDDEN_CHANGE_RATE * dt_s)
+
+        if self._squared_innovation(predicted, measurement) > SQUARED_GATE:
+            rate_variance = np.array([NEW_SPEED_STD, NEW_SPEED_STD, FORCE_RATE_STD]) ** 2
+            covariance[RATES, RATES] += np.diag(rate_variance)
+            covariance[CONTACT, CONTACT] += np.diag(rate_variance * dt_s**2)
+            predicted = predicted.with_component(mean, covariance, log_weight)
+        elif np.hypot(mean[X_RATE], mean[Y_RATE]) > SPEED_STD:
+            mean[CONTACT] -= dt_s * mean[RATES]
+            mean[RATES] = 0.0
+            predicted = predicted.with_component(mean, covariance, log_weight)
+        return self._update(predicted, measurement, UPDATE_ITERATIONS)
+
+    def _squared_innovation(self, components: Components, measurement: Measurement) -> float:
+        """Compute the squared Mahalanobis distance of the innovation of the most probable component."""
+        best = components.best
+        charge_pC, jacobian = self._charges_and_jacobian(components.mean)
+        charge_covariance = jacobian @ components.covariance @ jacobian.swapaxes(1, 2)
+        innovation_covariance = charge_covariance[best] + np.diag(measurement.variance)
+        innovation = measurement.charge_pC - charge_pC[best]
+        return float(innovation @ np.linalg.solve(innovation_covariance, innovation))
+
+    def _charges_and_jacobian(self, mean: Array) -> tuple[Array, Array]:
+        """Compute the charges of states, and their derivatives with respect to the state.
+
+        Args:
+            mean: States, shape (n, 6 + n_electrode).
+
+        Returns:
+            The charges, shape (n, n_electrode), pC, and their derivatives, shape (n, n_electrode, 6 + n_electrode).
+        """
+        charge_pC, contact_jacobian = self.charges.linearised(mean[:, CONTACT])
+        gains = np.exp(mean[:, GAINS])
+        charge_pC = charge_pC * gains
+        rate_jacobian = np.zeros((*charge_pC.shape, 3))
+        gain_jacobian = charge_pC[:, :, None] * np.eye(charge_pC.shape[1])
+        jacobian = np.concatenate([contact_jacobian * gains[:, :, None], rate_jacobian, gain_jacobian], axis=2)
+        return charge_pC, jacobian
+
+    def _linearise_update(self, state: Array, prior: Components, measurement: Measurement) -> LinearisedUpdate:
+        """Linearise the update of the components about a state of each, shape (n, 6 + n_electrode)."""
+        charge_pC, jacobian = self._charges_and_jacobian(state)
+        transposed = jacobian.swapaxes(1, 2)
+        cross_covariance = jacobian @ prior.covariance
+        charge_covariance = cross_covariance @ transposed
+        innovation_covariance = charge_covariance + np.diag(measurement.variance)
+        state_correction = ((prior.mean - state)[:, None] @ transposed)[:, 0]
+        innovation = measurement.charge_pC - charge_pC - state_correction
+        weighted_innovation = np.linalg.solve(innovation_covariance, innovation[:, :, None])
+        return LinearisedUpdate(
+            charge_pC, cross_covariance, charge_covariance, innovation_covariance, np.asarray(weighted_innovation)
+        )
+
+    def _update(self, prior: Components, measurement: Measurement, iterations: int) -> Components | None:
+        """Update the components with the charges, and prune and split them.
+
+        Args:
+            prior: Predicted components.
+            measurement: Charges of this step.
+            iterations: Number of iterations towards the most probable state of each component.
+
+        Returns:
+            The components, or None if no component explains the charges.
+        """
+        state = prior.mean
+        linearised = self._linearise_update(state, prior, measurement)
+        for _ in range(iterations):
+            transposed = linearised.cross_covariance.swapaxes(1, 2)
+            step = prior.mean + (transposed @ linearised.weighted_innovation)[:, :, 0] - state
+            state = state + _limit_iteration_step(step)
+            linearised = self._linearise_update(state, prior, measurement)
+
+        weighted = linearised.weighted_innovation
+        squared_misfit = ((measurement.charge_pC - linearised.charge_pC) ** 2 / measurement.variance).sum(axis=1)
+        squared_state_change = (weighted.swapaxes(1, 2) @ linearised.charge_covariance @ weighted)[:, 0, 0]
+        square = squared_misfit + squared_state_change
+        log_determinant = np.linalg.slogdet(linearised.innovation_covariance)[1]
+        log_weight = prior.log_weight - 0.5 * (square + log_determinant)
+        log_weight[np.hypot(state[:, X], state[:, Y]) > MAX_RELATIVE_RADIUS * self.charges.radius_mm] = -np.inf
+        best = int(log_weight.argmax())
+        if not (square[best] < MAX_SQUARE and np.isfinite(log_weight[best])):
+            return None
+
+        cross_covariance = linearised.cross_covariance
+        gain = np.linalg.solve(linearised.innovation_covariance, cross_covariance)
+        covariance = prior.covariance - cross_covariance.swapaxes(1, 2) @ gain
+        covariance = 0.5 * (covariance + covariance.swapaxes(1, 2))
+        misfit = math.sqrt(squared_misfit[best])
+        updated = Components(state, covariance, log_weight - log_weight[best], misfit)
+        return self._split_at_fold(prune_components(updated))
+
+    def _split_at_fold(self, components: Components) -> Components:
+        """Add a component towards each side of a fold if the most probable component extends across the fold."""
+        best = components.best
+        mean = components.mean[best]
+        covariance = components.covariance[best]
+        variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])  # in ascending order of the variances
+        longest = variances.size - 1
+        std_mm = math.sqrt(max(variances[longest], 0.0))
+        if std_mm < MIN_SPLIT_STD_mm or len(components.mean) > MAX_COMPONENTS - 2:
+            return components
+
+        # Change of the state if the position changes by one standard deviation along the longest axis.
+        direction = covariance[:, POSITION] @ axes[:, longest] / std_mm
+        sides = np.array([1.0, -1.0])
+        probes = mean + FOLD_DISTANCE * np.outer(sides, direction)
+        if not self._is_across_fold(mean, probes).any():
+            return components
+
+        removed_share = 1.0 - SPLIT_STD_RATIO**2
+        narrow_covariance = covariance - removed_share * np.outer(direction, direction)
+        log_weight = components.log_weight[best] - 0.5 * SPLIT_DISTANCE**2
+        for added_mean in mean + SPLIT_DISTANCE * np.outer(sides, direction):
+            components = components.with_component(added_mean, narrow_covariance, log_weight)
+        return components
+
+    def _is_across_fold(self, state: Array, other_states: Array) -> Booleans:
+        """Return whether the orientation of the map from contacts to charges differs between two states.
+
+        Args:
+            state: A state, shape (6 + n_electrode,).
+            other_states: The states to compare it with, shape (n, 6 + n_electrode).
+
+        Returns:
+            Whether an odd number of folds lies in between, shape (n,).
+        """
+        states = np.vstack([state, other_states])
+        _, jacobian = self.charges.linearised(states[:, CONTACT])
+        orientation = np.linalg.det(jacobian[0].T @ jacobian[1:])
+        return np.asarray(orientation < 0.0)
+
+    def _group(self, components: Components) -> list[ContactHypothesis]:
+        """Combine the components that describe the same contact, in descending order of the probability."""
+        probability = np.exp(components.log_weight - components.log_weight.max())
+        probability /= probability.sum()
+        remaining = np.argsort(-probability, kind="stable")
+        hypotheses = []
+        while remaining.size:
+            is_same = self._is_same_contact(components, remaining)
+            rows = remaining[is_same]
+            hypotheses.append(combine_components(components.select(rows), probability[rows]))
+            remaining = remaining[~is_same]
+        return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)
+
+    def _is_same_contact(self, components: Components, rows: Integers) -> Booleans:
+        """Return which components describe the same contact as the first one of them.
+
+        Args:
+            components: All components.
+            rows: Indices of the components to compare, shape (n,).
+
+        Returns:
+            Whether each component is near the first one and on the same side of the folds, shape (n,).
+        """
+        first = rows[0]
+        mean = components.mean[rows]
+        position_variance = components.covariance[:, [X, Y], [X, Y]]
+        std_mm = np.sqrt(position_variance[first] + position_variance[rows])
+        distance_mm = np.abs(mean[:, POSITION] - components.mean[first, POSITION])
+        is_near = (distance_mm < SEPARATE_DISTANCE * std_mm).all(axis=1)
+        is_same = is_near & ~self._is_across_fold(components.mean[first], mean)
+        is_same[0] = True
+        return np.asarray(is_same)
+
+
+def _limit_iteration_step(step: Array) -> Array:
+    """Shorten steps of the state, shape (n, 6 + n_electrode), to those within which the linearisation is accurate."""
+    position_excess = np.hypot(step[:, X], step[:, Y]) / MAX_ITERATION_STEP_mm
+    force_excess = np.abs(step[:, LOG_FORCE]) / MAX_ITERATION_LOG_STEP
+    excess = np.maximum(position_excess, force_excess)
+    return np.asarray(step / np.maximum(excess, 1.0)[:, None])
+
+
+def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
+    """Return contacts (x, y, ln F) of medium force on a spiral that covers the film, shape (n, 3)."""
+    number = np.arange(N_INITIAL_COMPONENTS)
+    angle = GOLDEN_ANGLE * number
+    relative_radius = np.sqrt((number + 0.5) / N_INITIAL_COMPONENTS)
+    x_mm, y_mm = charges.radius_mm * relative_radius * np.array([np.cos(angle), np.sin(angle)])
+    log_force = np.full(N_INITIAL_COMPONENTS, np.log(charges.force_N).mean())
+    return np.column_stack([x_mm, y_mm, log_force])
+
+
+def contact_mixture(predictor: Predictor) -> ContactMixture | None:
+    """Return the mixture for the film of a model; None if the model has no file `charges.npz`.
+
+    Raises:
+        ModelError: If the file is damaged.
+    """
+    charges = read_charges(predictor.folder, len(predictor.metadata.electrodes))
+    if charges is None:
+        return None
+    return ContactMixture(charges, predictor.metadata.noise)

@@ -1,0 +1,125 @@
+"""Noise of the measured contacts: the shape of its covariance, and its size as estimated from the frames.
+
+A model states the standard deviations for the noise of its training. The noise of a board may be smaller or larger. The
+noise changes from frame to frame, whereas a contact moves smoothly. Its size is therefore estimated from the residuals
+of a linear extrapolation through the two previous frames.
+"""
+
+import math
+from typing import NamedTuple
+
+PRIOR_FRAMES = 5
+"""Number of frames whose weight the variance stated by the model has."""
+
+MAX_FRAMES = 100
+"""Number of frames over which the estimate is averaged."""
+
+MIN_INTERVAL_s = 0.0045
+"""Time after which the noise is independent, s. A board may filter its charges over a shorter time."""
+
+MAX_RELATIVE_SQUARE = 6.0
+"""Largest squared residual of a frame, relative to the present estimate. Sudden movements are not noise."""
+
+MIN_RELATIVE_VARIANCE = 0.01
+"""Smallest variance of the noise, relative to the variance stated by the model."""
+
+MAX_RELATIVE_VARIANCE = 100.0
+"""Largest variance of the noise, relative to the variance stated by the model."""
+
+MIN_UNCORRELATED_SHARE = 1e-6
+"""Smallest value of 1 - r^2, where r is the correlation of x and y. It keeps the covariance invertible."""
+
+
+class CovarianceShape(NamedTuple):
+    """Covariance of a measurement divided by the square root of its determinant, so that the determinant is 1.
+
+    Attributes:
+        inverse_xx: Element xx of the inverse of this matrix, divided by the number of dimensions.
+        inverse_yy: Element yy of the same.
+        inverse_xy: Element xy of the same.
+        dimensions: Number of dimensions: 2 for a position, 1 for the logarithm of a force.
+    """
+
+    inverse_xx: float
+    inverse_yy: float
+    inverse_xy: float
+    dimensions: int
+
+    @classmethod
+    def of_position(cls, x_std_mm: float, y_std_mm: float, correlation: float) -> tuple["CovarianceShape", float]:
+        """Split the covariance of a position into its shape and its size.
+
+        Args:
+            x_std_mm: Standard deviation of x, mm.
+            y_std_mm: Standard deviation of y, mm.
+            correlation: Correlation of x and y, from -1 to 1.
+
+        Returns:
+            The shape, and the square root of the determinant of the covariance, mm^2.
+        """
+        uncorrelated_share = 1.0 - correlation * correlation
+        root = math.sqrt(max(uncorrelated_share, MIN_UNCORRELATED_SHARE))
+        dimensions = 2
+        scale = dimensions * root
+        inverse_xx = y_std_mm / (x_std_mm * scale)
+        inverse_yy = x_std_mm / (y_std_mm * scale)
+        inverse_xy = -correlation / scale
+        return cls(inverse_xx, inverse_yy, inverse_xy, dimensions), x_std_mm * y_std_mm * root
+
+    def mean_square(self, difference: complex) -> float:
+        """Compute the squared Mahalanobis distance of a difference x + iy, divided by the number of dimensions."""
+        x = difference.real
+        y = difference.imag
+        return (self.inverse_xx * x + 2.0 * self.inverse_xy * y) * x + self.inverse_yy * y * y
+
+
+SCALAR_SHAPE = CovarianceShape(inverse_xx=1.0, inverse_yy=0.0, inverse_xy=0.0, dimensions=1)
+"""Shape of the variance of a real number, such as the logarithm of a force."""
+
+
+class NoiseEstimate(NamedTuple):
+    """Size of the noise, as estimated from the frames.
+
+    Attributes:
+        relative_variance: Variance of the noise, relative to the variance stated by the model.
+        frames: Number of frames in the average, at most `MAX_FRAMES`.
+        measured: Latest measured value: a position x + iy, mm, or the logarithm of a force.
+        rate: Rate of change between the latest two measured values, mm/s or 1/s.
+        dt_s: Time between the latest two measured values, s; 0 if there is only one.
+    """
+
+    relative_variance: float
+    frames: int
+    measured: complex
+    rate: complex
+    dt_s: float
+
+    @classmethod
+    def start(cls, measured: complex) -> "NoiseEstimate":
+        """Return the estimate after the first measured value: the variance that the model states."""
+        return cls(relative_variance=1.0, frames=PRIOR_FRAMES, measured=measured, rate=0j, dt_s=0.0)
+
+    def updated(
+        self, measured: complex, dt_s: float, shape: CovarianceShape, stated_variance: float
+    ) -> "NoiseEstimate":
+        """Return the estimate after another measured value.
+
+        Args:
+            measured: The measured value: a position x + iy, mm, or the logarithm of a force.
+            dt_s: Time since the latest measured value, s, at least `MIN_INTERVAL_s`.
+            shape: Shape of the covariance of the measured value.
+            stated_variance: Variance of the noise as stated by the model, mm^2, or dimensionless for a force.
+        """
+        change = measured - self.measured
+        rate = change / dt_s
+        if self.dt_s <= 0.0:
+            return self._replace(measured=measured, rate=rate, dt_s=dt_s)
+
+        time_ratio = dt_s / self.dt_s
+        extrapolation_variance = stated_variance * (1.0 + time_ratio * time_ratio + (1.0 + time_ratio) ** 2)
+        square = shape.mean_square(change - self.rate * dt_s) / extrapolation_variance
+        square = min(square, MAX_RELATIVE_SQUARE * self.relative_variance)
+        frames = min(self.frames + 1, MAX_FRAMES)
+        variance = self.relative_variance + (square - self.relative_variance) / frames
+        variance = min(max(variance, MIN_RELATIVE_VARIANCE), MAX_RELATIVE_VARIANCE)
+        return NoiseEstimate(variance, frames, measured, rate, dt_s)

@@ -1,0 +1,238 @@
+"""Components of the Gaussian mixture of `contact_mixture`, with their prediction, pruning and combination."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Integers
+from isocharge.serve.prediction.contact import Contact
+from isocharge.serve.tracking.motion import MIN_ACCELERATION_SHARE, POSITION_MOTION
+
+X = 0
+"""Index of the position x in a state, mm."""
+
+Y = 1
+"""Index of the position y in a state, mm."""
+
+LOG_FORCE = 2
+"""Index of ln F in a state, where F is the force in N."""
+
+X_RATE = 3
+"""Index of the velocity along x in a state, mm/s."""
+
+Y_RATE = 4
+"""Index of the velocity along y in a state, mm/s."""
+
+LOG_FORCE_RATE = 5
+"""Index of the rate of ln F in a state, 1/s."""
+
+POSITION = slice(X, LOG_FORCE)
+"""Slice of x and y in a state."""
+
+CONTACT = slice(X, X_RATE)
+"""Slice of x, y and ln F in a state."""
+
+VELOCITY = slice(X_RATE, LOG_FORCE_RATE)
+"""Slice of the velocities along x and y in a state."""
+
+RATES = slice(X_RATE, LOG_FORCE_RATE + 1)
+"""Slice of the rates of x, y and ln F in a state."""
+
+MOTION = slice(X, LOG_FORCE_RATE + 1)
+"""Slice of x, y, ln F and their rates in a state."""
+
+N_MOTION = LOG_FORCE_RATE + 1
+"""Number of entries of `MOTION`."""
+
+GAINS = slice(N_MOTION, None)
+"""Slice of the logarithms of the electrode gains in a state."""
+
+FORCE_ACCELERATION_DENSITY = 2.0
+"""Spectral density of the second derivative of ln F, 1/s^3."""
+
+MAX_COMPONENTS = 8
+"""Largest number of components that are kept after an update."""
+
+MIN_LOG_WEIGHT = -14.0
+"""Logarithm of the weight, relative to the largest weight, below which a component is removed."""
+
+MERGE_DISTANCE = 0.7
+"""Distance in each motion state, in standard deviations, below which two components are merged."""
+
+
+class ContactHypothesis(NamedTuple):
+    """A contact that explains the charges.
+
+    Attributes:
+        mean: Mean of the state, shape (6 + n_electrode,): x and y (mm), ln F, their rates (mm/s, 1/s), and the
+            logarithms of the gains.
+        covariance: Covariance of the state, shape (6 + n_electrode, 6 + n_electrode).
+        probability: Probability that this contact touches the film.
+        misfit: Distance of the measured charges from the charges of the contact, in standard deviations.
+    """
+
+    mean: Array
+    covariance: Array
+    probability: float
+    misfit: float
+
+    def extrapolated(self, dt_s: float) -> "ContactHypothesis":
+        """Return the hypothesis at a time that is `dt_s` later, s. The covariance is kept, because `dt_s` is short."""
+        mean = self.mean.copy()
+        mean[CONTACT] += dt_s * mean[RATES]
+        return self._replace(mean=mean)
+
+    @property
+    def contact(self) -> Contact:
+        """The contact in the form in which a model predicts it."""
+        x_mm, y_mm, log_force = self.mean[CONTACT].tolist()
+        covariance = self.covariance[CONTACT, CONTACT]
+        std = np.sqrt(covariance.diagonal())
+        correlation = covariance / np.outer(std, std)
+        x_std_mm, y_std_mm, log_force_std = std.tolist()
+        force_N = math.exp(log_force)
+        return Contact(
+            x_mm,
+            y_mm,
+            force_N,
+            x_std_mm,
+            y_std_mm,
+            log_force_std * force_N,
+            self.misfit,
+            xy_correlation=float(correlation[X, Y]),
+            xF_correlation=float(correlation[X, LOG_FORCE]),
+            yF_correlation=float(correlation[Y, LOG_FORCE]),
+        )
+
+    @property
+    def velocity_mm_per_s(self) -> tuple[float, float]:
+        """Velocity along x and y, mm/s."""
+        vx_mm_per_s, vy_mm_per_s = self.mean[VELOCITY].tolist()
+        return vx_mm_per_s, vy_mm_per_s
+
+    @property
+    def moving_probability(self) -> float:
+        """Probability that a contact at rest would be estimated to be slower (chi-squared test of the velocity)."""
+        velocity = self.mean[VELOCITY]
+        covariance = self.covariance[VELOCITY, VELOCITY]
+        squared_distance = float(velocity @ np.linalg.solve(covariance, velocity))
+        return -math.expm1(-0.5 * squared_distance)
+
+
+class Components(NamedTuple):
+    """The components of the mixture.
+
+    Attributes:
+        mean: Means of the state, shape (n, 6 + n_electrode).
+        covariance: Covariances of the state, shape (n, 6 + n_electrode, 6 + n_electrode).
+        log_weight: Logarithms of the weights, shape (n,). Only their differences matter.
+        misfit: Distance of the latest charges from those of the most probable component, in standard deviations.
+    """
+
+    mean: Array
+    covariance: Array
+    log_weight: Array
+    misfit: float = math.nan
+
+    @property
+    def best(self) -> int:
+        """Index of the most probable component."""
+        return int(self.log_weight.argmax())
+
+    def select(self, rows: "list[int] | Integers") -> "Components":
+        """Return some of the components."""
+        return self._replace(mean=self.mean[rows], covariance=self.covariance[rows], log_weight=self.log_weight[rows])
+
+    def with_component(self, mean: Array, covariance: Array, log_weight: float) -> "Components":
+        """Return the components and another one.
+
+        Args:
+            mean: Mean of the state, shape (6 + n_electrode,).
+            covariance: Covariance of the state, shape (6 + n_electrode, 6 + n_electrode).
+            log_weight: Logarithm of the weight.
+        """
+        return self._replace(
+            mean=np.vstack([self.mean, mean]),
+            covariance=np.concatenate([self.covariance, covariance[None]]),
+            log_weight=np.append(self.log_weight, log_weight),
+        )
+
+
+def predict_components(components: Components, dt_s: float) -> Components:
+    """Predict the components: constant velocity with white acceleration.
+
+    Args:
+        components: Components after the previous step.
+        dt_s: Time since the previous step, s.
+    """
+    mean = components.mean.copy()
+    mean[:, CONTACT] += dt_s * mean[:, RATES]
+
+    transition = np.eye(mean.shape[1])
+    transition[CONTACT, RATES] = dt_s * np.eye(3)
+    covariance = transition @ components.covariance @ transition.T
+
+    squared_speed = (mean[:, VELOCITY] ** 2).sum(axis=1)
+    relative_density = np.maximum(squared_speed / POSITION_MOTION.velocity_variance, MIN_ACCELERATION_SHARE)
+    position_density = POSITION_MOTION.acceleration_density * relative_density
+    _add_process_noise(covariance, X, X_RATE, position_density, dt_s)
+    _add_process_noise(covariance, Y, Y_RATE, position_density, dt_s)
+    _add_process_noise(covariance, LOG_FORCE, LOG_FORCE_RATE, FORCE_ACCELERATION_DENSITY, dt_s)
+    return components._replace(mean=mean, covariance=covariance)
+
+
+def _add_process_noise(covariance: Array, value: int, rate: int, density: Array | float, dt_s: float) -> None:
+    """Add the process noise of a white acceleration in place (Bar-Shalom, Li and Kirubarajan 2001, 6.2.2).
+
+    Args:
+        covariance: Covariances of the state, shape (n, 6 + n_electrode, 6 + n_electrode).
+        value: Index of the value in the state.
+        rate: Index of its rate in the state.
+        density: Spectral density of the acceleration, shape (n,) or a number, in squared units of the value per s^3.
+        dt_s: Length of the step, s.
+    """
+    covariance[:, value, value] += density * dt_s**3 / 3.0
+    covariance[:, value, rate] += density * dt_s**2 / 2.0
+    covariance[:, rate, value] += density * dt_s**2 / 2.0
+    covariance[:, rate, rate] += density * dt_s
+
+
+def prune_components(components: Components) -> Components:
+    """Remove improbable components, merge similar ones, and keep at most `MAX_COMPONENTS`."""
+    log_weight = components.log_weight.copy()
+    descending = np.argsort(-log_weight, kind="stable")
+    kept: list[int] = []
+    for row in descending[log_weight[descending] > MIN_LOG_WEIGHT].tolist():
+        similar = _similar_component(components, row, kept)
+        if similar is None:
+            kept.append(row)
+        else:
+            log_weight[similar] = np.logaddexp(log_weight[similar], log_weight[row])
+    return components._replace(log_weight=log_weight).select(kept[:MAX_COMPONENTS])
+
+
+def _similar_component(components: Components, row: int, candidates: list[int]) -> int | None:
+    """Return the first candidate whose motion state is similar to that of a component; None if there is none."""
+    mean = components.mean[:, MOTION]
+    std = np.sqrt(components.covariance[row].diagonal()[MOTION])
+    for candidate in candidates:
+        if (np.abs(mean[row] - mean[candidate]) < MERGE_DISTANCE * std).all():
+            return candidate
+    return None
+
+
+def combine_components(components: Components, probability: Array) -> ContactHypothesis:
+    """Combine components of the same contact by matching the mean and the covariance of the state.
+
+    Args:
+        components: The components.
+        probability: Probability of each component, shape (n,).
+    """
+    total = probability.sum()
+    share = probability / total
+    mean = share @ components.mean
+    deviation = components.mean - mean
+    covariance_within = np.tensordot(share, components.covariance, 1)
+    covariance_between = (share[:, None] * deviation).T @ deviation
+    return ContactHypothesis(mean, covariance_within + covariance_between, float(total), components.misfit)

@@ -1,0 +1,75 @@
+"""Events of a touch: press, hold, slide, tap and release."""
+
+from isocharge.serve.record.record import TrackedContact
+
+HOLD_TIME_s = 0.2
+"""Time at rest after which a contact is held, s."""
+
+MAX_TAP_TIME_s = 0.25
+"""Longest time of a tap, s."""
+
+SLIDE_DISTANCE_mm = 0.3
+"""Distance from the place of rest above which a moving contact slides, mm."""
+
+SLIDE_PROBABILITY = 0.95
+"""Probability of a movement above which a contact may slide."""
+
+REST_PROBABILITY = 0.5
+"""Probability of a movement below which a contact is at rest."""
+
+
+class TouchEvents:
+    """Derives the events of a touch from the tracked contacts."""
+
+    def __init__(self) -> None:
+        """Begin without a touch."""
+        self._press_s = 0.0
+        self._rest_position = 0j
+        self._rest_begin_s = 0.0
+        self._latest_event = ""
+
+    def begin(self, tracked: TrackedContact, t_s: float) -> str:
+        """Begin a touch, and return its first event.
+
+        Args:
+            tracked: The first tracked contact.
+            t_s: Time of the frame, s.
+        """
+        self._press_s = t_s
+        self._rest_position = complex(tracked.x_mm, tracked.y_mm)
+        self._rest_begin_s = t_s
+        self._latest_event = "press"
+        return "press"
+
+    def step(self, tracked: TrackedContact, t_s: float) -> str | None:
+        """Return the event that begins with a frame; None if there is none.
+
+        Args:
+            tracked: The tracked contact.
+            t_s: Time of the frame, s.
+        """
+        position = complex(tracked.x_mm, tracked.y_mm)
+        is_away = abs(position - self._rest_position) > SLIDE_DISTANCE_mm
+        if tracked.moving > SLIDE_PROBABILITY:
+            if is_away and self._latest_event != "slide":
+                self._latest_event = "slide"
+                return "slide"
+        elif tracked.moving < REST_PROBABILITY:
+            if is_away:
+                self._rest_position = position
+                self._rest_begin_s = t_s
+            elif self._latest_event != "hold" and t_s - self._rest_begin_s >= HOLD_TIME_s:
+                self._latest_event = "hold"
+                return "hold"
+        return None
+
+    def end(self, t_s: float) -> str:
+        """Return the event with which a touch ends.
+
+        Args:
+            t_s: Time of the first frame without a contact, s.
+        """
+        is_short = t_s - self._press_s <= MAX_TAP_TIME_s
+        if self._latest_event == "press" and is_short:
+            return "tap"
+        return "release"

@@ -1,0 +1,214 @@
+"""A contact is followed across a fold whose mirror image is known: x and 2 FOLD - x have the same charges."""
+
+import json
+import re
+import shutil
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.polynomial import Polynomial, chebyshev
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import ModelError
+from isocharge.common.files import sha256_of
+from isocharge.serve import Chunk, Frame, Predictor, TouchStream, encode_frame
+from isocharge.serve.live.device import device_from_table
+from isocharge.serve.model.charge_series import ChargeSeries, Series, read_charges
+from isocharge.serve.model.metadata import ModelNoise
+from isocharge.serve.tracking.contact_mixture import GAIN_STD, ContactMixture
+from isocharge.serve.tracking.tracker import Tracker
+
+RADIUS = 6.0
+"""Largest distance of a contact from the centre, mm."""
+
+FOLD = 2.0
+"""Position x of the fold, mm."""
+
+FORCES = (0.05, 2.0)
+"""Smallest and largest force, N."""
+
+NOISE = ModelNoise(name="reference", white_pC=1.0, gain=0.002)
+
+MODEL_CONTACT = (0.0,) * 10
+"""Contact predicted by a model that describes one side of the fold only. The tracker does not use its values."""
+
+
+def charges(x, y, force):
+    """Compute charges with ln(Q_1 / Q_0) = 0.1 (x - x^2 / (2 FOLD)) and ln(Q_2 / Q_0) = 0.1 y, pC."""
+    folded_x = 0.1 * (x - x**2 / (2.0 * FOLD))
+    return 2000.0 * (force**0.7 * np.exp([0.0 * x, folded_x, 0.1 * y])).T
+
+
+def folded_series():
+    """Return the same charges as a series."""
+    log_low, log_high = np.log(FORCES)
+    coefficients = np.zeros((3, 3, 2, 3))
+    coefficients[0, 0, 0, :] = np.log(2000.0) + 0.7 * 0.5 * (log_low + log_high)
+    coefficients[0, 0, 1, :] = 0.7 * 0.5 * (log_high - log_low)
+    folded_x = Polynomial([0.0, 0.1, -0.05 / FOLD])(Polynomial([0.0, RADIUS]))
+    coefficients[:, 0, 0, 1] += chebyshev.poly2cheb(folded_x.coef)
+    coefficients[0, 1, 0, 2] += 0.1 * RADIUS
+    return ChargeSeries(Series(coefficients), RADIUS, FORCES)
+
+
+def noisy_charges(x, y=1.0, force=0.5, seed=0, gains=(1.0, 1.0, 1.0)):
+    """Return charges with noise of contacts at positions x, shape (n,), mm, in the shape (n, 3), pC."""
+    clean = charges(x, y + 0.0 * x, force + 0.0 * x) * gains
+    rng = np.random.default_rng(seed)
+    return clean + np.sqrt(NOISE.variance(clean)) * rng.standard_normal(clean.shape)
+
+
+def new_tracker():
+    """Return a tracker of the folded film."""
+    return Tracker(mixture=ContactMixture(folded_series(), NOISE))
+
+
+def track(x, rate_Hz=1000.0, **options):
+    """Track contacts at positions x, mm; return the tracked contact and the other contact of each frame."""
+    tracker = new_tracker()
+    results = []
+    for number, charge_pC in enumerate(noisy_charges(x, **options)):
+        tracked, _ = tracker.update(MODEL_CONTACT, number / rate_Hz, (), charge_pC)
+        results.append((tracked, tracker.other))
+    return results
+
+
+def test_charge_series_equals_the_closed_form_and_is_a_power_of_the_force_outside_its_range():
+    contact = np.array([[3.0, -2.0, 0.5], [-5.0, 1.0, 0.01], [0.0, 0.0, 4.0]])
+    x, y, force = contact.T
+    charge, slopes = folded_series().linearised(np.column_stack([x, y, np.log(force)]))
+    x_slope, _, log_force_slope = np.moveaxis(slopes, 2, 0)
+    assert np.allclose(charge, charges(x, y, force), rtol=1e-12)
+    assert np.allclose(log_force_slope, 0.7 * charge, rtol=1e-12)
+    assert np.allclose(x_slope[:, 1], 0.1 * (1.0 - x / FOLD) * charge[:, 1], rtol=1e-12)
+
+
+def test_contact_at_rest_beside_a_fold_has_an_other_contact_of_equal_probability():
+    """A contact rests at x = 0, so x = 4 is as probable. Only the gain errors, which do not average out, limit y."""
+    tracked, other = track(np.zeros(200))[-1]
+    assert other.probability == pytest.approx(0.5, abs=0.1)
+    assert sorted([tracked.x_mm, other.x_mm]) == pytest.approx([0.0, 2.0 * FOLD], abs=3.0 * tracked.x_std_mm)
+    assert tracked.y_std_mm == pytest.approx(np.sqrt(2.0) * GAIN_STD / 0.1, rel=0.05)
+    assert tracked.force_std_N / tracked.force_N == pytest.approx(GAIN_STD / 0.7, rel=0.05)
+
+
+@pytest.mark.parametrize("rate_Hz", [200.0, 1000.0])
+@pytest.mark.parametrize("speed", [10.0, 50.0, 200.0])
+@pytest.mark.parametrize("gains", [(1.0, 1.0, 1.0), (1.007, 0.993, 1.0), (0.99, 1.01, 1.0)])
+def test_sliding_contact_is_followed_across_a_fold(rate_Hz: float, speed: float, gains: Sequence[float]):
+    """The contact begins at x = -4, which has no mirror image on the film. Gain errors displace or hide the fold."""
+    t = np.arange(0.0, 0.4 + 9.0 / speed, 1.0 / rate_Hz)
+    x = np.clip(speed * (t - 0.2), 0.0, 9.0) - 4.0
+    results = track(x, rate_Hz, gains=np.array(gains))
+    _, other_before = results[int(0.1 * rate_Hz)]
+    assert other_before is None
+
+    is_across = (x > FOLD) & (t > 0.22 + (FOLD + 4.0) / speed)
+    is_right = []
+    for number in np.flatnonzero(is_across):
+        candidates = [contact for contact in results[number] if contact is not None]
+        is_right.append(any(contact.x_mm > FOLD for contact in candidates))
+    assert np.mean(is_right) > 0.99
+
+    end_errors_mm = [abs(contact.x_mm - x[-1]) for contact in results[-1] if contact is not None]
+    assert min(end_errors_mm) < 0.3
+    assert len(end_errors_mm) == 1 or gains != (1.0, 1.0, 1.0)
+
+
+def test_contact_that_turns_back_in_front_of_a_fold_stays_on_its_side():
+    t = np.arange(0.0, 1.2, 1e-3)
+    x = np.interp(t, [0.2, 0.6, 1.0], [-4.0, -0.5, -4.0])
+    results = track(x)
+    _, other_at_end = results[-1]
+    tracked_in_slide, _ = results[400]
+    assert max(tracked.x_mm for tracked, _ in results) < FOLD
+    assert other_at_end is None
+    assert tracked_in_slide.vx_mm_s == pytest.approx(3.5 / 0.4, rel=0.2)
+
+
+def test_charges_of_no_contact_are_not_tracked_and_saturated_frames_are_ignored():
+    tracker = new_tracker()
+    for number in range(20):
+        assert tracker.update(MODEL_CONTACT, number / 1000.0, (), np.array([1e3, 1e6, 10.0])) == (None, None)
+    assert tracker.update(None, 0.05) == (None, None)
+
+    results = []
+    for number, charge_pC in enumerate(noisy_charges(np.full(30, -4.0))):
+        results.append(tracker.update(MODEL_CONTACT, 0.1 + number / 1000.0, (), charge_pC))
+    last_tracked, _ = results[-1]
+    assert [event for _, event in results if event] == ["press"]
+    assert last_tracked.x_mm == pytest.approx(-4.0, abs=0.3)
+    assert tracker.update(MODEL_CONTACT, 0.2, ("saturated",), np.full(3, 1e5)) == (last_tracked, None)
+
+
+@pytest.fixture
+def model(models, tmp_path):
+    """A model with the file `charges.npz` of its film."""
+    folder = shutil.copytree(models / "linear", tmp_path / "linear") / "1"
+    put_charges(folder, folded_series().to_bytes())
+    return folder
+
+
+def put_charges(folder, data):
+    """Write `charges.npz` beside a model, and its checksum into `golden.json`, as `write_model` does."""
+    (folder / "charges.npz").write_bytes(data)
+    golden = json.loads((folder / "golden.json").read_text("utf-8"))
+    golden["files"] = {"charges.npz": sha256_of(data)}
+    (folder / "golden.json").write_text(json.dumps(golden), "utf-8")
+
+
+def recorded_lines(predictor: Predictor, rows: Array, table: dict) -> list[str]:
+    """Return the records of a stream of charges, shape (n, 3), pC, as JSON."""
+    device = device_from_table({"tare": {"frames": 10}, "track": {}} | table, "b")
+    touch = TouchStream(predictor, device, now_ns=lambda: 0)
+    lines = []
+    for number, row in enumerate(rows.tolist()):
+        chunk = Chunk(encode_frame(Frame(number, 1000 * number, tuple(row))), 5.0 + 1e-3 * number, 0)
+        lines += [record.to_json() for record in touch.feed(chunk)]
+    return lines
+
+
+def test_records_with_track_have_the_field_other_and_are_repeated_bit_for_bit(model):
+    rows = np.concatenate([np.zeros((10, 3)), noisy_charges(np.zeros(40)), np.zeros((5, 3))])
+    predictor = Predictor(model)
+    lines = recorded_lines(predictor, rows, {})
+    assert lines == recorded_lines(predictor, rows, {})
+
+    last = json.loads(lines[45])
+    released = json.loads(lines[-1])
+    tracked = last["tracked"]
+    assert abs(tracked["x_mm"] + last["other"]["x_mm"] - 2.0 * FOLD) < 1.0
+    for name in ("x_mm", "y_mm", "force_N"):
+        assert last[name] == tracked[name]
+    assert last["flags"] == []
+    assert (released["tracked"], released["other"]) == (None, None)
+
+
+def test_memory_section_widens_the_force_of_a_tracked_contact_on_a_folding_film(model):
+    rows = np.concatenate([np.zeros((10, 3)), noisy_charges(np.zeros(40))])
+    predictor = Predictor(model)
+    exact = json.loads(recorded_lines(predictor, rows, {})[45])
+    uncertain = json.loads(recorded_lines(predictor, rows, {"memory": {"creep": 0.08, "thermoelastic": 0.06}})[45])
+    for wide, narrow in ((uncertain, exact), (uncertain["tracked"], exact["tracked"])):
+        assert 1.1 < wide["force_std_N"] / narrow["force_std_N"] < 3.0
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda data: data[:200], "zip"),
+        (lambda data: data[::-1], "zip"),
+        (lambda data: re.sub(rb"(PK\x01\x02.{4})\0", rb"\g<1>" b"\x01", data, flags=re.DOTALL), "encrypted"),
+        (
+            lambda _: ChargeSeries(Series(np.zeros((3, 3, 2, 4))), 6.0, FORCES).to_bytes(),
+            r"shape \(n, n, n, 3\), got \(3, 3, 2, 4\)",
+        ),
+        (lambda _: ChargeSeries(Series(np.full((3, 3, 2, 3), np.nan)), 6.0, FORCES).to_bytes(), "finite"),
+        (lambda _: ChargeSeries(folded_series().series, 6.0, (2.0, 1.0)).to_bytes(), "got 2 and 1 N"),
+    ],
+)
+def test_damaged_charges_npz_raises_a_model_error(model, spoil, message):
+    put_charges(model, spoil(folded_series().to_bytes()))
+    with pytest.raises(ModelError, match=rf"charges\.npz: .*({message}).*train again"):
+        read_charges(model, 3)
