@@ -1,7 +1,7 @@
-"""Rung 8: charges and deflections of independent solvers.
+"""Charges and deflections compared with independent solvers.
 
 `film_cases.json`: axisymmetric collocation (1e-8) and dolfinx P3 (about 1e-4), errors below 3e-4.
-`film_cases_skfem.json`: scikit-fem P3, what neither of them has: off-centre polygons, the rim, thick films (3e-5).
+`film_cases_skfem.json`: scikit-fem P3 (3e-5), with off-centre polygons, ellipses, presses near the rim and thick films.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""What the tests of forward maps share."""
+"""Fixtures for the tests of forward maps."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ from kept import kept
 
 @pytest.fixture(scope="session")
 def near_electrodes() -> Sensor:
-    """Uniaxial, the electrodes 5 mm from the centre, so that the probe comes to lie on them."""
+    """A uniaxial sensor with electrodes 5 mm from the centre, so that the probe can lie on them."""
     sensor = load_sensor("four-25um-uniaxial")
     inward = tuple(
         replace(e, corners=tuple((x - 0.5 * e.centre[0], y - 0.5 * e.centre[1]) for x, y in e.corners))
@@ -33,7 +33,7 @@ def near_electrodes() -> Sensor:
 
 @pytest.fixture(scope="session")
 def near_map(near_electrodes: Sensor) -> ForwardMap:
-    """A membrane, with few and cheap solves; the probe comes to lie on the electrodes."""
+    """A forward map of a membrane with few solves. The probe can lie on the electrodes."""
     theory = Theory(stretching=True, bending=False, pretensioned=False)
     settings = SolveSettings(theory=theory, resolution=Resolution(4, 8, 4))
     return kept(ForwardMap.build, near_electrodes, Circle(1.0), 5.0, (0.3, 1.0), settings)
@@ -45,7 +45,7 @@ def near_spline(near_map: ForwardMap) -> ChargeSpline:
 
 
 def narrow_family(prior: FilmPrior) -> FilmFamily:
-    """Compared with four direct solves in place of 24."""
+    """The family is compared with four direct solves instead of 24."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("isocharge.simulate.forward.film_family.CHECK_COUNT", 4)
         return FilmFamily.build(prior, radius=3.0, force_range=(0.8, 1.2), counts=(2, 2, 2, 2, 2))
@@ -53,7 +53,7 @@ def narrow_family(prior: FilmPrior) -> FilmFamily:
 
 @pytest.fixture(scope="session")
 def film_family() -> tuple[FilmPrior, FilmFamily]:
-    """Films of a narrow spread."""
+    """A prior distribution with small standard deviations, and the family of its films."""
     spread = FilmSpread(pretension=0.2, young=0.02, thickness=0.02, probe_radius=0.03)
     prior = FilmPrior(load_sensor("three-25um-biaxial"), Circle(1.0), spread)
     return prior, kept(narrow_family, prior)

@@ -1,4 +1,4 @@
-"""What every map from contacts to charges keeps: derivatives, domain, names."""
+"""Properties of all charge maps: derivatives, domain and electrode names."""
 
 import numpy as np
 import pytest

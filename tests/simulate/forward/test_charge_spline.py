@@ -1,4 +1,4 @@
-"""The forward map as splines: against the map."""
+"""Spline approximations compared with the forward map."""
 
 from dataclasses import replace
 

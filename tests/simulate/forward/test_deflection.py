@@ -1,4 +1,4 @@
-"""The table of deflections against the film, solved where the table has no entry; and its file."""
+"""The deflection table compared with direct solves between its entries, and its file."""
 
 import json
 import math

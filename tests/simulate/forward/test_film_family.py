@@ -1,4 +1,4 @@
-"""A family of films: its maps against direct solves, exact scales, its arrays, and the released files."""
+"""Families of films: comparison with direct solves, exact scaling, arrays and released files."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -47,7 +47,7 @@ def test_family_check_covers_all_forces_and_distances(prior, family, monkeypatch
 
 
 def test_modulus_and_loads_scale_exactly(prior, family):
-    """Twice the modulus, pretension and force is the same shape with twice the stress."""
+    """Twice the modulus, pretension and force give the same deflection with twice the stress."""
     sensor, probe = prior.film(prior.mean)
     film = sensor.film
     twice = replace(sensor, film=replace(film, young=2.0 * film.young, pretension=2.0 * film.pretension))

@@ -1,4 +1,4 @@
-"""The forward map against direct solves."""
+"""Forward maps compared with direct solves."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ QUICK_SETTINGS = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
 QUICK = {"radius": 4.0, "force_range": (0.7, 1.0), "settings": QUICK_SETTINGS}
 """A small family without bending: few and cheap solves."""
 TRACED = Electrode.of_square("A", (5.0, 0.0), 3.0).with_trace(((5.0, 0.0), (-2.0, -1.0), (-9.0, -30.0)), 0.5)
-"""Its trace runs through the presses."""
+"""An electrode whose trace crosses the positions of the presses."""
 
 
 @pytest.fixture(params=[Polygon.triangle(2.5), Ellipse(2.0, 1.4)], ids=["triangle", "ellipse"])
@@ -55,7 +55,7 @@ def errors(forward_map: ForwardMap, contact: np.ndarray, rotation: np.ndarray | 
 
 
 def draw(forward_map: ForwardMap, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Contacts over the whole domain, and orientations."""
+    """Draw contacts in the whole domain, and orientations (rad)."""
     rng, domain = np.random.default_rng(seed), forward_map.domain
     z = domain.radius * np.sqrt(rng.random(count)) * np.exp(2j * np.pi * rng.random(count))
     force = np.exp(rng.uniform(*np.log(domain.force_range), count))
@@ -63,7 +63,7 @@ def draw(forward_map: ForwardMap, count: int, seed: int) -> tuple[np.ndarray, np
 
 
 def test_forward_map_agrees_with_direct_solves_between_the_nodes(three_map, near_map):
-    """All terms out to 8 mm, and a membrane with half of the presses on an electrode."""
+    """One map has all terms up to 8 mm. The other is a membrane with half of the presses on an electrode."""
     contact, _ = draw(near_map, 8, seed=1)
     contact[:4, :2] = [(4.9, 0.3), (0.2, 4.5), (-4.2, 0.0), (1.2, -4.5)]
     for error in (errors(three_map, draw(three_map, 6, seed=0)[0]), errors(near_map, contact)):
@@ -71,7 +71,7 @@ def test_forward_map_agrees_with_direct_solves_between_the_nodes(three_map, near
 
 
 def test_forward_map_agrees_with_direct_solves_for_random_orientations(oriented_map):
-    """Over electrodes and beside them; the charges have the probe's period, and no shorter one."""
+    """The charges have the period of the probe, and no shorter one."""
     error = errors(oriented_map, *draw(oriented_map, 10, seed=10))
     assert np.quantile(error, 0.95) < 1e-3
     assert error.max() < 5e-3
@@ -125,7 +125,7 @@ FILMS = {
 
 @pytest.mark.parametrize(("film", "surface", "theory"), FILMS.values(), ids=FILMS.keys())
 def test_forward_map_of_other_films(near_electrodes, film, surface, theory):
-    """Read at the surface, bending is in though nobody asked for it."""
+    """A readout at the surface includes bending automatically."""
     sensor = replace(near_electrodes, film=replace(near_electrodes.film, **film), surface=surface)
     forward_map = kept(ForwardMap.build, sensor, Circle(1.0), 2.0, (0.8, 1.0), SolveSettings(theory=theory))
     assert forward_map.theory.bending == (film != {"pretension": 0.5})
@@ -138,7 +138,7 @@ def test_forward_map_with_one_force():
 
 
 def test_zero_force_gives_zero_charges(three_map):
-    """An untouched film has no position; it counts among the presses of a message all the same."""
+    """Contacts with zero force may have any position. They are counted in the index of an error message."""
     contact = np.array([[1.0, 0.0, 0.0], [50.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [2.0, 0.0, 1.0]])
     charge = three_map.charges(contact)
     assert not charge[:3].any()
@@ -148,7 +148,7 @@ def test_zero_force_gives_zero_charges(three_map):
 
 
 def test_charges_of_many_presses_equal_those_of_single_presses(three_map, oriented_map):
-    """More than a chunk, and the order kept; untouched rows among them; also none."""
+    """There are more presses than in one chunk, some have zero force, and an empty array is accepted."""
     for forward_map in (three_map, oriented_map):
         contact, rotation = draw(forward_map, 300, seed=8)
         contact[::7, 2] = 0.0
@@ -199,7 +199,7 @@ def test_orientations_are_spread_evenly_and_solved_once_each(folds, rotations):
 
 @pytest.mark.parametrize("period", [2 * np.pi, np.pi, 2 * np.pi / 3])
 def test_family_weights_interpolate_smooth_functions(period):
-    """A power of the force, a smooth function of the distance, the first harmonics of the orientation."""
+    """The function is a power of the force, smooth in the distance, and has the first harmonics of the orientation."""
     rng = np.random.default_rng(9)
     distance, force = 8.0 * np.sqrt(rng.random(200)), np.exp(rng.uniform(np.log(0.05), np.log(2.0), 200))
     rotation = rng.uniform(-7.0, 7.0, 200)

@@ -1,4 +1,4 @@
-"""From stress to charge: the mean over an electrode, the paper's edges, polygons, and what is not modelled."""
+"""Conversion of stress into charge: area and edge readout, polygons, pressure and temperature."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ def sensor(request) -> Sensor:
 
 @pytest.mark.parametrize("per_side", [1, COARSE, FINE])
 def test_linear_stress_is_read_at_the_centre(sensor, per_side):
-    """Mean over a square, or over two opposite edges, of a linear function: its value in the middle; no shear."""
+    """The mean of a linear function over a square or two opposite edges is its value at the centre."""
     charge = charge_of(sensor, lambda x, y: (1.0 + 3.0 * x - 2.0 * y, -4.0 * x + y, x), per_side)
     x, y = np.array([electrode.centre for electrode in sensor.electrodes]).T
     expected = AREA * (D31 * (1.0 + 3.0 * x - 2.0 * y) + D32 * (-4.0 * x + y))
@@ -52,7 +52,7 @@ def test_linear_stress_is_read_at_the_centre(sensor, per_side):
 
 
 def test_edge_readout_equals_equation_3_of_the_paper():
-    """Quadratic stresses tell the edges apart: s11 over left and right, s22 over lower and upper (eq. 3)."""
+    """Quadratic stresses distinguish the edges: s11 on the left and right, s22 on the lower and upper edges (eq. 3)."""
     square = Electrode.of_square("A", (5.0, -2.0), 3.0)
     sensor = replace(load_sensor("four-25um-uniaxial"), electrodes=(square,), readout="edge")
     h2 = 1.5**2
@@ -83,7 +83,7 @@ def test_polygon_integrates_polynomials_exactly():
 
 
 def test_charge_is_linear_in_gains_and_coefficients(solved):
-    """A square and a triangle have different numbers of points; padding must not add charge."""
+    """A square and a triangle have different numbers of points. The padding must not add charge."""
     sensor = load_sensor("four-25um-uniaxial")
     both = (sensor.electrodes[0], TRIANGLE)
     together = touch_charge(replace(sensor, electrodes=both), solved)
@@ -105,7 +105,7 @@ def midpoints(low, high, step=0.02):
 
 @pytest.mark.parametrize("at", [(4.0, 3.0), (10.5, 2.0), (14.0, 0.2)])  # away, beside the square, on the trace
 def test_a_trace_collects_the_stress_under_it(film, at):
-    """A square with a trace that bends, against sums over small cells of its three rectangles."""
+    """The charge of a square with a bent trace equals the sum over small cells of its three rectangles."""
     path = ((10.0, 0.0), (18.0, 0.0), (18.0, 20.0))
     traced = Electrode.of_square("A", (10.0, 0.0), 3.0).with_trace(path, 0.5)
     solved = press(film, Circle(1.0), at, 1.0)
@@ -138,7 +138,7 @@ def test_concave_electrode_equals_the_sum_of_two_rectangles(solved):
 
 
 def test_pressure_and_thermal_charge_only_where_front_and_back_overlap():
-    """A back that is the square: its trace collects nothing."""
+    """The back metal covers the square only, so the trace collects no charge."""
     square = Electrode.of_square("A", (10.0, 0.0), 3.0)
     traced = replace(square.with_trace(((10.0, 0.0), (20.0, 0.0)), 0.5), back=(square.corners,))
     for charge in (
@@ -151,7 +151,7 @@ def test_pressure_and_thermal_charge_only_where_front_and_back_overlap():
 
 
 def test_pretension_cancels_in_the_touch_charge(film):
-    """A feather's touch on a film under 1 MPa: the tension's own 400 pC do not show."""
+    """Under a very small force, the 400 pC of a pretension of 1 MPa do not appear."""
     taut = replace(load_sensor("four-25um-biaxial"), film=replace(film, pretension=1.0))
     assert np.abs(touch_charge(taut, press(taut.film, Circle(1.0), (3.0, 1.0), 1e-6))).max() < 1e-5
 
@@ -203,7 +203,7 @@ def test_contact_charge_is_proportional_to_the_covered_area(probe, at, covered):
 
 
 def test_contact_charge_follows_gain_and_place_of_the_electrodes():
-    """A layout that is shifted to where the probe is, read with a gain of two."""
+    """The layout is shifted to the probe, and the gain is two."""
     calibration = Calibration(gain={"A": 2.0}, shift=(2.0, 0.0))
     still = contact_charge(with_d33(), Circle(1.0), (8.5, 0.2), 1.0)
     moved = contact_charge(with_d33(calibration=calibration), Circle(1.0), (10.5, 0.2), 1.0)

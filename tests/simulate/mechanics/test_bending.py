@@ -1,4 +1,4 @@
-"""Bending against planes, which have none, and a clamped plate's lowest frequency."""
+"""Bending energy of plane fields, which is zero, and the lowest frequency of a clamped plate."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def fine(request, mesh_of):
 
 
 def test_tilt_has_bending_energy_at_the_clamped_rim_only(fine):
-    """A plane has no curvature inside; against the clamp it is a kink. Bending knows nothing of the mean of W."""
+    """A plane has no curvature inside the film, and a kink at the clamp. A constant W has no bending energy."""
     bent = Bending(fine.geometry, 1.0).laplacian(fine.points @ [0.5, 0.0])
     assert np.abs(bent[fine.inside]).max() < 1e-7
     assert np.abs(bent[fine.template.on_rim]).max() > 1.0

@@ -44,7 +44,7 @@ def test_residual_is_the_gradient_of_the_energy(elastic, mesh):
 
 
 def test_tangent_is_the_derivative_of_the_residual(elastic, mesh):
-    """Of the condensed matrix where bending carries a fourth unknown."""
+    """With bending, the derivative is that of the matrix in which the fourth unknown is condensed."""
     field, direction = mesh.random_field(0), mesh.random_field(100)
     slope = sum(share * elastic.residual(field + step * direction) for step, share in STENCIL)
     tangent = elastic.tangent(field)
@@ -54,7 +54,7 @@ def test_tangent_is_the_derivative_of_the_residual(elastic, mesh):
 
 
 def test_guard_tension_is_added_to_the_tangent_only(elastic, mesh):
-    """It adds the Laplacian of every component, weighted as tension is, and nothing to force or energy."""
+    """The tangent changes by the Laplacian of every component; the forces and the energy do not change."""
     field = mesh.random_field(3)
     change = elastic.tangent(field, 0.7) - elastic.tangent(field)
     more = ElasticFilm(mesh.geometry, elastic.groups.stiffened(0.7)).tangent(field) - elastic.tangent(field)

@@ -1,4 +1,4 @@
-"""Stretching against formulas written down a second time: strain, stress, energy, rigid motions, the patch test."""
+"""Stretching compared with an independent implementation of the formulas, with rigid motions and a patch test."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def green(slope: np.ndarray, amplitude2: float) -> np.ndarray:
 
 @pytest.mark.parametrize("poisson", [0.0, 0.34, 0.49])
 def test_stress_solves_the_plane_stress_compliance(poisson):
-    """Hooke's law the other way round: strain from stress with unit modulus."""
+    """Return the strain for a stress and Young's modulus 1 (Hooke's law)."""
     e11, e22, shear = 0.3, -0.2, 0.5
     s11, s22, s12 = stress(np.array([e11, e22, shear]), poisson)
     np.testing.assert_allclose([s11 - poisson * s22, s22 - poisson * s11, 2 * (1 + poisson) * s12], [e11, e22, shear])
@@ -66,7 +66,7 @@ def test_rigid_motion_has_no_energy(mesh, motion, amplitude2):
 
 @pytest.mark.parametrize("tension", [0.0, 0.5])
 def test_patch_of_uniform_strain_is_exact(mesh, tension):
-    """A linear field: energy as Hooke says, no out-of-balance force inside, only on the boundary of what is meshed."""
+    """A linear field has the energy of Hooke's law, and out-of-balance forces on the boundary of the mesh only."""
     gradient, scene = np.array([[0.3, -0.1, 0.4], [0.2, 0.1, -0.6]]), groups(0.2, tension)
     membrane, field = Membrane(mesh.geometry, scene), mesh.points @ gradient
     e, nu = green(gradient, scene.amplitude2), scene.poisson

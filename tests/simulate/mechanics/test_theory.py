@@ -1,4 +1,4 @@
-"""Which terms a press gets, and that what is left out is as small as the result says."""
+"""Choice of the theory, and the error of the omitted terms."""
 
 from dataclasses import replace
 
@@ -76,7 +76,7 @@ def test_choose_theory_gives_the_fewest_terms(film, thickness, pretension, force
 )
 @settings(derandomize=True)
 def test_chosen_theory_is_accurate_or_the_full_theory(thickness, pretension, force, accuracy):
-    """And asking for more never takes a term away."""
+    """A higher accuracy never removes a term."""
     film = Film(45.0, thickness, 3000.0, 0.34, pretension)
     theory, finer = choose_theory(film, PROBE, force, accuracy), choose_theory(film, PROBE, force, 0.1 * accuracy)
     assert theory.name.endswith("+ bending") or modelling_error(film, PROBE, force, theory) <= accuracy
@@ -104,7 +104,7 @@ def test_amplitude_solves_the_cubic_equation(thickness, pretension, force, poiss
 
 
 def test_theory_for_a_sensor_suffices_for_all_forces_and_the_surface(film):
-    """Linear at the small end, nonlinear at the other: nonlinear; a surface needs bending."""
+    """The theory is nonlinear if it is nonlinear for the largest force. The readout of a surface needs bending."""
     sensor = replace(load_sensor("three-25um-biaxial"), film=thick(film, 0.3))
     assert theory_for(sensor, PROBE, (1e-4, 1e-4)).name == "linear plate"
     assert theory_for(sensor, PROBE, (1e-4, 5.0)).name == "nonlinear membrane + bending"

@@ -1,4 +1,4 @@
-"""Where the mesh lies: areas, straight and round edges, load, and finding points again."""
+"""Position of the mesh: areas, edges, load, and the location of points."""
 
 import copy
 
@@ -40,7 +40,7 @@ def probes(draw) -> Probe:
 
 @st.composite
 def presses(draw) -> tuple[Probe, tuple[float, float], Resolution, float]:
-    """Presses that are accepted, up to the rim: probe, place, mesh and layer."""
+    """Generate accepted presses up to the rim: probe, position, resolution and layer."""
     probe, layer = draw(probes()), 10.0 ** draw(st.floats(-3.0, -1.0))
     share, angle = draw(st.one_of(st.floats(0.0, 0.97), st.floats(0.9, 0.999))), draw(st.floats(-np.pi, np.pi))
     distance = share * (RADIUS - probe.reach)
@@ -76,7 +76,7 @@ def accuracy(film: np.ndarray, placement: Placement) -> np.ndarray:
 @given(scene=presses(), seed=st.integers(0, 2**32 - 1))
 @COMMON
 def test_locate_is_the_inverse_of_the_element_map(scene, seed):
-    """All over the film, on the rim, and on every seam: the nodes, the hub, the footprint's edge."""
+    """The points lie all over the film, on the rim, at the nodes and on the edge of the footprint."""
     probe, at, resolution, layer = scene
     placement, mesh = place(FILM, probe, at, resolution, layer).placement, template_for(probe, resolution)
     rng = np.random.default_rng(seed)
@@ -92,7 +92,7 @@ def test_locate_is_the_inverse_of_the_element_map(scene, seed):
 @given(scene=presses())
 @COMMON
 def test_accepted_presses_have_no_folded_elements(scene):
-    """Jacobians positive at every integration point and node; the film's area is there."""
+    """The Jacobian is positive at every integration point and node, and the total area is that of the film."""
     probe, at, resolution, layer = scene
     mesh = template_for(probe, resolution)
     geometry = place(FILM, probe, at, resolution, layer).geometry
@@ -104,7 +104,7 @@ def test_accepted_presses_have_no_folded_elements(scene):
 @given(scene=presses())
 @COMMON
 def test_footprint_elements_have_the_area_centroid_and_load_of_the_probe(scene):
-    """Its area, centroid and share of the load: exact for polygons, to the mesh's accuracy for circles."""
+    """Area, centroid and load are exact for polygons, and accurate to the mesh error for curved probes."""
     probe, at, resolution, layer = scene
     mesh, distance = template_for(probe, resolution), float(np.hypot(*at)) / RADIUS
     placed = place(FILM, probe, at, resolution, layer)
@@ -126,7 +126,7 @@ def test_footprint_elements_have_the_area_centroid_and_load_of_the_probe(scene):
     ids=["rectangle", "triangle"],
 )
 def test_load_is_uniform_over_a_polygon(probe, distance):
-    """Second moments about the centroid, from the corners' closed formula, to round-off: no staircase of elements."""
+    """The second moments of the load equal the closed form for polygons to round-off."""
     resolution = Resolution(4, 8, 3)
     mesh = template_for(probe, resolution)
     placed = place(FILM, probe, (distance * RADIUS, 0.0), resolution, 0.05)

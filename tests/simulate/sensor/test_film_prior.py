@@ -1,4 +1,4 @@
-"""Films that a sensor may be: draws, and parameters to and from sensors."""
+"""Prior distribution of films: drawn films, and conversion between parameters and sensors."""
 
 from dataclasses import replace
 

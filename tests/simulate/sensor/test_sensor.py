@@ -1,4 +1,4 @@
-"""What a sensor may be, and what calibration does to it."""
+"""Validation of sensors, and the effect of the calibration."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def three() -> Sensor:
     ],
 )
 def test_invalid_film_raises_error(film, changes, message):
-    """Sizes in metres and pascals among them: the message names the likely value."""
+    """For values that are probably in metres or pascals, the message gives the likely value."""
     with pytest.raises(SensorError, match=message):
         replace(film, **changes)
 
@@ -205,7 +205,7 @@ def test_place_rotates_then_shifts():
 
 
 def test_rotation_by_the_symmetry_angle_of_the_layout_permutes_the_charges():
-    """The four squares rotated onto each other: A stands where B was (+90), and so on."""
+    """A rotation by 90 degrees moves A to the position of B, and so on."""
     sensor = load_sensor("four-25um-biaxial")
     solved = press(sensor.film, Circle(1.0), (3.0, 1.0), 1.0)
     rotated = replace(sensor, calibration=Calibration(rotation=0.5 * np.pi))

@@ -1,4 +1,4 @@
-"""The sensor file: built-in sensors as designed, one clear error for every way to be wrong, and nothing lost."""
+"""Sensor files: built-in sensors, error messages for invalid files, and round trips."""
 
 import copy
 import json
@@ -127,7 +127,7 @@ def test_optional_keys_have_defaults():
 
 
 def test_traces_and_back_metal_are_read():
-    """A trace is written as the polygon that it is."""
+    """A trace is written as a polygon."""
     pad, back = ((8.0, 0.0), (12.0, 0.0), (10.0, 4.0)), (((0.0, -9.0), (9.0, -9.0), (9.0, 9.0), (0.0, 9.0)),)
     table = {"polygon_mm": pad, "trace_mm": [[10, 0], [10, -5]], "width_mm": 0.5, "back_mm": back}
     (electrode,) = sensor_from_dict(whole() | {"readout": "area", "electrodes": {"A": table}}).electrodes

@@ -1,4 +1,4 @@
-"""Condensation and sparse solve against dense algebra."""
+"""Static condensation and sparse solve, compared with a dense solve."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Reading an equilibrium: frames, refusals, and what it says about itself."""
+"""Results of an equilibrium: rotated frames, error messages and error estimates."""
 
 from dataclasses import replace
 
@@ -73,7 +73,7 @@ def test_points_off_the_film_raise_scene_error(made_up, read):
 
 @pytest.mark.parametrize("at", [(0.0, 0.0), (-9.0, 14.0)])
 def test_stress_of_a_linear_field_is_constant_and_rotated(film, made_up, at):
-    """The patch test through the public function: the field is linear in the frame of the press."""
+    """Patch test of `touch_stress`: the field is linear in the frame of the press."""
     gradient = np.array([[0.3, -0.1, 0.4], [0.2, 0.1, -0.6]])
     solved = made_up(lambda x: x @ gradient, at)
     f = np.eye(3, 2) + (gradient * np.array([0.1, 0.1, np.sqrt(0.1)])).T
@@ -107,7 +107,7 @@ def test_vertical_forces_balance_round_the_probe(film):
 
 
 def test_compression_near_the_rim_gives_a_warning(film):
-    """No wrinkles where the forward map works."""
+    """A press at half the radius gives no warning about wrinkles. A press at three quarters does."""
     for distance, taut in ((0.5, True), (0.75, False)):
         settings = SolveSettings(theory=MEMBRANE, resolution=Resolution(5, 8, 5))
         solved = press(film, Circle(1.0), (distance * film.radius, 0.0), 1.0, settings)
@@ -116,7 +116,7 @@ def test_compression_near_the_rim_gives_a_warning(film):
 
 
 def test_stress_above_the_yield_stress_of_pvdf_gives_a_warning(film):
-    """Pretension counts in the largest stress."""
+    """The largest stress includes the pretension."""
     light, heavy = (press(film, Circle(1.0), (2.0, 0.0), force) for force in (0.01, 5.0))
     taut = press(replace(film, pretension=44.99), Circle(1.0), (2.0, 0.0), 0.01)
     assert not cautions(light)
@@ -127,7 +127,7 @@ def test_stress_above_the_yield_stress_of_pvdf_gives_a_warning(film):
 
 
 def test_principal_stress_is_that_of_the_points(film):
-    """No point of the film is stressed beyond what the result says, at either surface."""
+    """No point of the film exceeds the reported stresses, at either surface."""
     solved = press(film, Circle(1.0), (6.0, 2.0), 1.0)
     z = film.radius * np.sqrt(np.linspace(0.0, 1.0, 4000)) * np.exp(2.4j * np.arange(4000))
     z = np.concatenate([z, complex(6.0, 2.0) + 0.05 * z])
@@ -141,7 +141,7 @@ def test_principal_stress_is_that_of_the_points(film):
 
 
 def test_press_reaches_the_required_accuracy(film):
-    """And costs: a finer mesh for more digits."""
+    """A higher accuracy needs a finer mesh."""
     sensor, scene = load_sensor("four-25um-uniaxial"), (film, Circle(1.0), (9.0, 1.0), 1.0)
     exact = touch_charge(sensor, press(*scene, SolveSettings(theory=FULL, resolution=Resolution(8, 8, 7, 2))))
     sizes = []
@@ -153,7 +153,7 @@ def test_press_reaches_the_required_accuracy(film):
 
 
 def test_error_estimates_of_singular_cases(film):
-    """A field whose highest modes hold nothing but round-off, and a theory that is wrong by factors."""
+    """The highest modes contain round-off only, or the theory cannot describe the film."""
     taut, linear = replace(film, pretension=10.0), Theory(stretching=False, bending=False, pretensioned=True)
     settings = SolveSettings(theory=linear, resolution=Resolution(12, 8, 3))
     assert 0.0 <= mesh_error(press(taut, Circle(0.9 * film.radius), (0.0, 0.0), 1e-3, settings)) < 1e-4

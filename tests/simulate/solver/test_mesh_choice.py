@@ -1,4 +1,4 @@
-"""Which mesh a press gets, and how wrong it is where shapes do not tell: two meshes compared."""
+"""Choice of the mesh, and error estimates from two meshes."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ elements promise 0.1 % or better and are wrong by up to 70 times; just inside th
 
 
 def worst_error(film: Film, rough, fine) -> float:
-    """Of a charge of the built-in layouts, relative to the largest of a layout."""
+    """Return the largest error of a charge of the built-in layouts, relative to the largest charge of the layout."""
     errors = []
     for name in ("three-25um-biaxial", "four-25um-uniaxial"):
         sensor = replace(load_sensor(name), film=film)
@@ -57,7 +57,7 @@ def worst_error(film: Film, rough, fine) -> float:
 @pytest.mark.first_cases(1)
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
 def test_mesh_error_bounds_the_difference_from_a_finer_mesh(scene):
-    """Against a mesh two orders higher with more rings, evenly and at the rim."""
+    """The finer mesh has an order that is higher by two, and more rings."""
     thickness, pretension, poisson, probe, distance, force = scene
     film = Film(45.0, thickness, 3000.0, poisson, pretension)
     at = (distance * np.cos(0.34), distance * np.sin(0.34))
@@ -86,7 +86,7 @@ def test_needs_second_mesh_near_the_rim_and_for_large_probes(probe, distance, ac
 
 
 def test_equilibrium_on_two_meshes_can_start_a_neighbouring_press():
-    """Although its mesh is of a higher order than the neighbour's first."""
+    """The mesh of the equilibrium has a higher order than the first mesh of the neighbouring press."""
     probe, at, force = NEAR_THE_RIM
     first = press(FILM, probe, at, force)
     cold, warm = (press(FILM, probe, at, 1.05 * force, start=start) for start in (None, first))
@@ -97,7 +97,7 @@ def test_equilibrium_on_two_meshes_can_start_a_neighbouring_press():
 
 
 def test_meshes_with_different_equilibria_raise_solve_error(monkeypatch):
-    """Meshes that differ by a tenth are not two views of one film; by less, the difference is the estimate."""
+    """A difference above a tenth is an error. A smaller difference is the error estimate."""
     scene = FILM, *NEAR_THE_RIM
     monkeypatch.setattr("isocharge.simulate.solver.press.MAX_EXTRA_ORDERS", 1)
     monkeypatch.setattr("isocharge.simulate.solver.press.relative_difference", lambda *_: 0.09)

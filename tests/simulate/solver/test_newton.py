@@ -1,4 +1,4 @@
-"""A flat film converges for every force, thin or thick; failures are stated, never hidden."""
+"""Convergence of Newton's method from the flat film, and reports of failures."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ FAILING = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 3), toleran
     ids=str,
 )
 def test_newton_converges_from_the_flat_film_for_every_force(film, changes, theory, probe):
-    """No help from the user: no force steps, no tension, no start."""
+    """The user provides no load steps, no pretension and no starting equilibrium."""
     for force in FORCES:
         solved = press(replace(film, **changes), PROBES[probe], (5.0, 3.0), force, SolveSettings(theory=theory))
         assert solved.residual <= 1e-7 or "round-off" in solved.message
@@ -48,7 +48,7 @@ def test_presses_near_the_rim_and_of_large_probes_converge(film, probe, at, forc
 
 @pytest.mark.parametrize("theory", [MEMBRANE, FULL], ids=["membrane", "full"])
 def test_newton_converges_quadratically(film, theory):
-    """The last step nearly squares the residual: the tangent is the true one at the end."""
+    """The last step nearly squares the residual, because the tangent is exact near the solution."""
     residuals = [
         press(film, Circle(1.0), (3.0, 0.0), 1.0, SolveSettings(theory=theory, tolerance=tolerance)).residual
         for tolerance in (1e-1, 1e-2, 1e-4)
@@ -89,7 +89,7 @@ def test_failed_solve_raises_solve_error_or_returns_status(film, monkeypatch):
 
 
 def test_start_with_nan_fails(film):
-    """The press is solved from a small force up instead, and is none the worse."""
+    """The press is then solved with increasing forces, with the same result."""
     good, bad = (press(film, Circle(1.0), (0.0, 0.0), 1.0) for _ in range(2))
     bad.field[0, 2] = np.nan
     solved = press(film, Circle(1.0), (0.0, 0.0), 1.0, start=bad)
@@ -101,7 +101,7 @@ WRINKLES = r"no equilibrium at .* N, position \(.*\) mm: .* it wrinkles, which h
 
 
 def test_wrinkling_film_raises_solve_error(film, monkeypatch):
-    """Stopped early, beside the rim, where it is compressed: the message says so. In the middle it does not."""
+    """The message mentions the compression near the rim, and does not mention it at the centre."""
     monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 3)
     mesh = SolveSettings(theory=FULL, resolution=Resolution(5, 8, 6, 1))
     with pytest.raises(SolveError, match=WRINKLES):
@@ -112,7 +112,7 @@ def test_wrinkling_film_raises_solve_error(film, monkeypatch):
 
 @pytest.mark.parametrize(("factor", "converges"), [(1.001, True), (3.0, False)])
 def test_linear_solve_is_refined_and_reports_the_correction(film, monkeypatch, factor, converges):
-    """By its residual, which the solver has no part in: what is far off is no answer."""
+    """A linear solver with a wrong scale is corrected if the corrections converge, and reported as failed otherwise."""
     scene = replace(film, thickness=2.0, pretension=1.0), Circle(1.0), (5.0, 0.0), 1e-3
     exact, solve = press(*scene), Factor.solve
     assert exact.iterations == 2

@@ -1,4 +1,4 @@
-"""Stress under the hardest press, and the force that keeps it below a limit."""
+"""Largest stress under a press, and the largest force within a stress limit."""
 
 import re
 from dataclasses import replace
@@ -14,7 +14,7 @@ FILM, TIP = load_sensor("four-25um-biaxial").film, Circle(1.0)
 
 
 def test_stress_of_a_slack_membrane_grows_with_the_force_to_two_thirds():
-    """So does every stress in it (Foeppl 1907), and at 0.3 um bending adds nothing; to what the mesh resolves."""
+    """All stresses of a membrane are proportional to F^(2/3) (Foeppl 1907). Bending is negligible at 0.3 um."""
     thin = replace(FILM, thickness=3e-4, pretension=0.0)
     assert largest_stress(thin, TIP, 0.008) / largest_stress(thin, TIP, 0.001) == pytest.approx(4.0, rel=0.03)
 

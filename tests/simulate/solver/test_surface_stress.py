@@ -1,4 +1,4 @@
-"""Stress at the film's surfaces: plates on paper, the sign, and what a sensor that reads them needs."""
+"""Stress at the surfaces of the film: closed forms of plates, signs, and the required theory."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def surface_stress(solved, surface: str, points: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("share", [0.1, 0.3])
 def test_bending_stress_outside_the_footprint(thick, share):
-    """Radial and hoop stress of a clamped plate on the touched side, to the rim; between the axes there is shear."""
+    """Radial and hoop stress of a clamped plate at the top surface, up to the rim."""
     c = share * thick.radius
     solved = press(thick, Circle(c), (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
     for r in (1.5 * c, 0.6 * thick.radius, 0.99 * thick.radius):
@@ -75,7 +75,7 @@ def test_bending_stress_under_the_centre_of_the_probe(thick, share):
 
 
 def test_bending_stress_has_opposite_signs_at_both_surfaces(thick):
-    """The touched side is compressed under the probe and stretched at the rim; the other the other way round."""
+    """The top surface is compressed under the probe and stretched at the rim; the bottom surface is the opposite."""
     solved = press(thick, Polygon.rectangle(4.0, 2.0, 0.5), (6.0, 4.0), FORCE)
     points = np.array([(6.0, 4.0), (0.0, -44.9), (10.0, 10.0)])
     top, bottom = (surface_stress(solved, surface, points) for surface in ("top", "bottom"))
@@ -85,7 +85,7 @@ def test_bending_stress_has_opposite_signs_at_both_surfaces(thick):
 
 
 def test_charge_of_a_surface_is_the_integral_of_its_stress(thick):
-    """A small electrode reads A (d31 s11 + d32 s22) of its own side."""
+    """The charge of a small electrode is A (d31 s11 + d32 s22) with the stress at its surface."""
     probe, corner = Circle(2.0), np.array([(12.0, 0.0), (12.1, 0.0), (12.1, 0.1), (12.0, 0.1)])
     sensor = replace(load_sensor("four-25um-uniaxial"), film=thick)
     sensor = replace(sensor, electrodes=(Electrode("A", tuple((float(x), float(y)) for x, y in corner)),))
