@@ -172,7 +172,7 @@ def vector(value):
 @pytest.mark.usefixtures("rosbags_knows_json")
 @settings(max_examples=15, deadline=None)
 @given(data=st.data())
-def test_rosbags_reads_every_message(tmp_path_factory, encoding, data):
+def test_rosbags_reads_every_message_of_an_mcap_file(tmp_path_factory, encoding, data):
     written = data.draw(st.lists(records(), max_size=20))
     lines = [record.to_json() for record in written]
     path = write(tmp_path_factory.mktemp("bag") / "touch.mcap", written, encoding)
@@ -187,7 +187,7 @@ def test_rosbags_reads_every_message(tmp_path_factory, encoding, data):
         assert sorted(line for _, line in topics["/isocharge/record"]) == sorted(lines)
 
 
-def test_stock_rosbags_reads_the_file_of_ros_messages(tmp_path):
+def test_rosbags_reads_records_encoded_as_ros2_messages(tmp_path):
     """With nothing changed in it, and `ros2 bag` takes such a file, too: one encoding, the definitions of ROS."""
     written = [press(number) for number in range(500)]
     lines = [record.to_json() for record in written]
@@ -197,12 +197,12 @@ def test_stock_rosbags_reads_the_file_of_ros_messages(tmp_path):
 @pytest.mark.parametrize(
     ("name", "definition"), [(WRENCH, WRENCH_DEFINITION), (POSE, POSE_DEFINITION), (STRING, STRING_DEFINITION)]
 )
-def test_definitions_are_those_of_ros(name, definition):
+def test_message_definitions_equal_those_of_ros2(name, definition):
     for kind, fields in get_types_from_msg(definition, name).items():
         assert fields == ROS.fielddefs[kind], kind
 
 
-def test_readers_of_mcap_find_schemas_index_and_checksums(tmp_path):
+def test_mcap_reader_finds_schemas_index_and_checksums(tmp_path):
     """What Foxglove, Lichtblick and PlotJuggler need to open a file at any time in it."""
     written = [press(number) for number in range(5000)]
     lines = [record.to_json() for record in written]
@@ -238,7 +238,7 @@ def test_every_record_is_valid_under_its_schema(record):
     jsonschema_rs.Draft7Validator(record_schema(ELECTRODES)).validate(json.loads(record.to_json()))
 
 
-def test_the_schema_refuses_what_is_no_record():
+def test_schema_refuses_json_that_is_not_a_record():
     valid, record = jsonschema_rs.Draft7Validator(record_schema(ELECTRODES)).is_valid, json.loads(press(0).to_json())
     assert valid(record)
     for name in field_names():
@@ -246,7 +246,7 @@ def test_the_schema_refuses_what_is_no_record():
         assert not valid(record | {name: [1.0] if name != "contact" else None}), name
 
 
-def test_a_contact_that_is_followed_is_wrench_and_pose_and_the_record_says_both(tmp_path):
+def test_wrench_and_pose_describe_the_tracked_contact(tmp_path):
     tracked = TrackedContact(1.0, -4.0, 0.25, 0.01, 0.02, 0.001, 5.0, 0.0, 0.9)
     film = FollowedFilm(0.7, 0.05, 12)
     records = [
@@ -278,7 +278,7 @@ def whole_messages(data):
     return [each.data.decode() for each in messages if isinstance(each, Message) and each.data.startswith(b"{")]
 
 
-def test_a_process_that_is_killed_leaves_all_but_the_last_second(tmp_path):
+def test_killed_process_leaves_a_file_with_all_but_the_last_second(tmp_path):
     path = tmp_path / "touch.mcap"
     code = f"""
 import os, pickle, signal, sys
@@ -300,15 +300,15 @@ with McapFile(Path({str(path)!r}), ("A", "B", "C"), now=lambda: clock[0]) as fil
     assert 69 <= len(recovered) < 120  # of 2.4 s, written every second
 
 
-def test_a_disk_that_is_full_from_the_start_is_an_error(tmp_path, fill_disk):
+def test_disk_that_is_full_at_the_start_is_an_error(tmp_path, fill_disk):
     fill_disk(0)
     with pytest.raises(OutputError, match=r"a\.mcap cannot be written: No space left on device; choose another"):
         McapFile(tmp_path / "a.mcap", ("A",)).__enter__()
 
 
-def test_a_full_disk_ends_the_file_and_not_the_stream(tmp_path, fill_disk, caplog, monkeypatch):
+def test_full_disk_ends_the_mcap_file_but_not_the_stream(tmp_path, fill_disk, caplog, monkeypatch):
     path = tmp_path / "touch.mcap"
-    monkeypatch.setattr("isocharge.serve.export.mcap_file.FLUSH_S", 0.01)
+    monkeypatch.setattr("isocharge.serve.export.mcap_file.FLUSH_INTERVAL_S", 0.01)
     fill_disk(12000)
     written = [press(number, misfit=np.pi * number) for number in range(2000)]
     outputs = Outputs([str(path)], OutputContext(electrodes=ELECTRODES, is_live=True))
@@ -326,7 +326,7 @@ def test_a_full_disk_ends_the_file_and_not_the_stream(tmp_path, fill_disk, caplo
 
 
 @pytest.mark.parametrize("timestamp", [None, -1.0, 2.0**31, 1e11])
-def test_times_that_ros_has_not(tmp_path, timestamp):
+def test_timestamp_outside_the_range_of_ros2_is_refused(tmp_path, timestamp):
     with McapFile(tmp_path / "touch.mcap", ELECTRODES) as file:
         with pytest.raises(InputError, match=r"timestamp .*: expected unix seconds from 1970 to 2038"):
             file.write(press(0, timestamp=timestamp))
@@ -334,7 +334,7 @@ def test_times_that_ros_has_not(tmp_path, timestamp):
     assert file.records == 1
 
 
-def test_numbers_of_messages_begin_again_after_32_bits(tmp_path):
+def test_sequence_number_restarts_after_32_bits(tmp_path):
     with McapFile(tmp_path / "touch.mcap", ELECTRODES) as file:
         file.records = (1 << 32) - 1
         file.write(press(0))
@@ -343,7 +343,7 @@ def test_numbers_of_messages_begin_again_after_32_bits(tmp_path):
     assert {each.sequence for each in records if isinstance(each, Message)} == {(1 << 32) - 1, 0}
 
 
-def test_nothing_is_overwritten(tmp_path):
+def test_existing_mcap_file_is_not_overwritten(tmp_path):
     path = tmp_path / "touch.mcap"
     path.write_text("mine")
     with pytest.raises(OutputExists, match="already there"), McapFile(path, ELECTRODES):

@@ -102,7 +102,7 @@ class RandomBoard:
         return all(("se" if name[0] == "s" else "t_") in names for name in self.head if name not in ("status", "kind"))
 
 
-def test_random_boards_are_read_as_they_were_packed():
+def test_frames_of_random_boards_are_recognised():
     """All but one at most: at rest, bytes that never change may belong to their neighbours or not."""
     wrong = []
     for seed in range(5000, 5024):
@@ -113,7 +113,7 @@ def test_random_boards_are_read_as_they_were_packed():
     assert len(wrong) <= 1, wrong
 
 
-def test_damage_does_not_hinder():
+def test_frames_are_recognised_in_a_damaged_stream():
     """One byte of three hundred is wrong."""
     board, rng = RandomBoard(3), np.random.default_rng(0)
     damaged = np.frombuffer(board.data, np.uint8).copy()
@@ -134,7 +134,7 @@ def test_constant_bytes_and_nothing_are_not_recognised():
 
 
 @pytest.mark.parametrize("per_datagram", [1, 3])
-def test_datagrams_of_bare_structs(per_datagram):
+def test_datagrams_of_plain_structs_are_recognised(per_datagram):
     values = np.random.default_rng(1).normal([5.0, -3.0, 0.0, 11.0], 0.3, (300, 4)).astype(np.float32)
     frames = [struct.pack("<I4f", k, *row) for k, row in enumerate(values)]
     chunks = [b"".join(frames[at : at + per_datagram]) for at in range(0, 300, per_datagram)]
@@ -143,7 +143,7 @@ def test_datagrams_of_bare_structs(per_datagram):
     assert [(entry["name"], entry["type"]) for entry in table["fields"]][:2] == [("seq", "u32"), ("ch1", "f32")]
 
 
-def test_a_cyclic_check_without_a_name_is_described():
+def test_unnamed_crc_is_recognised_by_its_polynomial():
     """CRC-16 of an own start value over the payload alone: no catalogue has it."""
     crc = crcmod.mkCrcFun(0x11021, initCrc=0x1234, rev=False, xorOut=0x4321)
     rows = np.random.default_rng(2).normal([100, 200, -300], 20, (200, 3)).round().astype(int)
@@ -166,14 +166,14 @@ def test_a_cyclic_check_without_a_name_is_described():
         (lambda _, q: f"A:{q},B:{q + 0.5}", {}),
     ],
 )
-def test_number_and_clock_in_text(lines, expected):
+def test_counter_and_clock_columns_in_text_are_recognised(lines, expected):
     """At 500 lines a second; a column whose ticks are of no usual unit stays a channel."""
     rng = np.random.default_rng(0)
     text = "\n" + "\n".join(lines(k, round(rng.normal(5.0, 0.3), 3)) for k in range(400)) + "\n"
     assert recognise([text.encode()], 0.8) == {"format": "text"} | expected
 
 
-def test_the_header_of_a_csv_is_written_down():
+def test_header_of_a_csv_stream_becomes_part_of_the_device_file():
     """A board sends it once, at its start: who comes later reads the columns by the device file."""
     rng = np.random.default_rng(0)
     lines = [f"{k},{2 * k},{rng.normal(5.0, 0.3):.3f},{rng.normal(5.0, 0.3):.3f}" for k in range(400)]

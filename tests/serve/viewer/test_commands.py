@@ -120,7 +120,7 @@ def test_a_replay_is_sought_and_played_fast(film, models, start, command, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("live", "said"),
+    ("live", "message"),
     [
         ("[::]:0", "--token"),  # others are let in on purpose only
         (":8001", "expected PORT or HOST:PORT"),
@@ -130,5 +130,5 @@ def test_a_replay_is_sought_and_played_fast(film, models, start, command, tmp_pa
         ("1" * 5000, "expected PORT or HOST:PORT"),
     ],
 )
-def test_addresses_that_no_page_may_have(models, refused, live, said):
-    refused("serve", "stream", "linear", "--models", models, "--port", "x", "--live", live, said=said)
+def test_addresses_that_no_page_may_have(models, refused, live, message):
+    refused("serve", "stream", "linear", "--models", models, "--port", "x", "--live", live, message=message)

@@ -55,7 +55,7 @@ def parse(text, kind=LiveRequest | ReplayRequest):
         ('{"do": "speed", "value": 24}', Speed(24.0)),
     ],
 )
-def test_requests_are_read(text, request_):
+def test_requests_of_the_page_are_parsed(text, request_):
     assert parse(text) == request_
 
 
@@ -75,12 +75,12 @@ def test_requests_are_read(text, request_):
         "tare",
     ],
 )
-def test_other_requests_are_refused(content):
+def test_invalid_requests_are_refused(content):
     with pytest.raises(RequestError):
         parse(json.dumps(content))
 
 
-def test_a_live_page_does_not_seek():
+def test_live_page_refuses_replay_requests():
     with pytest.raises(RequestError, match="one of tare, back, record, marker"):
         parse('{"do": "seek", "value": 1}', LiveRequest)
 
@@ -89,7 +89,7 @@ def test_a_live_page_does_not_seek():
 @example("[" * 5000)
 @example('{"do": "seek", "value": NaN}')
 @example('{"do": "seek", "value": 1' + "0" * 4000 + "}")
-def test_no_text_breaks_it(text):
+def test_any_text_is_parsed_or_refused_as_a_request(text):
     with pytest.raises(RequestError):
         parse(text)
 
@@ -103,13 +103,13 @@ def test_confirmations_have_four_bytes():
 FORM = SampleFormat(("A", "B", "C"))
 
 
-def test_what_no_float32_holds_is_clipped(record):
+def test_numbers_beyond_float32_are_clipped(record):
     form = SampleFormat(("A",))
     sample = np.frombuffer(form.pack(record(charge_pC={"A": -1e300}, misfit=1e200)), form.dtype)[0]
     assert -sample["charge_pC"][0] == sample["misfit"] == np.finfo(np.float32).max
 
 
-def test_a_contact_that_is_followed_is_shown_in_place_of_the_frames(record):
+def test_sample_contains_the_tracked_contact(record):
     tracked = TrackedContact(2.0, 3.0, 0.4, 0.01, 0.02, 0.001, 0.0, 0.0, 0.1)
     tracking = Tracking(tracked, None, OtherContact(5.0, -1.0, 1.0, 0.25))
     followed = record(x_mm=1.0, misfit=0.5, xy_correlation=0.25, tracking=tracking)
@@ -119,7 +119,7 @@ def test_a_contact_that_is_followed_is_shown_in_place_of_the_frames(record):
     assert (sample["other_x_mm"], sample["other_y_mm"]) == (5.0, -1.0)
 
 
-def test_electrodes_are_drawn_where_they_lie(film):
+def test_electrode_polygons_include_the_calibration(film):
     """Squares of a released model; a polygon and its trace, turned by a right angle and shifted."""
     described = describe_film("left", load_model(find_model("three-25um-biaxial")).metadata, None)
     squares = np.array([described["outlines_mm"][name] for name in "ABC"])
@@ -135,7 +135,7 @@ def test_electrodes_are_drawn_where_they_lie(film):
     np.testing.assert_allclose(described["more_mm"]["C"], [[[0.5, 2.25], [9.5, 2.25], [9.5, 3.25]]], atol=1e-12)
 
 
-def test_every_flag_has_a_bit_of_its_own():
+def test_every_flag_has_its_own_bit():
     words = {value for name, value in vars(flags).items() if name.isupper() and isinstance(value, str)}
     assert set(FLAG_BITS) == words
     assert len(set(FLAG_BITS.values())) == len(words)
@@ -178,7 +178,7 @@ def test_short_tap_is_not_lost_by_coalescing(start, max_samples):
     assert touching["force_N"].max() >= 0.4
 
 
-def test_the_newest_contact_counts():
+def test_coalescing_shows_the_latest_contact_of_a_run():
     """While something touches, what is shown is where it is now, not where it was pressed hardest."""
     assert coalesce(samples(np.linspace(2.0, 1.0, 64)), 1)["timestamp"][0] == 0.063
 
@@ -195,7 +195,7 @@ def node(script):
 
 
 @pytest.mark.parametrize(("radius_mm", "middle"), [(None, [30.0, 0.0]), (45.0, [0.0, 0.0])])
-def test_the_plan_shows_an_area_that_begins_at_the_origin(radius_mm, middle):
+def test_page_shows_the_whole_area_of_a_film_whose_corner_is_the_origin(radius_mm, middle):
     """A pad of x from 0 to 60 mm in the middle of the view, a film with its own centre; (50, 0) is inside both."""
     film = {
         "working_area_mm": [[0, -15], [60, -15], [60, 15], [0, 15]],
@@ -219,7 +219,7 @@ def test_the_plan_shows_an_area_that_begins_at_the_origin(radius_mm, middle):
     assert middle[0] + 0.9 * reach < beyond[0] < middle[0] + reach
 
 
-def test_the_page_reads_what_the_server_writes(record):
+def test_page_decodes_the_samples_of_the_server(record):
     form = SampleFormat(("A", "B", "C"))
     changes = {
         "charge_pC": {"A": 1.5, "B": None, "C": -3.0},
@@ -249,7 +249,7 @@ def test_the_page_reads_what_the_server_writes(record):
     assert {"contact": False, "x": None, "bits": 0}.items() <= second.items()
 
 
-def test_the_page_interpolates_the_deflection():
+def test_page_interpolates_the_deflection_field():
     """At the nodes of the table the page gives its numbers, turned and mirrored with the press."""
     path = next((VIEWER / "fields").glob("*.json"))
     field = read_deflection_field(path)

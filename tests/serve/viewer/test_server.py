@@ -32,7 +32,7 @@ def put(page, record, count, **changes):
         page.reader.send_sample(page.form.pack(record(**changed)))
 
 
-def test_a_new_viewer_sees_the_last_seconds(page, record, viewer):
+def test_new_viewer_receives_the_last_seconds(page, record, viewer):
     async def talk(client):
         seen, headers = 0, []
         while seen < 1000:
@@ -48,7 +48,7 @@ def test_a_new_viewer_sees_the_last_seconds(page, record, viewer):
 
 
 @pytest.mark.parametrize("turns", [20, 200])
-def test_nobody_gets_more_than_he_draws(page, record, viewer, turns):
+def test_viewer_receives_samples_only_after_confirming_earlier_ones(page, record, viewer, turns):
     """Two messages that are not confirmed: then nothing, and what came meanwhile in one, few samples for all or most.
 
     What was too much to be kept is counted.
@@ -73,7 +73,7 @@ def test_nobody_gets_more_than_he_draws(page, record, viewer, turns):
     assert len(rows) < 600
 
 
-def test_a_stalled_viewer_holds_up_neither_reader_nor_others(page, record, viewer):
+def test_stalled_viewer_delays_neither_the_reader_nor_other_viewers(page, record, viewer):
     async def talk(client):
         async with connect(page.live) as stalled:
             stalled.transport.pause_reading()
@@ -91,7 +91,7 @@ def test_a_stalled_viewer_holds_up_neither_reader_nor_others(page, record, viewe
     assert page.reader.dropped == 0
 
 
-def test_states_reach_the_viewer(page, viewer):
+def test_state_messages_are_sent_to_the_viewer(page, viewer):
     async def talk(client):
         page.reader.send_message(counters={"frames": 7}, recording="x.rec")
         page.reader.send_message(marker=[1.0, ""])
@@ -110,7 +110,7 @@ def test_states_reach_the_viewer(page, viewer):
 @pytest.mark.parametrize(
     "nonsense", ["", "nonsense", "[]", '{"do": "shutdown"}', b"", b"12345", "[" * 4000, "\0" * 100]
 )
-def test_nonsense_is_answered_and_nothing_breaks(page, record, viewer, nonsense):
+def test_invalid_message_is_answered_with_an_error(page, record, viewer, nonsense):
     async def talk(client):
         await client.socket.send(nonsense)
         error = await client.text("error")
@@ -121,7 +121,7 @@ def test_nonsense_is_answered_and_nothing_breaks(page, record, viewer, nonsense)
     assert "expected" in viewer(page, talk)
 
 
-def test_a_message_that_is_too_long_ends_the_connection(page, viewer):
+def test_too_long_message_ends_the_connection(page, viewer):
     async def talk(client):
         await client.socket.send("x" * 5000)
         while True:
@@ -154,7 +154,7 @@ def followed(place):
     return client
 
 
-def test_who_reads_no_answers_is_not_read_either(start_page, monkeypatch):
+def test_reading_is_paused_while_the_client_reads_no_responses(start_page, monkeypatch):
     """Pongs that nobody takes would fill the memory."""
     monkeypatch.setattr(server, "MAX_BURST_BYTES", 1 << 40)
     with followed(urlsplit(start_page().url)) as hostile:
@@ -164,7 +164,7 @@ def test_who_reads_no_answers_is_not_read_either(start_page, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", FLOODS)
-def test_a_flood_of_any_frame_ends_the_connection(page, record, viewer, kind):
+def test_too_much_data_in_any_kind_of_frame_ends_the_connection(page, record, viewer, kind):
     """Also of one that is no message, and a good viewer gets its samples beside."""
     place = urlsplit(page.url)
 
@@ -197,7 +197,7 @@ def test_rate_limit_refills_with_time():
     assert spends == [True, True, False, True, True, False]
 
 
-def test_viewers_are_bounded(page, viewer):
+def test_number_of_viewers_is_limited(page, viewer):
     async def talk(client):
         others = [await connect(page.live) for _ in range(MAX_VIEWERS - 1)]
         with pytest.raises(InvalidStatus) as refused:
@@ -223,7 +223,7 @@ def test_viewers_are_bounded(page, viewer):
     ],
     ids=["trailers", "headers", "address", "body", "noise"],
 )
-def test_what_is_no_request_for_the_page(page, request_):
+def test_wrong_http_request_is_refused(page, request_):
     """It is refused or answered before it is read to its end, whatever its length."""
     place = urlsplit(page.url)
     with socket.create_connection((place.hostname, place.port), timeout=20) as connection:
@@ -238,7 +238,7 @@ def test_what_is_no_request_for_the_page(page, request_):
     assert page.get("/")[0] == 200
 
 
-def test_another_site_s_page_gets_nothing(page, viewer):
+def test_websocket_from_a_page_of_another_site_is_refused(page, viewer):
     with pytest.raises(InvalidStatus) as refused:
         viewer(page, None, origin="http://evil.example")
     assert refused.value.response.status_code == 403
@@ -246,7 +246,7 @@ def test_another_site_s_page_gets_nothing(page, viewer):
         page.get("/session.json", Host="evil.example")
 
 
-def test_the_token_is_asked_for(start_page, viewer):
+def test_description_and_websocket_need_the_token(start_page, viewer):
     page = start_page(token="s3cret")
     assert page.get("/")[0] == 200  # the page itself says nothing of a film
     with pytest.raises(urllib.error.HTTPError, match="401"):
@@ -266,7 +266,7 @@ def test_the_token_is_asked_for(start_page, viewer):
         assert viewer(page, talk, **options) == "isocharge.live.1"
 
 
-def test_the_end_of_the_stream_ends_the_page(start_page, viewer):
+def test_page_ends_with_the_stream(start_page, viewer):
     page = start_page()
 
     async def talk(client):
@@ -280,12 +280,12 @@ def test_the_end_of_the_stream_ends_the_page(start_page, viewer):
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "/../server.py", "/vendor"])
-def test_other_paths(page, path):
+def test_unknown_path_is_not_found(page, path):
     with pytest.raises(urllib.error.HTTPError, match="404"):
         page.get(path)
 
 
-def test_files_of_the_page(page):
+def test_files_of_the_page_are_served(page):
     """Every file that the page names is served, loads nothing from elsewhere, and a browser is told to see to it."""
     status, headers, body = page.get("/")
     assert (status, headers["X-Content-Type-Options"], headers["Referrer-Policy"]) == (200, "nosniff", "no-referrer")
@@ -304,19 +304,19 @@ def bearer(token):
 
 
 @pytest.mark.parametrize("host", [b"127.0.0.1:8001", b"localhost:8001", b"[::1]:8001", b"192.168.1.7"])
-def test_this_machine_s_page_is_answered(host):
+def test_access_allows_pages_of_this_machine(host):
     Access().check({b"host": host, b"origin": b"http://" + host})
 
 
 @pytest.mark.parametrize(
     "origin", [b"http://evil.example", b"null", b"http://127.0.0.1:9999", b"http://[", b"file://", b"\xff\xfe"]
 )
-def test_another_site_s_page_is_refused(origin):
+def test_access_refuses_pages_of_other_sites(origin):
     with pytest.raises(OriginError):
         Access().check({b"host": b"127.0.0.1:8001", b"origin": origin})
 
 
-def test_a_name_that_points_here_is_refused():
+def test_access_refuses_a_rebound_host_name():
     """DNS rebinding: the page and the server then have the same name, and it is not ours."""
     headers = {b"host": b"evil.example:8001", b"origin": b"http://evil.example:8001"}
     with pytest.raises(OriginError, match=r"expected an IP address or one of 127\.0\.0\.1, localhost"):
@@ -325,7 +325,7 @@ def test_a_name_that_points_here_is_refused():
     Access(Token("secret")).check(headers | {b"authorization": b"Bearer secret"})  # nobody has it by accident
 
 
-def test_token_by_header_or_subprotocol():
+def test_access_takes_the_token_from_header_or_subprotocol():
     access, headers = Access(Token("s3cret?>~")), {b"host": b"127.0.0.1:1"}
     access.check(headers | {b"authorization": b"Bearer s3cret?>~"})
     access.check(headers, ["isocharge.live.1", bearer("s3cret?>~")])

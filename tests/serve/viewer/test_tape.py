@@ -29,7 +29,7 @@ def samples(times, force_N=0.0):
     return rows
 
 
-def test_a_live_tape_keeps_the_latest():
+def test_live_tape_stores_the_latest_samples():
     tape = Tape(FORM.dtype, capacity=10)
     for first in range(0, 35, 7):
         tape.append(samples(np.arange(first, first + 7.0)))
@@ -39,7 +39,7 @@ def test_a_live_tape_keeps_the_latest():
     assert tape.samples(tape.oldest, tape.total)["timestamp"].tolist() == list(range(50, 60))
 
 
-def test_a_recorded_tape_keeps_all(recorded):
+def test_recorded_tape_stores_all_samples(recorded):
     tape = recorded
     assert tape.span() == (0.0, 0.0)
     for first in range(0, 3000, 1000):
@@ -48,7 +48,7 @@ def test_a_recorded_tape_keeps_all(recorded):
     assert tape.index(1e9 + 15.001) == 1501
 
 
-def test_times_never_go_back(recorded):
+def test_recorded_tape_replaces_times_that_go_back(recorded):
     tape = recorded
     tape.append(samples([10.0, 12.0, 11.0]))
     tape.append(samples([5.0, 13.0]))
@@ -71,7 +71,7 @@ def test_overview_has_the_largest_force_of_each_piece(recorded):
 SAMPLE = bytes(range(64))
 
 
-def test_samples_arrive_whole_and_in_order():
+def test_link_delivers_complete_samples_in_order():
     reader, page = make_link()
     for number in range(100):
         reader.send_sample(bytes([number]) * 64)
@@ -84,7 +84,7 @@ def test_samples_arrive_whole_and_in_order():
     page.close_here()
 
 
-def test_a_reader_does_not_wait_for_a_page_that_takes_nothing():
+def test_reader_does_not_wait_for_a_page_that_reads_nothing():
     reader, page = make_link()
     began = time.perf_counter()
     for _ in range(40_000):

@@ -15,7 +15,7 @@ def script():
     return wander(seed=5, seconds=120.0, rate_Hz=200.0, radius_mm=8.0, force_range_N=(0.05, 2.0))
 
 
-def test_wander_begins_with_a_second_of_rest(script):
+def test_wander_begins_with_one_second_without_a_press(script):
     assert not script.touching[:200].any()
     assert script.touching[200:210].any()
 
@@ -28,7 +28,7 @@ def test_wander_stays_inside_radius_and_forces(script):
     assert np.isnan([script.x_mm[~on], script.y_mm[~on]]).all()
 
 
-def test_wander_depends_on_the_seed_alone():
+def test_wander_is_reproducible_with_the_same_seed():
     one, same, other = (wander(seed=seed, seconds=5.0).force_N for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
     assert not np.array_equal(one, other)
@@ -51,7 +51,7 @@ def test_wander_depends_on_the_seed_alone():
         (partial(Script, np.zeros(2), np.zeros(2), np.zeros(2), 0.0), r"a positive rate, got 0.0 Hz"),
     ],
 )
-def test_impossible_scripts(make, message):
+def test_impossible_script_is_refused(make, message):
     with pytest.raises(SceneError, match=message):
         make()
 
@@ -59,7 +59,7 @@ def test_impossible_scripts(make, message):
 PRESSES = "presses = [[0, 1, 2, 0], [1, 1, 2, 0], [1.1, 1, 2, 0.5], [2.1, 3, 2, 0.5], [2.2, 3, 2, 0]]\n"
 
 
-def test_script_from_a_file(tmp_path):
+def test_load_script_reads_a_toml_file(tmp_path):
     path = tmp_path / "play.toml"
     path.write_text(PRESSES + "limit_pC = 900\n[faults]\nlose_share = 0.1\n")
     play = load_script(path)
@@ -87,7 +87,7 @@ def test_script_from_a_file(tmp_path):
         ("[faults]\nlose_shar = 0.1", "unknown key 'faults.lose_shar'; did you mean 'lose_share'"),
     ],
 )
-def test_scripts_that_are_wrong(text, message, tmp_path):
+def test_wrong_script_file_is_refused(text, message, tmp_path):
     path = tmp_path / "play.toml"
     path.write_text(text)
     with pytest.raises(SceneError, match=message):

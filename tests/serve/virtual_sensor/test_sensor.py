@@ -24,7 +24,7 @@ def sent(sensor, count):
     return [next(iter(BinaryParser().feed(data)), None) for data in islice(sensor.frames(), count)]
 
 
-def test_frames_carry_script_noise_and_offset(film):
+def test_frames_contain_script_charges_noise_and_offset(film):
     script = Script(np.array([1.0, np.nan]), np.array([2.0, np.nan]), np.array([0.5, 0.0]), 500.0)
     noise = lambda charge_pC, rng: charge_pC + rng.integers(1, 2, charge_pC.shape)  # noqa: E731
     frames = sent(VirtualSensor(film.charges, script, noise=noise, offset_pC=[10.0, 20.0, 30.0]), 4)
@@ -35,12 +35,12 @@ def test_frames_carry_script_noise_and_offset(film):
         assert (frame.seq, frame.t_us) == (k, k * 2000)
 
 
-def test_the_default_offset_is_small_but_not_zero(film):
+def test_default_offset_is_small_and_not_zero(film):
     (frame,) = sent(VirtualSensor(film.charges, wander(seed=1, seconds=0.5)), 1)
     assert 0.0 < np.abs(frame.values).max() <= 20.0
 
 
-def test_the_amplifier_takes_the_script_in_order_and_over_and_over(film):
+def test_amplifier_receives_the_repeated_script_in_the_order_of_time(film):
     """One with a memory: it counts the rows that it has been given."""
     seen = []
 
@@ -55,7 +55,7 @@ def test_the_amplifier_takes_the_script_in_order_and_over_and_over(film):
     assert {len(block) for block in seen} == {500}  # half a second
 
 
-def test_numbers_and_clock_wrap(film):
+def test_frame_number_and_clock_overflow(film):
     """At a frame a second, the 32 bits of a clock in us last for 4294.97 s."""
     frames = []
     sensor = VirtualSensor(film.charges, steady(10, 1.0), encode=lambda frame: bytes(frames.append(frame) or 1))
@@ -65,7 +65,7 @@ def test_numbers_and_clock_wrap(film):
 
 
 @pytest.mark.parametrize("charges", [np.zeros(3), np.zeros((2, 3)), np.full((10, 3), np.nan)])
-def test_forward_map_that_is_refused(charges):
+def test_forward_map_with_wrong_charges_is_refused(charges):
     with pytest.raises(SceneError, match=r"forward map: expected finite charges of shape \(10, electrodes\)"):
         VirtualSensor(lambda *_: charges, steady())
 
@@ -78,7 +78,7 @@ def test_forward_map_that_is_refused(charges):
         (Faults(unplug_every_s=0.25, unplug_s=0.0625), [*range(128, 160), *range(256, 288)]),
     ],
 )
-def test_silence_comes_when_asked(film, faults, silent):
+def test_faults_gap_unplug_and_lose_suppress_frames(film, faults, silent):
     frames = sent(VirtualSensor(film.charges, steady(rate_Hz=512.0), faults=faults), 300)
     assert [k for k, frame in enumerate(frames) if frame is None] == silent
     assert [k for k in range(300) if faults.is_unplugged(k / 512.0)] == (silent if faults.unplug_every_s else [])
@@ -89,7 +89,7 @@ def test_clock_drift(film):
     assert [frame.t_us for frame in frames] == [round(k * 1000.5) for k in range(100)]
 
 
-def test_corruption_flips_drops_and_adds():
+def test_corrupt_flips_drops_and_adds_bytes():
     data, rng = bytes(1000), np.random.default_rng(0)
     lengths = [len(corrupt(data, 0.01, rng)) for _ in range(200)]
     assert np.mean(lengths) == pytest.approx(1000, abs=1.0)
@@ -105,7 +105,7 @@ def read(url, count):
     return frames, parser.counts
 
 
-def test_frames_come_on_time_and_their_truth_is_known(film):
+def test_frames_are_sent_on_time_with_their_truth(film):
     script = wander(seed=3, seconds=2.0, rate_Hz=1000.0)
     with VirtualSensor(film.charges, script) as sensor:
         frames, _ = read(sensor.url, 1200)
@@ -120,7 +120,7 @@ def test_frames_come_on_time_and_their_truth_is_known(film):
     assert late_s[-300:].min() - late_s[:300].min() < 0.02  # 0.05 if it slept between frames, not until deadlines
 
 
-def test_frames_are_withheld_until_somebody_reads(film):
+def test_frames_are_withheld_while_nobody_reads(film):
     """What does not fit is withheld whole: a late reader sees a gap at most, and no damaged frame."""
     with VirtualSensor(film.charges, steady(rate_Hz=2000.0)) as sensor:
         while sensor.withheld < 100:
@@ -138,7 +138,7 @@ def test_frames_are_withheld_until_somebody_reads(film):
         sensor.url  # noqa: B018
 
 
-def test_a_port_that_vanishes_comes_back_under_the_same_name(film):
+def test_unplugged_port_returns_under_the_same_link(film):
     encode = lambda frame: encode_text(frame, "pairs")  # noqa: E731
     faults = Faults(unplug_every_s=0.8, unplug_s=0.3)
     with VirtualSensor(film.charges, steady(rate_Hz=500.0), faults=faults, encode=encode) as sensor:

@@ -1,4 +1,4 @@
-"""Prediction records as an MCAP file: the record itself, the wrench of the press and its pose.
+"""MCAP files with prediction records, the wrench of each press and its pose.
 
 | topic | message | written for |
 |---|---|---|
@@ -6,9 +6,9 @@
 | `/isocharge/wrench` | `geometry_msgs/msg/WrenchStamped` | every record with a force, 0 N out of contact included |
 | `/isocharge/pose` | `geometry_msgs/msg/PoseWithCovarianceStamped` | every record with a position |
 
-Log time and publish time are the record's `timestamp`. The file grows by whole chunks, one a second or sooner. A
-process that is killed leaves a file without its index, from which `mcap recover` and viewers take all but the last
-second.
+Log time and publish time are the `timestamp` of the record. The file is written in complete chunks at least once per
+second. If the process is killed, the file has no index; `mcap recover` and viewers can then read everything except the
+last second.
 """
 
 import json
@@ -40,17 +40,19 @@ from isocharge.serve.record.schema import SCHEMA_NAME, record_schema
 with require("record"):
     from mcap.writer import Writer
 
-RECORD_TOPIC, WRENCH_TOPIC, POSE_TOPIC = "/isocharge/record", "/isocharge/wrench", "/isocharge/pose"
+RECORD_TOPIC = "/isocharge/record"
+WRENCH_TOPIC = "/isocharge/wrench"
+POSE_TOPIC = "/isocharge/pose"
 
-FLUSH_S = 1.0
-"""Longest time for which records wait in memory, s; more are lost if the process is killed."""
+FLUSH_INTERVAL_S = 1.0
+"""Longest time for which records wait in memory, s. These records are lost if the process is killed."""
 
-LARGEST_COUNT = 0xFFFFFFFF
+MAX_SEQUENCE_NUMBER = 0xFFFFFFFF
 """Largest sequence number of a message, after which it begins again at 0."""
 
 
 class McapFile:
-    """Writes an MCAP file; a context manager.
+    """Context manager that writes an MCAP file.
 
     Attributes:
         path: The file.
@@ -65,14 +67,14 @@ class McapFile:
         encoding: RecordEncoding = RecordEncoding.json,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Describe a file; it is created on entering the context.
+        """Store the settings of the file, which is created when the context is entered.
 
         Args:
-            path: The file; it must not exist.
+            path: The file, which must not exist.
             electrodes: Names of the electrodes, for the schema.
-            encoding: How records are written: JSON with a schema for viewers, or as a ROS 2 message, for tools that
-                refuse a file with any other (`ros2 bag`, rosbags).
-            now: A clock that never goes back, s.
+            encoding: Encoding of the records: JSON with a schema for viewers, or ROS 2 messages for tools that refuse
+                other messages (`ros2 bag`, rosbags).
+            now: Monotonic clock, s.
         """
         self.path = path
         self.records = 0
@@ -87,11 +89,11 @@ class McapFile:
         """Create the file.
 
         Raises:
-            OutputExists: If it is already there.
-            OutputError: If it cannot be created.
+            OutputExists: If the file exists already.
+            OutputError: If the file cannot be created.
         """
         self._file = WholeWrites(self.path)
-        self._writer = Writer(self._file)  # type: ignore[arg-type]  # all it uses is write, tell and flush
+        self._writer = Writer(self._file)  # type: ignore[arg-type]  # it uses only write, tell and flush
         self._flushed = self._now()
         with refusals_explained(self.path):
             self._writer.start(profile="ros2", library="isocharge")
@@ -106,7 +108,7 @@ class McapFile:
         """Write the index and close the file.
 
         Raises:
-            OSError: If the disk is full, or gone.
+            OSError: If the disk is full or was removed.
         """
         with self._lock, closing(self._file):
             if not self.is_abandoned:
@@ -117,7 +119,7 @@ class McapFile:
 
         Raises:
             InputError: If ROS 2 has no time stamp for the time of the record.
-            OSError: If the disk is full, or was removed.
+            OSError: If the disk is full or was removed.
         """
         values = record.json_values
         time_ns = time_of(values)
@@ -132,13 +134,12 @@ class McapFile:
             self._add(messages, time_ns)
 
     def _add(self, messages: dict[str, bytes | None], time_ns: int) -> None:
+        sequence = self.records & MAX_SEQUENCE_NUMBER
         for topic, data in messages.items():
             if data is not None:
-                self._writer.add_message(
-                    self._channels[topic], time_ns, data, publish_time=time_ns, sequence=self.records & LARGEST_COUNT
-                )
+                self._writer.add_message(self._channels[topic], time_ns, data, publish_time=time_ns, sequence=sequence)
         self.records += 1
-        if self._now() - self._flushed >= FLUSH_S:
+        if self._now() - self._flushed >= FLUSH_INTERVAL_S:
             self._writer.flush()  # type: ignore[no-untyped-call]
             self._flushed = self._now()
 

@@ -21,13 +21,13 @@ from typing import Any
 
 from isocharge.common.errors import InputError
 
-DEFLECTION_STD = 5e-3
+DEFLECTION_STD_m = 5e-3
 """Standard deviation of z, m. The model does not estimate the deflection of the film, which is a few millimetres."""
 
-TURN_VARIANCE = math.pi**2 / 3.0
+ROTATION_VARIANCE_rad2 = math.pi**2 / 3.0
 """Variance of every rotation, rad^2: the variance of an angle that is uniformly distributed over a full turn."""
 
-LATEST_S = 1 << 31
+MAX_TIMESTAMP_S = 1 << 31
 """Upper limit of the times that a ROS 2 time stamp can hold, unix seconds: the year 2038."""
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
@@ -85,7 +85,7 @@ def time_of(record: Mapping[str, Any]) -> int:
         InputError: If ROS 2 has no time stamp for this time.
     """
     seconds: float | None = record["timestamp"]
-    if seconds is None or not 0.0 <= seconds < LATEST_S:
+    if seconds is None or not 0.0 <= seconds < MAX_TIMESTAMP_S:
         raise InputError(
             f"timestamp {seconds!r}: expected unix seconds from 1970 to 2038, as ROS 2 holds them; set the clock of "
             "the computer that reads the sensor"
@@ -132,7 +132,7 @@ def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
     if None in (x_mm, y_mm, x_std_mm, y_std_mm):
         return None
     xy_correlation = contact.get("xy_correlation") or 0.0  # a record of an earlier version has none
-    variances = ((1e-3 * x_std_mm) ** 2, (1e-3 * y_std_mm) ** 2, DEFLECTION_STD**2, *[TURN_VARIANCE] * 3)
+    variances = ((1e-3 * x_std_mm) ** 2, (1e-3 * y_std_mm) ** 2, DEFLECTION_STD_m**2, *[ROTATION_VARIANCE_rad2] * 3)
     xy_covariance = 1e-6 * x_std_mm * y_std_mm * xy_correlation
     covariance = [0.0] * 36  # row by row: x, y, z, and the rotations about these axes
     covariance[::7] = variances

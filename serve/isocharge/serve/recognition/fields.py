@@ -29,10 +29,10 @@ CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
 }
 """Name of the field, and value of one tick in the unit of that name, by the tick rate of a clock, Hz."""
 
-TOLERANCE = 0.06
+CLOCK_RATE_TOLERANCE = 0.06
 """Largest relative deviation of a tick rate from a common one. It is not small, because frames arrive in bursts."""
 
-PLAUSIBLE = (1e-7, 1e8)
+PLAUSIBLE_MAGNITUDES = (1e-7, 1e8)
 """Smallest and largest typical magnitude of a floating-point channel."""
 
 TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "f32", "f64")
@@ -64,7 +64,7 @@ def clock_of(step: Array, rate_Hz: float) -> tuple[str, float] | None:
     """
     tick_rate_Hz = steady_step(step) * rate_Hz
     for common_rate_Hz, clock in CLOCKS.items():
-        if abs(tick_rate_Hz / common_rate_Hz - 1.0) < TOLERANCE:
+        if abs(tick_rate_Hz / common_rate_Hz - 1.0) < CLOCK_RATE_TOLERANCE:
             return clock
     return None
 
@@ -171,7 +171,7 @@ def _numbers(
     unit = 1.0
     if is_float:
         unit = magnitude * 256.0 ** (np.argmin(is_zero) - weights.fraction * size)
-        if not PLAUSIBLE[0] < magnitude < PLAUSIBLE[1]:
+        if not PLAUSIBLE_MAGNITUDES[0] < magnitude < PLAUSIBLE_MAGNITUDES[1]:
             return
     if is_unsigned:
         half_range = 1 << (8 * size - 1)

@@ -25,14 +25,17 @@ from isocharge.serve.frames.stuffing import STUFFINGS, Stuffing
 
 Bytes = NDArray[np.uint8]
 
-SHORTEST, LONGEST = 4, 256
-"""Shortest and longest frame that is recognised, bytes."""
+MIN_FRAME_BYTES = 4
+"""Shortest frame that is recognised, bytes."""
 
-FEWEST = 5
+MAX_FRAME_BYTES = 256
+"""Longest frame that is recognised, bytes."""
+
+MIN_FRAMES = 5
 """Smallest number of frames from which a format is recognised."""
 
-MOST_BYTES = 1 << 16
-"""Number of bytes of a stream that are examined."""
+MAX_EXAMINED_BYTES = 1 << 16
+"""Largest number of bytes of a stream that are examined."""
 
 STUFFED_SHARE = 0.9
 """Smallest share of the pieces between delimiters that must have one length, dimensionless."""
@@ -43,7 +46,7 @@ COVERED_SHARE = 0.4
 SINGLE_SHARE = 0.05
 """Share of a stream by which a single byte must cover more than a pair, which rarely repeats by chance."""
 
-MOST_LENGTHS = 3
+MAX_FRAME_LENGTHS = 3
 """Number of frame lengths that are tried."""
 
 CONSTANT_SHARE = 0.98
@@ -82,10 +85,11 @@ def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
 
 def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Windows]:
     """Yield every possible division of a stream into frames, the most certain first."""
-    data = b"".join(chunks)[:MOST_BYTES]
+    data = b"".join(chunks)[:MAX_EXAMINED_BYTES]
     if are_datagrams:
         common = gcd(*map(len, chunks))
-        lengths = [length for length in range(SHORTEST, min(common, LONGEST) + 1) if common % length == 0]
+        candidates = range(MIN_FRAME_BYTES, min(common, MAX_FRAME_BYTES) + 1)
+        lengths = [length for length in candidates if common % length == 0]
         yield from (_side_by_side(DATAGRAM, data, length) for length in lengths)
     for name, stuffing in STUFFINGS.items():
         yield from _stuffed(name, stuffing, data)
@@ -103,7 +107,7 @@ def _stuffed(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
         with suppress(ValueError):
             decoded.append(stuffing.decode(piece))
     length, count = _most_common_length(decoded)
-    if count < STUFFED_SHARE * len(pieces) or not SHORTEST <= length <= LONGEST:
+    if count < STUFFED_SHARE * len(pieces) or not MIN_FRAME_BYTES <= length <= MAX_FRAME_BYTES:
         return
     # If decoding makes the lengths no more regular, every frame only happens to begin with the delimiter.
     if name == "cobs" or count > _most_common_length(pieces)[1]:
@@ -132,7 +136,7 @@ def _synchronised(stream: Bytes) -> Iterator[Windows]:
         coverage, _ = best[length]
         return -round(coverage, 1), length
 
-    for length in sorted(best, key=by_coverage)[:MOST_LENGTHS]:
+    for length in sorted(best, key=by_coverage)[:MAX_FRAME_LENGTHS]:
         _, starts = best[length]
         yield Windows(SYNC, stream, starts, length)
 
@@ -146,17 +150,17 @@ def _repeats(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]
     order = np.argsort(codes, kind="stable")
     gaps = np.diff(order)
     firsts = order[:-1]
-    repeats = (np.diff(codes[order]) == 0) & (gaps >= SHORTEST) & (gaps <= LONGEST)
+    repeats = (np.diff(codes[order]) == 0) & (gaps >= MIN_FRAME_BYTES) & (gaps <= MAX_FRAME_BYTES)
     gaps = gaps[repeats]
     firsts = firsts[repeats]
-    keys = codes[firsts] * (LONGEST + 1) + gaps  # one number for each pair of code and distance
+    keys = codes[firsts] * (MAX_FRAME_BYTES + 1) + gaps  # one number for each pair of code and distance
     for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
-        length = int(key) % (LONGEST + 1)
+        length = int(key) % (MAX_FRAME_BYTES + 1)
         if count * length >= COVERED_SHARE * len(codes):
             yield length, firsts[keys == key]
 
 
-CYCLIC = {
+UNNAMED_CRCS = {
     size: [Crc(8 * size, polynomial, 0, reflected, 0) for polynomial in polynomials for reflected in (False, True)]
     for size, polynomials in {
         4: (0x04C11DB7, 0x1EDC6F41),
@@ -167,17 +171,21 @@ CYCLIC = {
 }
 """Cyclic redundancy checks that are tried without a name, by their size in bytes, with initial and final value 0."""
 
-FEWEST_ROWS, MOST_ROWS = 6, 24
-"""Smallest number of different frames from which a checksum is recognised, and largest number that is examined."""
+MIN_CHECKED_FRAMES = 6
+"""Smallest number of different frames from which a checksum is recognised."""
+
+MAX_CHECKED_FRAMES = 24
+"""Largest number of different frames from which a checksum is recognised."""
 
 FITTING_SHARE = 0.75
 """Smallest share of frames whose checksum must fit, because some frames may be damaged."""
 
-MOST_SKIPPED = 16
+MAX_FIRST_COVERED_BYTE = 16
 """Largest position of the first byte that a checksum covers."""
 
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
+"""Byte orders that are tried."""
 
 
 class Check(NamedTuple):
@@ -202,13 +210,13 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     """
     rows = np.unique(rows, axis=0)
     shuffled = np.random.default_rng(0).permutation(len(rows))  # sorted neighbours differ in a few bits only
-    rows = rows[shuffled[:MOST_ROWS]]
-    if len(rows) < FEWEST_ROWS:
+    rows = rows[shuffled[:MAX_CHECKED_FRAMES]]
+    if len(rows) < MIN_CHECKED_FRAMES:
         return
     _, constant = usual_bytes(rows)
     frames = [row.tobytes() for row in rows]
-    n_leading_constant = int(np.argmin([*constant[:MOST_SKIPPED], False]))
-    for size in CYCLIC:
+    n_leading_constant = int(np.argmin([*constant[:MAX_FIRST_COVERED_BYTE], False]))
+    for size in UNNAMED_CRCS:
         if size + 2 > len(constant) or constant[-size:].all():
             continue
         last_begin = min(n_leading_constant, len(constant) - size - 1)
@@ -243,7 +251,7 @@ def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size
 
 def _unnamed(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check]:
     """Yield the cyclic redundancy checks that fit, by their parameters. The constant part is their final value."""
-    for crc in CYCLIC[size]:
+    for crc in UNNAMED_CRCS[size]:
         finals = Counter(crc(frame[:-size]) ^ int.from_bytes(frame[-size:], order) for frame in frames)
         final, count = finals.most_common(1)[0]
         if count >= FITTING_SHARE * len(frames):

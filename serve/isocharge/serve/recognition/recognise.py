@@ -13,8 +13,8 @@ from isocharge.serve.frames.text import Layout, TextParser
 from isocharge.serve.frames.text_lines import Notation
 from isocharge.serve.recognition.fields import Part, Weights, clock_of, parts_of, split_frame, steady_step
 from isocharge.serve.recognition.framing import (
-    FEWEST,
-    MOST_BYTES,
+    MAX_EXAMINED_BYTES,
+    MIN_FRAMES,
     ORDERS,
     Check,
     Windows,
@@ -23,16 +23,17 @@ from isocharge.serve.recognition.framing import (
     usual_bytes,
 )
 
-MOST_FRAMES = 300
+MAX_EXAMINED_FRAMES = 300
 """Number of frames that are examined."""
 
-MOST_STARTS = 24
+MAX_FRAME_STARTS = 24
 """Number of constant bytes that are tried as the first byte of a frame."""
 
-LONGEST_SYNC = 6
+MAX_SYNC_BYTES = 6
 """Longest sync, bytes. The bytes after it may be constant only by chance."""
 
 WEIGHTS = Weights()
+"""Weights that were fitted on random boards."""
 
 
 def described_frames(
@@ -46,7 +47,7 @@ def described_frames(
         are_datagrams: Whether each chunk is a datagram.
         weights: Contributions to the score.
     """
-    seconds *= min(1.0, MOST_BYTES / max(1, sum(map(len, chunks))))
+    seconds *= min(1.0, MAX_EXAMINED_BYTES / max(1, sum(map(len, chunks))))
     for _, group in groupby(framings(chunks, are_datagrams=are_datagrams), key=lambda windows: windows.framing):
         tables = [scored for windows in group for scored in _scored_tables(windows, seconds, weights)]
         if tables:
@@ -61,13 +62,13 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
     stream, including the bytes outside of all frames, so that frames of different lengths can be compared.
     """
     length = windows.length
-    rows = windows.rows()[:MOST_FRAMES]
-    if len(rows) < FEWEST - 1:
+    rows = windows.rows()[:MAX_EXAMINED_FRAMES]
+    if len(rows) < MIN_FRAMES - 1:
         return
     has_sync = windows.framing == SYNC
     usual, constant = usual_bytes(rows[:, :length])
     may_be_sync = constant & (usual != 0)  # zeros are mostly the high bytes of numbers
-    starts = np.flatnonzero(may_be_sync)[:MOST_STARTS].tolist() if has_sync else [0]
+    starts = np.flatnonzero(may_be_sync)[:MAX_FRAME_STARTS].tolist() if has_sync else [0]
     checks = [(start, check) for start in starts for check in find_checks(rows[:, start : start + length])]
     covered = min(1.0, len(windows.starts) * length / len(windows.stream))
     rate_Hz = len(windows.stream) / length / seconds
@@ -77,7 +78,7 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
             frame_parts = (parts_at[start:] + parts_at[:start])[: length - check.size]
             syncs: Sequence[int] = [0]
             if has_sync:
-                longest = int(np.argmin([*np.roll(may_be_sync, -start)[:LONGEST_SYNC], False]))
+                longest = int(np.argmin([*np.roll(may_be_sync, -start)[:MAX_SYNC_BYTES], False]))
                 syncs = range(1, longest + 1)
             score, sync, parts = split_frame(frame_parts, syncs, weights)
             if any(part.role == "channel" for part in parts):
@@ -139,13 +140,13 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
         are_datagrams: Whether each chunk is a datagram.
     """
     frames, share = _read(BinaryParser(), chunks)
-    if len(frames) >= FEWEST and share > CLEAR_SHARE:
+    if len(frames) >= MIN_FRAMES and share > CLEAR_SHARE:
         return {"format": "binary"}
     text = None
     parser = TextParser()
     frames, share = _read(parser, chunks)
     frames = [frame for frame in frames if len(frame.values) == len(frames[-1].values)]
-    if parser.layout is not None and len(frames) >= FEWEST:
+    if parser.layout is not None and len(frames) >= MIN_FRAMES:
         text = {"format": "text"} | _text_keys(parser.layout, frames, len(frames) / seconds)
         if share >= CLEAR_SHARE:
             return text

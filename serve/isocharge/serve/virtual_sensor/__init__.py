@@ -1,4 +1,4 @@
-"""A board that does not exist: script of presses, faults on request, a pseudo-terminal.
+"""Virtual sensor: a pseudo-terminal that sends the frames of a board, with scripted or random presses and faults.
 
 May import: frames.
 """

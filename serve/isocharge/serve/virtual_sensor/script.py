@@ -1,4 +1,4 @@
-"""Scripts of a virtual sensor: position and force of the press in each frame, and the faults on the way to a reader."""
+"""Scripts of a virtual sensor: position and force of the press in each frame, and faults of the transmission."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,35 +13,38 @@ from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError
 from isocharge.common.structs import Finite, NotNegative, Settings, WrongKey, read_toml
 
-REST_S = 1.0
-"""Rest at the start of a script, s: time for a tare."""
+INITIAL_REST_S = 1.0
+"""Time without a press at the start of a random script, s. A reader measures its tare in this time."""
 
-PRESS_S = (1.0, 3.0)
-"""Shortest and longest press, s."""
+PRESS_DURATION_S = (1.0, 3.0)
+"""Shortest and longest duration of a random press, s."""
 
-PAUSE_S = (0.6, 1.2)
-"""Shortest and longest pause between presses, s: long enough for the tare of a reader that comes late."""
+PAUSE_DURATION_S = (0.6, 1.2)
+"""Shortest and longest pause between random presses, s. A reader that starts late can measure its tare in a pause."""
 
 RAMP_S = 0.15
-"""Time in which the force rises from the smallest to that of the press, or falls back, s."""
+"""Time in which the force of a random press rises or falls, s."""
 
+Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 
-Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+ROW_DESCRIPTION = "[seconds, x_mm, y_mm, force_N] with a force from 0"
+"""Description of a row of presses in a script file, for error messages."""
 
-ROW = "[seconds, x_mm, y_mm, force_N] with a force from 0"
+MAX_SCRIPT_FRAMES = 2_000_000
+"""Largest number of frames of a script from a file, which is nearly three hours at 200 Hz."""
 
-MOST_FRAMES = 2_000_000
-"""Longest script from a file, frames: nearly three hours at 200 Hz."""
+BITS_PER_BYTE = 8
 
 
 @dataclass(frozen=True)
 class Script:
-    """Position and force for each frame.
+    """Position and force of the press in each frame.
 
     Attributes:
-        x_mm, y_mm: Position, shape (n,), mm; NaN where nothing touches.
-        force_N: Force, shape (n,), N; 0 where nothing touches.
-        rate_Hz: Frames per second.
+        x_mm: Position, shape (n,), mm; NaN while nothing touches.
+        y_mm: Position, shape (n,), mm; NaN while nothing touches.
+        force_N: Force, shape (n,), N; 0 while nothing touches.
+        rate_Hz: Number of frames per second, Hz.
     """
 
     x_mm: Array
@@ -61,23 +64,25 @@ class Script:
 
     @property
     def touching(self) -> Booleans:
-        """Where something touches, shape (n,)."""
+        """Whether something touches in each frame, shape (n,)."""
         return self.force_N > 0.0
 
 
 class Faults(Settings, frozen=True, kw_only=True):
-    """Faults between board and reader; by default there is none.
+    """Faults between the board and the reader. By default there are no faults.
 
     Attributes:
-        lose_share: Share of frames that are not sent, dimensionless.
-        corrupt_share: Share of bytes that are flipped, dropped or followed by a random one, dimensionless.
-        gap_every_s, gap_s: Interval and length of the gaps in which nothing is sent, s; interval 0 for no gaps.
-        unplug_every_s, unplug_s: Interval and length of the outages of the port, s; interval 0 for no outages.
-        clock_ppm: Excess of the device's clock rate over the true one, parts per million.
+        lose_share: Fraction of the frames that are not sent, dimensionless.
+        corrupt_share: Fraction of the bytes that are changed, dropped or followed by a random byte, dimensionless.
+        gap_every_s: Interval of the gaps in which nothing is sent, s; 0 for no gaps.
+        gap_s: Length of each gap, s.
+        unplug_every_s: Interval of the outages of the port, s; 0 for no outages.
+        unplug_s: Length of each outage, s.
+        clock_ppm: Deviation of the device's clock rate from the true rate, parts per million.
     """
 
-    lose_share: Share = 0.0
-    corrupt_share: Share = 0.0
+    lose_share: Fraction = 0.0
+    corrupt_share: Fraction = 0.0
     gap_every_s: NotNegative = 0.0
     gap_s: NotNegative = 0.1
     unplug_every_s: NotNegative = 0.0
@@ -85,32 +90,35 @@ class Faults(Settings, frozen=True, kw_only=True):
     clock_ppm: Annotated[float, Meta(gt=-1e6, lt=1e6)] = 0.0
 
     def is_silent(self, t_s: float) -> bool:
-        """Whether nothing is sent at this time, s from the start: a gap, or the port is away."""
-        return _is_in(t_s, self.gap_every_s, self.gap_s) or self.is_unplugged(t_s)
+        """Return whether a time since the start of the script, s, lies in a gap or in an outage of the port."""
+        return _is_in_interval(t_s, self.gap_every_s, self.gap_s) or self.is_unplugged(t_s)
 
     def is_unplugged(self, t_s: float) -> bool:
-        """Whether the port is away at this time, s from the start."""
-        return _is_in(t_s, self.unplug_every_s, self.unplug_s)
+        """Return whether a time since the start of the script, s, lies in an outage of the port."""
+        return _is_in_interval(t_s, self.unplug_every_s, self.unplug_s)
 
 
-def _is_in(t_s: float, every_s: float, length_s: float) -> bool:
-    """Whether a time lies in one of the intervals that recur, the first after one period; a period of 0 has none."""
-    return every_s > 0.0 and t_s >= every_s and t_s % every_s < length_s
+def _is_in_interval(t_s: float, period_s: float, length_s: float) -> bool:
+    """Return whether a time lies in a periodic interval. The first interval begins after one period.
+
+    A period of 0 means that there are no intervals.
+    """
+    return period_s > 0.0 and t_s >= period_s and t_s % period_s < length_s
 
 
 class VirtualScript(Settings, frozen=True):
-    """The file of `isocharge serve virtual --script`.
+    """Content of the file for `isocharge serve virtual --script`.
 
     Attributes:
-        presses: Rows (seconds, x_mm, y_mm, force_N), interpolated linearly; nothing touches where the force is 0.
-            Without rows, presses are random.
-        faults: Between board and reader.
-        temperature_step_K: Temperature step of the air after 10 s, K; None leaves it to the amplifier.
-        drift_pC_per_s: Drift from the bias current, pC/s; likewise.
-        limit_pC: Largest charge that the converter reads, pC; likewise.
+        presses: Rows (seconds, x_mm, y_mm, force_N), which are interpolated linearly. Nothing touches while the force
+            is 0. Without rows, the presses are random.
+        faults: Faults between the board and the reader.
+        temperature_step_K: Step of the air temperature after 10 s, K; None for the value of the noise model.
+        drift_pC_per_s: Drift of the charges caused by the bias current, pC/s; None for the value of the noise model.
+        limit_pC: Largest charge that the converter measures, pC; None for the value of the noise model.
     """
 
-    presses: tuple[Annotated[tuple[Finite, Finite, Finite, NotNegative], Meta(description=ROW)], ...] = ()
+    presses: tuple[Annotated[tuple[Finite, Finite, Finite, NotNegative], Meta(description=ROW_DESCRIPTION)], ...] = ()
     faults: Faults = Faults()
     temperature_step_K: Finite | None = None
     drift_pC_per_s: NotNegative | None = None
@@ -122,28 +130,37 @@ class VirtualScript(Settings, frozen=True):
             raise WrongKey("presses", "two rows or more with growing seconds", self.presses)
 
     def script(self, rate_Hz: float) -> Script | None:
-        """The presses at a rate, Hz; None if they are random.
+        """Interpolate the presses at a frame rate; return None if the presses are random.
+
+        Args:
+            rate_Hz: Number of frames per second, Hz.
 
         Raises:
             SceneError: If there are too many frames.
         """
         if not self.presses:
             return None
-        seconds, x_mm, y_mm, force_N = np.array(self.presses).T
-        if not (seconds[-1] - seconds[0]) * rate_Hz <= MOST_FRAMES:
+        row_s, row_x_mm, row_y_mm, row_force_N = np.array(self.presses).T
+        start_s = row_s[0]
+        end_s = row_s[-1]
+        duration_s = end_s - start_s
+        if not duration_s * rate_Hz <= MAX_SCRIPT_FRAMES:
             raise SceneError(
-                f"script: expected at most {MOST_FRAMES} frames, got {seconds[-1] - seconds[0]:g} s at {rate_Hz:g} Hz"
+                f"script: expected at most {MAX_SCRIPT_FRAMES} frames, got {duration_s:g} s at {rate_Hz:g} Hz"
             )
-        times = np.arange(seconds[0], seconds[-1], 1.0 / rate_Hz)
-        x, y, force = (np.interp(times, seconds, values) for values in (x_mm, y_mm, force_N))
-        return Script(np.where(force > 0, x, np.nan), np.where(force > 0, y, np.nan), force, rate_Hz)
+        frame_s = np.arange(start_s, end_s, 1.0 / rate_Hz)
+        force_N = np.interp(frame_s, row_s, row_force_N)
+        is_touch = force_N > 0.0
+        x_mm = np.where(is_touch, np.interp(frame_s, row_s, row_x_mm), np.nan)
+        y_mm = np.where(is_touch, np.interp(frame_s, row_s, row_y_mm), np.nan)
+        return Script(x_mm, y_mm, force_N, rate_Hz)
 
 
 def load_script(path: Path) -> VirtualScript:
-    """Read a script, TOML.
+    """Read a script from a TOML file.
 
     Raises:
-        SceneError: If it cannot be read, or a key is unknown or wrong.
+        SceneError: If the file cannot be read, or a key is unknown or wrong.
     """
     return read_toml(path, "a script of a virtual sensor", SceneError, VirtualScript)
 
@@ -156,60 +173,95 @@ def wander(
     radius_mm: float = DEFAULT_RADIUS,
     force_range_N: tuple[float, float] = DEFAULT_PLAYED_FORCE_RANGE,
 ) -> Script:
-    """A script of random presses that wander over the film: a second of rest, then presses of 1 to 3 s with pauses.
+    """Create a script of random presses that move over the film, with pauses between them.
 
-    Position and the logarithm of the force vary smoothly within a press. A force never leaves its range, because
-    forward maps hold in a range of forces only.
+    The position and the logarithm of the force vary smoothly within a press. The forces stay in their range, because a
+    forward map is valid only in a range of forces.
 
     Args:
         seed: Seed of all random choices.
         seconds: Length of the script, s.
-        rate_Hz: Frames per second.
-        radius_mm: Radius of the disk that holds all presses, mm.
+        rate_Hz: Number of frames per second, Hz.
+        radius_mm: Radius of the disk that contains all presses, mm.
         force_range_N: Smallest and largest force, N.
 
     Raises:
-        SceneError: If a number is out of its range.
+        SceneError: If an argument is outside its range.
     """
-    low, high = force_range_N
-    if not (0.0 < low <= high and radius_mm > 0.0 and rate_Hz > 0.0 and seconds * rate_Hz >= 1.0):
+    low_N, high_N = force_range_N
+    if not (0.0 < low_N <= high_N and radius_mm > 0.0 and rate_Hz > 0.0 and seconds * rate_Hz >= 1.0):
         raise SceneError(
             "wander: expected 0 < smallest <= largest force, a positive radius and at least one frame, got "
             f"{force_range_N} N, {radius_mm} mm, {seconds} s at {rate_Hz} Hz"
         )
-    rng, t = np.random.default_rng(seed), np.arange(round(seconds * rate_Hz)) / rate_Hz
-    position, force_N = np.full(t.size, complex(np.nan, np.nan)), np.zeros(t.size)
-    start = REST_S
-    while start < seconds:
-        end = start + rng.uniform(*PRESS_S)
-        inside = (t >= start) & (t < end)
-        position[inside] = radius_mm * _random_path(rng, t[inside] - start)
-        force_N[inside] = low * (high / low) ** _force_level(rng, t[inside] - start, end - start)
-        start = end + rng.uniform(*PAUSE_S)
-    return Script(position.real, position.imag, force_N, rate_Hz)
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(round(seconds * rate_Hz)) / rate_Hz
+    position_mm = np.full(t_s.size, complex(np.nan, np.nan))  # x + i y
+    force_N = np.zeros(t_s.size)
+    start_s = INITIAL_REST_S
+    while start_s < seconds:
+        end_s = start_s + rng.uniform(*PRESS_DURATION_S)
+        is_press = (t_s >= start_s) & (t_s < end_s)
+        press_s = t_s[is_press] - start_s
+        position_mm[is_press] = radius_mm * _random_path(rng, press_s)
+        force_N[is_press] = low_N * (high_N / low_N) ** _force_level(rng, press_s, end_s - start_s)
+        start_s = end_s + rng.uniform(*PAUSE_DURATION_S)
+    return Script(position_mm.real, position_mm.imag, force_N, rate_Hz)
 
 
-def _random_path(rng: np.random.Generator, t: Array) -> Complexes:
-    """Points of a smooth random path inside the unit disk at times t from 0 on, s, shape (n,)."""
+def _random_path(rng: np.random.Generator, t_s: Array) -> Complexes:
+    """Draw a smooth random path inside the unit disk.
+
+    Args:
+        rng: Source of the random numbers.
+        t_s: Times since the start of the press, shape (n,), s.
+
+    Returns:
+        Points x + i y, shape (n,).
+    """
     start = np.sqrt(rng.uniform()) * np.exp(2j * np.pi * rng.uniform())
     turns_per_s = rng.uniform(-0.5, 0.5, size=(3, 1))
-    sway = 0.25 * (np.exp(2j * np.pi * turns_per_s * t) - 1.0)
-    path = start + (np.exp(2j * np.pi * rng.uniform(size=(3, 1))) * sway).sum(axis=0)
-    return np.asarray(path / (1.0 + np.abs(path) ** 8) ** (1 / 8))  # points well inside hardly move
+    circles = 0.25 * (np.exp(2j * np.pi * turns_per_s * t_s) - 1.0)
+    directions = np.exp(2j * np.pi * rng.uniform(size=(3, 1)))
+    path = start + (directions * circles).sum(axis=0)
+    # The division keeps the path inside the disk and hardly moves points that are well inside.
+    return np.asarray(path / (1.0 + np.abs(path) ** 8) ** (1 / 8))
 
 
-def _force_level(rng: np.random.Generator, t: Array, duration: float) -> Array:
-    """Level of the force, from 0 (smallest) to 1 (largest), at times t from 0 to the duration, s, shape (n,)."""
-    level = rng.uniform() + 0.15 * np.sin(2.0 * np.pi * (rng.uniform(0.3, 1.0) * t + rng.uniform()))
-    ramp = np.clip(np.minimum(t, duration - t) / RAMP_S, 0.0, 1.0)
-    return np.clip(level, 0.0, 1.0) * ramp * ramp * (3.0 - 2.0 * ramp)
+def _force_level(rng: np.random.Generator, t_s: Array, duration_s: float) -> Array:
+    """Draw the level of the force of a press, from 0 (smallest force) to 1 (largest force), shape (n,).
+
+    Args:
+        rng: Source of the random numbers.
+        t_s: Times since the start of the press, shape (n,), s.
+        duration_s: Duration of the press, s.
+    """
+    mean_level = rng.uniform()
+    frequency_Hz = rng.uniform(0.3, 1.0)
+    phase_turns = rng.uniform()
+    level = mean_level + 0.15 * np.sin(2.0 * np.pi * (frequency_Hz * t_s + phase_turns))
+    ramp = np.clip(np.minimum(t_s, duration_s - t_s) / RAMP_S, 0.0, 1.0)
+    smooth_ramp = ramp * ramp * (3.0 - 2.0 * ramp)
+    return np.clip(level, 0.0, 1.0) * smooth_ramp
 
 
-def corrupt(data: bytes, share: float, rng: np.random.Generator) -> bytes:
-    """Damage a share of bytes: a third each is flipped in one bit, dropped, or followed by a random byte."""
-    damaged = [bytes([byte]) for byte in data]
-    for position in np.flatnonzero(rng.random(len(data)) < share).tolist():
-        kind, extra = int(rng.integers(3)), int(rng.integers(256))
-        flipped = bytes([data[position] ^ 1 << extra % 8])
-        damaged[position] = (flipped, b"", bytes([data[position], extra]))[kind]
-    return b"".join(damaged)
+def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
+    """Damage a fraction of the bytes. A damaged byte has one flipped bit, is dropped, or is followed by a random byte.
+
+    Args:
+        data: The bytes.
+        fraction: Mean fraction of the bytes that are damaged, dimensionless.
+        rng: Source of the random numbers.
+    """
+    pieces = [bytes([byte]) for byte in data]
+    for position in np.flatnonzero(rng.random(len(data)) < fraction).tolist():
+        byte = data[position]
+        damage = int(rng.integers(3))
+        random_byte = int(rng.integers(256))
+        if damage == 0:
+            pieces[position] = bytes([byte ^ 1 << random_byte % BITS_PER_BYTE])
+        elif damage == 1:
+            pieces[position] = b""
+        else:
+            pieces[position] = bytes([byte, random_byte])
+    return b"".join(pieces)

@@ -1,9 +1,9 @@
-"""A virtual sensor: a pseudo-terminal that sends frames like a board, from any forward map.
+"""Virtual sensor: a pseudo-terminal that sends the frames of a board, with charges from any forward map.
 
-The touch charges of the whole script are computed before it plays; the amplifier, which has a memory, processes them
-block by block. Frames are written at absolute deadlines, so the rate does not drift. The writer never waits for a
-reader: a frame that does not fit into the port's buffer is withheld whole and counted, and the reader sees a gap in the
-frame numbers.
+The touch charges of the whole script are computed before the first frame is sent. The amplifier, whose output depends
+on earlier charges, processes them block by block. Frames are written at absolute times, so the frame rate does not
+drift. The sensor never waits for a reader: a frame that does not fit into the buffer of the port is discarded and
+counted, and the reader receives a gap in the frame numbers.
 """
 
 import array
@@ -26,47 +26,56 @@ from isocharge.serve.frames.binary import encode_frame
 from isocharge.serve.frames.frame import SEQ_MODULUS, T_US_MODULUS, Frame
 from isocharge.serve.virtual_sensor.script import Faults, Script, corrupt
 
-PORT_BUFFER = 3840
-"""Largest number of bytes that wait for the reader. Linux holds 4095: beyond, a write could be cut within a frame."""
+PORT_BUFFER_BYTES = 3840
+"""Largest number of bytes that wait for the reader. The buffer of Linux has 4095 bytes; if it were full, a frame could
+be written incompletely."""
 
 
 class PseudoPort:
-    """An open pseudo-terminal in raw mode; `url` is the device path. Close it to make the port vanish."""
+    """An open pseudo-terminal in raw mode.
+
+    Attributes:
+        url: Path of the device for the reader.
+    """
 
     def __init__(self) -> None:
-        """Open one.
+        """Open a pseudo-terminal.
 
         Raises:
-            PortError: If the system has none: Windows.
+            PortError: If the operating system has no pseudo-terminals, as Windows.
         """
         tty, self._fcntl, self._termios = posix_modules()
-        # The reader's end stays open here, so the port does not hang up when a reader closes it.
+        # The reader's end also stays open here, so that the port is not hung up when a reader closes it.
         self._writer, self._reader = os.openpty()
         tty.setraw(self._reader)
         os.set_blocking(self._writer, False)
         self.url = os.ttyname(self._reader)
 
     def write_whole(self, data: bytes) -> bool:
-        """Write all of `data`, or nothing if the reader is too far behind, without waiting; whether it was written."""
-        waiting = array.array("i", [0])
-        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, waiting)
-        if waiting[0] + len(data) > PORT_BUFFER:
+        """Write data completely, or not at all if the buffer is too full, without waiting.
+
+        Returns:
+            Whether the data were written.
+        """
+        waiting_bytes = array.array("i", [0])
+        self._fcntl.ioctl(self._reader, self._termios.FIONREAD, waiting_bytes)
+        if waiting_bytes[0] + len(data) > PORT_BUFFER_BYTES:
             return False
         with contextlib.suppress(BlockingIOError):
             return os.write(self._writer, data) == len(data)
         return False
 
     def close(self) -> None:
-        """Make the port vanish, as when a cable is pulled."""
+        """Close the pseudo-terminal. For the reader this is like pulling the cable."""
         os.close(self._writer)
         os.close(self._reader)
 
 
 def posix_modules() -> tuple[Any, Any, Any]:
-    """The modules `tty`, `fcntl` and `termios`, which handle pseudo-terminals.
+    """Import the modules `tty`, `fcntl` and `termios`, which handle pseudo-terminals.
 
     Raises:
-        PortError: If this system has no pseudo-terminals.
+        PortError: If the operating system has no pseudo-terminals.
     """
     try:
         tty, fcntl, termios = map(importlib.import_module, ("tty", "fcntl", "termios"))
@@ -79,29 +88,33 @@ def posix_modules() -> tuple[Any, Any, Any]:
 
 
 Charges = Callable[[Array], Array]
-"""Contacts (x, y, F), shape (n, 3), mm and N, to touch charges, shape (n, electrodes), pC: `charges` of a ChargeMap."""
+"""Forward map: function from contacts (x, y, F), shape (n, 3), mm and N, to charges, shape (n, electrodes), pC."""
 
 Noise = Callable[[Array, np.random.Generator], Array]
-"""`noise(charge_pC, rng)`: charges to the output of an amplifier, both of shape (n, electrodes), pC.
+"""Amplifier: function from charges and a random generator to measured charges, both of shape (n, electrodes), pC.
 
-It is called block by block in the order of time, so it may have a memory.
+The function is called block by block in the order of time, so that the output may depend on earlier charges.
 """
 
 Encode = Callable[[Frame], bytes]
-"""A frame to its bytes."""
+"""Frame format: function from a frame to its bytes."""
 
 BLOCK_S = 0.5
 """Length of the blocks that the amplifier processes, s."""
 
+MAX_RANDOM_OFFSET_pC = 20.0
+"""Largest absolute value of a random constant charge, pC."""
+
 
 class Truth(NamedTuple):
-    """The press in one frame.
+    """The true press in one frame.
 
     Attributes:
-        x_mm, y_mm: Position, mm; NaN where nothing touches.
-        force_N: Force, N; 0 where nothing touches.
+        x_mm: Position, mm; NaN if nothing touches.
+        y_mm: Position, mm; NaN if nothing touches.
+        force_N: Force, N; 0 if nothing touches.
         charge_pC: Touch charges without noise and offset, shape (electrodes,), pC.
-        sent_s: When the frame was written, on `time.perf_counter`, s.
+        sent_s: Time at which the frame was written, on the clock `time.perf_counter`, s.
     """
 
     x_mm: float
@@ -112,16 +125,16 @@ class Truth(NamedTuple):
 
 
 class VirtualSensor:
-    """Plays a script, over and over, from entering the context to leaving it.
+    """Context manager that plays a script repeatedly while the context is active.
 
-    Readers may come and go. Entering the context sets the counters to 0.
+    Readers may open and close the port at any time. Entering the context resets the counters.
 
     Attributes:
-        port_path: Device path of the pseudo-terminal that was opened first.
-        withheld: Frames that did not fit into the port, because nobody read.
-        lost: Frames that a fault lost.
-        corrupted: Frames that a fault damaged.
-        unplugged: Times that the port vanished and came back.
+        port_path: Path of the pseudo-terminal that was opened first.
+        withheld: Number of frames that were discarded because they did not fit into the buffer of the port.
+        lost: Number of frames that were not sent because of a fault.
+        corrupted: Number of frames that were damaged by a fault.
+        unplugged: Number of outages of the port that have ended.
 
     Example:
         >>> with VirtualSensor(charges, wander(seed=1)) as sensor:  # doctest: +SKIP
@@ -144,29 +157,39 @@ class VirtualSensor:
         """Compute the charges of the script.
 
         Args:
-            charges: Forward map; called once, for the frames in which something touches.
+            charges: Forward map. It is called once, for the frames in which something touches.
             script: The presses.
-            noise: The amplifier; None for clean charges.
-            offset_pC: Constant charge on each electrode, pC, which the reader tares away; by default drawn at random
-                up to 20 pC.
+            noise: Amplifier; None for charges without noise.
+            offset_pC: Constant charge on each electrode, pC, which the reader subtracts as its tare. By default the
+                charges are drawn at random.
             seed: Seed of noise, offset and faults.
-            encode: The frame format.
-            faults: By default there are no faults.
-            link: Path of a symbolic link to the port while it plays. Without one, a sensor whose port vanishes makes
-                its own, because the port comes back under another name.
+            encode: Frame format.
+            faults: Faults between the sensor and the reader; none by default.
+            link: Path of a symbolic link to the port, which exists while the context is active. If the faults contain
+                outages, a temporary link is created by default, because the port has another name after an outage.
 
         Raises:
-            SceneError: If the forward map gives charges of another shape, or not finite.
+            SceneError: If the forward map returns charges of another shape, or charges that are not finite.
         """
         self._rng = np.random.default_rng(seed)
-        self._script, self._noise, self._encode = script, noise, encode
-        self._faults, self._link = faults or Faults(), link
+        self._script = script
+        self._noise = noise
+        self._encode = encode
+        self._faults = faults or Faults()
+        self._link = link
         self._clean_pC = _clean_charges(charges, script)
-        self._next: tuple[Script, Array] | None = None
-        random_pC = self._rng.uniform(-20.0, 20.0, self._clean_pC.shape[1])
+        self._next_script: tuple[Script, Array] | None = None
+        n_electrode = self._clean_pC.shape[1]
+        random_pC = self._rng.uniform(-MAX_RANDOM_OFFSET_pC, MAX_RANDOM_OFFSET_pC, n_electrode)
         self._offset_pC = random_pC if offset_pC is None else np.asarray(offset_pC)
+
+        self.withheld = 0
+        self.lost = 0
+        self.corrupted = 0
+        self.unplugged = 0
+        self._frame_count = 0
+        self._script_start = 0  # number of the frame with which the script began
         self._sent_s = np.full(SEQ_MODULUS, np.nan)
-        self._begin = self._frames = self.withheld = self.lost = self.corrupted = self.unplugged = 0
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
         self._port: PseudoPort | None = None
@@ -175,10 +198,10 @@ class VirtualSensor:
 
     @property
     def url(self) -> str:
-        """Path for the reader.
+        """Path of the port for the reader.
 
         Raises:
-            PortError: Outside the context.
+            PortError: If the context is not active.
         """
         if self._writer is None:
             raise PortError("the virtual sensor does not play; use `with VirtualSensor(...) as sensor`")
@@ -186,66 +209,89 @@ class VirtualSensor:
 
     @property
     def sent(self) -> int:
-        """Frames that were written."""
-        return self._frames - self.withheld - self.lost
+        """Number of frames that were written."""
+        return self._frame_count - self.withheld - self.lost
 
     def use(self, charges: Charges, script: Script) -> None:
-        """Go on with another script of the same rate, from its begin, within `BLOCK_S`; the amplifier stays as it is.
+        """Continue with another script of the same frame rate, from its start. The amplifier keeps its state.
+
+        The change takes effect within `BLOCK_S`.
+
+        Args:
+            charges: Forward map.
+            script: The presses.
 
         Raises:
-            SceneError: As on construction.
+            SceneError: If the forward map returns charges of another shape, or charges that are not finite.
         """
-        self._next = script, _clean_charges(charges, script)
+        self._next_script = (script, _clean_charges(charges, script))
 
     def frames(self) -> Iterator[bytes]:
-        """The bytes of each frame from the first on, by no clock; nothing for a frame that a fault loses."""
-        self.lost = self.corrupted = self._begin = 0
-        block = max(1, round(BLOCK_S * self._script.rate_Hz))
-        for first in itertools.count(step=block):
-            if self._next is not None:
-                (self._script, self._clean_pC), self._next, self._begin = self._next, None, first
-            rows = range(first - self._begin, first - self._begin + block)
+        """Yield the bytes of each frame without waiting for its time; empty bytes for a frame that a fault loses."""
+        self.lost = 0
+        self.corrupted = 0
+        self._script_start = 0
+        block_size = max(1, round(BLOCK_S * self._script.rate_Hz))
+        for first in itertools.count(step=block_size):
+            if self._next_script is not None:
+                self._script, self._clean_pC = self._next_script
+                self._next_script = None
+                self._script_start = first
+            rows = range(first - self._script_start, first - self._script_start + block_size)
             clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")
-            output_pC = clean_pC if self._noise is None else self._noise(clean_pC, self._rng)
-            for number, row in enumerate((output_pC + self._offset_pC).tolist(), first):
-                yield self._frame(number, tuple(row))
+            measured_pC = clean_pC if self._noise is None else self._noise(clean_pC, self._rng)
+            for number, charge_pC in enumerate((measured_pC + self._offset_pC).tolist(), first):
+                yield self._frame(number, tuple(charge_pC))
 
     def _frame(self, number: int, charge_pC: tuple[float, ...]) -> bytes:
-        faults, t_s = self._faults, self._since_begin_s(number)
-        if faults.is_silent(t_s) or (faults.lose_share and self._rng.random() < faults.lose_share):
+        """Encode a frame, and apply the faults."""
+        faults = self._faults
+        is_silent = faults.is_silent(self._script_time_s(number))
+        if is_silent or (faults.lose_share and self._rng.random() < faults.lose_share):
             self.lost += 1
             return b""
         t_us = round(number / self._script.rate_Hz * (1e6 + faults.clock_ppm)) % T_US_MODULUS
-        whole = self._encode(Frame(number % SEQ_MODULUS, t_us, charge_pC))
-        data = corrupt(whole, faults.corrupt_share, self._rng) if faults.corrupt_share else whole
-        self.corrupted += data != whole
-        return data
+        data = self._encode(Frame(number % SEQ_MODULUS, t_us, charge_pC))
+        if not faults.corrupt_share:
+            return data
+        damaged = corrupt(data, faults.corrupt_share, self._rng)
+        if damaged != data:
+            self.corrupted += 1
+        return damaged
 
-    def _since_begin_s(self, number: int) -> float:
-        """Time of a frame since the script began, s."""
-        return (number - self._begin) / self._script.rate_Hz
+    def _script_time_s(self, number: int) -> float:
+        """Return the time of a frame since the start of the script, s."""
+        return (number - self._script_start) / self._script.rate_Hz
 
     def truth(self, seq: int) -> Truth:
-        """The press in the latest frame with this number.
+        """Return the true press in the latest frame with a frame number.
 
         Raises:
-            SceneError: If no frame had it yet.
+            SceneError: If no frame with this number has been played.
         """
-        latest = self._frames - 1
-        frame = latest - (latest - seq) % SEQ_MODULUS
-        if frame < 0 or not 0 <= seq < SEQ_MODULUS:
+        latest = self._frame_count - 1
+        number = latest - (latest - seq) % SEQ_MODULUS
+        if number < 0 or not 0 <= seq < SEQ_MODULUS:
             raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest, SEQ_MODULUS - 1)}")
-        at, script = (frame - self._begin) % len(self._script), self._script
-        x_mm, y_mm, force_N = (float(values[at]) for values in (script.x_mm, script.y_mm, script.force_N))
-        return Truth(x_mm, y_mm, force_N, self._clean_pC[at], float(self._sent_s[seq]))
+        script = self._script
+        row = (number - self._script_start) % len(script)
+        return Truth(
+            x_mm=float(script.x_mm[row]),
+            y_mm=float(script.y_mm[row]),
+            force_N=float(script.force_N[row]),
+            charge_pC=self._clean_pC[row],
+            sent_s=float(self._sent_s[seq]),
+        )
 
     def __enter__(self) -> Self:
         """Open the port and start to play.
 
         Raises:
-            InputError: If the link cannot be made.
+            InputError: If the link cannot be created.
         """
-        self._frames = self.withheld = self.unplugged = 0
+        self._frame_count = 0
+        self.withheld = 0
+        self.unplugged = 0
         if self._link is None and self._faults.unplug_every_s > 0.0:
             self._folder = tempfile.TemporaryDirectory(prefix="isocharge-")
             self._link = Path(self._folder.name) / "film"
@@ -264,24 +310,29 @@ class VirtualSensor:
         self._writer = None
         if self._folder is not None:
             self._folder.cleanup()
-            self._folder = self._link = None
+            self._folder = None
+            self._link = None
 
     def _play(self) -> None:
-        start = time.perf_counter()
+        """Write each frame at its time until the sensor is stopped."""
+        start_s = time.perf_counter()
         for number, data in enumerate(self.frames()):
-            if self._stop.wait(max(0.0, start + number / self._script.rate_Hz - time.perf_counter())):
+            due_s = start_s + number / self._script.rate_Hz
+            if self._stop.wait(max(0.0, due_s - time.perf_counter())):
                 return
             self._sent_s[number % SEQ_MODULUS] = time.perf_counter()
-            self._frames = number + 1  # before writing: a quick reader may ask for the truth at once
-            if self._faults.is_unplugged(self._since_begin_s(number)):
+            # Count the frame before it is written, because a reader may ask for its truth as soon as it has the frame.
+            self._frame_count = number + 1
+            if self._faults.is_unplugged(self._script_time_s(number)):
                 self._unplug()
             elif self._port is None:
                 self._plug()
                 self.unplugged += 1
-            if data and self._port is not None:
-                self.withheld += not self._port.write_whole(data)
+            if data and self._port is not None and not self._port.write_whole(data):
+                self.withheld += 1
 
     def _plug(self) -> PseudoPort:
+        """Open the port and create the link."""
         port = PseudoPort()
         try:
             if self._link:
@@ -295,6 +346,7 @@ class VirtualSensor:
         return port
 
     def _unplug(self) -> None:
+        """Remove the link and close the port."""
         if self._port is None:
             return
         if self._link:
@@ -304,14 +356,16 @@ class VirtualSensor:
 
 
 def _clean_charges(forward: Charges, script: Script) -> Array:
-    """Touch charges of a whole script, shape (n, electrodes), pC; zero where nothing touches."""
-    touching = script.touching
-    pressed = forward(np.column_stack([script.x_mm, script.y_mm, script.force_N])[touching])
-    if pressed.ndim != 2 or len(pressed) != touching.sum() or not np.isfinite(pressed).all():
+    """Compute the touch charges of a script, shape (n, electrodes), pC. They are zero while nothing touches."""
+    is_touch = script.touching
+    count = int(is_touch.sum())
+    contacts = np.column_stack([script.x_mm, script.y_mm, script.force_N])
+    touch_pC = forward(contacts[is_touch])
+    if touch_pC.ndim != 2 or len(touch_pC) != count or not np.isfinite(touch_pC).all():
         raise SceneError(
-            f"forward map: expected finite charges of shape ({touching.sum()}, electrodes), got shape "
-            f"{pressed.shape} with {np.count_nonzero(~np.isfinite(pressed))} not finite"
+            f"forward map: expected finite charges of shape ({count}, electrodes), got shape "
+            f"{touch_pC.shape} with {np.count_nonzero(~np.isfinite(touch_pC))} not finite"
         )
-    charges = np.zeros((len(script), pressed.shape[1]))
-    charges[touching] = pressed
-    return charges
+    charge_pC = np.zeros((len(script), touch_pC.shape[1]))
+    charge_pC[is_touch] = touch_pC
+    return charge_pC

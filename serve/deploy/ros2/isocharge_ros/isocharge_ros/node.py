@@ -6,7 +6,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 
 from isocharge.serve import Port, Predictor, load_device, stream
-from isocharge.serve.export.record_messages import DEFLECTION_STD, TURN_VARIANCE, contact_of, time_of
+from isocharge.serve.export.record_messages import DEFLECTION_STD_m, ROTATION_VARIANCE_rad2, contact_of, time_of
 
 
 class TouchNode(Node):
@@ -33,7 +33,7 @@ class TouchNode(Node):
             message = self.stamped(PoseWithCovarianceStamped(), record)
             message.pose.pose.position.x, message.pose.pose.position.y = x, y
             x_std, y_std = 1e-3 * touch["x_std_mm"], 1e-3 * touch["y_std_mm"]
-            message.pose.covariance[::7] = [x_std**2, y_std**2, DEFLECTION_STD**2, *[TURN_VARIANCE] * 3]
+            message.pose.covariance[::7] = [x_std**2, y_std**2, DEFLECTION_STD_m**2, *[ROTATION_VARIANCE_rad2] * 3]
             message.pose.covariance[1] = message.pose.covariance[6] = x_std * y_std * (record.xy_correlation or 0.0)
             self.pose.publish(message)
 
