@@ -1,4 +1,4 @@
-"""Steady presses: taken when the charges have settled, at the true charge; refused with the reason otherwise."""
+"""A press is taken with its true charge as soon as it is steady, and otherwise refused with a reason."""
 
 import math
 import re
@@ -21,13 +21,16 @@ NAMES = ("A", "B", "C", "D")
 
 
 def readings(charge_pC, *, noise_pC=1.0, flags=None):
-    """Readings of charges (n, 4), in contact where the first is above 20 pC."""
-    tare, rng = Tare(np.zeros(4), np.full(4, noise_pC), 100), np.random.default_rng(1)
+    """Yield readings of charges with noise, shape (n, 4), pC, in contact where the first charge is above 20 pC."""
+    tare = Tare(np.zeros(4), np.full(4, noise_pC), 100)
+    rng = np.random.default_rng(1)
     for k, clean in enumerate(charge_pC):
         noisy = clean + np.hypot(noise_pC, 0.002 * clean) * rng.standard_normal(4)
         contact = clean[0] > 20.0
-        words = flags(k) if flags else ()
-        reading = Reading(noisy, None if TARE in words else noisy, tare, contact and TARE not in words, words)
+        frame_flags = flags(k) if flags else ()
+        has_tare = TARE not in frame_flags
+        charge_pC = noisy if has_tare else None
+        reading = Reading(noisy, charge_pC, tare, contact=contact and has_tare, flags=frame_flags)
         yield TimedReading(reading, ReadingTime(1e9 + k / RATE_HZ, round(1e6 * k / RATE_HZ), 1.0 / RATE_HZ))
 
 
@@ -44,16 +47,21 @@ def held(seconds, change=lambda _: 1.0, press=PRESS):
     return np.array([press * change(k / RATE_HZ) for k in range(round(seconds * RATE_HZ))])
 
 
+def taken_presses(results):
+    """Return the presses that were taken."""
+    return [result.press for result in results if result.press]
+
+
 def events(seen):
-    """Phases in their order, without repeats."""
-    phases = [one.phase.value for one in seen]
+    """Return the phases in their order, without repetitions."""
+    phases = [result.phase.value for result in seen]
     return [phases[0], *(after for before, after in pairwise(phases) if after != before)]
 
 
-def test_a_press_is_taken_once_and_the_next_one_after_a_lift():
+def test_press_is_taken_once_and_the_next_press_after_a_lift():
     seen = watched(rest(1), held(2), rest(1), held(2, press=PRESS / 2), rest(1))
     assert events(seen) == ["waiting", "settling", "taken", "lift"] * 2 + ["waiting"]
-    for press, clean in zip([one.press for one in seen if one.press], (PRESS, PRESS / 2), strict=True):
+    for press, clean in zip(taken_presses(seen), (PRESS, PRESS / 2), strict=True):
         standard_error = np.hypot(1.0, 0.002 * clean) * math.sqrt(1 / press.frames + 1 / 50)
         assert (np.abs(press.charge_pC - clean) < 4 * standard_error).all()
         np.testing.assert_allclose(press.scatter_pC, np.hypot(1.0, 0.002 * clean), rtol=0.35)
@@ -61,15 +69,15 @@ def test_a_press_is_taken_once_and_the_next_one_after_a_lift():
         assert press.frames == pytest.approx(100, abs=2)
 
 
-def test_what_was_there_before_the_touch_is_no_touch_charge():
-    """The amplifier has drifted by 9 pC since the tare: below the touch threshold, and in the press too."""
-    (press,) = [one.press for one in watched(rest(1, 9.0), held(2) + 9.0, rest(1, 9.0)) if one.press]
+def test_drift_before_the_touch_is_subtracted():
+    """The amplifier has drifted by 9 pC since the tare, which is below the touch threshold."""
+    (press,) = taken_presses(watched(rest(1, 9.0), held(2) + 9.0, rest(1, 9.0)))
     np.testing.assert_allclose(press.charge_pC, PRESS, atol=1.5)
 
 
-def test_a_press_that_settles_late_is_taken_late():
-    """The force comes in with a time constant of 0.4 s: the mean may be off by the drift that is allowed, 0.5 %."""
-    (seen,) = [one for one in watched(rest(1), held(6, lambda t: 1 - math.exp(-t / 0.4))) if one.press]
+def test_press_whose_force_rises_slowly_is_taken_later():
+    """The force rises with a time constant of 0.4 s. The mean may be wrong by the largest allowed drift, 0.5 %."""
+    (seen,) = [result for result in watched(rest(1), held(6, lambda t: 1 - math.exp(-t / 0.4))) if result.press]
     assert seen.held_s > 1.5
     np.testing.assert_allclose(seen.press.charge_pC, PRESS, rtol=0.01)
 
@@ -87,55 +95,55 @@ def test_a_press_that_settles_late_is_taken_late():
         (lambda t: 1.0 + 0.1 * math.sin(40.0 * t), "the charge of A shakes by"),
     ],
 )
-def test_a_press_that_creeps_moves_or_shakes_is_refused(change, reason):
+def test_press_that_creeps_moves_or_shakes_is_refused_with_a_reason(change, reason):
     seen = watched(rest(1), held(9, change), rest(1))
     assert events(seen) == ["waiting", "settling", "refused", "lift", "waiting"]
-    (refused,) = [one for one in seen if one.phase is Phase.refused]
+    (refused,) = [result for result in seen if result.phase is Phase.refused]
     assert refused.reason.startswith("not steady within 8 s: ")
     assert re.search(reason, refused.reason), refused.reason
 
 
-def test_each_press_fades_for_its_own_reason_and_not_for_being_released():
+def test_reason_of_each_press_is_its_own_leak_or_creep_and_not_the_release():
     release = lambda t: min(1.0, 10.0 * (5.0 - t))  # noqa: E731
     leak = held(5, lambda t: release(t) * math.exp(-t / 5.0))
     creep = held(5, lambda t: release(t) * (1.0 - 0.3 * math.log10(t + 0.01)))
     seen = watched(rest(1), leak, rest(1), creep, rest(1), leak, rest(1))
-    said = [one.reason for one in seen if one.phase is Phase.refused]
-    for words, reason in zip(("tau_s = 5 ", "the film creeps", "tau_s = 5 "), said, strict=True):
-        assert words in reason
+    reasons = [result.reason for result in seen if result.phase is Phase.refused]
+    for expected, reason in zip(("tau_s = 5 ", "the film creeps", "tau_s = 5 "), reasons, strict=True):
+        assert expected in reason
 
 
-def test_a_trembling_hand_is_taken():
-    """1 % of the charge at 9 Hz; the mean is right all the same."""
-    (press,) = [one.press for one in watched(rest(1), held(4, lambda t: 1 + 0.014 * math.sin(56.0 * t))) if one.press]
+def test_press_of_a_trembling_hand_is_taken():
+    """The charge varies by 1 % at 9 Hz, and its mean is nevertheless correct."""
+    (press,) = taken_presses(watched(rest(1), held(4, lambda t: 1 + 0.014 * math.sin(56.0 * t))))
     np.testing.assert_allclose(press.charge_pC, PRESS, rtol=0.005)
 
 
-def test_a_press_without_a_rest_before_it_is_refused():
-    """What was there before the touch is not known: a charge without it may be wrong by any amount."""
+def test_press_without_a_rest_before_it_is_refused():
+    """The charge at rest before the touch is unknown, so the touch charge could have any error."""
     seen = watched(rest(1), held(2), rest(0.05), held(2), rest(1))
     assert events(seen) == ["waiting", "settling", "taken", "lift", "waiting", "settling", "refused", "lift", "waiting"]
-    assert "too soon" in next(one.reason for one in seen if one.phase is Phase.refused)
+    assert "too soon" in next(result.reason for result in seen if result.phase is Phase.refused)
 
 
-def test_a_short_press_is_refused_and_a_blip_is_nothing():
+def test_short_press_is_refused_and_a_very_short_touch_is_ignored():
     seen = watched(rest(1), held(0.3), rest(1), held(0.05), rest(1))
-    assert [one.reason for one in seen if one.phase is Phase.refused] == [
+    assert [result.reason for result in seen if result.phase is Phase.refused] == [
         "released after 0.3 s, before it was steady: hold it longer"
     ]
-    assert not [one for one in seen if one.press]
+    assert not [result for result in seen if result.press]
 
 
-def test_saturation_is_refused_until_the_next_press():
-    seen = watched(rest(1), held(2), rest(1), held(2), flags=lambda k: (SATURATED,) * (k == 220))
+def test_saturated_press_is_refused_and_the_next_press_is_taken():
+    seen = watched(rest(1), held(2), rest(1), held(2), flags=lambda k: (SATURATED,) if k == 220 else ())
     assert events(seen) == ["waiting", "settling", "refused", "lift", "waiting", "settling", "taken", "lift"]
-    assert [one.reason for one in seen if one.phase is Phase.refused] == [
+    assert [result.reason for result in seen if result.phase is Phase.refused] == [
         "an amplifier is at its limit: press less hard"
     ]
 
 
-def test_a_lost_port_ends_the_press():
-    """The film is tared again; a press that was under way is not taken, nor is the rest of it."""
+def test_press_is_refused_after_the_port_was_lost():
+    """The film is tared again. Neither the press that was under way nor its continuation is taken."""
     words = lambda k: ((RECONNECTED,) if k == 220 else ()) + ((TARE,) if k < 50 or 220 <= k < 320 else ())  # noqa: E731
     seen = watched(rest(1), held(0.5), rest(1), held(2), flags=words)
     assert events(seen) == [
@@ -149,7 +157,7 @@ def test_a_lost_port_ends_the_press():
         "taken",
         "lift",
     ]
-    assert "the port was away" in next(one.reason for one in seen if one.phase is Phase.refused)
+    assert "the port was away" in next(result.reason for result in seen if result.phase is Phase.refused)
 
 
 def test_an_armed_watch_takes_no_press_that_has_begun():
@@ -161,7 +169,7 @@ def test_an_armed_watch_takes_no_press_that_has_begun():
     assert events(seen) == ["waiting", "settling", "lift", "waiting", "settling", "taken", "lift"]
 
 
-def test_frames_of_a_fast_board_are_looked_at_ten_times_a_window(monkeypatch):
+def test_window_is_checked_ten_times_in_its_length_at_any_frame_rate(monkeypatch):
     calls = []
     monkeypatch.setattr(steady_press, "unsteadiness", lambda *_: calls.append(1) or "no")
     watched(rest(1), held(2.0))

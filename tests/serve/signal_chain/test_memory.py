@@ -42,7 +42,7 @@ def undo(charge_pC, table=MEMORY, noise_pC=0.3, misfit=None):
     for k, row in enumerate(charge_pC + noise_pC * rng.standard_normal(charge_pC.shape)):
         readings.append(chain.advance(row, k / RATE_HZ, 1.0 / RATE_HZ))
     charges = [np.zeros(count) if reading.charge_pC is None else reading.charge_pC for reading in readings]
-    return np.array(charges), *np.array([(reading.contact, reading.doubt) for reading in readings]).T
+    return np.array(charges), *np.array([(reading.contact, reading.charge_scale_std) for reading in readings]).T
 
 
 def pressed(t, begin, end):

@@ -1,13 +1,18 @@
-"""Why a held press fades: the amplifier leaks, or the film creeps.
+"""Why the charges of a held press decrease: the amplifier leaks, or the film creeps.
 
-A leak takes the same share of the charge in equal times, creep in equal ratios of time:
+A leak removes equal shares of the charge in equal times. Creep removes equal shares when the time grows by equal
+factors:
 
-    ln Q = a - t / tau,    ln Q = a + b ln t,
+    leak:   ln Q = a - t / tau
+    creep:  ln Q = a + b ln t
 
-t since the touch. Both lines are fitted to the charges of the press; which of them holds is said only where the other
-leaves three times its residual. Creep with a thermoelastic step (`isocharge.serve.signal_chain.memory`) is said
-where that leaves a third of what either leaves. [leak] undoes the first and would make an error that grows with time of
-the others, which [memory] undoes.
+where t is the time since the touch. Both lines are fitted to the charges of a press. A law is only reported if the
+squared residuals of the other law are at least `MIN_RESIDUAL_RATIO` times as large. Creep with a thermoelastic step
+(see `isocharge.serve.signal_chain.memory`) is reported if it reduces the squared residuals of both lines by this
+factor.
+
+The section [leak] of a device file corrects a leak, and the section [memory] corrects creep. If [leak] is used for
+creep, the error grows with time.
 """
 
 from collections.abc import Sequence
@@ -18,25 +23,27 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.signal_chain.memory import MOST_CREEP, MemoryRule
 
-CLEARER = 9.0
-"""Ratio of the squared residuals from which one law is said to hold: below it a hand that trembles decides."""
+MIN_RESIDUAL_RATIO = 9.0
+"""Ratio of the squared residuals of two laws from which the better law is reported. The variations of the force of a
+hand would decide at a smaller ratio."""
 
-FEWEST = 5
-"""Charges of a press that are compared, at least."""
+MIN_WINDOWS = 5
+"""Smallest number of charges of a press that are compared."""
 
-UNTOLD = (
+UNDECIDED = (
     "or the amplifier leaks or the film creeps, which cannot be told apart yet: hold a press for several seconds, and "
     "set no [leak] before"
 )
+"""Advice if neither law fits clearly better; the end of a sentence."""
 
 
 class Fading(NamedTuple):
-    """The law by which a press fades; nothing where none is clear.
+    """The law by which the charges of a press decrease. All values are at their defaults if no law fits clearly better.
 
     Attributes:
         tau_s: Time constant of a leak, s.
-        creep: Share that creep takes in each decade of time, dimensionless.
-        thermoelastic: Share that the touch had more at first, dimensionless.
+        creep: Share of the charge that creep removes in each decade of time, dimensionless.
+        thermoelastic: Share by which the charge is larger at the beginning of the touch, dimensionless.
     """
 
     tau_s: float | None = None
@@ -45,56 +52,92 @@ class Fading(NamedTuple):
 
     @property
     def memory(self) -> dict[str, float] | None:
-        """The section `[memory]` that undoes it; None if there is none."""
+        """Settings of the section `[memory]` that correct the decrease; None if no settings correct it."""
         if self.creep is None or not self.creep < MOST_CREEP:
             return None
-        step = {"thermoelastic": float(f"{self.thermoelastic:.2g}")} if self.thermoelastic else {}
-        return {"creep": float(f"{self.creep:.2g}")} | step
+        settings = {"creep": float(f"{self.creep:.2g}")}
+        if self.thermoelastic:
+            settings["thermoelastic"] = float(f"{self.thermoelastic:.2g}")
+        return settings
 
     @property
     def remedy(self) -> str:
-        """What to do about creep: half a sentence."""
+        """What the user can do about creep; a part of a sentence."""
         if self.memory is None:
             return "wait longer before each reading"
-        keys = ", ".join(f"{key} = {value:g}" for key, value in self.memory.items())
-        return f"wait longer before each reading, or put [memory] {keys} into a device file"
+        settings = ", ".join(f"{key} = {value:g}" for key, value in self.memory.items())
+        return f"wait longer before each reading, or put [memory] {settings} into a device file"
+
+
+class LineFit(NamedTuple):
+    """A straight line that was fitted to points.
+
+    Attributes:
+        slope: Slope of the line.
+        squared_residual: Sum of the squared residuals.
+    """
+
+    slope: float
+    squared_residual: float
 
 
 def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
-    """By which law a press fades that is held with the same force.
+    """Determine the law by which the charges of a press with a constant force decrease.
 
     Args:
-        sizes: Times since the touch, s, and mean magnitudes of the charges then, positive, pC.
+        sizes: Times since the touch, s, and mean magnitudes of the charges at these times, positive, pC.
     """
-    if len(sizes) < FEWEST:
+    if len(sizes) < MIN_WINDOWS:
         return Fading()
     held_s, size_pC = np.array(sizes).T
-    of_leak, left_by_leak = _line(held_s, np.log(size_pC))
-    of_creep, left_by_creep = _line(np.log(held_s), np.log(size_pC))
-    if max(of_leak, of_creep) >= 0.0:
+    log_size = np.log(size_pC)
+    leak = _fit_line(held_s, log_size)
+    creep = _fit_line(np.log(held_s), log_size)
+    if max(leak.slope, creep.slope) >= 0.0:
         return Fading()
-    if left_by_creep > CLEARER * left_by_leak:
-        return Fading(tau_s=-1.0 / of_leak)
-    both = _of_both(held_s, size_pC, min(left_by_leak, left_by_creep) / CLEARER)
-    if both is None and left_by_leak > CLEARER * left_by_creep:
-        return Fading(creep=-float(np.expm1(of_creep * np.log(10.0))))
-    return both or Fading()
+    if creep.squared_residual > MIN_RESIDUAL_RATIO * leak.squared_residual:
+        return Fading(tau_s=-1.0 / leak.slope)
+
+    max_squared_residual = min(leak.squared_residual, creep.squared_residual) / MIN_RESIDUAL_RATIO
+    creep_and_step = _fit_creep_and_step(held_s, size_pC, max_squared_residual)
+    if creep_and_step is not None:
+        return creep_and_step
+    if leak.squared_residual > MIN_RESIDUAL_RATIO * creep.squared_residual:
+        return Fading(creep=-float(np.expm1(creep.slope * np.log(10.0))))
+    return Fading()
 
 
-def _of_both(held_s: Array, size_pC: Array, most: float) -> Fading | None:
-    """Creep with a thermoelastic step, if that leaves at most so much of the squares of ln Q."""
+def _fit_creep_and_step(held_s: Array, size_pC: Array, max_squared_residual: float) -> Fading | None:
+    """Fit creep with a thermoelastic step.
+
+    Args:
+        held_s: Times since the touch, shape (n,), s.
+        size_pC: Mean magnitudes of the charges, shape (n,), pC.
+        max_squared_residual: Sum of the squared residuals of ln Q above which the fit is rejected.
+
+    Returns:
+        The law; None if the fit is rejected, or its parameters are not physical.
+    """
     step = np.exp(-held_s / MemoryRule().warmth_s)
-    columns = np.column_stack([np.ones_like(held_s), -np.log10(held_s), step])
-    level, creep, cooled = np.linalg.lstsq(columns, size_pC, rcond=None)[0].tolist()
-    fitted_pC = columns @ [level, creep, cooled]
-    if not (level > 0.0 and 0.0 < creep < level and 0.0 < cooled < level and fitted_pC.min() > 0.0):
+    design_matrix = np.column_stack([np.ones_like(held_s), -np.log10(held_s), step])
+    coefficients = np.linalg.lstsq(design_matrix, size_pC, rcond=None)[0]
+    level_pC, creep_pC, step_pC = coefficients.tolist()
+    fitted_pC = design_matrix @ coefficients
+    is_physical = level_pC > 0.0 and 0.0 < creep_pC < level_pC and 0.0 < step_pC < level_pC and fitted_pC.min() > 0.0
+    if not is_physical:
         return None
-    left = float(np.square(np.log(size_pC / fitted_pC)).sum())
-    return Fading(creep=creep / level, thermoelastic=cooled / level) if left < most else None
+    squared_residual = float(np.square(np.log(size_pC / fitted_pC)).sum())
+    if squared_residual >= max_squared_residual:
+        return None
+    return Fading(creep=creep_pC / level_pC, thermoelastic=step_pC / level_pC)
 
 
 def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
-    """What may fade such a press, and what to do: the end of a sentence; `sizes` as for `law_of_fading`."""
+    """Return why the charges of a press may decrease, and what the user can do; the end of a sentence.
+
+    Args:
+        sizes: Times since the touch, s, and mean magnitudes of the charges at these times, positive, pC.
+    """
     law = law_of_fading(sizes)
     if law.tau_s is not None:
         return f"or the amplifier leaks: then put [leak] tau_s = {law.tau_s:.2g} into a device file"
@@ -103,11 +146,13 @@ def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
             f"or the film creeps, by {100.0 * law.creep:.2g} % in each decade of time: {law.remedy}; this is no leak, "
             "so set no [leak] for it"
         )
-    return UNTOLD
+    return UNDECIDED
 
 
-def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Slope of the straight line through points, and the sum of its squared residuals."""
-    x, y = x - x.mean(), y - y.mean()
-    slope = float(x @ y) / float(x @ x)
-    return slope, float(np.square(y - slope * x).sum())
+def _fit_line(x: Array, y: Array) -> LineFit:
+    """Fit a straight line to points with the coordinates x and y, each of shape (n,)."""
+    centred_x = x - x.mean()
+    centred_y = y - y.mean()
+    slope = float(centred_x @ centred_y) / float(centred_x @ centred_x)
+    squared_residual = float(np.square(centred_y - slope * centred_x).sum())
+    return LineFit(slope, squared_residual)

@@ -1,8 +1,9 @@
-"""Presses that are held still: when the charges of a press have settled, and what they are then.
+"""Detection of presses that are held still, and measurement of their charges.
 
-A press is steady when, over a window, each charge scatters and drifts by little. Its charge is the mean over the window
-less the mean at rest just before the touch, so that slow drift of the amplifier or of the film's temperature does not
-count as touch. A press that saturates an amplifier, moves, creeps, or ends too early is refused, with the reason.
+A press is steady if, within a window of time, the scatter and the drift of each charge are small. The charge of the
+press is the mean over the window minus the mean at rest just before the touch. A slow drift of the amplifiers, or of
+the temperature of the film, therefore has no influence. A press is refused, with a reason, if it saturates an
+amplifier, moves, creeps or ends too early.
 """
 
 from collections import deque
@@ -19,53 +20,58 @@ from isocharge.serve.live.reading_stream import TimedReading
 from isocharge.serve.signal_chain.chain import Reading
 
 CHECKS_PER_WINDOW = 10
-"""How often a window is looked at while it moves by its own length: a board may send thousands of frames a second."""
+"""Number of checks in the length of a window. A board may send thousands of frames per second."""
 
 AWAY = "the port was away: leave the film alone until it is tared"
-"""Why a press is refused that was lost with its port."""
+"""Reason why a press is refused if the port was lost."""
 
 TOO_SOON = (
     "pressed too soon after the last touch: leave the film alone for half a second before; if that does not help, the "
     "amplifier leaks: a device file needs [leak] with the time constant of its circuit"
 )
-"""Why a press is refused before which there was no rest."""
+"""Reason why a press is refused if there was no rest before it."""
 
-LEAST_REST = 3
-"""Frames of rest before a touch, at least."""
+MIN_REST_FRAMES = 3
+"""Smallest number of frames at rest before a touch."""
 
-AS_CALM = 2.0
-"""Scatter over the least of the press up to which a window is of a held press: beyond it the probe leaves."""
+MAX_SCATTER_RATIO = 2.0
+"""Scatter of a window, relative to the calmest window of the press, above which the probe is leaving the film."""
 
-ALIKE = 0.3
-"""Largest difference of the charges' relative slopes, over their mean, at which all electrodes change alike."""
+MAX_SLOPE_DIFFERENCE = 0.3
+"""Largest deviation of a charge's relative slope from the mean slope, relative to the mean slope, for which all charges
+are said to change equally."""
+
+MIN_CHARGE_pC = 1e-9
+"""Smallest charge by which a drift is divided, pC."""
 
 
 class SteadyRule(NamedTuple):
-    """When a press is steady.
+    """Conditions for a steady press.
 
     Attributes:
         window_s: Length of the window, s.
-        fewest: Frames in a window, at least.
-        scatter_sigmas: Largest scatter about a straight line, in standard deviations of the noise.
-        noise_share: Noise of a charge under load as a share of it, on top of the noise at rest; a hand trembles by 1 %.
-        drift_share: Largest drift of a charge over the window, as a share of it or of the mean of all: half of what a
-            place known to 0.1 mm leaves, and what a time constant that is 5 % wrong leaves of a leak of 10 s.
-        drift_sigmas: Standard errors of the drift that are allowed on top.
-        latest_s: Time after the touch at which a press that has not settled is refused, s: the longer it is held, the
-            more the leak has been guessed.
-        shortest_s: Shorter touches are no presses, s.
+        min_frames: Smallest number of frames in a window.
+        max_scatter_sigmas: Largest scatter about a straight line, in standard deviations of the noise.
+        relative_noise: Standard deviation of a charge under load, relative to the charge, in addition to the noise at
+            rest. The force of a hand varies by about 1 %.
+        max_relative_drift: Largest drift of a charge over the window, relative to the larger of the charge and of the
+            mean magnitude of all charges. A drift of this size changes the position by about 0.05 mm.
+        drift_sigmas: Number of standard errors of the drift that are added to the largest drift.
+        max_held_s: Time after the touch at which a press that is not yet steady is refused, s. The longer a press is
+            held, the larger is the error of the leak correction.
+        min_held_s: Time below which a touch is not a press, s.
         rest_s: Length of the rest before the touch that is subtracted, s.
-        edge_s: Time next to a press that is no rest yet: the probe lands, or leaves, s.
+        edge_s: Time before and after a press that is not counted as rest, because the probe lands or leaves, s.
     """
 
     window_s: float = 0.5
-    fewest: int = 20
-    scatter_sigmas: float = 3.0
-    noise_share: float = 0.007
-    drift_share: float = 0.005
+    min_frames: int = 20
+    max_scatter_sigmas: float = 3.0
+    relative_noise: float = 0.007
+    max_relative_drift: float = 0.005
     drift_sigmas: float = 4.0
-    latest_s: float = 8.0
-    shortest_s: float = 0.1
+    max_held_s: float = 8.0
+    min_held_s: float = 0.1
     rest_s: float = 0.3
     edge_s: float = 0.05
 
@@ -85,13 +91,13 @@ class SteadyPress(NamedTuple):
     """A press that was held still.
 
     Attributes:
-        charge_pC: Touch charges, means over the window, shape (n_electrode,), pC.
+        charge_pC: Mean touch charges over the window, shape (n_electrode,), pC.
         scatter_pC: Standard deviations about a straight line in the window, shape (n_electrode,), pC.
-        drift_pC: Changes over the window by that line, shape (n_electrode,), pC.
-        held_s: From the touch to the end of the window, s.
+        drift_pC: Changes of this straight line over the window, shape (n_electrode,), pC.
+        held_s: Time from the touch to the end of the window, s.
         window_s: Length of the window, s.
-        frames: Frames in the window.
-        flags: Words from `isocharge.serve.flags` that frames of the window had.
+        frames: Number of frames in the window.
+        flags: Words of `isocharge.serve.flags` that frames of the window had.
     """
 
     charge_pC: Array
@@ -104,13 +110,13 @@ class SteadyPress(NamedTuple):
 
 
 class Watched(NamedTuple):
-    """What a press watch says of a reading.
+    """Result of a press watch for one reading.
 
     Attributes:
-        phase: What it waits for, or `taken` or `refused` once, at the reading that decides.
-        charge_pC: Touch charges of this reading above the rest before, shape (n_electrode,), pC; None without a tare.
-        held_s: Since the touch, s; 0 where nothing touches.
-        reason: Why a press is refused, or has not settled yet; a part of a sentence.
+        phase: What the watch waits for; `taken` or `refused` only for the reading with which a press is decided.
+        charge_pC: Touch charges of this reading minus the rest before, shape (n_electrode,), pC; None without a tare.
+        held_s: Time since the touch, s; 0 if nothing touches.
+        reason: Why a press is refused, or is not yet steady; a part of a sentence.
         press: The press that is taken.
     """
 
@@ -121,112 +127,177 @@ class Watched(NamedTuple):
     press: SteadyPress | None = None
 
 
+class WindowFrame(NamedTuple):
+    """A frame in the window of a press.
+
+    Attributes:
+        t_s: Time, s.
+        charge_pC: Touch charges minus the rest before, shape (n_electrode,), pC.
+        flags: Flags of the frame.
+    """
+
+    t_s: float
+    charge_pC: Array
+    flags: tuple[str, ...]
+
+
 class PressWatch:
-    """Readings in, steady presses out; one press from each touch. Belongs to one thread."""
+    """Finds one steady press in each touch; belongs to one thread."""
 
     def __init__(self, electrodes: tuple[str, ...], rule: SteadyRule | None = None) -> None:
-        """Set up the watch.
+        """Begin to wait for a tare.
 
         Args:
-            electrodes: Names, for reasons.
-            rule: When a press is steady.
+            electrodes: Names of the electrodes, which appear in the reasons.
+            rule: Conditions for a steady press.
         """
-        self._electrodes, self._rule = electrodes, rule or SteadyRule()
+        self._electrodes = electrodes
+        self._rule = rule or SteadyRule()
         self._phase = Phase.taring
         self._rest: deque[tuple[float, Array]] = deque()
-        self._window: deque[tuple[float, Array, tuple[str, ...]]] = deque()
+        self._window: deque[WindowFrame] = deque()
         self._rest_pC = np.zeros(len(electrodes))
-        self._begin_s = self._end_s = self._check_s = -np.inf
-        self._reason, self._calmest_pC, self._has_rest = "", np.inf, False
+        self._has_rest = False
+        self._begin_s = -np.inf
+        self._end_s = -np.inf
+        self._check_s = -np.inf
+        self._reason = ""
+        self._min_scatter_pC = np.inf
         self._sizes: list[tuple[float, float]] = []
 
     def arm(self) -> None:
-        """From now on, take only a press that has not begun yet."""
+        """Ignore the press that is under way, and take only the next one."""
         if self._phase is Phase.settling:
             self._phase = Phase.lift
 
     def feed(self, timed: TimedReading) -> Watched:
-        """Take the next reading."""
-        reading, t_s = timed.reading, timed.time.clock_s
+        """Process the next reading."""
+        reading = timed.reading
+        t_s = timed.time.clock_s
         if RECONNECTED in reading.flags or RESTART in reading.flags:
             self._rest.clear()
             return self._refuse(AWAY, Phase.taring)
-        if reading.charge_pC is None:  # no tare yet, or a frame without numbers
-            self._phase = Phase.taring if TARE in reading.flags else self._phase
+        if reading.charge_pC is None:  # There is no tare yet, or the frame is invalid.
+            if TARE in reading.flags:
+                self._phase = Phase.taring
             return Watched(self._phase)
         if not reading.contact:
-            return self._at_rest(reading.charge_pC, t_s)
+            return self._process_rest(reading.charge_pC, t_s)
+
         if self._phase in (Phase.waiting, Phase.taring):
-            self._touch(t_s)
-        charge_pC, held_s = reading.charge_pC - self._rest_pC, t_s - self._begin_s
+            self._begin_press(t_s)
+        charge_pC = reading.charge_pC - self._rest_pC
+        held_s = t_s - self._begin_s
         if self._phase is Phase.lift:
             return Watched(Phase.lift, charge_pC, held_s)
-        return self._settle(reading, charge_pC, t_s)._replace(charge_pC=charge_pC, held_s=held_s)
+        result = self._process_press(reading, charge_pC, t_s)
+        return result._replace(charge_pC=charge_pC, held_s=held_s)
 
-    def _at_rest(self, charge_pC: Array, t_s: float) -> Watched:
-        held_s, unsettled = self._end_s - self._begin_s, self._phase is Phase.settling
+    def _process_rest(self, charge_pC: Array, t_s: float) -> Watched:
+        """Store a frame in which nothing touches, and refuse a press that has ended before it was steady."""
+        rule = self._rule
+        held_s = self._end_s - self._begin_s
+        is_press_unfinished = self._phase is Phase.settling
         self._phase = Phase.waiting
-        if t_s > self._end_s + self._rule.edge_s:
+        if t_s > self._end_s + rule.edge_s:
             self._rest.append((t_s, charge_pC))
-        while self._rest and self._rest[0][0] < t_s - self._rule.rest_s - self._rule.edge_s:
+        oldest_s = t_s - rule.rest_s - rule.edge_s
+        while self._rest and self._rest[0][0] < oldest_s:
             self._rest.popleft()
-        if unsettled and held_s >= self._rule.shortest_s:
+
+        if is_press_unfinished and held_s >= rule.min_held_s:
             reason = self._reason or "hold it longer"
             return self._refuse(f"released after {held_s:.1f} s, before it was steady: {reason}", Phase.waiting)
         return Watched(Phase.waiting, charge_pC)
 
-    def _touch(self, t_s: float) -> None:
-        """A press begins: what was there just before is rest."""
-        rest = [charge_pC for at_s, charge_pC in self._rest if at_s <= t_s - self._rule.edge_s]
-        self._has_rest = len(rest) >= LEAST_REST
-        self._rest_pC = np.mean(rest, axis=0) if rest else np.zeros(len(self._electrodes))
+    def _begin_press(self, t_s: float) -> None:
+        """Begin a press at a time, s, and measure the rest just before it."""
+        rest = [charge_pC for rest_s, charge_pC in self._rest if rest_s <= t_s - self._rule.edge_s]
+        self._has_rest = len(rest) >= MIN_REST_FRAMES
+        self._rest_pC = np.zeros(len(self._electrodes))
+        if rest:
+            self._rest_pC = np.mean(rest, axis=0)
         self._rest.clear()
         self._window.clear()
         self._sizes.clear()
-        self._phase, self._begin_s, self._check_s, self._reason = Phase.settling, t_s, t_s, ""
-        self._calmest_pC = np.inf
+        self._phase = Phase.settling
+        self._begin_s = t_s
+        self._check_s = t_s
+        self._reason = ""
+        self._min_scatter_pC = np.inf
 
-    def _settle(self, reading: Reading, charge_pC: Array, t_s: float) -> Watched:
-        rule, self._end_s = self._rule, t_s
+    def _process_press(self, reading: Reading, charge_pC: Array, t_s: float) -> Watched:
+        """Add a frame to the window of a press, and take or refuse the press if it is decided."""
+        rule = self._rule
+        self._end_s = t_s
+        held_s = t_s - self._begin_s
         if SATURATED in reading.flags:
             return self._refuse("an amplifier is at its limit: press less hard", Phase.lift)
-        if not self._has_rest and t_s - self._begin_s >= rule.shortest_s:
+        if not self._has_rest and held_s >= rule.min_held_s:
             return self._refuse(TOO_SOON, Phase.lift)
-        self._window.append((t_s, charge_pC, reading.flags))
-        while self._window[0][0] < t_s - rule.window_s:
+
+        self._window.append(WindowFrame(t_s, charge_pC, reading.flags))
+        while self._window[0].t_s < t_s - rule.window_s:
             self._window.popleft()
-        full = t_s - self._begin_s >= rule.window_s and len(self._window) >= rule.fewest
-        if full and t_s - self._check_s >= rule.window_s / CHECKS_PER_WINDOW:
+        is_full = held_s >= rule.window_s and len(self._window) >= rule.min_frames
+        if is_full and t_s - self._check_s >= rule.window_s / CHECKS_PER_WINDOW:
             self._check_s = t_s
-            noise_pC = reading.tare.noise_pC if reading.tare else np.zeros_like(charge_pC)
-            press = self._measured(t_s)
-            calm = press.scatter_pC.max() <= AS_CALM * self._calmest_pC
-            self._calmest_pC = min(self._calmest_pC, float(press.scatter_pC.max()))
-            if calm and press.held_s >= 2.0 * press.window_s:  # the probe has landed before the window
-                self._sizes.append((press.held_s - 0.5 * press.window_s, float(np.abs(press.charge_pC).mean())))
-            reason = unsteadiness(rule, press, noise_pC, self._electrodes, self._sizes)
-            if not reason:
+            press = self._steady_press(reading)
+            if press is not None:
                 self._phase = Phase.lift
                 return Watched(Phase.taken, press=press)
-            if calm:
-                self._reason = reason
-        if t_s - self._begin_s > rule.latest_s:
+        if held_s > rule.max_held_s:
             reason = self._reason or "too few frames come"
-            return self._refuse(f"not steady within {rule.latest_s:g} s: {reason}", Phase.lift)
+            return self._refuse(f"not steady within {rule.max_held_s:g} s: {reason}", Phase.lift)
         return Watched(Phase.settling, reason=self._reason)
 
-    def _measured(self, t_s: float) -> SteadyPress:
-        """The window as a press, with a straight line through each charge."""
-        times, charges, flags = zip(*self._window, strict=True)
-        at, charge_pC = np.array(times) - times[0], np.array(charges)
-        centred = at - at.mean()
-        slope = centred @ charge_pC / max(float(centred @ centred), 1e-30)
+    def _steady_press(self, reading: Reading) -> SteadyPress | None:
+        """Return the press in the window if it is steady; otherwise None, and keep the reason."""
+        press = self._measure_window()
+        scatter_pC = float(press.scatter_pC.max())
+        is_calm = scatter_pC <= MAX_SCATTER_RATIO * self._min_scatter_pC
+        self._min_scatter_pC = min(self._min_scatter_pC, scatter_pC)
+        has_landed_before_window = press.held_s >= 2.0 * press.window_s
+        if is_calm and has_landed_before_window:
+            middle_s = press.held_s - 0.5 * press.window_s
+            self._sizes.append((middle_s, float(np.abs(press.charge_pC).mean())))
+
+        noise_pC = np.zeros_like(press.charge_pC)
+        if reading.tare is not None:
+            noise_pC = reading.tare.noise_pC
+        reason = unsteadiness(self._rule, press, noise_pC, self._electrodes, self._sizes)
+        if not reason:
+            return press
+        if is_calm:
+            self._reason = reason
+        return None
+
+    def _measure_window(self) -> SteadyPress:
+        """Fit a straight line to each charge in the window."""
+        frame_times, charges, flags = zip(*self._window, strict=True)
+        begin_s = frame_times[0]
+        end_s = self._end_s
+        times_s = np.array(frame_times) - begin_s
+        charge_pC = np.array(charges)
+        window_s = float(end_s - begin_s)
+
+        centred_s = times_s - times_s.mean()
+        slope = centred_s @ charge_pC / max(float(centred_s @ centred_s), 1e-30)
         mean_pC = charge_pC.mean(axis=0)
-        scatter_pC = (charge_pC - mean_pC - np.outer(centred, slope)).std(axis=0)
-        words = tuple(dict.fromkeys(word for group in flags for word in group))
-        return SteadyPress(mean_pC, scatter_pC, slope * at[-1], t_s - self._begin_s, float(at[-1]), len(charges), words)
+        residual_pC = charge_pC - mean_pC - np.outer(centred_s, slope)
+        different_flags = dict.fromkeys(flag for frame_flags in flags for flag in frame_flags)
+        return SteadyPress(
+            charge_pC=mean_pC,
+            scatter_pC=residual_pC.std(axis=0),
+            drift_pC=slope * window_s,
+            held_s=end_s - self._begin_s,
+            window_s=window_s,
+            frames=len(charges),
+            flags=tuple(different_flags),
+        )
 
     def _refuse(self, reason: str, phase: Phase) -> Watched:
+        """Refuse a press for a reason, and continue with a phase."""
         self._phase = phase
         return Watched(Phase.refused, reason=reason)
 
@@ -238,37 +309,39 @@ def unsteadiness(
     electrodes: tuple[str, ...],
     sizes: Sequence[tuple[float, float]],
 ) -> str:
-    """Why a press is not steady, a part of a sentence; empty if it is.
+    """Return why a press is not steady, as a part of a sentence; an empty string if it is steady.
 
     Args:
-        rule: When a press is steady.
-        press: A window of it.
+        rule: Conditions for a steady press.
+        press: A window of the press.
         noise_pC: Standard deviation of each charge at rest, shape (n_electrode,), pC.
-        electrodes: Names, for the reason.
-        sizes: Times since the touch, s, and mean magnitudes of the charges, pC, of the windows so far.
+        electrodes: Names of the electrodes, which appear in the reason.
+        sizes: Time since the touch, s, and mean magnitude of the charges, pC, of each window so far.
     """
-    size_pC = float(np.abs(press.charge_pC).mean())
-    noise_pC = np.hypot(noise_pC, rule.noise_share * size_pC)
-    excess = press.scatter_pC / noise_pC
-    if excess.max() > rule.scatter_sigmas:
-        worst = int(excess.argmax())
+    mean_size_pC = float(np.abs(press.charge_pC).mean())
+    noise_pC = np.hypot(noise_pC, rule.relative_noise * mean_size_pC)
+    relative_scatter = press.scatter_pC / noise_pC
+    if relative_scatter.max() > rule.max_scatter_sigmas:
+        worst = int(relative_scatter.argmax())
         return f"the charge of {electrodes[worst]} shakes by {press.scatter_pC[worst]:.2g} pC"
-    error_pC = press.scatter_pC * np.sqrt(12.0 / press.frames)
-    allowed_pC = rule.drift_share * np.maximum(np.abs(press.charge_pC), size_pC) + rule.drift_sigmas * error_pC
-    if (np.abs(press.drift_pC) <= allowed_pC).all():
+
+    drift_std_pC = press.scatter_pC * np.sqrt(12.0 / press.frames)
+    size_pC = np.maximum(np.abs(press.charge_pC), mean_size_pC)
+    max_drift_pC = rule.max_relative_drift * size_pC + rule.drift_sigmas * drift_std_pC
+    if (np.abs(press.drift_pC) <= max_drift_pC).all():
         return ""
-    return _drift_words(press, sizes)
+    return _drift_reason(press, sizes)
 
 
-def _drift_words(press: SteadyPress, sizes: Sequence[tuple[float, float]]) -> str:
-    """What changes: the force, if all charges change alike, or the place."""
-    share_per_s = press.drift_pC / np.maximum(np.abs(press.charge_pC), 1e-9) / press.window_s
-    mean = float(share_per_s.mean())
-    if np.abs(share_per_s - mean).max() > ALIKE * abs(mean):
+def _drift_reason(press: SteadyPress, sizes: Sequence[tuple[float, float]]) -> str:
+    """Return what changes: the force if all charges change equally, otherwise the position; `sizes` as above."""
+    relative_slope = press.drift_pC / np.maximum(np.abs(press.charge_pC), MIN_CHARGE_pC) / press.window_s
+    mean_slope = float(relative_slope.mean())
+    if np.abs(relative_slope - mean_slope).max() > MAX_SLOPE_DIFFERENCE * abs(mean_slope):
         return "the press moves: the ratios of the charges change"
-    if mean > 0.0:
-        return f"the charges rise by {100.0 * mean:.2g} % per second: hold the force"
+    if mean_slope > 0.0:
+        return f"the charges rise by {100.0 * mean_slope:.2g} % per second: hold the force"
     return (
-        f"the charges fall by {-100.0 * mean:.2g} % per second on all electrodes alike: hold the force; "
+        f"the charges fall by {-100.0 * mean_slope:.2g} % per second on all electrodes alike: hold the force; "
         f"{cause_of_fading(sizes)}"
     )

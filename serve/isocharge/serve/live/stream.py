@@ -369,12 +369,12 @@ class TouchStream:
         if contact is None:
             return None
         if self._tracker is not None and self._tracker.mixture_contact is not None:
-            return 0.0, 0.0, LARGEST_FORCE_EXPONENT * reading.doubt * contact.force_N
-        if reading.doubt <= 0.0 or charge_pC is None:
+            return 0.0, 0.0, LARGEST_FORCE_EXPONENT * reading.charge_scale_std * contact.force_N
+        if reading.charge_scale_std <= 0.0 or charge_pC is None:
             return None
         return self._charge_scale_sensitivity.shift(
             contact,
-            reading.doubt,
+            reading.charge_scale_std,
             lambda: self.answering_predictor.predict(charge_pC * (1.0 + CHARGE_SCALE_STEP)),
         )
 

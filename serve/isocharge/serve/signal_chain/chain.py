@@ -95,8 +95,8 @@ class Reading(NamedTuple):
         tare: The tare that was subtracted.
         contact: Whether something touches.
         flags: Words of `isocharge.serve.flags`: those that the frame had before the chain, then those of the chain.
-        doubt: Relative standard deviation that all touch charges have in common, because the memory of the film is not
-            known exactly.
+        charge_scale_std: Relative standard deviation that all touch charges have in common, because the memory of the
+            film is not known exactly.
     """
 
     raw_pC: Array
@@ -104,7 +104,7 @@ class Reading(NamedTuple):
     tare: Tare | None
     contact: bool
     flags: tuple[str, ...] = ()
-    doubt: float = 0.0
+    charge_scale_std: float = 0.0
 
 
 class SignalChain:
