@@ -1,4 +1,4 @@
-"""A released network for all films, whose family of solves the small fits share, and one with random weights."""
+"""A released network for all films, whose forward maps the short trainings share, and one with random weights."""
 
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from isocharge.train.films.conditional_network import ConditionalPerceptron, Fil
 from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.films.films_data import draw_film_presses
 from isocharge.train.films.films_model import ConditionalWeights
+from isocharge.train.training.folded_network import N_CONTACT_ANSWERS
 
 MODELS = Path(__file__).parents[3] / "models"
 
@@ -23,25 +24,32 @@ def films() -> FilmsModel:
 
 @pytest.fixture(scope="session")
 def random_films(films):
-    """For any sensor: weights that nobody trained, all of them in use; with the same networks in torch."""
+    """A function from a sensor to a model with random weights, its inputs, and its networks in PyTorch."""
 
-    def of(sensor):
-        prior, domain = FilmPrior(sensor, films.prior.probe), Domain(8.0, (0.05, 2.0))
-        inputs = FilmInputs.fit(
-            FilmScaling(prior, domain), draw_film_presses(prior, films.family, domain, 8, 16, seed=3)
-        )
+    def random_films_of(sensor):
+        prior = FilmPrior(sensor, films.prior.probe)
+        domain = Domain(8.0, (0.05, 2.0))
+        presses = draw_film_presses(prior, films.family, domain, 8, 16, seed=3)
+        inputs = FilmInputs.fit(FilmScaling(prior, domain), presses)
         torch.manual_seed(5)
-        n_electrode, n_context = inputs.mean.size, inputs.scaling.statistics.mean.size
-        parts = [ConditionalPerceptron(n_electrode, (12, 10), outputs, n_context) for outputs in (6, n_electrode)]
-        for part in parts:
-            for parameter in part.parameters():
-                torch.nn.init.normal_(parameter, std=0.2)
-        weights = [ConditionalWeights(part.to_arrays()) for part in parts]
-        noise = noise_model("reference")
-        model = FilmsModel(films.family, inputs.scaling, inputs.mean, inputs.whitening, *weights, noise)
-        return model, inputs, parts
+        n_electrode = inputs.mean.size
+        n_context = inputs.scaling.statistics.mean.size
+        contact = ConditionalPerceptron(n_electrode, (12, 10), N_CONTACT_ANSWERS, n_context)
+        misfit = ConditionalPerceptron(n_electrode, (12, 10), n_electrode, n_context)
+        for parameter in [*contact.parameters(), *misfit.parameters()]:
+            torch.nn.init.normal_(parameter, std=0.2)
+        model = FilmsModel(
+            family=films.family,
+            scaling=inputs.scaling,
+            mean=inputs.mean,
+            whitening=inputs.whitening,
+            contact=ConditionalWeights(contact.to_arrays()),
+            misfit=ConditionalWeights(misfit.to_arrays()),
+            noise=noise_model("reference"),
+        )
+        return model, inputs, [contact, misfit]
 
-    return of
+    return random_films_of
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""The network for all films: what is divided out is exact, and folded it is the conditional network."""
+"""The network for all films: exact scales of the charges, and the networks of single films."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,16 +16,18 @@ from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.training.folded_network import MISFIT_UNIT
 from isocharge.train.training.output_regression import adapt_to_charges
 
-AT, FORCE = (3.0, -4.0), 0.3
+POSITION_mm = (3.0, -4.0)
+FORCE_N = 0.3
 
 
-def solved(prior, parameters, at, force):
-    """Charges of one solve, pC."""
+def solved_charge(prior, parameters, position_mm, force_N):
+    """Simulate one press, and return its charges, pC."""
     sensor, probe = prior.film(parameters)
-    return touch_charge(sensor, press(sensor.film, probe, at, force))
+    return touch_charge(sensor, press(sensor.film, probe, position_mm, force_N))
 
 
-def changed(prior, **values):
+def changed_parameters(prior, **values):
+    """Return the mean parameters of a prior with other values for some of them."""
     parameters = prior.mean.copy()
     for name, value in values.items():
         parameters[prior.names.index(name.replace("gain_", "gain "))] = value
@@ -43,24 +45,26 @@ def changed(prior, **values):
             {"rotation": -0.1, "young": -0.2, "pretension": 1.5 * np.exp(-0.2), "d31": 0.1, "d32": 0.1, "gain_A": 0.05},
             2e-4,
         ),
-        ({"thickness": 0.05}, 2e-3),  # what is left is the bending
+        ({"thickness": 0.05}, 2e-3),  # bending does not scale in the same way
     ],
 )
-def test_charges_scale_and_places_rotate_exactly(films, film, rtol):
-    """The film's charge is the mean film's at the place and force that it stands for, times the exact factors."""
-    prior, scaling = films.prior, FilmScaling(films.prior, films.domain)
-    parameters = changed(prior, **film)
-    unit = scaling.domain.to_unit(np.array([[*AT, FORCE]]))
-    x, y, force = scaling.domain.to_contact(scaling.to_film(parameters, unit))[0]
+def test_charges_scale_and_positions_rotate_exactly(films, film, rtol):
+    """The charges of a film are those of the mean film at the transformed contact, times the exact factors."""
+    prior = films.prior
+    scaling = FilmScaling(prior, films.domain)
+    parameters = changed_parameters(prior, **film)
+    unit = scaling.domain.to_unit(np.array([[*POSITION_mm, FORCE_N]]))
+    [(x_mm, y_mm, force_N)] = scaling.domain.to_contact(scaling.to_film(parameters, unit))
     factor = np.exp(scaling.log_charge_scale(parameters) - scaling.log_charge_scale(prior.mean))
-    expected = factor * solved(prior, prior.mean, AT, FORCE)
-    np.testing.assert_allclose(solved(prior, parameters, (x, y), force), expected, rtol=rtol)
+    expected = factor * solved_charge(prior, prior.mean, POSITION_mm, FORCE_N)
+    np.testing.assert_allclose(solved_charge(prior, parameters, (x_mm, y_mm), force_N), expected, rtol=rtol)
 
 
-def test_the_electrodes_carry_the_place_along(films):
-    """The frame in which the network works is the electrodes': they stand where `place` puts them."""
-    prior, scaling = films.prior, films.scaling
-    parameters = changed(prior, shift_x=0.4, shift_y=-0.2, rotation=0.1)
+def test_positions_move_with_the_electrodes(films):
+    """The network works in the frame of the electrodes, which the calibration of the sensor places."""
+    prior = films.prior
+    scaling = films.scaling
+    parameters = changed_parameters(prior, shift_x=0.4, shift_y=-0.2, rotation=0.1)
     sensor, _ = prior.film(parameters)
     centres = np.array([electrode.centre for electrode in prior.sensor.electrodes])
     units = np.column_stack([centres / scaling.domain.radius, np.zeros(len(centres))])
@@ -71,16 +75,20 @@ def test_the_electrodes_carry_the_place_along(films):
 THREE = load_sensor("three-25um-biaxial")
 
 
-def by_torch(films, inputs, parts, parameters, charge):
-    """What the torch networks answer about one film, in single precision as they are trained."""
+def torch_answers(films, inputs, networks, parameters, charge):
+    """Evaluate the PyTorch networks for one film, in single precision as in the training."""
     film = parameters[None]
     with torch.no_grad():
         values = inputs.values(torch.tensor(charge[None]).float(), film)
-        out, residual = (part(values, inputs.context(film))[0].double().numpy() for part in parts)
-    unit = films.scaling.to_film(np.broadcast_to(parameters, (len(out), parameters.size)), out[:, :3])
-    contact, std = films.domain.to_contact(unit), np.exp(out[:, 3:]) * films.domain.scale
+        contact_outputs, misfit_vector = (
+            network(values, inputs.context(film))[0].double().numpy() for network in networks
+        )
+    mean, log_std = np.split(contact_outputs, 2, axis=1)
+    contact = films.domain.to_contact(films.scaling.to_film(np.tile(film, (len(mean), 1)), mean))
+    std = np.exp(log_std) * films.domain.scale
     std[:, 2] *= contact[:, 2]
-    return contact, std, MISFIT_UNIT * np.sinh(np.linalg.norm(residual, axis=1, keepdims=True))
+    length = np.linalg.norm(misfit_vector, axis=1, keepdims=True)
+    return contact, std, MISFIT_UNIT * np.sinh(length)
 
 
 @pytest.mark.parametrize(
@@ -88,39 +96,44 @@ def by_torch(films, inputs, parts, parameters, charge):
     [
         load_sensor("four-25um-biaxial"),
         THREE,
-        replace(THREE, calibration=Calibration({"A": 1.3}, (0.5, -0.3), 0.2)),  # the film's own deviations on top
+        replace(THREE, calibration=Calibration({"A": 1.3}, (0.5, -0.3), 0.2)),  # a described calibration in addition
     ],
     ids=["four", "three", "calibrated"],
 )
-def test_folded_is_the_conditional_network(random_films, sensor):
-    model, inputs, parts = random_films(sensor)
+def test_the_network_of_a_film_is_the_conditional_network(random_films, sensor):
+    model, inputs, networks = random_films(sensor)
     for parameters in model.prior.draw(np.random.default_rng(4), 3):
         charge = model.film(parameters, correlation=False).test.noisy(model.noise, seed=0)[:40]
-        folded, expected = model.fold(parameters).predict(charge), by_torch(model, inputs, parts, parameters, charge)
-        for mine, theirs in zip(folded, expected, strict=True):
-            np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=2e-5)
+        answers = model.fold(parameters).predict(charge)
+        expected_answers = torch_answers(model, inputs, networks, parameters, charge)
+        for answer, expected in zip(answers, expected_answers, strict=True):
+            np.testing.assert_allclose(answer, expected, rtol=1e-5, atol=2e-5)
 
 
 @pytest.mark.parametrize(
     "factor",
     [None, lambda contact: 0.5 * np.exp(0.02 * contact[:, :2] @ [[1.0, -1.0, 0.5, 0.0], [0.0, 1.0, 0.5, -1.0]])],
-    ids=["known", "half the charges, aslant"],
+    ids=["the simulated film", "half of the charges, with a gradient"],
 )
-def test_its_intervals_hold(films, drawn, factor):
-    """The 95 % intervals hold 92 to 98 % of the coordinates, and the misfit is that of noise."""
+def test_the_intervals_of_films_contain_the_truth(films, drawn, factor):
+    """The 95 % intervals contain 92 to 98 % of the coordinates, and the misfits are those of noise."""
     errors = [evaluate(films.film(parameters, correlation=False, charge_factor=factor)) for parameters in drawn]
     assert 0.92 < np.mean([error["coverage_95"] for error in errors]) < 0.98
     assert np.median([error["misfit_p99"] for error in errors]) < 5.0
 
 
-def test_what_is_linear_in_the_logarithms_is_corrected_exactly(films, drawn):
-    """Charges of channels that are mixed, by 200 of them; the others are answered as those that they stand for."""
-    network, rng = films.fold(drawn[0]), np.random.default_rng(2)
-    logs = rng.normal(6.0, 0.3, (300, 4))
-    as_if = np.exp(logs @ rng.normal(np.eye(4), 0.1) + 0.7)
-    expected = network.predict(as_if)
-    found = adapt_to_charges(network, np.exp(logs[:200]), as_if[:200], expected[0][:200]).predict(np.exp(logs))
-    np.testing.assert_allclose(np.hstack(found[::2]), np.hstack(expected[::2]), rtol=1e-6)
+def test_a_linear_map_of_the_logarithms_is_corrected_exactly(films, drawn):
+    """The map is fitted to 200 presses; the adapted network also answers the other 100 correctly."""
+    network = films.fold(drawn[0])
+    rng = np.random.default_rng(2)
+    logarithms = rng.normal(6.0, 0.3, (300, 4))
+    charge = np.exp(logarithms)
+    equivalent = np.exp(logarithms @ rng.normal(np.eye(4), 0.1) + 0.7)
+    expected_contact, _, expected_misfit = network.predict(equivalent)
+    adapted = adapt_to_charges(network, charge[:200], equivalent[:200], expected_contact[:200])
+    contact, _, misfit = adapted.predict(charge)
+    np.testing.assert_allclose(contact, expected_contact, rtol=1e-6)
+    np.testing.assert_allclose(misfit, expected_misfit, rtol=1e-6)
 
 
 NO_FILM = r"expected 13 finite parameters \(pretension, young"
@@ -136,13 +149,13 @@ NO_FILM = r"expected 13 finite parameters \(pretension, young"
     ],
     ids=["few", "not finite", "two films", "outside"],
 )
-def test_what_is_no_film_is_refused(films, parameters, error, message):
+def test_wrong_parameters_are_refused(films, parameters, error, message):
     with pytest.raises(error, match=message):
         films.film(parameters)
 
 
 def test_a_film_becomes_a_served_model(films, random_films, drawn, tmp_path):
-    """Its graph is node for node that of the model that was trained on the film as described: the same speed."""
+    """The graph has the nodes of a model that was trained on a single film, so it is as fast."""
     fitted = films.film(drawn[0], provenance=Provenance(files={"presses.csv": b"x_mm\n"}))
     folder = release(fitted, tmp_path / "mine", command="test", card=lambda about, _: f"# {about.name}\n").folder
     model = load_model(folder)
