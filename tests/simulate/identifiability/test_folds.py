@@ -21,10 +21,10 @@ from isocharge.simulate.forward.charge_map import differences, within
 from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import (
-    FINEST,
+    SEGMENT_LENGTH,
     find_folds,
+    has_reversed_orientation,
     scaled_derivatives,
-    turned_over,
 )
 from isocharge.simulate.identifiability.nearest_contact import nearest_contact
 from isocharge.simulate.numerics.disk import Rings
@@ -41,7 +41,7 @@ FINE_STEPS = (1e-3, 1e-3, 1e-3)
 
 @dataclass(frozen=True)
 class FineMap(FunctionMap):
-    """Differences over a tenth of a FINEST: these maps vary within some 0.1 mm."""
+    """Differences over a tenth of a SEGMENT_LENGTH: these maps vary within some 0.1 mm."""
 
     def derivatives(self, contact):
         return differences(self.function, contact, FINE_STEPS)
@@ -121,8 +121,8 @@ def test_a_fold_smaller_than_the_grid_is_found():
 
     model, rings = shaped_charges(pocket, lambda _, y: y), Rings.spread(5.0, 25, 40)
     scaled = rings.per_ring(scaled_derivatives(model, rings.contacts(1.0), REFERENCE))
-    assert not turned_over(scaled[:-1], scaled[1:]).any()
-    assert not turned_over(scaled, np.roll(scaled, -1, axis=1)).any()
+    assert not has_reversed_orientation(scaled[:-1], scaled[1:]).any()
+    assert not has_reversed_orientation(scaled, np.roll(scaled, -1, axis=1)).any()
     points = folds_of(model, rings)
     assert len(points)
     assert np.hypot(*(points - at).T).max() < 2.0 * width
@@ -155,7 +155,7 @@ def test_four_charges_lose_rank_at_a_point():
     model = shaped_charges(lambda x, _: (x - 1) ** 2, lambda x, y: (x - 1) * (y + 2), lambda _, y: y)
     points = folds_of(model)
     assert len(points)
-    assert points == pytest.approx(np.broadcast_to([1.0, -2.0], points.shape), abs=2.0 * FINEST)
+    assert points == pytest.approx(np.broadcast_to([1.0, -2.0], points.shape), abs=2.0 * SEGMENT_LENGTH)
 
 
 def test_a_map_that_bends_sharply_loses_no_rank():
@@ -163,7 +163,7 @@ def test_a_map_that_bends_sharply_loses_no_rank():
     bend = 0.2
     model = shaped_charges(lambda x, _: bend * np.cos(x / bend), lambda x, _: bend * np.sin(x / bend), lambda _, y: y)
     near, far = (scaled_derivatives(model, np.array([[x, 0.0, 1.0]]), REFERENCE) for x in (-0.2, 0.2))
-    assert turned_over(near, far)
+    assert has_reversed_orientation(near, far)
     for rings in (Rings.spread(0.5, 2, 8), Rings.spread(0.5, 20, 40)):
         assert len(folds_of(within(model, 0.5), rings)) == 0
 
@@ -174,7 +174,7 @@ def test_an_electrode_within_the_area_is_no_fold(film):
     for count, seems in ((13, True), (130, False)):
         rings = Rings.spread(4.0, count, 60)
         scaled = rings.per_ring(scaled_derivatives(charges, rings.contacts(force), REFERENCE))
-        assert turned_over(scaled[:-1], scaled[1:]).any() == seems
+        assert has_reversed_orientation(scaled[:-1], scaled[1:]).any() == seems
     assert len(find_folds(charges, Rings.spread(4.0, 13, 60), force, REFERENCE).points) == 0
 
 

@@ -1,1 +1,1 @@
-"""What charges determine about a contact: Cramer-Rao limits, folds, ambiguous pairs, working area."""
+"""Identifiability of contacts from charges: Cramer-Rao limits, folds, ambiguous pairs and the working area."""

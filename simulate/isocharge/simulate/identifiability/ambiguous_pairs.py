@@ -1,7 +1,7 @@
-"""Contacts far apart with the same charges.
+"""Pairs of distant contacts that have the same charges.
 
-A map without folds may still give two distant contacts the same charges, as a sheet may lie on itself without a crease.
-The search for such pairs covers the whole film at once.
+A charge map without folds may still give two distant contacts the same charges. The search for such pairs covers the
+whole domain of the map.
 """
 
 from dataclasses import dataclass
@@ -19,28 +19,38 @@ from isocharge.simulate.numerics.disk import INNER_RADIUS, lattice
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 INDISTINGUISHABLE_SIGMAS = 3.0
-"""Largest difference of the charges at which two contacts count as the same, standard deviations of the noise."""
+"""Largest difference of the charges of two contacts that count as indistinguishable, in standard deviations of the
+noise."""
 
-APART, WIDTHS = 1.0, 6.0
-"""Smallest distance of an ambiguous pair: APART, mm, and WIDTHS standard deviations of the position. Nearer contacts
-are one uncertain contact."""
+MIN_DISTANCE = 1.0
+"""Smallest distance between the contacts of an ambiguous pair, mm."""
+
+MIN_DISTANCE_SIGMAS = 6.0
+"""Smallest distance between the contacts of an ambiguous pair, in standard deviations of the position. Two nearer
+contacts count as a single contact with a large uncertainty."""
 
 FORCES = 8
 """Number of forces at which the charges of the second contact are tabulated."""
 
 EXPONENT = 2.0 / 3.0
-"""Exponent of the force in the charge of a slack membrane, dimensionless; the ratio of the charge to this power of the
-force is tabulated, because it varies little."""
+"""Exponent of the force in the charge of a slack membrane, dimensionless. The ratio of the charge to this power of the
+force is tabulated, because it varies little with the force."""
+
+NEIGHBOURS = 9
+"""Number of lattice points, including the point itself, among which a candidate must have the smallest difference."""
+
+MAX_CANDIDATES = 2
+"""Largest number of candidates for the second contact of each first contact."""
 
 
 @dataclass(frozen=True)
 class AmbiguousPairs:
-    """Pairs of contacts with the same charges, the nearest to the centre first.
+    """Pairs of contacts with the same charges, ordered by the distance of the outer contact from the centre.
 
     Attributes:
-        first: (x, y, F), shape (n, 3), mm and N.
-        second: The other contact of each pair, likewise.
-        distance: Difference of their charges, standard deviations of the noise, shape (n,).
+        first: First contact (x, y, F) of each pair, shape (n, 3), mm and N.
+        second: Second contact (x, y, F) of each pair, shape (n, 3), mm and N.
+        distance: Difference of the charges of each pair, shape (n,), in standard deviations of the noise.
     """
 
     first: Array
@@ -49,7 +59,7 @@ class AmbiguousPairs:
 
     @classmethod
     def none(cls) -> "AmbiguousPairs":
-        """No pair."""
+        """Return an empty result."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
     def __len__(self) -> int:
@@ -58,19 +68,22 @@ class AmbiguousPairs:
     @property
     def outer_radius(self) -> Array:
         """Distance of the outer contact of each pair from the centre, shape (n,), mm."""
-        return np.asarray(np.maximum(np.hypot(*self.first[:, :2].T), np.hypot(*self.second[:, :2].T)))
+        first_radius = np.hypot(*self.first[:, :2].T)
+        second_radius = np.hypot(*self.second[:, :2].T)
+        return np.asarray(np.maximum(first_radius, second_radius))
 
     @property
     def radius(self) -> float:
-        """Radius of the smallest disk that holds both contacts of a pair, mm; infinite if there are no pairs."""
+        """Radius of the smallest centred disk that contains both contacts of a pair, mm; infinite without pairs."""
         return float(self.outer_radius.min(initial=np.inf))
 
     @property
     def summary(self) -> str:
-        """The pair nearest to the centre, in a sentence; nothing without pairs."""
+        """Sentence about the pair nearest to the centre; empty without pairs."""
         if not len(self):
             return ""
-        (x, y, force), (other_x, other_y, other_force) = self.first[0], self.second[0]
+        x, y, force = self.first[0]
+        other_x, other_y, other_force = self.second[0]
         return (
             f"Contacts far apart can have the same charges: {force:.3g} N at ({x:.1f}, {y:.1f}) mm and "
             f"{other_force:.3g} N at ({other_x:.1f}, {other_y:.1f}) mm are alike within "
@@ -79,55 +92,68 @@ class AmbiguousPairs:
 
 
 def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
-    """Pairs of contacts far apart whose charges differ by less than the noise.
+    """Find pairs of distant contacts whose charges differ by less than the noise.
 
-    For each position of a square lattice, pressed with `force`, every other position is tried with the force that fits
-    best; the best two are improved by least squares.
+    For each position of a square lattice, pressed with `force`, all other positions are compared with the force that
+    fits best. The best candidates are then improved by least squares.
 
     Args:
-        charge_map: The charges.
+        charge_map: Charges as a function of the contact.
         noise: Noise of the readings.
-        force: Force of the first contact of each pair, N; the second may have any.
-        places: Number of positions of the lattice: 1,000 take some 3 s with splines.
+        force: Force of the first contact of each pair, N. The second contact may have any force of the map.
+        places: Number of positions of the lattice.
     """
     unit = lattice(places)
     position = INNER_RADIUS * charge_map.domain.radius * np.stack([unit.real, unit.imag], axis=1)
     first = np.column_stack([position, np.full(len(position), force)])
     charge = charge_map.charges(first)
-    apart = np.maximum(APART, WIDTHS * limits_at(charge_map, first, noise).position)
-    pairs, start = _candidates(charge_map, noise, position, charge, apart)
-    if not pairs.size:
+    min_distance = np.maximum(MIN_DISTANCE, MIN_DISTANCE_SIGMAS * limits_at(charge_map, first, noise).position)
+    first_number, start = _candidates(charge_map, noise, position, charge, min_distance)
+    if not first_number.size:
         return AmbiguousPairs.none()
-    second, distance = nearest_contact(charge_map, noise, charge[pairs], start)
-    far = np.hypot(*(second - first[pairs])[:, :2].T) > apart[pairs]
-    ambiguous = np.flatnonzero(far & (distance < INDISTINGUISHABLE_SIGMAS))
-    found = AmbiguousPairs(first[pairs[ambiguous]], second[ambiguous], distance[ambiguous])
-    order = np.argsort(found.outer_radius, kind="stable")
-    return AmbiguousPairs(found.first[order], found.second[order], found.distance[order])
+    second, difference = nearest_contact(charge_map, noise, charge[first_number], start)
+    distance = np.hypot(*(second - first[first_number])[:, :2].T)
+    is_ambiguous = (distance > min_distance[first_number]) & (difference < INDISTINGUISHABLE_SIGMAS)
+    pairs = AmbiguousPairs(first[first_number[is_ambiguous]], second[is_ambiguous], difference[is_ambiguous])
+    order = np.argsort(pairs.outer_radius, kind="stable")
+    return AmbiguousPairs(pairs.first[order], pairs.second[order], pairs.distance[order])
 
 
 def _candidates(
-    charge_map: ChargeMap, noise: NoiseModel, position: Array, charge: Array, apart: Array
+    charge_map: ChargeMap, noise: NoiseModel, position: Array, charge: Array, min_distance: Array
 ) -> tuple[Integers, Array]:
-    """Numbers of first contacts, and for each a contact (x, y, F) far away that may have the same charges."""
+    """Find candidates for the second contacts of pairs on the lattice.
+
+    Args:
+        charge_map: Charges as a function of the contact.
+        noise: Noise of the readings.
+        position: Positions of the lattice, shape (n, 2), mm.
+        charge: Charges of the first contacts at these positions, shape (n, n_electrode), pC.
+        min_distance: Smallest distance of the second contact from each first contact, shape (n,), mm.
+
+    Returns:
+        Numbers of the first contacts, shape (m,), and a candidate (x, y, F) for each, shape (m, 3), mm and N.
+    """
     profile, terms = _tabulate(charge_map, position)
-    neighbours = cKDTree(position).query(position, min(9, len(position)))[1]
-    numbers, contacts = [], []
-    for i, row in enumerate(charge):
+    neighbours = cKDTree(position).query(position, min(NEIGHBOURS, len(position)))[1]
+    numbers = []
+    contacts = []
+    for number, row in enumerate(charge):
         observed = np.broadcast_to(row, charge.shape)
         logs = profile.best(terms, observed, noise)
-        known = profile.charge(logs, terms)
-        chi2 = ((observed - known) ** 2 / noise.variance(known)).sum(axis=1)
-        lowest = chi2 <= chi2[neighbours].min(axis=1)
-        elsewhere = np.flatnonzero(lowest & (np.hypot(*(position - position[i]).T) > apart[i]))
-        best = elsewhere[np.argsort(chi2[elsewhere])[:2]]
-        numbers.append(np.full(best.size, i))
+        predicted = profile.charge(logs, terms)
+        chi2 = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)
+        is_local_minimum = chi2 <= chi2[neighbours].min(axis=1)
+        is_distant = np.hypot(*(position - position[number]).T) > min_distance[number]
+        candidates = np.flatnonzero(is_local_minimum & is_distant)
+        best = candidates[np.argsort(chi2[candidates])[:MAX_CANDIDATES]]
+        numbers.append(np.full(best.size, number))
         contacts.append(np.concatenate([position[best], np.exp(logs[best])[:, None]], axis=1))
     return np.concatenate(numbers), np.concatenate(contacts)
 
 
 def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Array]:
-    """Charges at every position as a function of the force."""
+    """Tabulate the charges at every position, shape (n, 2), mm, as a function of the force."""
     low, high = np.log(charge_map.domain.force_range)
     nodes = chebyshev_nodes(FORCES, low, high) if high > low else np.array([low])
     forces = np.clip(np.exp(nodes), *charge_map.domain.force_range)

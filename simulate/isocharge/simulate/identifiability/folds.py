@@ -1,81 +1,115 @@
 """Folds of a charge map.
 
-Charges determine a contact only where the map from (x, y, ln F) to the charges is one to one. Across a fold it is not:
-its derivative J = d(Q)/d(x, y, ln F) loses rank and the map turns over. With three electrodes det J changes sign there,
-and folds are lines. With more, J is not square and loses rank at points only; there the map crosses itself, and
-contacts on both sides of the point have the same charges (Whitney 1944).
+Charges determine a contact only where the map from (x, y, ln F) to the charges is one to one. At a fold it is not: the
+derivative J = d(Q)/d(x, y, ln F) is singular there, and the map reverses its orientation across the fold. With three
+electrodes, det J changes its sign, and folds are lines. With more electrodes, J is not square and is singular only at
+isolated points. At such a point the map intersects itself, so that contacts on both sides of the point have the same
+charges (Whitney 1944).
 
-The map turns over between a and b if det(J(a)' W J(b)) < 0, with the weights W = 1 / sigma^2; for three electrodes this
-is the sign of det J(a) det J(b). Between distant contacts that proves nothing with more than three electrodes: the map
-may have turned by more than a right angle without losing rank, as it does beside an electrode. So what seems to turn
-over is bisected until it does within FINEST, or until neither half does. In between, folds smaller than the grid are
-reached by following the smallest singular value of J downhill.
+The orientation is reversed between a and b if det(J(a)' W J(b)) < 0, with the weights W = 1 / sigma^2. For three
+electrodes this is the sign of det J(a) det J(b). With more electrodes, the criterion is reliable only for near
+contacts, because the map may turn by more than a right angle between distant contacts, for example beside an electrode,
+without being singular. A segment with reversed orientation is therefore bisected until it is shorter than
+`SEGMENT_LENGTH`, or until neither half has reversed orientation. Folds smaller than the grid are found by following the
+smallest singular value of J to its minima.
 
-Electrodes on one circle fold a biaxial film near this circle, however many they are: their charges hardly change if the
-press moves to its mirror image in the circle.
+If the electrodes lie on one circle, an isotropic film has a fold near this circle for any number of electrodes, because
+the charges hardly change if the press is moved to its mirror image in the circle.
 
-Even without folds two contacts may have the same charges, see `ambiguous_pairs`.
+Even without folds, two distant contacts may have the same charges; see `ambiguous_pairs`.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # loads a part when it is used
+import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, onto_disk
 
-FINEST = 0.02
-"""Distance within which a map turns over at a fold, mm. Beside an electrode it may turn over within 0.1 mm and yet lose
-nothing: at 1 N the charges still tell the sides apart. On a circle of four electrodes it takes some 0.01 mm."""
+SEGMENT_LENGTH = 0.02
+"""Length of a segment with reversed orientation that counts as a fold, mm. Beside an electrode the orientation may be
+reversed within 0.1 mm without ambiguity of the charges at 1 N. On a circle of four electrodes it is reversed within
+about 0.01 mm."""
 
-MOST_STEPS = 40
-"""Steps downhill to a minimum at most: it takes 8 to 20, more where it creeps along a valley."""
+MAX_STEPS = 40
+"""Largest number of steps of the compass search. Most minima need 8 to 20; minima in narrow valleys need more."""
 
-COMPASS = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange(8) / 4.0)], axis=1)
-"""Eight directions, shape (8, 2); a direction and the one four later are opposite."""
+MIN_COMPASS_STEP = 0.1 * SEGMENT_LENGTH
+"""Step of the compass search below which it ends, mm."""
+
+_COMPASS_ANGLE = np.pi * np.arange(8) / 4.0
+
+COMPASS = np.stack([np.cos(_COMPASS_ANGLE), np.sin(_COMPASS_ANGLE)], axis=1)
+"""Unit vectors in eight directions, shape (8, 2). The vectors i and i + 4 are opposite."""
 
 
-def turned_over(first: Array, second: Array) -> Booleans:
-    """Whether the map turns over between neighbours, given J / sigma of both, shape (..., n_electrode, 3): (...)."""
+def has_reversed_orientation(first: Array, second: Array) -> Booleans:
+    """Return whether the charge map reverses its orientation between neighbouring contacts.
+
+    Args:
+        first: J / sigma of the first contacts, shape (..., n_electrode, 3).
+        second: J / sigma of the second contacts, shape (..., n_electrode, 3).
+
+    Returns:
+        Shape (...).
+    """
     products = np.einsum("...ei,...ej->...ij", _unit_columns(first), _unit_columns(second))
     return np.asarray(np.linalg.det(products) < 0.0)
 
 
 def _unit_columns(jacobian: Array) -> Array:
-    """Columns of unit length: the sign of a determinant is then not lost in rounding."""
-    return np.asarray(jacobian / np.maximum(np.linalg.norm(jacobian, axis=-2, keepdims=True), np.finfo(float).tiny))
+    """Scale the columns to unit length, so that rounding errors do not change the sign of the determinant."""
+    length = np.linalg.norm(jacobian, axis=-2, keepdims=True)
+    return np.asarray(jacobian / np.maximum(length, np.finfo(float).tiny))
 
 
 def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> Array:
-    """J / sigma of contacts (x, y, F): shape (n, 3) to (n, n_electrode, 3), 1/mm, 1/mm and without unit."""
-    charge, slopes = linearised(charge_map, contact)
-    return np.asarray(slopes / noise.sigma(charge)[..., None])
+    """Compute J / sigma for contacts.
+
+    Args:
+        charge_map: Charges as a function of the contact.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        noise: Noise of the readings.
+
+    Returns:
+        Derivatives with respect to x (1/mm), y (1/mm) and ln F (dimensionless), shape (n, n_electrode, 3).
+    """
+    charge, jacobian = linearised(charge_map, contact)
+    return np.asarray(jacobian / noise.sigma(charge)[..., None])
 
 
 def singular_values(scaled: Array) -> Array:
-    """Singular values of J / sigma for the position with unknown force: (n, n_electrode, 3) to (n, 2), 1/mm.
+    """Compute the singular values of J / sigma for the position if the force is unknown.
 
-    One over them are the smallest and the largest standard deviation of the position by direction; at a fold the second
-    is zero.
+    Their inverses are the smallest and the largest standard deviation of the position by direction. At a fold the
+    second singular value is zero.
+
+    Args:
+        scaled: J / sigma, shape (n, n_electrode, 3).
+
+    Returns:
+        Singular values in descending order, shape (n, 2), 1/mm.
     """
-    toward = scaled[:, :, 2] / np.maximum(np.linalg.norm(scaled[:, :, 2], axis=1, keepdims=True), np.finfo(float).tiny)
-    moved = scaled[:, :, :2]
-    across = moved - toward[:, :, None] * np.einsum("ne,nei->ni", toward, moved)[:, None]
-    return np.asarray(np.linalg.svd(across, compute_uv=False))
+    by_position = scaled[:, :, :2]
+    by_force = scaled[:, :, 2]
+    force_direction = by_force / np.maximum(np.linalg.norm(by_force, axis=1, keepdims=True), np.finfo(float).tiny)
+    along_force = np.einsum("ne,nei->ni", force_direction, by_position)
+    across_force = by_position - force_direction[:, :, None] * along_force[:, None]
+    return np.asarray(np.linalg.svd(across_force, compute_uv=False))
 
 
 @dataclass(frozen=True)
 class Folds:
-    """Where a map folds under one force, and where it is nearest to folding.
+    """Folds of a charge map under one force, and the positions where the map is nearest to a fold.
 
     Attributes:
-        points: Shape (n, 2), mm, the nearest to the centre first: on fold lines, with three electrodes; where rank is
-            lost, with more.
-        weakest: Local minima of the smallest singular value of J, shape (k, 2), mm: the position errors between the
-            places of a grid are largest there.
+        points: Positions on folds, ordered by the distance from the centre, shape (n, 2), mm. With three electrodes
+            they lie on fold lines; with more electrodes they are the points where J is singular.
+        weakest: Local minima of the smallest singular value of J, shape (k, 2), mm. The position error has its local
+            maxima there, which may lie between the positions of a grid.
     """
 
     points: Array
@@ -83,92 +117,125 @@ class Folds:
 
 
 def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel) -> Folds:
-    """Folds and weakest places.
+    """Find the folds and the local minima of the smallest singular value under one force.
 
     Args:
-        charge_map: The charges.
-        rings: Positions between which folds are looked for; they need not be as fine as the folds.
+        charge_map: Charges as a function of the contact.
+        rings: Positions between which folds are searched. They may be coarser than the folds.
         force: Force of the contacts, N.
         noise: Noise of the readings.
     """
     search = _FoldSearch(charge_map, noise, force)
     scaled = rings.per_ring(search.scaled(rings.position.reshape(-1, 2)))
-    weakest = search.weakest_places(rings, scaled)
-    points = np.concatenate([search.crossings(rings, scaled), search.folded(weakest)])
-    return Folds(points[np.argsort(np.hypot(*points.T), kind="stable")], weakest)
+    weakest = search.weakest_positions(rings, scaled)
+    points = np.concatenate([search.folds_between(rings, scaled), search.folds_about(weakest)])
+    from_centre = np.argsort(np.hypot(*points.T), kind="stable")
+    return Folds(points[from_centre], weakest)
 
 
 class _FoldSearch:
-    """The search under one force; positions have shape (n, 2), mm."""
+    """Search of folds under one force. Positions have the shape (n, 2) and the unit mm."""
 
     def __init__(self, charge_map: ChargeMap, noise: NoiseModel, force: float) -> None:
-        self.charge_map, self.noise, self.force = charge_map, noise, force
+        self.charge_map = charge_map
+        self.noise = noise
+        self.force = force
         self.radius = INNER_RADIUS * charge_map.domain.radius
 
     def scaled(self, position: Array) -> Array:
-        """J / sigma, shape (n, n_electrode, 3)."""
-        at = onto_disk(position, self.radius)
-        return scaled_derivatives(self.charge_map, np.column_stack([at, np.full(len(at), self.force)]), self.noise)
+        """Compute J / sigma at positions, shape (n, n_electrode, 3)."""
+        inside = onto_disk(position, self.radius)
+        contact = np.column_stack([inside, np.full(len(inside), self.force)])
+        return scaled_derivatives(self.charge_map, contact, self.noise)
 
-    def weakest(self, position: Array) -> Array:
-        """Smallest singular value of J / sigma for the position, shape (n,), 1/mm."""
-        return singular_values(self.scaled(position))[:, -1]
+    def smallest_singular_value(self, position: Array) -> Array:
+        """Compute the smallest singular value of J / sigma for the position, shape (n,), 1/mm."""
+        return singular_values(self.scaled(position))[:, 1]
 
-    def crossings(self, rings: Rings, scaled: Array) -> Array:
-        """Folds between neighbours on the rings, with J / sigma of all, shape (n_ring, n_angle, n_electrode, 3)."""
-        at = rings.position
-        across = turned_over(scaled[:-1], scaled[1:])
-        around = turned_over(scaled, np.roll(scaled, -1, axis=1))
-        first = np.concatenate([at[:-1][across], at[around]])
-        second = np.concatenate([at[1:][across], np.roll(at, -1, axis=1)[around]])
-        return self._bisected(first, second)
+    def folds_between(self, rings: Rings, scaled: Array) -> Array:
+        """Find folds between neighbouring positions of the rings.
 
-    def _bisected(self, first: Array, second: Array) -> Array:
-        """Middles of those segments, between whose ends the map turns over, that still do at a length of FINEST."""
+        Args:
+            rings: Positions.
+            scaled: J / sigma at all positions, shape (n_ring, n_angle, n_electrode, 3).
+        """
+        position = rings.position
+        next_position = np.roll(position, -1, axis=1)
+        radially = has_reversed_orientation(scaled[:-1], scaled[1:])
+        along_ring = has_reversed_orientation(scaled, np.roll(scaled, -1, axis=1))
+        first = np.concatenate([position[:-1][radially], position[along_ring]])
+        second = np.concatenate([position[1:][radially], next_position[along_ring]])
+        return self._bisect(first, second)
+
+    def _bisect(self, first: Array, second: Array) -> Array:
+        """Bisect segments with reversed orientation, and return the centres of those of the length `SEGMENT_LENGTH`.
+
+        Args:
+            first: First ends of the segments.
+            second: Second ends of the segments.
+        """
         points = [np.empty((0, 2))]
         if len(first):
-            start, end = self.scaled(first), self.scaled(second)
+            first_scaled = self.scaled(first)
+            second_scaled = self.scaled(second)
         while len(first):
             middle = 0.5 * (first + second)
-            short = np.hypot(*(second - first).T) <= FINEST
-            points.append(middle[short])
-            between = self.scaled(middle)
-            lower, upper = turned_over(start, between), turned_over(between, end)
-            rest = ~short & (lower | upper)
-            ahead = (upper & ~lower)[rest, None]
-            first, second = np.where(ahead, middle[rest], first[rest]), np.where(ahead, second[rest], middle[rest])
-            start = np.where(ahead[..., None], between[rest], start[rest])
-            end = np.where(ahead[..., None], end[rest], between[rest])
+            is_short = np.hypot(*(second - first).T) <= SEGMENT_LENGTH
+            points.append(middle[is_short])
+
+            middle_scaled = self.scaled(middle)
+            in_first_half = has_reversed_orientation(first_scaled, middle_scaled)
+            in_second_half = has_reversed_orientation(middle_scaled, second_scaled)
+            rest = ~is_short & (in_first_half | in_second_half)
+            take_second = (in_second_half & ~in_first_half)[rest, None]
+            first = np.where(take_second, middle[rest], first[rest])
+            second = np.where(take_second, second[rest], middle[rest])
+            first_scaled = np.where(take_second[..., None], middle_scaled[rest], first_scaled[rest])
+            second_scaled = np.where(take_second[..., None], second_scaled[rest], middle_scaled[rest])
         return np.concatenate(points)
 
-    def weakest_places(self, rings: Rings, scaled: Array) -> Array:
-        """Minima of the smallest singular value, followed downhill from those among the positions of the rings."""
-        weakest = singular_values(scaled.reshape(-1, *scaled.shape[2:]))[:, -1].reshape(scaled.shape[:2])
-        lowest = weakest == scipy.ndimage.minimum_filter(weakest, 3, mode=("nearest", "wrap"))
-        step = np.maximum(rings.distance[0], rings.distance * 2.0 * np.pi / scaled.shape[1])
-        ring, _ = np.nonzero(lowest)  # not empty: the lowest value of all is one
-        return self._downhill(rings.position[lowest], weakest[lowest], step[ring])
+    def weakest_positions(self, rings: Rings, scaled: Array) -> Array:
+        """Find the local minima of the smallest singular value, starting from the minima among the positions of rings.
 
-    def folded(self, position: Array) -> Array:
-        """Those positions about which the map turns over: folds that no two neighbours on the rings enclose."""
-        around = self.scaled((position[:, None] + 0.5 * FINEST * COMPASS).reshape(-1, 2))
-        around = around.reshape(len(position), 8, *around.shape[1:])
-        return np.asarray(position[turned_over(around[:, :4], around[:, 4:]).any(axis=1)])
+        Args:
+            rings: Positions.
+            scaled: J / sigma at all positions, shape (n_ring, n_angle, n_electrode, 3).
+        """
+        values = singular_values(scaled.reshape(-1, *scaled.shape[2:]))[:, 1].reshape(scaled.shape[:2])
+        is_minimum = values == scipy.ndimage.minimum_filter(values, 3, mode=("nearest", "wrap"))
+        spacing = np.maximum(rings.distance[0], rings.distance * 2.0 * np.pi / scaled.shape[1])
+        ring, _ = np.nonzero(is_minimum)  # there is at least one, the global minimum
+        return self._minimise(rings.position[is_minimum], values[is_minimum], spacing[ring])
 
-    def _downhill(self, position: Array, value: Array, step: Array) -> Array:
-        """Minima of the smallest singular value near positions, by a compass search (Kolda, Lewis, Torczon 2003)."""
-        active = np.flatnonzero(step > 0.1 * FINEST)
-        for _ in range(MOST_STEPS):
+    def folds_about(self, position: Array) -> Array:
+        """Return those positions about which the orientation is reversed within `SEGMENT_LENGTH`."""
+        around = self.scaled((position[:, None] + 0.5 * SEGMENT_LENGTH * COMPASS).reshape(-1, 2))
+        around = around.reshape(len(position), len(COMPASS), *around.shape[1:])
+        is_fold = has_reversed_orientation(around[:, :4], around[:, 4:]).any(axis=1)
+        return np.asarray(position[is_fold])
+
+    def _minimise(self, position: Array, value: Array, step: Array) -> Array:
+        """Find local minima of the smallest singular value by a compass search (Kolda, Lewis and Torczon 2003).
+
+        Args:
+            position: Starting positions, which are overwritten.
+            value: Smallest singular value at these positions, shape (n,), 1/mm.
+            step: First step of each search, shape (n,), mm.
+        """
+        active = np.flatnonzero(step > MIN_COMPASS_STEP)
+        for _ in range(MAX_STEPS):
             if not active.size:
                 break
-            tried = position[active, None] + step[active, None, None] * COMPASS
-            tried = onto_disk(tried.reshape(-1, 2), self.radius)
-            values = self.weakest(tried).reshape(-1, 8)
-            best = values.argmin(axis=1)
-            lowest = np.take_along_axis(values, best[:, None], axis=1)[:, 0]
-            lower = lowest < value[active]
-            moved = active[lower]
-            position[moved], value[moved] = tried.reshape(-1, 8, 2)[lower, best[lower]], lowest[lower]
-            step[active[~lower]] *= 0.5
-            active = active[step[active] > 0.1 * FINEST]
+            trial = position[active, None] + step[active, None, None] * COMPASS
+            trial = onto_disk(trial.reshape(-1, 2), self.radius)
+            trial_values = self.smallest_singular_value(trial).reshape(-1, len(COMPASS))
+            best = trial_values.argmin(axis=1)
+            best_value = np.take_along_axis(trial_values, best[:, None], axis=1)[:, 0]
+            is_lower = best_value < value[active]
+
+            moved = active[is_lower]
+            position[moved] = trial.reshape(-1, len(COMPASS), 2)[is_lower, best[is_lower]]
+            value[moved] = best_value[is_lower]
+            step[active[~is_lower]] *= 0.5
+            active = active[step[active] > MIN_COMPASS_STEP]
         return position

@@ -1,4 +1,4 @@
-"""How well the charges of a sensor determine a contact: limits over the film, folds and the working area."""
+"""Identification: how well the charges of a sensor determine a contact, with limits, folds and the working area."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import scaled_derivatives, singular_values
 from isocharge.simulate.identifiability.working_area import (
-    ERROR,
+    DEFAULT_ERROR,
     Bound,
     WorkingArea,
     working_area,
@@ -27,35 +27,39 @@ from isocharge.simulate.numerics.disk import Rings
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
-CLEAR = 0.75
-"""Largest search radius over the film's radius, dimensionless: presses nearer to the rim take ever longer to solve."""
+MAX_SEARCH_RADIUS = 0.75
+"""Largest search radius in units of the film radius, dimensionless. The time of a solve increases towards the rim."""
 
-RETREAT, RETREATS = 0.9, 3
-"""Factor on the search radius if the charges cannot be interpolated that far, and the largest number of reductions."""
+RADIUS_REDUCTION = 0.9
+"""Factor of the search radius if the charges cannot be interpolated, dimensionless."""
 
-USUAL_PROBE = Circle(1.0)
+MAX_REDUCTIONS = 3
+"""Largest number of reductions of the search radius."""
+
+DEFAULT_PROBE = Circle(1.0)
 """Probe of the released models, mm."""
 
-MOST_PAIRS = 20
-"""Most ambiguous pairs that the numbers for JSON list."""
+MAX_LISTED_PAIRS = 20
+"""Largest number of ambiguous pairs that the JSON output lists."""
 
-CONTACT = ("x_mm", "y_mm", "force_N")
+CONTACT_KEYS = ("x_mm", "y_mm", "force_N")
 """Keys of a contact in JSON."""
 
-IN_JSON: dict[Bound, str] = {"fold": "fold", "ambiguous pair": "twins", "error": "error", "search": "searched"}
-"""Names of the bounds in files and JSON."""
+BOUND_NAMES: dict[Bound, str] = {"fold": "fold", "ambiguous pair": "twins", "error": "error", "search": "searched"}
+"""Names of the bounds of a working area in JSON."""
 
 
 @dataclass(frozen=True)
 class LimitMap:
-    """Cramer-Rao limits under one force on rings about the centre.
+    """Cramer-Rao limits for one force on rings about the centre.
 
     Attributes:
         force: Force, N.
-        rings: Positions.
-        position: Position error, root mean square, shape (n_ring, n_angle), mm.
-        relative_force: Error of the force over the force, shape (n_ring, n_angle).
-        condition: Largest over smallest standard deviation of the position by direction, shape (n_ring, n_angle).
+        rings: Positions at which the limits are evaluated.
+        position: Position error (root mean square), shape (n_ring, n_angle), mm.
+        relative_force: Standard deviation of the force divided by the force, shape (n_ring, n_angle), dimensionless.
+        condition: Ratio of the largest to the smallest standard deviation of the position by direction, shape (n_ring,
+            n_angle), dimensionless.
     """
 
     force: float
@@ -66,17 +70,31 @@ class LimitMap:
 
     @classmethod
     def of(cls, charge_map: ChargeMap, noise: NoiseModel, force: float, rings: Rings) -> "LimitMap":
-        """Limits at every position of the rings."""
+        """Compute the limits at every position of the rings.
+
+        Args:
+            charge_map: Charges as a function of the contact.
+            noise: Noise of the readings.
+            force: Force of the contacts, N.
+            rings: Positions of the contacts.
+        """
         contact = rings.contacts(force)
         limits = limits_at(charge_map, contact, noise)
         largest, smallest = singular_values(scaled_derivatives(charge_map, contact, noise)).T
-        values = (limits.position, limits.force, largest / np.maximum(smallest, 1e-12 * largest))
-        return cls(force, rings, *(rings.per_ring(value) for value in values))
+        condition = largest / np.maximum(smallest, 1e-12 * largest)
+        return cls(
+            force,
+            rings,
+            position=rings.per_ring(limits.position),
+            relative_force=rings.per_ring(limits.force),
+            condition=rings.per_ring(condition),
+        )
 
     def statistics(self) -> dict[str, float]:
-        """Errors, each position weighted with its area."""
+        """Compute statistics of the errors, in which each position is weighted with the area that it represents."""
         area = np.repeat(self.rings.distance, self.position.shape[1])
-        position, force = self.position.ravel(), 100.0 * self.relative_force.ravel()
+        position = self.position.ravel()
+        force = 100.0 * self.relative_force.ravel()
         return {
             "force_N": self.force,
             "position_median_mm": _median(position, area),
@@ -91,16 +109,16 @@ class LimitMap:
 
 @dataclass(frozen=True)
 class Identification:
-    """How well the charges determine a contact.
+    """Result of `identify`.
 
     Attributes:
-        sensor: The sensor.
-        probe: The footprint.
+        sensor: Sensor.
+        probe: Probe.
         noise: Noise of the readings.
-        charges: Charges of the sensor, with fast derivatives.
-        area: The working area, with folds and ambiguous pairs.
-        maps: Limits under the smallest force, 1 N if that is in the range, and the largest.
-        inside: The same within the working area; none where that is a point.
+        charges: Charge map of the sensor with fast derivatives.
+        area: Working area with folds and ambiguous pairs.
+        maps: Limits for the smallest force, for 1 N if it is in the range of forces, and for the largest force.
+        inner_maps: Limits for the same forces within the working area; empty if the working area has the radius 0.
     """
 
     sensor: Sensor
@@ -109,35 +127,39 @@ class Identification:
     charges: ChargeMap = field(repr=False)
     area: WorkingArea
     maps: tuple[LimitMap, ...] = field(repr=False)
-    inside: tuple[LimitMap, ...] = field(repr=False)
+    inner_maps: tuple[LimitMap, ...] = field(repr=False)
 
     @classmethod
-    def of(cls, forward_map: ForwardMap, noise: NoiseModel, *, error: float = ERROR) -> "Identification":
-        """See `identify`; within the radius and the forces of a forward map that is already solved."""
+    def of(cls, forward_map: ForwardMap, noise: NoiseModel, *, error: float = DEFAULT_ERROR) -> "Identification":
+        """Identify the sensor of a forward map within the radius and the forces of the map.
+
+        Args:
+            forward_map: Solved forward map.
+            noise: Noise of the readings. The white noise must be positive.
+            error: Largest Cramer-Rao position error allowed in the working area, mm.
+        """
         check_determined(len(forward_map.electrodes))
         charges = with_fast_derivatives(forward_map)
         low, high = charges.domain.force_range
         forces = sorted({low, min(max(low, 1.0), high), high})
         area = working_area(charges, noise, error=error)
-        maps, inside = (
-            tuple(LimitMap.of(charges, noise, force, Rings.spread(radius)) for force in forces if radius > 0.0)
-            for radius in (charges.domain.radius, area.radius)
-        )
-        return cls(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inside)
+        maps = _limit_maps(charges, noise, forces, charges.domain.radius)
+        inner_maps = _limit_maps(charges, noise, forces, area.radius)
+        return cls(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inner_maps)
 
     @property
     def determined_share(self) -> float:
-        """Share of the searched disk in which the error is at most the allowed one at every force, dimensionless.
+        """Share of the searched disk in which the error does not exceed its limit for any force, dimensionless.
 
-        That is on either side of the folds: where contacts are determined once it is known which of those with the same
-        charges it is, as from the frames before.
+        The disk includes the regions on both sides of folds. There the charges determine the contact only together with
+        other information, such as preceding frames, that tells contacts with the same charges apart.
         """
-        good = np.all([limits.position <= self.area.error for limits in self.maps], axis=0)
-        return float(np.average(good.mean(axis=1), weights=self.maps[0].rings.distance))
+        is_allowed = np.all([limits.position <= self.area.error for limits in self.maps], axis=0)
+        return float(np.average(is_allowed.mean(axis=1), weights=self.maps[0].rings.distance))
 
     @property
     def summary(self) -> str:
-        """The working area in a few sentences."""
+        """Description of the working area in a few sentences."""
         area = self.area
         if not (len(area.folds) or len(area.pairs)):
             return area.summary
@@ -149,7 +171,7 @@ class Identification:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON; infinite radii are None."""
+        """Return the results for JSON, in which infinite radii are None."""
         area = self.area
         pairs = (area.pairs.first, area.pairs.second, area.pairs.distance)
         return {
@@ -159,7 +181,7 @@ class Identification:
             "force_N": list(area.force_range),
             "working_area": {
                 "radius_mm": area.radius,
-                "why": IN_JSON[area.bound],
+                "why": BOUND_NAMES[area.bound],
                 "fold_radius_mm": finite_or_none(area.fold_radius),
                 "twin_radius_mm": finite_or_none(area.pairs.radius),
                 "error_radius_mm": area.error_radius,
@@ -169,7 +191,7 @@ class Identification:
                 "determined_share": self.determined_share,
                 "words": self.summary,
             },
-            "limits_in_working_area": [limits.statistics() for limits in self.inside],
+            "limits_in_working_area": [limits.statistics() for limits in self.inner_maps],
             "by_distance": {
                 "distance_mm": self.maps[0].rings.distance.tolist(),
                 **{
@@ -181,40 +203,41 @@ class Identification:
             "folds_mm": area.folds.round(3).tolist(),
             "twins": [
                 {
-                    "first": dict(zip(CONTACT, first.tolist(), strict=True)),
-                    "second": dict(zip(CONTACT, second.tolist(), strict=True)),
+                    "first": dict(zip(CONTACT_KEYS, first.tolist(), strict=True)),
+                    "second": dict(zip(CONTACT_KEYS, second.tolist(), strict=True)),
                     "sigmas_apart": float(distance),
                 }
-                for first, second, distance in zip(*(column[:MOST_PAIRS] for column in pairs), strict=True)
+                for first, second, distance in zip(*(column[:MAX_LISTED_PAIRS] for column in pairs), strict=True)
             ],
         }
 
 
 def identify(
     sensor: Sensor,
-    probe: Probe = USUAL_PROBE,
+    probe: Probe = DEFAULT_PROBE,
     noise: NoiseModel | None = None,
     *,
     force_range: tuple[float, float] = DEFAULT_FORCE_RANGE,
     radius: float | None = None,
-    error: float = ERROR,
+    error: float = DEFAULT_ERROR,
     executor: Executor | None = None,
 ) -> Identification:
-    """How well the charges of a sensor determine contacts: some 20 s.
+    """Compute how well the charges of a sensor determine contacts.
 
     Args:
-        sensor: The sensor.
-        probe: The object that presses.
-        noise: Noise of the readings, with white noise above zero; `reference` if absent.
+        sensor: Sensor.
+        probe: Probe that presses the film.
+        noise: Noise of the readings, whose white noise must be positive; the level `reference` if absent.
         force_range: Smallest and largest force, N.
-        radius: Distance from the centre up to which contacts are searched, mm; to the electrodes' far corners if
-            absent.
+        radius: Distance from the centre up to which contacts are searched, mm; the distance of the outermost corner of
+            an electrode if absent.
         error: Largest Cramer-Rao position error allowed in the working area, mm.
-        executor: Runs the solves; this process if absent.
+        executor: Executor that runs the solves; this process if absent.
 
     Raises:
-        SceneError: If there are fewer than three electrodes, no noise, or some presses cannot exist.
-        SolveError: If an equilibrium or the target of the interpolation error was not reached.
+        SceneError: If there are fewer than three electrodes, if there is no white noise, or if the film cannot be
+            pressed as required.
+        SolveError: If an equilibrium or the allowed interpolation error is not reached.
     """
     check_determined(len(sensor.electrodes))
     noise = noise or noise_model("reference")
@@ -223,42 +246,51 @@ def identify(
             f"noise: expected white noise above 0 pC, got that of {noise.name!r}: without noise the errors have no "
             "lower limit"
         )
-    forward_map = (
-        map_to_search(sensor, probe, force_range, executor)
-        if radius is None
-        else ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
-    )
+    if radius is None:
+        forward_map = map_to_search(sensor, probe, force_range, executor)
+    else:
+        forward_map = ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
     return Identification.of(forward_map, noise, error=error)
 
 
 def search_radius(sensor: Sensor, probe: Probe) -> float:
-    """Radius of the search for the working area, mm: to the outermost corner of an electrode.
+    """Return the radius of the search for the working area, mm: the distance of the outermost corner of an electrode.
 
-    Electrodes that surround the working area bound it, mostly by a fold that runs through them.
+    Electrodes that surround the working area bound it, mostly by a fold near the electrodes.
     """
-    corners = np.concatenate([sensor.calibration.place(np.array(e.corners)) for e in sensor.electrodes])
-    return min(float(np.hypot(*corners.T).max()), CLEAR * sensor.film.radius - probe.reach)
+    corners = [sensor.calibration.place(np.array(electrode.corners)) for electrode in sensor.electrodes]
+    outermost = float(np.hypot(*np.concatenate(corners).T).max())
+    return min(outermost, MAX_SEARCH_RADIUS * sensor.film.radius - probe.reach)
 
 
 def map_to_search(
     sensor: Sensor, probe: Probe, force_range: tuple[float, float], executor: Executor | None = None
 ) -> ForwardMap:
-    """A forward map over the search radius, or a smaller one if the charges cannot be interpolated so far out.
+    """Solve a forward map over the search radius, or over a smaller radius if the charges cannot be interpolated.
 
     Raises:
-        SceneError: If some presses cannot exist.
-        SolveError: If an equilibrium or the target of the interpolation error was not reached.
+        SceneError: If the film cannot be pressed as required.
+        SolveError: If an equilibrium or the allowed interpolation error is not reached.
     """
     radius = search_radius(sensor, probe)
-    for _ in range(RETREATS):
+    for _ in range(MAX_REDUCTIONS):
         try:
             return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
         except SolveError:
-            radius *= RETREAT
+            radius *= RADIUS_REDUCTION
     return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
 
 
+def _limit_maps(charges: ChargeMap, noise: NoiseModel, forces: list[float], radius: float) -> tuple[LimitMap, ...]:
+    """Compute the limits for each force up to a radius, mm; no limits if the radius is 0."""
+    if radius <= 0.0:
+        return ()
+    rings = Rings.spread(radius)
+    return tuple(LimitMap.of(charges, noise, force, rings) for force in forces)
+
+
 def _median(values: Array, weights: Array) -> float:
+    """Compute the weighted median of values; both arguments have the shape (n,)."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])

@@ -1,4 +1,4 @@
-"""The contact whose charges are nearest to given ones, in standard deviations of the noise.
+"""Contact whose charges are nearest to given charges, in standard deviations of the noise:
 
 min over contacts c of the domain of |(Q - Q(c)) / sigma|
 """
@@ -6,7 +6,7 @@ min over contacts c of the domain of |(Q - Q(c)) / sigma|
 from collections.abc import Callable
 
 import numpy as np
-import scipy  # loads a part when it is used
+import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
@@ -15,93 +15,133 @@ from isocharge.simulate.numerics.disk import INNER_RADIUS
 from isocharge.simulate.numerics.disk_least_squares import MAX_STEPS, minimise
 
 STEPS = 8
-"""Steps from a start that is near: most charges need five."""
+"""Number of steps from a start near the solution. Most charges need five."""
 
 CANDIDATES = 4096
-"""Contacts among which starts are chosen: spread over the domain, and a quarter as many along its rim."""
+"""Number of contacts among which the starts are chosen. They are spread over the domain, with a quarter of them on the
+edge of the disk."""
 
 CHUNK = 2048
-"""Charges compared with all candidates at once."""
+"""Number of charges that are compared with all candidates at once, which limits the memory."""
 
 
 def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, start: Array) -> tuple[Array, Array]:
-    """Contacts that explain charges best, by least squares from a start that is near.
+    """Find the contacts that explain charges best, by least squares from a start near the solution.
 
     Args:
-        charge_map: The charges of contacts.
-        noise: Of the readings.
-        charge: To be explained, shape (n, n_electrode), pC.
-        start: Contacts (x, y, F) to start from, shape (n, 3), mm and N.
+        charge_map: Charges as a function of the contact.
+        noise: Noise of the readings.
+        charge: Charges to explain, shape (n, n_electrode), pC.
+        start: Contacts (x, y, F) from which the search starts, shape (n, 3), mm and N.
 
     Returns:
-        Contacts within the map's domain, shape (n, 3), and how far their charges are from those given, in standard
-        deviations, shape (n,).
+        Contacts within the domain of the map, shape (n, 3), and the distance of their charges from the given charges in
+        standard deviations of the noise, shape (n,).
     """
-    contact, residual = _descent(charge_map, charge, lambda _, known: noise.sigma(known), start, STEPS)
+
+    def sigma(_: Integers, predicted: Array) -> Array:
+        return noise.sigma(predicted)
+
+    contact, residual = _descend(charge_map, charge, sigma, start, STEPS)
     return contact, np.linalg.norm(residual, axis=1)
 
 
 def explain(charge_map: ChargeMap, charge: Array, sigma: Array, start: Array) -> tuple[Array, Array]:
-    """The contacts that descent from a start leads to.
+    """Find the contacts to which the least-squares descent from a start leads.
 
     Args:
-        charge_map: The charges of contacts.
-        charge: To be explained, shape (n, n_electrode), pC.
-        sigma: The unit of distance, shape (n, n_electrode), pC.
-        start: Contacts (x, y, F), shape (n, 3), mm and N.
+        charge_map: Charges as a function of the contact.
+        charge: Charges to explain, shape (n, n_electrode), pC.
+        sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
+        start: Contacts (x, y, F) from which the search starts, shape (n, 3), mm and N.
 
     Returns:
-        Contacts within the map's domain, shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
+        Contacts within the domain of the map, shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
-    return _descent(charge_map, charge, lambda rows, _: sigma[rows], start, MAX_STEPS)
+
+    def sigma_of(rows: Integers, _: Array) -> Array:
+        return np.asarray(sigma[rows])
+
+    return _descend(charge_map, charge, sigma_of, start, MAX_STEPS)
 
 
-def _descent(
+def _descend(
     charge_map: ChargeMap, charge: Array, sigma_of: Callable[[Integers, Array], Array], start: Array, steps: int
 ) -> tuple[Array, Array]:
-    """As `explain`; the unit of distance is a function of the rows of charges and of the charges that explain them."""
-    radius, force_range = INNER_RADIUS * charge_map.domain.radius, charge_map.domain.force_range
+    """Run the least-squares descent of `explain`.
+
+    Args:
+        charge_map: Charges as a function of the contact.
+        charge: Charges to explain, shape (n, n_electrode), pC.
+        sigma_of: Function from rows of the charges and the predicted charges to standard deviations, pC.
+        start: Contacts (x, y, F), shape (n, 3), mm and N.
+        steps: Largest number of steps.
+    """
+    radius = INNER_RADIUS * charge_map.domain.radius
+    force_range = charge_map.domain.force_range
     low, high = np.log(force_range)
-    centre, scale = charge_map.domain.centre, np.array([radius, radius, 0.5 * (high - low)])  # one force: no width
+    centre = charge_map.domain.centre
+    scale = np.array([radius, radius, 0.5 * (high - low)])
+    divisor = np.where(scale > 0.0, scale, 1.0)  # the range of ln F is zero if the map has a single force
 
     def to_contact(unit: Array) -> Array:
         logs = unit * scale + centre
         return np.column_stack([logs[:, :2], np.clip(np.exp(logs[:, 2]), *force_range)])
 
     def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
-        known, slopes = linearised(charge_map, to_contact(unit))
-        sigma = sigma_of(rows, known)
-        return (charge[rows] - known) / sigma, -(slopes * scale / sigma[..., None]).swapaxes(1, 2)
+        predicted, slopes = linearised(charge_map, to_contact(unit))
+        sigma = sigma_of(rows, predicted)
+        return (charge[rows] - predicted) / sigma, -(slopes * scale / sigma[..., None]).swapaxes(1, 2)
 
-    logs = np.column_stack([start[:, :2], np.log(start[:, 2])])
-    unit, residual = minimise(residuals, (logs - centre) / np.where(scale > 0.0, scale, 1.0), steps)
+    log_start = np.column_stack([start[:, :2], np.log(start[:, 2])])
+    unit, residual = minimise(residuals, (log_start - centre) / divisor, steps)
     return to_contact(unit), residual
 
 
 def search(
     charge_map: ChargeMap, charge: Array, sigma: Array, *, starts: int = 2, candidates: int = CANDIDATES
 ) -> tuple[Array, Array]:
-    """The nearest contacts from the best few of many starts; other arguments and result as `explain`."""
-    spread = charge_map.domain.to_contact(INNER_RADIUS * _spread(candidates))
-    known = charge_map.charges(spread)
-    chunks = range(0, max(len(charge), 1), CHUNK)
-    nearest = [_nearest_rows(charge[k : k + CHUNK], sigma[k : k + CHUNK], known, starts) for k in chunks]
-    answers = [explain(charge_map, charge, sigma, spread[rows]) for rows in np.concatenate(nearest).T]
-    squares = np.stack([(residual**2).sum(axis=1) for _, residual in answers])
-    best = squares.argmin(axis=0), np.arange(len(charge))
-    return np.stack([contact for contact, _ in answers])[best], np.stack([residual for _, residual in answers])[best]
+    """Find the nearest contacts by a descent from each of the best few of many candidates.
+
+    Args:
+        charge_map: Charges as a function of the contact.
+        charge: Charges to explain, shape (n, n_electrode), pC.
+        sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
+        starts: Number of descents for each row of charges.
+        candidates: Number of contacts among which the starts are chosen.
+
+    Returns:
+        Contacts and residuals, as of `explain`.
+    """
+    candidate_contacts = charge_map.domain.to_contact(INNER_RADIUS * _unit_candidates(candidates))
+    candidate_charges = charge_map.charges(candidate_contacts)
+    start_rows = []
+    for first in range(0, max(len(charge), 1), CHUNK):
+        chunk = slice(first, first + CHUNK)
+        start_rows.append(_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, starts))
+    answers = [explain(charge_map, charge, sigma, candidate_contacts[rows]) for rows in np.concatenate(start_rows).T]
+    contacts = np.stack([contact for contact, _ in answers])
+    residuals = np.stack([residual for _, residual in answers])
+    best = (residuals**2).sum(axis=2).argmin(axis=0)
+    each = np.arange(len(charge))
+    return contacts[best, each], residuals[best, each]
 
 
-def _spread(count: int) -> Array:
-    """Contacts in unit coordinates, shape (count, 3)."""
+def _unit_candidates(count: int) -> Array:
+    """Return candidates in unit coordinates of the domain, shape (count, 3)."""
     sobol = scipy.stats.qmc.Sobol(3, scramble=False).random(count)
-    radius, angle = np.sqrt(sobol[:, 0]), 2.0 * np.pi * sobol[:, 1]
+    radius = np.sqrt(sobol[:, 0])
     radius[::4] = 1.0
+    angle = 2.0 * np.pi * sobol[:, 1]
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), 2.0 * sobol[:, 2] - 1.0], axis=1)
 
 
-def _nearest_rows(charge: Array, sigma: Array, known: Array, count: int) -> Integers:
-    """Numbers of the nearest candidates, shape (n, count): |Q - K|^2 multiplied out, one matrix product each."""
+def _nearest_rows(charge: Array, sigma: Array, candidate_charges: Array, count: int) -> Integers:
+    """Return the numbers of the nearest candidates, shape (n, count).
+
+    The squared distance is expanded, so that it consists of two matrix products. The term that does not depend on the
+    candidate is omitted.
+    """
     weight = sigma**-2.0
-    square = weight @ (known**2).T - 2.0 * (charge * weight) @ known.T
-    return np.asarray(np.argpartition(square, count - 1, axis=1)[:, :count])
+    squared_distance = weight @ (candidate_charges**2).T - 2.0 * (charge * weight) @ candidate_charges.T
+    return np.asarray(np.argpartition(squared_distance, count - 1, axis=1)[:, :count])

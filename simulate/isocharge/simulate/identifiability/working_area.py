@@ -1,4 +1,4 @@
-"""The working area: the disk within which the charges determine the contact."""
+"""Working area: the disk within which the charges determine the contact."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -14,36 +14,36 @@ from isocharge.simulate.identifiability.folds import find_folds
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings
 
-ERROR = 1.0
-"""Default of the largest Cramer-Rao position error in a working area, mm: the radius of the usual probe."""
+DEFAULT_ERROR = 1.0
+"""Default of the largest Cramer-Rao position error in a working area, mm. It is the radius of the default probe."""
 
-GRID = 0.1
+RADIUS_STEP = 0.1
 """Step to which radii of working areas are rounded down, mm."""
 
-CONFIRMATIONS = 4
-"""Most times that rings within the area are tried, each time within a smaller one: beside electrodes the error rises
-between one ring and the next."""
+MAX_CONFIRMATIONS = 4
+"""Largest number of times that the error is evaluated again on finer rings within the area. Beside electrodes the error
+may exceed its limit between two rings."""
 
 Bound = Literal["fold", "ambiguous pair", "error", "search"]
-"""What bounds a working area: "search" if nothing else does within the radius of the search. Near a fold the error
-grows without bounds, so "error" comes before "fold"."""
+"""Reason for the radius of a working area. "search" means that the radius of the search is the only bound. The error
+grows without limit towards a fold, so the bound before a fold is mostly "error"."""
 
 
 @dataclass(frozen=True)
 class WorkingArea:
-    """The largest disk about the film's centre within which the charges determine the contact.
+    """Largest disk about the centre of the film within which the charges determine the contact.
 
     Attributes:
-        radius: Radius of the disk, mm, rounded down to 0.1 mm; 0 if there is none.
-        bound: What bounds it.
-        fold_radius: Distance from the centre of the nearest fold, mm; infinite if there is none. With more than three
-            electrodes a fold is a point where the map loses rank.
-        error_radius: Radius within which the position error is at most `error` at every force, mm.
-        error: Allowed Cramer-Rao position error (root mean square), mm.
+        radius: Radius of the disk, mm, rounded down to 0.1 mm; 0 if there is no such disk.
+        bound: Reason for the radius.
+        fold_radius: Distance of the nearest fold from the centre, mm; infinite without folds. With more than three
+            electrodes, a fold is a point where the derivative of the map is singular.
+        error_radius: Radius within which the position error is at most `error` for every force, mm.
+        error: Largest allowed Cramer-Rao position error (root mean square), mm.
         searched: Radius of the search, mm.
         force_range: Smallest and largest force, N.
-        folds: Positions on fold lines, or where rank is lost, shape (n, 2), mm.
-        pairs: Pairs of contacts far apart with the same charges.
+        folds: Positions on folds, shape (n, 2), mm.
+        pairs: Pairs of distant contacts with the same charges.
         electrodes: Number of electrodes.
     """
 
@@ -60,12 +60,12 @@ class WorkingArea:
 
     @property
     def unambiguous_radius(self) -> float:
-        """Radius of the largest disk without folds and ambiguous pairs, whatever the error, mm, to 0.1 mm."""
+        """Radius of the largest disk without folds and ambiguous pairs, regardless of the error, mm."""
         return _round_down(min(self.fold_radius, self.pairs.radius, self.searched))
 
     @property
     def summary(self) -> str:
-        """The working area in a few sentences."""
+        """Description of the working area in a few sentences."""
         low, high = self.force_range
         parts = [f"Working area: up to {self.radius:.3g} mm from the centre, {low:g} to {high:g} N."]
         if self.error_radius < min(self.searched, self.fold_radius, self.pairs.radius):
@@ -84,44 +84,49 @@ class WorkingArea:
 
 
 def working_area(
-    charge_map: ChargeMap, noise: NoiseModel, *, error: float = ERROR, search_pairs: bool = True
+    charge_map: ChargeMap, noise: NoiseModel, *, error: float = DEFAULT_ERROR, search_pairs: bool = True
 ) -> WorkingArea:
-    """Find the working area within the domain of a map.
+    """Find the working area within the domain of a charge map.
 
-    From a forward map it takes some 10 s (4 s for splines, 1 s for folds and errors, 3 s for ambiguous pairs); from any
-    other map, such as a fit to measured charges, 400,000 evaluations, or 130,000 without ambiguous pairs.
+    A forward map is first replaced by splines. Any other map, such as a fit to measured charges, is evaluated about
+    400,000 times, or 130,000 times without the search for ambiguous pairs.
 
     Args:
-        charge_map: The charges.
-        noise: Noise of the readings, with white noise above zero.
-        error: Allowed Cramer-Rao position error, mm, at every force.
-        search_pairs: Whether to search for contacts far apart with the same charges, too.
+        charge_map: Charges as a function of the contact.
+        noise: Noise of the readings. The white noise must be positive.
+        error: Largest allowed Cramer-Rao position error for every force, mm.
+        search_pairs: Whether to search for distant contacts with the same charges as well.
 
     Raises:
         SceneError: If there are fewer than three charges.
     """
     check_determined(len(charge_map.electrodes))
     charge_map = with_fast_derivatives(charge_map)
-    searched, (low, high) = charge_map.domain.radius, charge_map.domain.force_range
-    rings, forces = Rings.spread(searched), sorted({low, float(np.sqrt(low * high)), high})
+    searched = charge_map.domain.radius
+    low, high = charge_map.domain.force_range
+    rings = Rings.spread(searched)
+    forces = sorted({low, float(np.sqrt(low * high)), high})
     searches = [find_folds(charge_map, rings, force, noise) for force in forces]
     folds = np.concatenate([search.points for search in searches])
     fold_radius = float(np.hypot(*folds.T).min(initial=np.inf))
-    error_radius = min(
-        min(_within(charge_map, rings, force, noise, error), _nearest_over(charge_map, weakest, force, noise, error))
-        for force, weakest in zip(forces, (search.weakest for search in searches), strict=True)
-    )
+
+    error_radius = np.inf
+    for force, search in zip(forces, searches, strict=True):
+        ring_radius = _error_radius(charge_map, rings, force, noise, error)
+        weakest_radius = _nearest_exceeding(charge_map, search.weakest, force, noise, error)
+        error_radius = min(error_radius, ring_radius, weakest_radius)
     error_radius = _confirmed(charge_map, error_radius, forces, noise, error)
     pairs = find_ambiguous_pairs(charge_map, noise, low) if search_pairs else AmbiguousPairs.none()
-    ends: dict[Bound, float] = {
+
+    radii: dict[Bound, float] = {
         "search": searched,
         "fold": fold_radius,
         "ambiguous pair": pairs.radius,
         "error": error_radius if error_radius < searched else np.inf,
     }
-    bound = min(ends, key=lambda each: ends[each])
+    bound = min(radii, key=lambda each: radii[each])
     return WorkingArea(
-        radius=_round_down(ends[bound]),
+        radius=_round_down(radii[bound]),
         bound=bound,
         fold_radius=fold_radius,
         error_radius=error_radius,
@@ -135,35 +140,61 @@ def working_area(
 
 
 def _confirmed(charge_map: ChargeMap, radius: float, forces: list[float], noise: NoiseModel, error: float) -> float:
-    """The radius within which the error is allowed, mm, or a smaller one where rings within it say so."""
-    for _ in range(CONFIRMATIONS if radius < charge_map.domain.radius else 0):
-        if (rounded := _round_down(radius)) <= 0.0:
+    """Evaluate the error again on rings within a radius, and reduce the radius where the error exceeds its limit.
+
+    Args:
+        charge_map: Charges as a function of the contact.
+        radius: Radius within which the error does not exceed its limit on coarser rings, mm.
+        forces: Forces of the contacts, N.
+        noise: Noise of the readings.
+        error: Largest allowed position error, mm.
+
+    Returns:
+        Confirmed radius, mm. A radius that is equal to that of the domain is returned unchanged.
+    """
+    if radius >= charge_map.domain.radius:
+        return radius
+    for _ in range(MAX_CONFIRMATIONS):
+        rounded = _round_down(radius)
+        if rounded <= 0.0:
             break
-        within = min(_within(charge_map, Rings.spread(rounded), force, noise, error) for force in forces)
-        if within >= rounded * (1.0 - 1e-9):
+        rings = Rings.spread(rounded)
+        confirmed_radius = min(_error_radius(charge_map, rings, force, noise, error) for force in forces)
+        if confirmed_radius >= rounded * (1.0 - 1e-9):
             break
-        radius = within
+        radius = confirmed_radius
     return radius
 
 
-def _within(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel, error: float) -> float:
-    """Distance at which the position error first exceeds the allowed one, mm; between rings ln(error) is linear."""
-    worst = rings.per_ring(limits_at(charge_map, rings.contacts(force), noise).position).max(axis=1)
-    over = np.flatnonzero(~(worst <= error))
-    if not over.size:
+def _error_radius(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel, error: float) -> float:
+    """Return the distance at which the position error first exceeds its limit, mm; ln(error) is interpolated linearly.
+
+    Args:
+        charge_map: Charges as a function of the contact.
+        rings: Positions at which the error is evaluated.
+        force: Force of the contacts, N.
+        noise: Noise of the readings.
+        error: Largest allowed position error, mm.
+    """
+    largest = rings.per_ring(limits_at(charge_map, rings.contacts(force), noise).position).max(axis=1)
+    exceeding = np.flatnonzero(~(largest <= error))  # including NaN
+    if not exceeding.size:
         return float(rings.distance[-1])
-    first = int(over[0])
+    first = int(exceeding[0])
     if first == 0:
         return 0.0
-    logs = np.log(worst[first - 1 : first + 1])
-    return float(np.interp(np.log(error), logs, rings.distance[first - 1 : first + 1]))
+    interval = slice(first - 1, first + 1)
+    return float(np.interp(np.log(error), np.log(largest[interval]), rings.distance[interval]))
 
 
-def _nearest_over(charge_map: ChargeMap, position: Array, force: float, noise: NoiseModel, error: float) -> float:
-    """Distance of the nearest position, shape (n, 2), at which the position error exceeds the allowed one, mm."""
-    limit = limits_at(charge_map, np.column_stack([position, np.full(len(position), force)]), noise).position
-    return float(np.hypot(*position.T).min(initial=np.inf, where=~(limit <= error)))
+def _nearest_exceeding(charge_map: ChargeMap, position: Array, force: float, noise: NoiseModel, error: float) -> float:
+    """Return the distance of the nearest position, shape (n, 2), whose error exceeds its limit, mm; else infinity."""
+    contact = np.column_stack([position, np.full(len(position), force)])
+    is_exceeding = ~(limits_at(charge_map, contact, noise).position <= error)  # including NaN
+    return float(np.hypot(*position.T).min(initial=np.inf, where=is_exceeding))
 
 
 def _round_down(radius: float) -> float:
-    return float(f"{np.floor(radius / GRID * (1.0 + 1e-9)) * GRID:.12g}")
+    """Round a radius down to a multiple of `RADIUS_STEP`, mm, without the rounding error of the product."""
+    steps = np.floor(radius / RADIUS_STEP * (1.0 + 1e-9))
+    return float(f"{steps * RADIUS_STEP:.12g}")

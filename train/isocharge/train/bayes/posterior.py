@@ -345,7 +345,7 @@ class Posterior:
         expected = self._profile.charge(best, terms)
         inverse_std = np.linalg.norm(self._profile.slope(best, expected) / self.noise.sigma(expected), axis=1)
         half_width = FORCE_HALF_WIDTH_STD / inverse_std
-        smallest, largest = self._profile.ends
+        smallest, largest = self._profile.log_range
         low = np.maximum(best - half_width, smallest)[:, None]
         high = np.minimum(best + half_width, largest)[:, None]
         nodes, weights = np.polynomial.legendre.leggauss(N_FORCE_NODES)
