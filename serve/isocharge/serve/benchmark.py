@@ -17,21 +17,22 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.progress import track
+from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.serve.prediction.predictor import Predictor
 
 Clock = Callable[[], int]
 """Function that returns the time, ns."""
 
-LEAST_CALLS = 3
+MIN_CALLS = 3
 """Smallest number of calls in a turn, however long they take."""
 
 ROUNDS = 10
 """Number of turns of every contender. The first one is a warm-up and does not count."""
 
-BATCHES = (16, 256, 4096)
+BATCH_SIZES = (16, 256, 4096)
 """Numbers of presses in a batch. The last one is the largest batch that a server accepts by default."""
 
-CHARGES = 4096
+N_CHARGES = 4096
 """Number of presses through which the calls cycle."""
 
 
@@ -104,7 +105,7 @@ def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
     """Call a function for the length of a turn, and return the durations of the calls, ns."""
     durations: list[int] = []
     end = clock() + turn_ns
-    while len(durations) < LEAST_CALLS or clock() < end:
+    while len(durations) < MIN_CALLS or clock() < end:
         begin = clock()
         call()
         durations.append(clock() - begin)
@@ -112,19 +113,20 @@ def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
 
 
 def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Singles:
-    """Draw presses from the golden vectors of a model that carry no flag.
+    """Draw presses from the golden vectors of a model whose contacts have no flag.
 
     Args:
         predictor: The model.
         golden_pC: Charges of the golden vectors, shape (n, electrodes), pC.
-        seed: Seed of the draws.
+        seed: Seed of the random choice.
 
     Returns:
-        Charges of shape (CHARGES, electrodes), pC.
+        Charges of shape (N_CHARGES, electrodes), pC.
     """
     flags = predictor.validity.batch_flags(predictor.predict_batch(golden_pC))
-    sound: Singles = golden_pC[[not words for words in flags]]
-    return sound[np.random.default_rng(seed).integers(0, len(sound), CHARGES)]
+    valid_pC: Singles = golden_pC[[not words for words in flags]]
+    rows = np.random.default_rng(seed).integers(0, len(valid_pC), N_CHARGES)
+    return valid_pC[rows]
 
 
 def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Contender]:
@@ -137,14 +139,14 @@ def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Cont
     """
     rows = cycle(charge_pC)
     lists = cycle(charge_pC.tolist())
-    out = np.zeros(7, np.float32)
+    out = np.zeros(N_WITHOUT_CORRELATION, np.float32)
     contenders = [
         Contender("predict_into, float32 array", 1, lambda: predictor.predict_into(next(rows), out)),
         Contender("predict, list of numbers", 1, lambda: predictor.predict(next(lists))),
     ]
     return contenders + [
         Contender(f"predict_batch, {n}", n, partial(predictor.predict_batch, charge_pC[:n]))
-        for n in BATCHES
+        for n in BATCH_SIZES
         if n <= len(charge_pC)
     ]
 

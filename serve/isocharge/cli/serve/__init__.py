@@ -1,4 +1,4 @@
-"""`isocharge serve ...`: one file a command.
+"""Commands of `isocharge serve`, one module each.
 
 May import: serve.pictures, shared.
 """

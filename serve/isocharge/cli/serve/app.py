@@ -1,4 +1,4 @@
-"""`isocharge serve ...`: its commands, one module each."""
+"""Command group `isocharge serve`. Each command has its own module."""
 
 from isocharge.cli.shared.lazy import LazyCommand, lazy_group
 

@@ -1,4 +1,4 @@
-"""`isocharge serve bench`: how fast a model is on this machine, and how accurate."""
+"""`isocharge serve bench`: measure the speed of a model on this machine, and print its errors."""
 
 from collections.abc import Iterator
 from typing import Annotated
@@ -10,11 +10,11 @@ from isocharge.cli.shared.terminal import show, show_json, shown_progress
 from isocharge.serve import Model, Predictor, check_golden, find_model, load_model
 from isocharge.serve.benchmark import Timing, in_process_contenders, machine, press_charges, take_turns
 
-ERRORS = {
+ERROR_NAMES = {
     "position, mm": ("position_median_mm", "position_rms_mm", "position_p99_mm"),
     "force, %": ("force_median_percent", "force_rms_percent", "force_p99_percent"),
 }
-"""Errors that a model states: median, rms, 99 %."""
+"""Names of the errors in the metadata of a model: median, root mean square and 99th percentile."""
 
 
 def bench_command(
@@ -26,9 +26,9 @@ def bench_command(
     ] = 10.0,
     json: JsonOption = False,
 ) -> None:
-    """Measure how fast a model predicts in process on this machine, with its error beside it.
+    """Measure how fast a model predicts in process on this machine, and print its errors.
 
-    The presses are the model's golden vectors, in pC. All calls take turns, after one round to warm up.
+    The charges are the golden vectors of the model, in pC. All calls are measured in turns, after a warm-up round.
 
     Example: isocharge serve bench three-25um-biaxial --seconds 10
     """
@@ -38,8 +38,8 @@ def bench_command(
     contenders = in_process_contenders(predictor, press_charges(predictor, loaded.golden.charge_pC))
     with shown_progress():
         timings = take_turns(contenders, seconds)
-    known = loaded.metadata.errors
-    errors = {name: known[name] for names in ERRORS.values() for name in names if name in known}
+    names = [name for names in ERROR_NAMES.values() for name in names]
+    errors = {name: loaded.metadata.errors[name] for name in names if name in loaded.metadata.errors}
     if json:
         report = {"model": loaded.metadata.label, "seconds": seconds, "machine": machine()}
         report |= {"timings": [timing._asdict() for timing in timings], "errors": errors}
@@ -49,7 +49,7 @@ def bench_command(
 
 
 def _lines(model: Model, timings: list[Timing], errors: dict[str, float]) -> Iterator[str]:
-    """The table for people."""
+    """Yield the lines of the report."""
     yield f"{model.metadata.label}, presses of its golden vectors; answers checked against golden.json"
     yield ", ".join(f"{name} {value}" for name, value in machine().items())
     yield ""
@@ -58,6 +58,6 @@ def _lines(model: Model, timings: list[Timing], errors: dict[str, float]) -> Ite
         yield f"{timing.name:30}{timing.p50_us:>10.1f}{timing.p99_us:>10.1f}{timing.presses_per_s:>12,.0f}"
     yield ""
     yield f"{'error of the model':30}{'median':>10}{'rms':>10}{'99 %':>12}"
-    for title, names in ERRORS.items():
+    for title, names in ERROR_NAMES.items():
         median, rms, p99 = (f"{errors[name]:.3g}" if name in errors else "-" for name in names)
         yield f"{title:30}{median:>10}{rms:>10}{p99:>12}"

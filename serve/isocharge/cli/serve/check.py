@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
+from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.options import JsonOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.terminal import show, show_json
 from isocharge.serve.prediction.predictor import Predictor
@@ -41,7 +41,7 @@ def check_command(
     Example: isocharge serve check three-25um-biaxial presses.csv --position-std 0.05
     """
     predictor = Predictor(model, models=models)
-    check = check_presses(predictor, read_presses_of(file, predictor.metadata.electrodes, position_std_mm, force_std))
+    check = check_presses(predictor, read_press_file(file, predictor.metadata.electrodes, position_std_mm, force_std))
     if json:
         show_json(check.to_dict())
     else:

@@ -1,4 +1,4 @@
-"""`isocharge serve http`: the models over HTTP, and over gRPC too if a port is given."""
+"""`isocharge serve http`: serve models over HTTP and, if a port is given, over gRPC."""
 
 import logging
 import os
@@ -79,7 +79,8 @@ def http_command(
 
     Example: isocharge serve http --port 8000
     """
-    token, address = given_token(token), Address(host, port, uds)
+    token = given_token(token)
+    address = Address(host, port, uds)
     check_exposure(address if grpc_port is None else Address(host), has_token=token is not None)
     if tls_key is not None and tls_cert is None:
         raise InputError("--tls-key: expected --tls-cert too, got the key alone")
@@ -89,44 +90,53 @@ def http_command(
     with suppress(KeyboardInterrupt), _traffic(log, token) as traffic:
         store = open_model_store(models)
         for reason in store.refusals():
-            _tell(traffic, "warning", "refused", reason)
+            _report(traffic, "warning", "refused", reason)
         handler = Handler(store, traffic=traffic, token=secret, browser_check=browser_check)
         server = HttpServer(handler, address, tls=tls)
         with closing(server), _grpc(handler, host, grpc_port, tls) as grpc_url:
-            _tell(traffic, "info", "serving", ", ".join(served.metadata.label for served in store.loaded_versions()))
-            for url in filter(None, (server.url, grpc_url)):
-                announce(url)
+            labels = [loaded.metadata.label for loaded in store.loaded_versions()]
+            _report(traffic, "info", "serving", ", ".join(labels))
+            announce(server.url)
+            if grpc_url:
+                announce(grpc_url)
             server.run()
 
 
 @contextmanager
 def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
-    """The counters of the servers, and their log on stderr; no request waits for whoever reads it."""
+    """Create the counters of the servers and, for JSON, the log on stderr, which is written by another thread.
+
+    Args:
+        log: Value of `--log`.
+        token: Token that the log must not contain.
+    """
     if log is LogFormat.text:
         yield Traffic()
         return
     with WriterQueue(write_stderr) as lines:
-        lines_of_json = RequestLog(lines.put, secret=token)
-        logging.basicConfig(level=logging.WARNING, handlers=[lines_of_json], force=True)
+        request_log = RequestLog(lines.put, secret=token)
+        logging.basicConfig(level=logging.WARNING, handlers=[request_log], force=True)
         logging.captureWarnings(True)
-        traffic = Traffic(lines_of_json)
+        traffic = Traffic(request_log)
         traffic.lost_lines = lambda: lines.lost
         yield traffic
 
 
-def _tell(traffic: Traffic, level: str, event: str, message: str) -> None:
-    """Say something about the server: a line of the log, or a sentence for people."""
-    if traffic.log is None:
-        say({"refused": f"refused: {message}", "serving": f"serving {message}; Ctrl-C stops"}[event])
-    else:
+def _report(traffic: Traffic, level: str, event: str, message: str) -> None:
+    """Report an event of the server as a line of the log or, without a log, as a sentence on stderr."""
+    if traffic.log is not None:
         traffic.log.message(level, event, message)
+    elif event == "refused":
+        say(f"refused: {message}")
+    else:
+        say(f"serving {message}; Ctrl-C stops")
 
 
 def _grpc(handler: Handler, host: str, port: int | None, tls: Tls | None) -> AbstractContextManager[str]:
-    """The gRPC server next to the HTTP server; yields its address, empty without a port."""
+    """Return the context of the gRPC server, which yields its address; an empty address if there is no port."""
     if port is None:
         return nullcontext("")
-    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # its core would print what our errors say already
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # the core of gRPC would print errors that are reported anyway
     with require("grpc"):
         from isocharge.serve.network.grpc import grpc_server
     return grpc_server(handler, host, port, tls)

@@ -1,4 +1,4 @@
-"""`isocharge serve predict`: charges from a file to contacts."""
+"""`isocharge serve predict`: compute contacts from the charges in a file."""
 
 import sys
 from io import TextIOWrapper
@@ -31,9 +31,9 @@ def predict_command(
     ] = False,
     models: ModelsOption = None,
 ) -> None:
-    """Turn charges of presses (pC) into positions (mm) and forces (N) with their standard deviations.
+    """Compute positions (mm) and forces (N) with their standard deviations from the charges of presses (pC).
 
-    The column `flags` says why not to trust a row: outside the working area or forces, misfit, far beyond both.
+    The column `flags` states why a row may be wrong: outside the working area or forces, misfit, far beyond both.
 
     Example: isocharge serve predict three-25um-biaxial presses.csv > contacts.csv
     """
@@ -42,7 +42,7 @@ def predict_command(
     with until_stopped():
         if json:
             for record in table_records(charge_pC, predictor):
-                print(record.to_json(), flush=True)  # at once: a reader on a pipe waits for it
+                print(record.to_json(), flush=True)  # a reader of a pipe receives each record at once
         else:
             write_contacts(predictor.predict_batch(charge_pC), sys.stdout, predictor.validity, charge_pC)
             sys.stdout.flush()

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from isocharge.cli.shared.forward_maps import SLACK
+from isocharge.cli.shared.forward_maps import ROUNDING_MARGIN
 from isocharge.cli.shared.options import SensorArgument
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import announce, say, shown_progress, until_stopped
@@ -211,11 +211,11 @@ def _largest_distance_mm(radius_mm: float, scripted_presses: Script | None) -> f
     if scripted_presses is None or not scripted_presses.touching.any():
         return radius_mm
     distance_mm = np.hypot(scripted_presses.x_mm, scripted_presses.y_mm)
-    return max(DEFAULT_RADIUS, SLACK * float(np.nanmax(distance_mm)))
+    return max(DEFAULT_RADIUS, ROUNDING_MARGIN * float(np.nanmax(distance_mm)))
 
 
 def _largest_force_N(force_max_N: float, scripted_presses: Script | None) -> float:
     """Return the force up to which charges are needed, N."""
     if scripted_presses is None:
         return force_max_N
-    return max(force_max_N, SLACK * float(scripted_presses.force_N.max()))
+    return max(force_max_N, ROUNDING_MARGIN * float(scripted_presses.force_N.max()))

@@ -1,4 +1,4 @@
-"""What several commands share: options, forward maps, messages and bars on stderr, stopping, the virtual sensor.
+"""Parts that several commands share: options, forward maps, output on the terminal, the live page, a virtual sensor.
 
 May import: nothing else of isocharge.cli.
 """

@@ -1,4 +1,4 @@
-"""Who solves for a command, what a stopped one says, the radius of a sweep and its presses, their stress."""
+"""Shared parts of commands that compute forward maps: workers, progress, the radius of a sweep, and its presses."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from isocharge.cli.shared.options import most_workers, radius_mm_of
+from isocharge.cli.shared.options import parse_radius_mm, worker_count
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError, IsochargeError
@@ -26,45 +26,57 @@ from isocharge.simulate.execution.workers import dask_workers, local_workers
 from isocharge.simulate.identifiability.identification import map_to_search
 from isocharge.simulate.solver.stress_limit import stress_caution
 
-SLACK = 1.0 + 1e-6
-"""Factor on the radius that a map is asked for: rounding may put the outermost presses just outside it."""
+ROUNDING_MARGIN = 1.0 + 1e-6
+"""Factor on the radius and the force of a forward map, because rounding may move the outermost presses outside."""
 
 
 def executor_for(workers: int | None, cluster: str | None) -> AbstractContextManager[Executor | None]:
-    """The workers that `--workers` and `--cluster` ask for.
+    """Return the executor for the values of `--workers` and `--cluster`.
 
     Raises:
-        InputError: If both are given.
+        InputError: If both options are given.
     """
     if workers and cluster:
         raise InputError("expected either --workers or --cluster, got both")
-    return dask_workers(cluster) if cluster else local_workers(most_workers(workers))
+    return dask_workers(cluster) if cluster else local_workers(worker_count(workers))
 
 
 @contextmanager
 def shown_run(target: Path) -> Iterator[None]:
-    """Progress of a resumable run as bars; if the user stops it, say that the same command goes on."""
+    """Show the progress of a resumable run. If the user stops the run, print that the same command continues it.
+
+    Args:
+        target: Output of the run.
+    """
     try:
         with shown_progress():
             yield
     except KeyboardInterrupt:
-        if (part := draft_of(target)).exists():
-            say(f"stopped; what is done is kept in {part}, and the same command goes on from there")
+        draft = draft_of(target)
+        if draft.exists():
+            say(f"stopped; what is done is kept in {draft}, and the same command goes on from there")
         raise
 
 
 def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tuple[float, float]) -> float:
-    """The radius of a sweep, mm, from `--radius`: a number, or `auto` for the working area of every probe.
+    """Return the radius of a sweep, mm.
+
+    Args:
+        text: Value of `--radius`: a number, or `auto` for the radius of the working area that all probes share.
+        sensor: The sensor.
+        probes: The probes.
+        force: Smallest and largest force, N.
 
     Raises:
-        InputError: If the text is neither, or there is no working area under `reference` noise.
+        InputError: If the text is neither a number nor `auto`, or there is no working area with `reference` noise.
     """
     if text != "auto":
-        return radius_mm_of(text)
+        return parse_radius_mm(text)
     areas = []
     for probe in probes:
-        areas.append(working_area(map_to_search(sensor, probe, force), noise_model("reference")))
-        say(f"{probe.notation}: {areas[-1].summary}")
+        area = working_area(map_to_search(sensor, probe, force), noise_model("reference"))
+        say(f"{probe.notation}: {area.summary}")
+        areas.append(area)
     radius = min(area.radius for area in areas)
     if radius == 0.0:
         raise InputError(
@@ -74,25 +86,35 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
     return radius
 
 
-def caution_of_stress(
-    film: Film, probes: Iterable[Probe], most_force: float, limit: float = DEFAULT_STRESS_LIMIT
-) -> None:
-    """Say which probes stress the film beyond a limit (MPa) at the largest force (N)."""
+def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit: float = DEFAULT_STRESS_LIMIT) -> None:
+    """Print a warning for each probe that stresses the film beyond a limit.
+
+    Args:
+        film: The film.
+        probes: The probes.
+        max_force: Largest force, N.
+        limit: Limit of the stress, MPa.
+    """
     for probe in probes:
-        with suppress(IsochargeError):  # what asked for the press meets the same error, and says it
-            if caution := stress_caution(film, probe, most_force, limit):
+        with suppress(IsochargeError):  # the computation of the press raises the same error later
+            caution = stress_caution(film, probe, max_force, limit)
+            if caution:
                 say(f"caution: {caution}")
 
 
-SAMPLES = 24_000
-"""Number of presses."""
+N_SIMULATED_PRESSES = 24_000
+"""Number of presses of `simulated_presses`."""
 
 
 def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, force: tuple[float, float]) -> Dataset:
-    """A sweep within a radius (mm) and a range of forces (N), else with its defaults, deleted once it is read.
+    """Simulate presses with the default settings of a sweep. One process is enough, because this takes a few seconds.
 
-    It takes a few seconds, so one process is enough.
+    Args:
+        sensor: The sensor.
+        probes: The probes.
+        radius: Largest distance of a press from the centre, mm.
+        force: Smallest and largest force, N.
     """
     with TemporaryDirectory() as folder:
-        sweep = Sweep(radius, force, samples=SAMPLES)
+        sweep = Sweep(radius, force, samples=N_SIMULATED_PRESSES)
         return read_dataset(run_sweep(Path(folder) / "presses", sensor, probes, sweep))

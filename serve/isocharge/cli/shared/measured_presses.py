@@ -1,4 +1,4 @@
-"""CSV files of measured presses in commands: options and reading."""
+"""Options and reading of files of measured presses in commands."""
 
 from pathlib import Path
 from typing import Annotated
@@ -26,10 +26,17 @@ ForceStdOption = Annotated[
 ]
 
 
-def read_presses_of(
+def read_press_file(
     file: Path, electrodes: tuple[str, ...] | None, position_std_mm: float = 0.1, force_std: float = 0.01
 ) -> MeasuredPresses:
-    """The presses of a file, of all columns without another meaning if `electrodes` are None; others are named."""
+    """Read a file of measured presses, and print which of its columns are ignored.
+
+    Args:
+        file: CSV or Parquet file.
+        electrodes: Names of the electrodes; None if all columns without another meaning are electrodes.
+        position_std_mm: Standard deviation of x and y where the file has none, mm.
+        force_std: Standard deviation of a force where the file has none, relative to the force.
+    """
     presses = read_presses(file, electrodes, position_std_mm=position_std_mm, force_std=force_std)
     if presses.ignored:
         say(ignored_words(str(file), presses.ignored))

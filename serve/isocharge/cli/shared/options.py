@@ -1,4 +1,4 @@
-"""Arguments and options that stand in several commands, and the numbers that their texts hold."""
+"""Arguments and options that several commands have, and the conversion of their values."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -92,28 +92,32 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object 
 
 
 def refuse(mistakes: Mapping[str, object]) -> None:
-    """Refuse what was asked for, before anything is computed.
+    """Refuse contradictory options before anything is computed.
 
     Args:
-        mistakes: Message to whether it holds; the first that does is said.
+        mistakes: Whether each mistake was made, by the error message.
 
     Raises:
-        InputError: If one holds.
+        InputError: For the first mistake that was made.
     """
-    for message, holds in mistakes.items():
-        if holds:
+    for message, was_made in mistakes.items():
+        if was_made:
             raise InputError(message)
 
 
-def most_workers(workers: int | None) -> int:
-    """The processes that were asked for; one per core if none were."""
+def worker_count(workers: int | None) -> int:
+    """Return the number of processes from `--workers`; without the option, one for each core up to 64."""
     from isocharge.simulate.execution.workers import cores
 
     return workers or min(cores(), 64)
 
 
-def position_of(text: str) -> tuple[float, float]:
-    """Position (x, y), mm, from `--at`."""
+def parse_position(text: str) -> tuple[float, float]:
+    """Parse the value of `--at`, and return the position (x, y), mm.
+
+    Raises:
+        InputError: If the text is not two numbers separated by a comma.
+    """
     try:
         x, y = (number_of(part.strip()) for part in text.split(","))
     except ValueError as error:
@@ -121,8 +125,12 @@ def position_of(text: str) -> tuple[float, float]:
     return x, y
 
 
-def radius_mm_of(text: str) -> float:
-    """Radius, mm, from `--radius` where it is not `auto`."""
+def parse_radius_mm(text: str) -> float:
+    """Parse a value of `--radius` other than `auto`, and return the radius, mm.
+
+    Raises:
+        InputError: If the text is not a number.
+    """
     try:
         return number_of(text)
     except ValueError as error:

@@ -55,8 +55,12 @@ def open_closed_streams() -> None:
         sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
 
 
-def forget(number: int) -> None:
-    """Discard what is still to be written to a stream, because Python would otherwise fail at exit."""
+def discard_output(number: int) -> None:
+    """Redirect a stream to the null device, because Python would otherwise fail at exit when it flushes the stream.
+
+    Args:
+        number: File descriptor of the stream.
+    """
     with suppress(OSError):
         null_device = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null_device, number)
@@ -80,7 +84,7 @@ def announce(line: str) -> None:
     try:
         print(printable(line), flush=True)
     except OSError:
-        forget(1)
+        discard_output(1)
 
 
 def stdout_writer() -> Callable[[str], None]:
@@ -100,7 +104,7 @@ def write_stderr(line: str) -> None:
     try:
         _write_all(2, f"{printable(line)}\n".encode())
     except OSError:
-        forget(2)
+        discard_output(2)
 
 
 def stdout_is_ready() -> bool:
@@ -129,41 +133,45 @@ def _write_all(descriptor: int, data: bytes) -> None:
 
 @contextmanager
 def until_stopped() -> Iterator[None]:
-    """Leave the block without an error at Ctrl-C, at SIGTERM, and when the reader of stdout goes away."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    """Leave the block without an error at Ctrl-C, at SIGTERM, and when the reader of stdout closes it."""
+    previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     except KeyboardInterrupt:
         pass
     except BrokenPipeError:
-        forget(1)
+        discard_output(1)
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, previous_handler)
 
 
 @contextmanager
 def stop_after(seconds: float | None) -> Iterator[None]:
-    """Interrupt the block after some time as by Ctrl-C, also while the command waits for a port; None for never."""
+    """Interrupt the block after some time, as Ctrl-C does, also while the command waits for a port.
+
+    Args:
+        seconds: Time, s; None for no limit.
+    """
     if seconds is None:
         yield
         return
-    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    previous_handler = signal.signal(signal.SIGALRM, signal.default_int_handler)
     signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGALRM, previous_handler)
 
 
 @contextmanager
 def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[None]:
     """Call `act` whenever a signal arrives during the block."""
-    before = signal.signal(number, lambda *_: act())
+    previous_handler = signal.signal(number, lambda *_: act())
     try:
         yield
     finally:
-        signal.signal(number, before)
+        signal.signal(number, previous_handler)
 
 
 def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
@@ -178,7 +186,7 @@ def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
     return act_or_stop
 
 
-LINE_S = 5.0
+PROGRESS_LINE_INTERVAL_S = 5.0
 """Time between two lines of progress if stderr is not a terminal, s."""
 
 
@@ -190,7 +198,7 @@ def say(message: str) -> None:
     try:
         typer.echo(printable_lines(message), err=True)
     except OSError:
-        forget(2)
+        discard_output(2)
 
 
 def this_command() -> str:
@@ -231,14 +239,14 @@ def shown_progress() -> Iterator[None]:
 
 
 class _ProgressLines:
-    """Progress as plain lines, at most one every `LINE_S`."""
+    """Progress as plain lines, at most one every `PROGRESS_LINE_INTERVAL_S`."""
 
     def __init__(self) -> None:
-        self._next_line_s = time.monotonic() + LINE_S
+        self._next_line_s = time.monotonic() + PROGRESS_LINE_INTERVAL_S
 
     def __call__(self, title: str, done: int, total: int, note: str) -> None:
         if time.monotonic() >= self._next_line_s:
-            self._next_line_s = time.monotonic() + LINE_S
+            self._next_line_s = time.monotonic() + PROGRESS_LINE_INTERVAL_S
             say(f"{title}: {done} of {total} {note}".rstrip())
 
 

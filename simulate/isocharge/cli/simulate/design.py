@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import caution_of_stress, executor_for, shown_run
+from isocharge.cli.shared.forward_maps import executor_for, shown_run, warn_of_stress
 from isocharge.cli.shared.options import (
     ForceOption,
     FreshOption,
@@ -94,7 +94,7 @@ def design_command(
         side=side,
         seed=seed,
     )
-    caution_of_stress(case.sensor.film, [footprint], force, stress_limit)
+    warn_of_stress(case.sensor.film, [footprint], force, stress_limit)
     identity = {
         "made_by": code_fingerprint(),
         "sensor": sensor_to_dict(case.sensor),

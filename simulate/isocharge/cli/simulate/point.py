@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from isocharge.cli.shared.options import ForceOption, JsonOption, SensorArgument, position_of
+from isocharge.cli.shared.options import ForceOption, JsonOption, SensorArgument, parse_position
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json
 from isocharge.common.errors import InputError
@@ -51,7 +51,7 @@ def point_command(
     terms = theory_by_name(theory, film_sensor.film) if theory != "auto" else None
     terms = terms or theory_for(film_sensor, pressing, (force, force), accuracy)
     settings = SolveSettings(accuracy=accuracy, theory=terms)
-    equilibrium = press(film_sensor.coated_film, pressing, position_of(at), force, settings)
+    equilibrium = press(film_sensor.coated_film, pressing, parse_position(at), force, settings)
     charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
     charge_pC = dict(zip(film_sensor.electrode_names, charge.tolist(), strict=True))
     report = {"charge_pC": charge_pC, **summary(equilibrium)}

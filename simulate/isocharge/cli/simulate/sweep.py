@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from isocharge.cli.shared.forward_maps import caution_of_stress, executor_for, shown_run, sweep_radius
+from isocharge.cli.shared.forward_maps import executor_for, shown_run, sweep_radius, warn_of_stress
 from isocharge.cli.shared.options import (
     ClusterOption,
     ForceRangeOption,
@@ -114,7 +114,7 @@ def sweep_command(
             with require("parquet"):  # missed now, not after the sweep
                 import pyarrow  # noqa: F401
     refuse_finished(output)
-    caution_of_stress(film_sensor.film, probes, force[1], stress_limit)
+    warn_of_stress(film_sensor.film, probes, force[1], stress_limit)
     with shown_run(output), executor_for(workers, cluster) as executor:
         reach = sweep_radius(radius, film_sensor, probes, force)
         sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
+from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.options import JsonOption, ModelsOption, StressLimitOption, refuse
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json, this_command
@@ -95,7 +95,7 @@ def calibrate_command(
     with calibration_folder(output, problem) if output is not None else nullcontext():
         presses = None
         if file is not None:
-            presses = read_presses_of(file, problem.electrodes, position_std_mm, force_std)
+            presses = read_press_file(file, problem.electrodes, position_std_mm, force_std)
             presses = _with_temperature(presses, temperature_C)
         if is_moved and earlier is not None and temperature_C is not None:
             result = read_moved(earlier, problem, temperature_C)

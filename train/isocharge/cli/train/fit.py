@@ -7,17 +7,17 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from isocharge.cli.shared.forward_maps import caution_of_stress, shown_run, simulated_presses, sweep_radius
-from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
+from isocharge.cli.shared.forward_maps import shown_run, simulated_presses, sweep_radius, warn_of_stress
+from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.options import (
     ConfigOption,
     FreshOption,
     JsonOption,
     ModelsOption,
     RadiusOption,
-    most_workers,
-    radius_mm_of,
+    parse_radius_mm,
     refuse,
+    worker_count,
 )
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.cli.train.calibrate import calibrate_into
@@ -131,10 +131,10 @@ def fit_command(
     if films:
         prior, sizes = _films(dataset, sensor, probes, radius, config)
         target = check_target(output, version, prior.sensor.electrode_names)
-        caution_of_stress(prior.sensor.film, [prior.probe], sizes.force_range[1])
+        warn_of_stress(prior.sensor.film, [prior.probe], sizes.force_range[1])
 
         def train_films(run: ResumableRun) -> FilmsModel:
-            with local_workers(most_workers(None)) as executor:
+            with local_workers(worker_count(None)) as executor:
                 return fit_films(prior, sizes, executor=executor, run=run)
 
         identity = films_identity(prior, sizes)
@@ -165,7 +165,7 @@ def fit_command(
         else:
             data = _presses(dataset, sensor, probes, radius)
     target = check_target(output, version, data.sensor.electrode_names)
-    caution_of_stress(data.sensor.film, map(parse_probe, data.probes), data.domain.force_range[1])
+    warn_of_stress(data.sensor.film, map(parse_probe, data.probes), data.domain.force_range[1])
     identity = fit_identity(data, settings)
     release_resumably(lambda run: fit(data, settings, run=run), identity, target, release, fresh=fresh, json=json)
 
@@ -188,7 +188,7 @@ def _presses(dataset: Path | None, sensor: str | None, probes: list[str], radius
 def _measured(file: Path, radius: str, stds: tuple[float, float]) -> MeasuredPresses:
     """Measured presses of any sensor; the columns that are taken for channels are said."""
     refuse({"--radius: belongs to --sensor; without it, the area is where the presses are": radius != DEFAULT_TEXT})
-    presses = usable_presses(read_presses_of(file, None, *stds))
+    presses = usable_presses(read_press_file(file, None, *stds))
     say(f"{file}: {len(presses)} presses of the channels {', '.join(presses.electrodes)}")
     return presses
 
@@ -205,8 +205,8 @@ def _rig(file: Path, sensor: str | None, probes: list[str], radius: str, stds: t
         }
     )
     described = load_sensor(str(sensor))
-    presses = read_presses_of(file, described.electrode_names, *stds)
-    return Rig(presses, described, parse_probe(probes[0]), radius_mm_of(radius))
+    presses = read_press_file(file, described.electrode_names, *stds)
+    return Rig(presses, described, parse_probe(probes[0]), parse_radius_mm(radius))
 
 
 def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | None:
@@ -250,7 +250,7 @@ def _films(
     probe = parse_probe(probes[0])
     if len(probes) != 1 or not isinstance(probe, Circle):
         raise InputError(f"--films: expected one round probe (circle:RADIUS), got {', '.join(probes)}")
-    return FilmPrior(load_sensor(str(sensor)), probe), FilmsConfig(radius=radius_mm_of(radius))
+    return FilmPrior(load_sensor(str(sensor)), probe), FilmsConfig(radius=parse_radius_mm(radius))
 
 
 def release_resumably(

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.measured_presses import read_presses_of
+from isocharge.cli.shared.measured_presses import read_press_file
 from isocharge.cli.shared.options import FreshOption, JsonOption, NewFolderOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
@@ -102,4 +102,4 @@ def _read(path: Path, sensor: str | None, probe: str) -> Dataset:
     if sensor is None:
         raise InputError(f"{path}: a file of measured presses needs --sensor SENSOR, which says what was pressed")
     described = load_sensor(sensor)
-    return dataset_of(read_presses_of(path, described.electrode_names), described, parse_probe(probe))
+    return dataset_of(read_press_file(path, described.electrode_names), described, parse_probe(probe))
