@@ -194,6 +194,15 @@ def test_memory_section_widens_the_force_of_a_tracked_contact_on_a_folding_film(
         assert 1.1 < wide["force_std_N"] / narrow["force_std_N"] < 3.0
 
 
+def test_stream_keeps_its_model_if_the_charges_npz_of_the_next_model_is_damaged(model, models):
+    first = Predictor(models / "linear")
+    stream = TouchStream(first, device_from_table({"track": {}}, "b"))
+    put_charges(model, b"damaged")
+    with pytest.raises(ModelError, match=r"charges\.npz"):
+        stream.use(Predictor(model))
+    assert stream.predictor is first
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [

@@ -3,40 +3,33 @@
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
 from isocharge.common.arrays import Array, Reals
 from isocharge.common.errors import ModelError
-from isocharge.serve.flags import FILM, GAP, INVALID, RECONNECTED, REPEAT, RESTART
+from isocharge.serve.flags import GAP, INVALID, RECONNECTED, REPEAT, RESTART
 from isocharge.serve.frames.frame import Frame, Parser, SequenceGaps
+from isocharge.serve.live.contact_stages import (
+    ChargeScaleStage,
+    ContactFrame,
+    ContactStage,
+    CurrentModel,
+    FilmStage,
+    PredictionStage,
+    TrackingStage,
+)
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.live.reading_stream import ReadingStream, TimedReading
 from isocharge.serve.port.source import Chunk
-from isocharge.serve.prediction.contact import Contact, Sensitivity
 from isocharge.serve.prediction.predictor import Predictor
-from isocharge.serve.record.record import (
-    NO_CONTACT,
-    NO_TRACKING,
-    UNKNOWN_CONTACT,
-    Charges,
-    PredictionRecord,
-    Tracking,
-)
+from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord
 from isocharge.serve.signal_chain.chain import Chain, Reading
-from isocharge.serve.tracking.contact_mixture import contact_mixture
-from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.serve.tracking.tracker import Tracker
 
 LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
 """Flags of a frame without a record that pass to the next record, because they describe what happened before it."""
-
-CHARGE_SCALE_STEP = 0.01
-"""Relative step of all touch charges by which the dependence of contacts on an error of their scale is computed."""
-
-LARGEST_FORCE_EXPONENT = 1.5
-"""Largest exponent of the force as a power of all charges together: that of a film without pretension."""
 
 
 class Policy(StrEnum):
@@ -158,7 +151,9 @@ class TouchStream:
         self.gaps = self._readings.gaps
         self.clock = self._readings.clock
         self.counts = StreamCounts()
-        self._tracker = None if device.track is None else Tracker(device.track)
+        self._tracker = None
+        if device.track is not None:
+            self._tracker = Tracker(device.track)
         self._before_restart = StreamTotals()
         self._policy = policy
         self._now_ns = now_ns
@@ -167,22 +162,28 @@ class TouchStream:
         self._set_model(predictor)
 
     def _set_model(self, predictor: Predictor) -> None:
-        follower = None
+        """Build the stages that the device file asks for, and use them from the next frame on.
+
+        Raises:
+            ModelError: If a stage cannot use the model. The stream then keeps its stages.
+        """
+        model = CurrentModel(predictor)
+        stages: list[ContactStage] = [PredictionStage(model)]
+        film_stage = None
         if self._follow_rule is not None:
-            follower = FilmFollower(predictor, self._follow_rule, self._readings.warming_ratio)
-        self._follower = follower
-        self.predictor = predictor
-        self._validity = predictor.validity
+            film_stage = FilmStage(model, self._follow_rule, self._readings.warming_ratio)
+            stages.append(film_stage)
         if self._tracker is not None:
-            # The file of charges describes the calibrated film, and would contradict a model that follows the film.
-            mixture = contact_mixture(predictor) if follower is None else None
-            self._tracker.mixture = mixture
-            if mixture is not None:
-                self._tracked_validity = replace(self._validity, corners_mm=mixture.charges.corners_mm)
+            stages.append(TrackingStage(self._tracker, predictor, is_film_followed=film_stage is not None))
+        stages.append(ChargeScaleStage(model))
+
+        self._model = model
+        self._stages = stages
+        self._film_stage = film_stage
+        self.predictor = predictor
         self._electrodes = predictor.metadata.electrodes
         self._label = predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
-        self._charge_scale_sensitivity = Sensitivity(CHARGE_SCALE_STEP)
 
     def use(self, predictor: Predictor) -> None:
         """Continue with another model of the same electrodes; tare and signal chain keep their state.
@@ -213,7 +214,7 @@ class TouchStream:
     @property
     def answering_predictor(self) -> Predictor:
         """The model of the film as it is now: that of the follower where the film is followed."""
-        return self.predictor if self._follower is None else self._follower.predictor
+        return self._model.predictor
 
     def tare(self) -> None:
         """Discard the tare, and measure it again from the next quiet frames."""
@@ -222,16 +223,13 @@ class TouchStream:
 
     def reset_film(self) -> None:
         """Go back to the film as it was calibrated, where it is followed."""
-        if self._follower is not None:
-            self._follower.reset()
+        if self._film_stage is not None:
+            self._film_stage.reset_film()
 
     def _discard_contact(self) -> None:
         """Discard the contact that is under way."""
-        self._charge_scale_sensitivity = Sensitivity(CHARGE_SCALE_STEP)
-        if self._follower is not None:
-            self._follower.discard_touch()
-        if self._tracker is not None:
-            self._tracker.reset()
+        for stage in self._stages:
+            stage.reset()
 
     def restart(self) -> None:
         """Begin as a new stream does, so that its records can be repeated from its bytes alone; `totals` continue."""
@@ -293,89 +291,27 @@ class TouchStream:
     def _record(self, chunk: Chunk, frame: Frame, timed: TimedReading) -> PredictionRecord:
         """Return the record of a frame. Its latency is measured after everything else has been computed."""
         reading, when = timed
-        contact, flags = self._contact(reading)
-        film = None
-        if self._follower is not None:
-            film = self._follower.film
-            flags = self._follow_film(self._follower, reading, contact, flags, when.clock_s)
-        tracked = None
-        event = None
-        other = None
-        if self._tracker is not None:
-            tracked, event = self._tracker.update(contact, when.clock_s, flags, reading.charge_pC)
-            other = self._tracker.other
-            if self._tracker.mixture_contact is not None:
-                contact = self._tracker.mixture_contact
-                flags = reading.flags + self._tracked_validity.flags(contact)
-        shift = self._charge_scale_error(contact, reading)
-        if contact is not None and shift is not None:
-            contact = contact.widened(shift)
-            tracked = tracked and tracked.widened(shift)
-        tracking = None
-        if self._tracker is not None:
-            found_nothing = tracked is None and event is None and other is None
-            tracking = NO_TRACKING if found_nothing else Tracking(tracked, event, other)
+        contact_frame = ContactFrame(reading, when.clock_s, reading.flags)
+        for stage in self._stages:
+            stage.step(contact_frame)
+        tare_pC = None
+        if reading.tare is not None:
+            tare_pC = reading.tare.charge_pC
         return PredictionRecord(
             timestamp=when.host_s,
             t_device_us=when.device_us,
             seq=frame.seq,
-            **_contact_fields(contact, flags),
+            **_contact_fields(contact_frame),
             contact=reading.contact,
             charge_pC=self._by_electrode(reading.charge_pC),
             charge_raw_pC=self._by_electrode(reading.raw_pC),
-            tare_pC=self._by_electrode(reading.tare.charge_pC if reading.tare else None),
-            flags=flags,
+            tare_pC=self._by_electrode(tare_pC),
+            flags=contact_frame.flags,
             latency_us=(self._now_ns() - chunk.clock_ns) / 1e3,
             model=self._label,
             frame_id=self.frame_id,
-            tracking=tracking,
-            film=film,
-        )
-
-    def _follow_film(
-        self,
-        follower: FilmFollower,
-        reading: Reading,
-        contact: Contact | None,
-        flags: tuple[str, ...],
-        clock_s: float,
-    ) -> tuple[str, ...]:
-        """Follow the film by a frame, and return the flags of the frame with those of the film."""
-        before = follower.predictor
-        follower.observe_frame(reading.charge_pC, contact, flags, clock_s)
-        if follower.predictor is not before:
-            self._charge_scale_sensitivity = Sensitivity(CHARGE_SCALE_STEP)
-        if contact is not None and follower.is_lost:
-            return (*flags, FILM)
-        return flags
-
-    def _contact(self, reading: Reading) -> tuple[Contact | None, tuple[str, ...]]:
-        """Return the contact, None without one, and the reading's flags with those of the contact."""
-        flags = reading.flags
-        if INVALID in flags or not reading.contact or reading.charge_pC is None:
-            return None, flags
-        contact = self.answering_predictor.predict(reading.charge_pC)
-        flags += self._validity.flags(contact)
-        if self._follower is not None:
-            contact = self._follower.add_pretension_error(contact, reading.charge_pC)
-        return contact, flags
-
-    def _charge_scale_error(self, contact: Contact | None, reading: Reading) -> tuple[float, float, float] | None:
-        """Return how far one standard deviation of the charges' common scale moves x and y, mm, and force, N.
-
-        The scale is uncertain where the film's memory is not known exactly. None if it moves nothing.
-        """
-        charge_pC = reading.charge_pC
-        if contact is None:
-            return None
-        if self._tracker is not None and self._tracker.mixture_contact is not None:
-            return 0.0, 0.0, LARGEST_FORCE_EXPONENT * reading.charge_scale_std * contact.force_N
-        if reading.charge_scale_std <= 0.0 or charge_pC is None:
-            return None
-        return self._charge_scale_sensitivity.shift(
-            contact,
-            reading.charge_scale_std,
-            lambda: self.answering_predictor.predict(charge_pC * (1.0 + CHARGE_SCALE_STEP)),
+            tracking=contact_frame.tracking,
+            film=contact_frame.film,
         )
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
@@ -390,11 +326,13 @@ class TouchStream:
         return self.answering_predictor.predict_batch(charge_pC).misfit
 
 
-def _contact_fields(contact: Contact | None, flags: tuple[str, ...]) -> Mapping[str, Any]:
+def _contact_fields(frame: ContactFrame) -> Mapping[str, Any]:
     """Return the fields of a record that describe its contact."""
-    if contact is not None:
-        return contact.fields()
-    return UNKNOWN_CONTACT if INVALID in flags else NO_CONTACT
+    if frame.contact is not None:
+        return frame.contact.fields()
+    if INVALID in frame.flags:
+        return UNKNOWN_CONTACT
+    return NO_CONTACT
 
 
 def _with_lasting_flags(reading: Reading, skipped_flags: set[str]) -> Reading:

@@ -1,0 +1,228 @@
+"""Stages that turn a reading of the charges into the contact of a record.
+
+The stages are, in this order:
+
+1. prediction: the contact that the model predicts, with the flags of its validity;
+2. film: the pretension of the film, followed from touch to touch (section `[follow]` of the device file);
+3. tracking: the contact followed from frame to frame (section `[track]`);
+4. charge scale: larger standard deviations where the charges have a common uncertainty (section `[memory]`).
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+
+from msgspec import structs
+
+from isocharge.common.arrays import Array
+from isocharge.serve.flags import FILM, INVALID
+from isocharge.serve.prediction.contact import Contact, Sensitivity
+from isocharge.serve.prediction.predictor import Predictor
+from isocharge.serve.record.record import NO_TRACKING, FollowedFilm, Tracking
+from isocharge.serve.signal_chain.chain import Reading
+from isocharge.serve.tracking.contact_mixture import contact_mixture
+from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule
+from isocharge.serve.tracking.tracker import Tracker
+
+CHARGE_SCALE_STEP = 0.01
+"""Relative step of all touch charges by which the dependence of contacts on an error of their scale is computed."""
+
+LARGEST_FORCE_EXPONENT = 1.5
+"""Largest exponent of the force as a power of all charges together: that of a film without pretension."""
+
+
+@dataclass(slots=True)
+class CurrentModel:
+    """The model that currently answers, which the stages share.
+
+    Attributes:
+        predictor: The model that was loaded or, if the film is followed, the model of the film as it is now.
+    """
+
+    predictor: Predictor
+
+
+@dataclass(slots=True)
+class ContactFrame:
+    """A frame on its way through the stages, which change it in place.
+
+    Attributes:
+        reading: Charges of the frame after the signal chain.
+        clock_s: Time of the frame on a clock that does not jump, s.
+        flags: Words of `isocharge.serve.flags`.
+        contact: The contact; None if nothing touches, or the frame is invalid.
+        film: The followed film; None if the film is not followed.
+        tracking: The tracked contact; None if contacts are not tracked.
+        is_mixture_contact: Whether the contact is that of a `ContactMixture` and not that of the model.
+    """
+
+    reading: Reading
+    clock_s: float
+    flags: tuple[str, ...]
+    contact: Contact | None = None
+    film: FollowedFilm | None = None
+    tracking: Tracking | None = None
+    is_mixture_contact: bool = False
+
+
+class ContactStage(ABC):
+    """A stage with its settings and its state."""
+
+    @abstractmethod
+    def step(self, frame: ContactFrame) -> None:
+        """Process the next frame in place."""
+
+    def reset(self) -> None:  # noqa: B027  # some stages have no state
+        """Discard the contact that is under way, as after an outage or a new tare."""
+
+
+class PredictionStage(ContactStage):
+    """Predicts the contact with the current model."""
+
+    def __init__(self, model: CurrentModel) -> None:
+        """Set the model.
+
+        Args:
+            model: The current model. The flags are those of the model at this moment.
+        """
+        self._model = model
+        self._validity = model.predictor.validity
+
+    def step(self, frame: ContactFrame) -> None:
+        """Predict the contact of a frame in which something touches, and add its flags."""
+        reading = frame.reading
+        if INVALID in reading.flags or not reading.contact or reading.charge_pC is None:
+            return
+        frame.contact = self._model.predictor.predict(reading.charge_pC)
+        frame.flags = reading.flags + self._validity.flags(frame.contact)
+
+
+class FilmStage(ContactStage):
+    """Follows the pretension of the film, and changes the current model accordingly.
+
+    Attributes:
+        follower: The follower of the film.
+    """
+
+    def __init__(self, model: CurrentModel, rule: FollowRule, warming_ratio: Array | float) -> None:
+        """Begin with the film as it was calibrated.
+
+        Args:
+            model: The current model.
+            rule: Settings.
+            warming_ratio: Charge of each electrode over the mean of all when the film warms, shape (n_electrode,).
+
+        Raises:
+            ModelError: If the film of the model cannot be followed.
+        """
+        self._model = model
+        self.follower = FilmFollower(model.predictor, rule, warming_ratio)
+
+    def step(self, frame: ContactFrame) -> None:
+        """Add the uncertainty of the pretension to the contact, and use the frame to follow the film."""
+        charge_pC = frame.reading.charge_pC
+        if frame.contact is not None and charge_pC is not None:
+            frame.contact = self.follower.add_pretension_error(frame.contact, charge_pC)
+        frame.film = self.follower.film
+        self.follower.observe_frame(charge_pC, frame.contact, frame.flags, frame.clock_s)
+        self._model.predictor = self.follower.predictor
+        if frame.contact is not None and self.follower.is_lost:
+            frame.flags = (*frame.flags, FILM)
+
+    def reset(self) -> None:
+        """Discard the touch that is under way; the pretension is kept."""
+        self.follower.discard_touch()
+
+    def reset_film(self) -> None:
+        """Return to the film as it was calibrated."""
+        self.follower.reset()
+        self._model.predictor = self.follower.predictor
+
+
+class TrackingStage(ContactStage):
+    """Tracks the contact from frame to frame."""
+
+    def __init__(self, tracker: Tracker, predictor: Predictor, *, is_film_followed: bool) -> None:
+        """Set the model of a tracker, which keeps the contact that is under way.
+
+        Args:
+            tracker: The tracker with its state.
+            predictor: The model that was loaded.
+            is_film_followed: Whether the film is followed. The file of charges describes the calibrated film. It is
+                not used in this case, because it would contradict the current model.
+
+        Raises:
+            ModelError: If the model's file of charges is damaged.
+        """
+        mixture = None
+        self._mixture_validity = predictor.validity
+        if not is_film_followed:
+            mixture = contact_mixture(predictor)
+        if mixture is not None:
+            self._mixture_validity = replace(predictor.validity, corners_mm=mixture.charges.corners_mm)
+        self._tracker = tracker
+        self._tracker.mixture = mixture
+
+    def step(self, frame: ContactFrame) -> None:
+        """Track the contact; where the map folds, the contact of the mixture replaces that of the model."""
+        tracker = self._tracker
+        reading = frame.reading
+        tracked, event = tracker.update(frame.contact, frame.clock_s, frame.flags, reading.charge_pC)
+        if tracked is None and event is None and tracker.other is None:
+            frame.tracking = NO_TRACKING
+        else:
+            frame.tracking = Tracking(tracked, event, tracker.other)
+        if tracker.mixture_contact is not None:
+            frame.contact = tracker.mixture_contact
+            frame.flags = reading.flags + self._mixture_validity.flags(frame.contact)
+            frame.is_mixture_contact = True
+
+    def reset(self) -> None:
+        """Discard the tracked contact."""
+        self._tracker.reset()
+
+
+class ChargeScaleStage(ContactStage):
+    """Increases the standard deviations of a contact where all charges have an uncertain common scale.
+
+    The scale is uncertain if the memory of the film is not known exactly.
+    """
+
+    def __init__(self, model: CurrentModel) -> None:
+        """Set the current model, with which the sensitivity of the contact is computed."""
+        self._model = model
+        self.reset()
+
+    def step(self, frame: ContactFrame) -> None:
+        """Increase the standard deviations of the contact and of the tracked contact."""
+        if frame.contact is None:
+            return
+        shift = self._shift(frame, frame.contact)
+        if shift is None:
+            return
+        frame.contact = frame.contact.widened(shift)
+        if frame.tracking is not None and frame.tracking.tracked is not None:
+            frame.tracking = structs.replace(frame.tracking, tracked=frame.tracking.tracked.widened(shift))
+
+    def reset(self) -> None:
+        """Discard the sensitivity of the previous contact."""
+        self._sensitivity = Sensitivity(CHARGE_SCALE_STEP)
+        self._sensitivity_predictor = self._model.predictor
+
+    def _shift(self, frame: ContactFrame, contact: Contact) -> tuple[float, float, float] | None:
+        """Return how far one standard deviation of the scale moves x and y, mm, and the force, N; None if not at all.
+
+        The scale of the charges does not change the position of a contact of the mixture, because only its force
+        depends on the scale.
+        """
+        charge_scale_std = frame.reading.charge_scale_std
+        charge_pC = frame.reading.charge_pC
+        if frame.is_mixture_contact:
+            return 0.0, 0.0, LARGEST_FORCE_EXPONENT * charge_scale_std * contact.force_N
+        if charge_scale_std <= 0.0 or charge_pC is None:
+            return None
+        predictor = self._model.predictor
+        if predictor is not self._sensitivity_predictor:
+            self.reset()
+        return self._sensitivity.shift(
+            contact, charge_scale_std, lambda: predictor.predict(charge_pC * (1.0 + CHARGE_SCALE_STEP))
+        )
