@@ -15,7 +15,7 @@ for stage in ("simulate", "train", "serve"):
 
 GROUPS = ("simulate", "train", "serve")
 SHELL_BLOCK = re.compile(r"^```(?:sh|text|console)\n(.*?)^```", re.DOTALL | re.MULTILINE)
-INLINE_CODE = re.compile(r"`(isocharge [^`]+)`")
+INLINE_CODE = re.compile(r"`(isocharge (?!COMMAND )[^`]+)`")
 END_OF_COMMAND = {"|", "&", "&&", ";", ">", "2>", "||", "#"}
 
 
