@@ -9,6 +9,7 @@ The packages follow the way of a frame; `serve/README.md` shows them.
 
 from typing import TYPE_CHECKING
 
+from isocharge.common.measured_presses import MeasuredPresses, read_presses, write_presses
 from isocharge.common.versions import version_attribute
 from isocharge.serve.examination.port_check import Examination, examine
 from isocharge.serve.frames.binary import BinaryParser, encode_frame
@@ -31,7 +32,6 @@ from isocharge.serve.model.model_folder import (
 from isocharge.serve.port.recording import RecordedClock, Recorder, Recording
 from isocharge.serve.port.source import Chunk, Port, open_source
 from isocharge.serve.prediction.contact import Contact, Contacts, Validity
-from isocharge.serve.prediction.measured_presses import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses
 from isocharge.serve.prediction.table import read_charges, table_records, write_contacts

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from attacks.companions import charge_arrays, linear_series, pretension_arrays
+from isocharge.common.chebyshev_series import Series
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import load_model, write_model
-from isocharge.serve.model.charge_series import ChargeSeries, Series, read_charges
+from isocharge.serve.model.charge_series import ChargeSeries, read_charges
 from isocharge.serve.model.companion_files import read_companion_file
 from isocharge.serve.model.pretensions import read_pretensions
 

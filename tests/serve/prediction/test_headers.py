@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import ChargeError, PressError
+from isocharge.common.measured_presses import read_press_list
 from isocharge.serve import read_charges, read_presses
-from isocharge.serve.prediction.measured_presses import read_press_list
 from isocharge.serve.prediction.table import read_charge_file
 
 NAMES = ("A", "B", "C")

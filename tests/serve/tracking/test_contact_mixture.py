@@ -10,11 +10,12 @@ import pytest
 from numpy.polynomial import Polynomial, chebyshev
 
 from isocharge.common.arrays import Array
+from isocharge.common.chebyshev_series import Series
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import Chunk, Frame, Predictor, TouchStream, encode_frame
 from isocharge.serve.live.device import device_from_table
-from isocharge.serve.model.charge_series import ChargeSeries, Series, read_charges
+from isocharge.serve.model.charge_series import ChargeSeries, read_charges
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.tracking.contact_mixture import GAIN_STD, ContactMixture
 from isocharge.serve.tracking.tracker import Tracker

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.terminal import say
-from isocharge.serve.prediction.measured_presses import MeasuredPresses, read_presses
-from isocharge.serve.prediction.tables.number_table import ignored_words
+from isocharge.common.measured_presses import MeasuredPresses, read_presses
+from isocharge.common.tables.number_table import ignored_words
 
 PositionStdOption = Annotated[
     float,

@@ -23,9 +23,9 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAU
 from isocharge.common.errors import InputError, OutputExists
 from isocharge.common.extras import require
 from isocharge.common.files import refuse_existing
+from isocharge.common.measured_presses import MOST_ROWS
 from isocharge.common.resumable_run import refuse_finished
 from isocharge.serve import MeasuredPresses, write_presses
-from isocharge.serve.prediction.measured_presses import MOST_ROWS
 from isocharge.simulate import Dataset, Sweep, load_sensor, parse_probe, read_dataset, run_sweep
 from isocharge.simulate.sensor.probe import PROBE_HELP
 

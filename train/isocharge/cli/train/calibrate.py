@@ -13,8 +13,8 @@ from isocharge.cli.shared.options import JsonOption, ModelsOption, StressLimitOp
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json, this_command
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
+from isocharge.common.measured_presses import COLDEST_C, WARMEST_C
 from isocharge.serve import MeasuredPresses
-from isocharge.serve.prediction.measured_presses import COLDEST_C, WARMEST_C
 from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
 from isocharge.train.calibration.folder import (

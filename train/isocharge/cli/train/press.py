@@ -21,9 +21,9 @@ from isocharge.cli.train.press_events import PressEvents
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError, PressError, error_prefix
+from isocharge.common.measured_presses import CONTACT, read_press_list
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch, SteadyPress
-from isocharge.serve.prediction.measured_presses import CONTACT, read_press_list
 from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, read_earlier
 from isocharge.train.calibration.folder import error_table

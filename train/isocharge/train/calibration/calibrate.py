@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.serve.prediction.measured_presses import MeasuredPresses, row_words
+from isocharge.common.measured_presses import MeasuredPresses, row_words
 from isocharge.simulate import Circle, Sensor
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses

@@ -20,7 +20,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.serve.prediction.measured_presses import FORCE_STD, POSITION_STD_MM
+from isocharge.common.measured_presses import FORCE_STD, POSITION_STD_MM
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.train.calibration.contacts import projected
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate

@@ -12,7 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Booleans
-from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.common.measured_presses import MeasuredPresses
 from isocharge.train.calibration.diagnosis import outside
 from isocharge.train.calibration.film_fit import FilmPosterior, refit_film
 from isocharge.train.calibration.press_data import PressData

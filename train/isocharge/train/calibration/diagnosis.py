@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import PressError
-from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.common.measured_presses import MeasuredPresses
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.calibration.film_charges import FilmCharges
 

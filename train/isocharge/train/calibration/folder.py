@@ -28,11 +28,11 @@ from threadpoolctl import threadpool_limits
 from isocharge.common.errors import ModelError, PressError
 from isocharge.common.files import refusals_explained, remove_empty, write_whole
 from isocharge.common.json_values import plain_values
+from isocharge.common.measured_presses import presses_text
 from isocharge.common.resumable_run import locked
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, version_folders
 from isocharge.serve.model.pretensions import FILE as PRETENSIONS
-from isocharge.serve.prediction.measured_presses import presses_text
 from isocharge.simulate.plots.figure import picture_bytes
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.calibration.calibrate import CalibrationResult, film_without_presses

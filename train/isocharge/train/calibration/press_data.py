@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.common.measured_presses import MeasuredPresses
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values

@@ -14,7 +14,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.serve.prediction.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
+from isocharge.common.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.train.calibration.calibrate import FEW, CalibrationResult, calibrate, no_presses
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.diagnosis import outside

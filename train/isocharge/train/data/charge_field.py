@@ -19,8 +19,9 @@ from numpy.polynomial import chebyshev
 from scipy.linalg import cho_factor, cho_solve
 
 from isocharge.common.arrays import Array
+from isocharge.common.chebyshev_series import CHUNK_SIZE, Series, chebyshev_terms, position_degrees
 from isocharge.common.errors import DatasetError, TrainingError
-from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, Series, chebyshev_terms, position_degrees
+from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import NoiseModel, working_area
 from isocharge.simulate.forward.charge_map import Domain, within
 from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs

@@ -12,7 +12,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import DatasetError, PressError
 from isocharge.common.files import sha256_of
-from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.common.measured_presses import MeasuredPresses
 from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
 from isocharge.train.data.channel_noise import Noise
 

@@ -7,7 +7,7 @@ import numpy as np
 import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array
-from isocharge.serve.prediction.measured_presses import MeasuredPresses, row_words
+from isocharge.common.measured_presses import MeasuredPresses, row_words
 from isocharge.simulate import Domain, ForwardMap, NoiseModel
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.rig.correction import Correction, Residuals, fit_correction

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.serve.prediction.measured_presses import MeasuredPresses
+from isocharge.common.measured_presses import MeasuredPresses
 from isocharge.simulate import NoiseModel
 from isocharge.simulate.forward.charge_map import ChargeMap, Domain, differences
 from isocharge.train.calibration.discrepancy import term_count, terms

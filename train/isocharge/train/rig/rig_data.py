@@ -13,7 +13,7 @@ import numpy as np
 from isocharge.common.arrays import Booleans
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.files import sha256_of
-from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text
+from isocharge.common.measured_presses import MeasuredPresses, presses_text
 from isocharge.simulate import Dataset, Domain, ForwardMap, Probe, Samples, Sensor, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 from isocharge.train.data.presses import (

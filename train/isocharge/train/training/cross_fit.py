@@ -22,8 +22,8 @@ from torch import Tensor
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import PressError, cut
+from isocharge.common.measured_presses import MeasuredPresses, presses_text
 from isocharge.common.resumable_run import ResumableRun
-from isocharge.serve.prediction.measured_presses import MeasuredPresses, presses_text
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
 from isocharge.train.data.measured_checks import check_measured_presses
 from isocharge.train.data.measured_sensor import LEAST_RANGE, MeasuredSensor, PressedArea

@@ -17,7 +17,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, shown
 from isocharge.common.number_text import number_of
-from isocharge.serve.prediction.tables.number_table import ColumnRule, NumberColumns, NumberTable
+from isocharge.common.tables.number_table import ColumnRule, NumberColumns, NumberTable
 
 _SEPARATORS = {";": "tr ',;' '.,'", "\t": r"tr '\t' ','"}
 """Other separators of spreadsheets, and the command that turns such a file into CSV with decimal points."""

@@ -14,15 +14,15 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError, error_prefix, shown
-from isocharge.serve.prediction.tables.csv_table import csv_text
-from isocharge.serve.prediction.tables.header_advice import ColumnMeaning
-from isocharge.serve.prediction.tables.number_table import (
+from isocharge.common.tables.csv_table import csv_text
+from isocharge.common.tables.header_advice import ColumnMeaning
+from isocharge.common.tables.number_table import (
     CHARGE_RULE,
     MOST_COLUMNS,
     ColumnRule,
     NumberColumns,
 )
-from isocharge.serve.prediction.tables.table_file import open_table, write_columns
+from isocharge.common.tables.table_file import open_table, write_columns
 
 POSITION_STD_MM = 0.1
 """Standard deviation of a position if nothing else is stated, mm: that of a stage that is set by hand."""

@@ -7,9 +7,9 @@ from pathlib import Path
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.files import bounded_lines, open_regular, refusals_explained, write_whole
-from isocharge.serve.prediction.tables.csv_table import CsvTable, csv_text
-from isocharge.serve.prediction.tables.number_table import NumberTable
-from isocharge.serve.prediction.tables.parquet_table import SUFFIX, ParquetTable, parquet_bytes, require_pyarrow
+from isocharge.common.tables.csv_table import CsvTable, csv_text
+from isocharge.common.tables.number_table import NumberTable
+from isocharge.common.tables.parquet_table import SUFFIX, ParquetTable, parquet_bytes, require_pyarrow
 
 
 def is_parquet(path: Path) -> bool:

@@ -1,0 +1,88 @@
+"""Chebyshev series in position and force, which describe the charges of all contacts on a film."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from isocharge.common.arrays import Array, Integers
+
+CHUNK_SIZE = 4096
+"""Number of contacts that are evaluated at a time, which limits the memory."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """A sum of products of Chebyshev polynomials in three coordinates, each from -1 to 1.
+
+    Attributes:
+        coefficients: Shape (degree + 1, degree + 1, force_degree + 1, n_electrode). The first three axes are the
+            degrees of the polynomials in x, in y and in the logarithm of the force.
+    """
+
+    coefficients: Array
+
+    def values(self, unit: Array) -> Array:
+        """Evaluate the series and its derivatives with respect to the three coordinates.
+
+        Args:
+            unit: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.
+
+        Returns:
+            Shape (n, 4, n_electrode): the value, then the three derivatives.
+        """
+        _, n_y, n_force, n_electrode = self.coefficients.shape
+        chunks = []
+        for points in np.array_split(unit, len(unit) // CHUNK_SIZE + 1):
+            position_terms, force_terms = chebyshev_terms(points, degree=n_y - 1, force_degree=n_force - 1)
+            force_coefficients = (position_terms @ self._rows).reshape(len(points), n_force, -1)
+            chunks.append((force_terms[:, None, :] @ force_coefficients)[:, 0])
+        return np.concatenate(chunks).reshape(len(unit), 4, n_electrode)
+
+    @cached_property
+    def _rows(self) -> Array:
+        """The coefficients of the series and of its derivatives, one row for each product of polynomials in x and y.
+
+        The shape is (n_term, (force_degree + 1) * 4 * n_electrode).
+        """
+        derivatives = [_derivative(self.coefficients, axis) for axis in range(3)]
+        stacked = np.stack([self.coefficients, *derivatives])
+        x_degree, y_degree = position_degrees(self.coefficients.shape[0] - 1)
+        rows = stacked[:, x_degree, y_degree].transpose(1, 2, 0, 3)
+        return np.asarray(rows.reshape(len(x_degree), -1))
+
+
+def position_degrees(degree: int) -> tuple[Integers, Integers]:
+    """Return the degrees in x and in y of all terms whose total degree is at most `degree`, each of shape (n_term,)."""
+    single = np.arange(degree + 1)
+    total = np.add.outer(single, single)
+    x_degree, y_degree = np.nonzero(total <= degree)
+    return x_degree, y_degree
+
+
+def chebyshev_terms(unit: Array, degree: int, force_degree: int) -> tuple[Array, Array]:
+    """Evaluate the polynomials of which a series consists.
+
+    Args:
+        unit: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.
+        degree: Largest total degree in x and y.
+        force_degree: Largest degree in the logarithm of the force.
+
+    Returns:
+        The products of the polynomials in x and y, shape (n, n_term), in the order of `position_degrees`, and the
+        polynomials in the logarithm of the force, shape (n, force_degree + 1).
+    """
+    inside = np.clip(unit, -1.0, 1.0)
+    x_polynomials = chebyshev.chebvander(inside[:, 0], degree).astype(float)
+    y_polynomials = chebyshev.chebvander(inside[:, 1], degree).astype(float)
+    force_polynomials = chebyshev.chebvander(inside[:, 2], force_degree).astype(float)
+    x_degree, y_degree = position_degrees(degree)
+    return x_polynomials[:, x_degree] * y_polynomials[:, y_degree], force_polynomials
+
+
+def _derivative(coefficients: Array, axis: int) -> Array:
+    """Return the coefficients of the derivative with respect to one coordinate, padded with zeros to the same shape."""
+    padding = [(0, 0)] * coefficients.ndim
+    padding[axis] = (0, 1)
+    return np.pad(chebyshev.chebder(coefficients, axis=axis), padding)
