@@ -19,9 +19,9 @@ for axes, kind in zip(pair, ("biaxial", "uniaxial"), strict=True):
     forward_map = ForwardMap.build(sensor, Polygon.triangle(4.0), radius=12.0, force_range=(0.9, 1.1))
     lines = Mapping.lines(sensor, "A", angles=np.deg2rad((35.0, 90.0)), length=12.0)
     curves = Curves.of(forward_map, lines, force=1.0)
-    apart = np.ptp(curves.own, axis=0) / curves.own.mean(axis=0)
+    apart = np.ptp(curves.own_charge, axis=0) / curves.own_charge.mean(axis=0)
     print(f"{kind}: the lines lie {100 * apart.min():.0f} to {100 * apart.max():.0f} % of the charge apart")
-    for angle, charge in zip(lines.angle, curves.own, strict=True):
+    for angle, charge in zip(lines.angle, curves.own_charge, strict=True):
         axes.plot(lines.distance, charge, "o-", label=f"{np.rad2deg(angle):.0f}°")
     axes.set(title=f"{kind} film, triangle, 1 N", xlabel="distance from the centre of A, mm")
 pair[0].set_ylabel("charge of A, pC")

@@ -156,7 +156,7 @@ def fig_11(solves: Solves) -> Entry:
     """Contours of all four electrodes under a circle."""
     sensor = solves.choices.sensor("four")
     field = ContourField(ChargeSpline.of(solves.forward_map("circle", sensor), AREA, solves.choices.spacing), FORCE)
-    reached_pC = {name: list(field.reach(name)) for name in sensor.electrode_names}
+    reached_pC = {name: list(field.charge_range(name)) for name in sensor.electrode_names}
     circle, triangle = (solves.charges(probe, sensor, solves.places) for probe in ("circle", "triangle"))
     change = np.abs(triangle / circle - 1.0)
     rows = [

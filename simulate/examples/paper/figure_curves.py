@@ -44,7 +44,7 @@ def curve_numbers(curves: Curves) -> dict[str, object]:
     return {
         "angle_deg": np.rad2deg(curves.mapping.angle).tolist(),
         "distance_mm": curves.mapping.distance.tolist(),
-        "charge_pC": curves.own.tolist(),
+        "charge_pC": curves.own_charge.tolist(),
     }
 
 
@@ -62,7 +62,7 @@ def fig_6(solves: Solves) -> Entry:
     whole = solves.choices.sensor("three", readout="area")
     area, _ = curves_of(solves, "triangle", whole, "A", FROM_A_DEG["three"])
     example, distance = _example(solves, at, smooth)
-    apart, change = 100.0 * _spread(at), 100.0 * np.abs(at.own / area.own - 1.0).max(axis=0)
+    apart, change = 100.0 * _spread(at), 100.0 * np.abs(at.own_charge / area.own_charge - 1.0).max(axis=0)
     rows = [
         example,
         Row(
@@ -93,7 +93,7 @@ def _example(solves: Solves, at: Curves, smooth: Curves) -> tuple[Row, Array]:
     contour = draw_contour(at, CONTOUR_PC, solves.choices.degree)
     knots = np.empty((0, 2)) if contour is None else contour.knots
     distance = np.linalg.norm(knots - at.mapping.origin, axis=1)
-    exact = np.array([np.interp(-CONTOUR_PC, -q, smooth.mapping.distance) for q in smooth.own])
+    exact = np.array([np.interp(-CONTOUR_PC, -q, smooth.mapping.distance) for q in smooth.own_charge])
     row = Row(
         f"{CONTOUR_PC:g} pC, distance from A on lines of 35° to 90°",
         "x1 to x7, in the figure",
@@ -109,7 +109,7 @@ def _at_distances(curves: Curves, percent: Array) -> str:
 
 def _spread(curves: Curves) -> Array:
     """Largest less smallest charge of the lines over their mean, at each distance."""
-    return np.ptp(curves.own, axis=0) / curves.own.mean(axis=0)
+    return np.ptp(curves.own_charge, axis=0) / curves.own_charge.mean(axis=0)
 
 
 def fig_8(solves: Solves) -> Entry:
@@ -164,12 +164,12 @@ def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
     figure, (left, right) = new_axes(12.0, 5.2, columns=2)
     draw_curves(left, curves, smooth)
     left.set_title("Fig. 8: rectangular probe, biaxial film, 1 N")
-    others, mean = {"color": PRESSED, "lw": 0.7}, smooth.own.mean(axis=0)
+    others, mean = {"color": PRESSED, "lw": 0.7}, smooth.own_charge.mean(axis=0)
     styles = {190.0: others | {"label": "the others"}} | {
         named: {"color": colour, "lw": 2.4, "label": f"{named:.0f}°"}
         for named, colour in zip(FIG_8_DEG, COLOURS, strict=False)
     }
-    for angle, charge in zip(np.rad2deg(curves.mapping.angle).round(6).tolist(), smooth.own, strict=True):
+    for angle, charge in zip(np.rad2deg(curves.mapping.angle).round(6).tolist(), smooth.own_charge, strict=True):
         right.plot(smooth.mapping.distance, 100.0 * (charge / mean - 1.0), **styles.get(angle, others))
     ratio, title = "charge over the mean of the lines, %", "the same, against the mean of the lines"
     finish_axes(right, "distance from the centre of B, mm", ratio, title)
@@ -178,7 +178,7 @@ def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
 
 def _angles(curves: Curves, extreme: Extreme) -> list[float]:
     """Angle of the line with the largest or smallest charge at each distance, degrees."""
-    index = extreme(curves.own, axis=0)
+    index = extreme(curves.own_charge, axis=0)
     return [round(float(angle), 6) for angle in np.rad2deg(curves.mapping.angle[index])]
 
 
@@ -194,7 +194,7 @@ def _best_ratio(solves: Solves) -> tuple[float, float]:
     """d32 over d31 with which the order of Fig. 8 holds at most distances, and the share of them."""
     sensor = solves.choices.sensor("three")
     by_d31, by_d32 = (
-        curves_of(solves, "rectangle", replace(sensor, piezo=piezo), "B", FIG_8_DEG)[0].own
+        curves_of(solves, "rectangle", replace(sensor, piezo=piezo), "B", FIG_8_DEG)[0].own_charge
         for piezo in (Piezo(d31=1.0, d32=0.0), Piezo(d31=0.0, d32=1.0))
     )
     best = (0.0, 0.0)
@@ -232,7 +232,9 @@ def fig_12(solves: Solves) -> Entry:
 def draw_curves(axes: Any, points: Curves, lines: Curves) -> None:
     """Charge against distance on each line of a mapping: marks where the scheme presses, lines between them."""
     colours = shades(points.mapping.angle.size)
-    for angle, colour, marks, line in zip(points.mapping.angle, colours, points.own, lines.own, strict=True):
+    for angle, colour, marks, line in zip(
+        points.mapping.angle, colours, points.own_charge, lines.own_charge, strict=True
+    ):
         axes.plot(points.mapping.distance, marks, "o", color=colour, ms=3.5)
         axes.plot(lines.mapping.distance, line, "-", color=colour, lw=1.1, label=f"{np.rad2deg(angle):.0f}°")
     name = points.mapping.electrode

@@ -28,7 +28,7 @@ def film() -> ForwardMap:
     return kept(ForwardMap.build, SENSOR, Circle(1.0), 9.0, (1.0, 1.0), settings)
 
 
-def test_the_papers_scheme():
+def test_mapping_lines_follow_the_scheme_of_the_paper():
     """Fig. 6: 35, 45, ..., 85 and 90 degrees, every 4 mm."""
     mapping = Mapping.lines(SENSOR, "A", (35 * DEG, 90 * DEG))
     np.testing.assert_allclose(mapping.angle / DEG, [35, 45, 55, 65, 75, 85, 90])
@@ -37,25 +37,25 @@ def test_the_papers_scheme():
     np.testing.assert_allclose(np.linalg.norm(mapping.points - [0.0, -10.0], axis=2), np.tile(mapping.distance, (7, 1)))
 
 
-def test_without_angles_lines_go_to_both_sides_of_the_centre():
+def test_mapping_lines_without_angles_are_symmetric_about_the_centre():
     mapping = Mapping.lines(SENSOR, "B")
     middle = mapping.angle[len(mapping.angle) // 2]
     assert middle / DEG == pytest.approx(210.0, abs=1e-4)
     np.testing.assert_allclose(mapping.angle - middle, -(mapping.angle - middle)[::-1], atol=1e-12)
 
 
-def test_curves_are_presses(film):
+def test_curves_are_the_charges_of_presses(film):
     curves = Curves.of(film, Mapping.lines(SENSOR, "A", (60 * DEG, 90 * DEG), length=16.0), 1.0)
     for line, step in ((0, 0), (3, 3)):
         at = tuple(curves.mapping.points[line, step])
         direct = touch_charge(SENSOR, press(SENSOR.film, Circle(1.0), at, 1.0, SolveSettings(theory=MEMBRANE)))
         np.testing.assert_allclose(curves.charge[line, step], direct, rtol=2e-3)
-    np.testing.assert_array_equal(curves.own, curves.charge[..., 0])
+    np.testing.assert_array_equal(curves.own_charge, curves.charge[..., 0])
 
 
-def test_polynomials_are_numpys(film):
+def test_polynomials_agree_with_numpy(film):
     curves = Curves.of(film, Mapping.lines(SENSOR, "A", (60 * DEG, 90 * DEG), length=16.0), 1.0)
-    for line, polynomial in zip(curves.own, curves.polynomials(2), strict=True):
+    for line, polynomial in zip(curves.own_charge, curves.polynomials(2), strict=True):
         expected = np.polyval(np.polyfit(curves.mapping.distance, line, 2), [5.0, 13.0])
         np.testing.assert_allclose(polynomial(np.array([5.0, 13.0])), expected, rtol=1e-9)
     with pytest.raises(SceneError, match="degree: expected 1 to 3 for 4 presses on a line, got 4"):
@@ -73,6 +73,6 @@ def test_polynomials_are_numpys(film):
         ({"electrode": "E"}, "no electrode 'E' on three-25um-biaxial: it has A, B, C"),
     ],
 )
-def test_impossible_lines_are_refused(change, message):
+def test_impossible_mapping_lines_raise_scene_error(change, message):
     with pytest.raises((SceneError, SensorError), match=message):
         Mapping.lines(SENSOR, **{"electrode": "A"} | change)

@@ -48,13 +48,13 @@ def test_contours_of_a_round_field_are_circles(name, distance):
     assert np.linalg.norm(contour[[0, -1]], axis=1).min() > RADIUS - 0.05  # as far as the edge
 
 
-def test_a_contour_inside_is_closed():
+def test_contour_inside_the_disk_is_closed():
     (contour,) = round_field((1.0, 2.0)).contours("A", 1e3 / (1.0 + 0.4**2))
     np.testing.assert_array_equal(contour[0], contour[-1])
     assert len(np.unique(np.round(contour, 9), axis=0)) > 50
 
 
-def test_the_charge_is_constant_on_a_contour(field):
+def test_charge_is_constant_on_a_contour(field):
     """Within 5e-3 mm, by the slope."""
     for charge in (700.0, 1200.0):
         (contour,) = field.contours("B", charge)
@@ -65,15 +65,15 @@ def test_the_charge_is_constant_on_a_contour(field):
         assert np.abs(away).max() < 5e-3
 
 
-def test_even_charges_are_reached(field):
-    low, high = field.reach("A")
+def test_even_charges_lie_within_the_charge_range(field):
+    low, high = field.charge_range("A")
     charges = field.even_charges("A", 5)
     assert low < min(charges) < max(charges) < high
     np.testing.assert_allclose(np.diff(np.log(charges)), np.diff(np.log(charges))[0], rtol=1e-9)
     assert all(field.contours("A", charge) for charge in charges)
 
 
-def test_a_charge_that_is_not_reached_has_no_contour(field):
+def test_charge_out_of_range_has_no_contour(field):
     assert field.contours("A", 9e3) == field.contours("A", -500.0) == ()
 
 
@@ -85,6 +85,6 @@ def test_a_charge_that_is_not_reached_has_no_contour(field):
         (lambda field: ContourField(field.charge_map, 2.0), SceneError, "expected 1 to 1 N, .* covers, got 2 N"),
     ],
 )
-def test_wrong_input_is_shown(field, ask, error, message):
+def test_wrong_input_is_shown_in_the_error(field, ask, error, message):
     with pytest.raises(error, match=message):
         ask(field)

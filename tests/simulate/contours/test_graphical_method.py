@@ -36,7 +36,7 @@ def layout(request):
     return sensor, [curves_of(sensor, name) for name in sensor.electrode_names]
 
 
-def test_roots_lie_on_the_circle():
+def test_roots_of_a_round_field_lie_on_a_circle():
     sensor = LAYOUTS["three"]
     contour = draw_contour(curves_of(sensor, "A"), float(charge_at(np.array(9.0))), degree=3)
     away = np.linalg.norm(contour.knots - sensor.electrodes[0].centre, axis=1)
@@ -45,11 +45,11 @@ def test_roots_lie_on_the_circle():
     np.testing.assert_allclose(np.linalg.norm(inner - sensor.electrodes[0].centre, axis=1), 9.0, rtol=2e-4)
 
 
-def test_lines_that_do_not_reach_the_charge_give_no_contour():
+def test_draw_contour_of_an_unreached_charge_is_none():
     assert draw_contour(curves_of(LAYOUTS["three"], "A"), 5e3) is None
 
 
-def test_two_contours_cross_where_their_circles_do():
+def test_contours_cross_at_the_crossings_of_circles():
     """In the press and in its mirror image in the line through both electrodes, once each."""
     sensor, z = LAYOUTS["three"], 1.0 + 2.0j
     charges = zip("AB", charges_of(sensor, np.array([z.real]), np.array([z.imag]))[0], strict=False)
@@ -59,7 +59,7 @@ def test_two_contours_cross_where_their_circles_do():
     np.testing.assert_allclose(np.sort_complex(one.crossings(other) @ [1.0, 1.0j]), [z, mirrored], atol=0.01)
 
 
-def test_presses_are_found(layout):
+def test_graphical_method_locates_presses(layout):
     sensor, curves = layout
     rng = np.random.default_rng(1)
     r, angle = 7.0 * np.sqrt(rng.random(20)), 2.0 * np.pi * rng.random(20)
@@ -71,7 +71,7 @@ def test_presses_are_found(layout):
     assert np.all(fix.contact[:, 2] == 1.0)
 
 
-def test_what_has_no_answer_has_a_status(layout):
+def test_graphical_method_reports_the_status_of_presses_without_a_position(layout):
     sensor, curves = layout
     charge = charges_of(sensor, np.array([1.0]), np.array([2.0]))
     drawn = DrawnTriangulation(curves, degree=3)
@@ -88,6 +88,6 @@ def test_what_has_no_answer_has_a_status(layout):
         (2, np.ones((1, 2)), SensorError, "at least three electrodes"),
     ],
 )
-def test_wrong_input_is_refused(layout, electrodes, charge, error, message):
+def test_wrong_input_of_the_graphical_method_raises_an_error(layout, electrodes, charge, error, message):
     with pytest.raises(error, match=message):
         DrawnTriangulation(layout[1][:electrodes]).locate(charge)

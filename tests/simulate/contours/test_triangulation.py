@@ -52,7 +52,7 @@ def draw(count: int, seed: int, radius: float = 7.0, forces: tuple[float, float]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_circles_are_trilaterated(layout):
+def test_triangulation_of_circular_contours_finds_the_position(layout):
     charge_map, contact = round_map(CENTRES[layout]), draw(300, seed=1)
     fix = Triangulation(charge_map).locate(charge_map.charges(contact), contact[:, 2])
     assert fix.found.mean() > 0.98  # two contours touch on the line between their electrodes
@@ -60,22 +60,22 @@ def test_circles_are_trilaterated(layout):
     assert np.median(fix.spread[fix.found]) < 1e-5
 
 
-def test_seeds_are_as_far_from_contours_as_from_the_press():
+def test_seed_grid_estimates_the_distance_from_contours():
     """Charges (10 + x) F and (10 + y) F, whose contours are parallel to the axes."""
     plane = FunctionMap(lambda c: (10.0 + c[:, :2]) * c[:, 2:], ("A", "B"), Domain(5.0, (0.5, 2.0)))
     grid, at = SeedGrid.of(plane), draw(200, seed=2, radius=5.0, forces=(0.5, 2.0))
-    charge, away = plane.charges(at), np.linalg.norm(at[:, None, :2] - grid.at, axis=2)
+    charge, away = plane.charges(at), np.linalg.norm(at[:, None, :2] - grid.position, axis=2)
     assert away.min(axis=1).max() < 0.75 * NODE_SPACING
     np.testing.assert_allclose(grid.distance(charge, at[:, 2:]), np.sqrt(0.5) * away, atol=0.02)
-    force = np.clip(charge.sum(axis=1)[:, None] / (20.0 + grid.at.sum(axis=1)), 0.5, 2.0)
+    force = np.clip(charge.sum(axis=1)[:, None] / (20.0 + grid.position.sum(axis=1)), 0.5, 2.0)
     np.testing.assert_allclose(grid.matching_force(charge), force, rtol=1e-3)
     for x, outside in ((at[:, 0], False), (5.5, True), (-5.5, True)):
         charge[:, 0] = (10.0 + x) * at[:, 2]
-        assert (grid.out_of_reach(charge, at[:, 2]) == outside).all()
+        assert (grid.is_out_of_range(charge, at[:, 2]) == outside).all()
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_force_is_found_with_the_position(layout):
+def test_locate_with_force_finds_position_and_force(layout):
     charge_map, contact = round_map(CENTRES[layout]), draw(200, seed=4)
     fix = Triangulation(charge_map).locate_with_force(charge_map.charges(contact))
     assert fix.found.mean() > 0.95
@@ -83,7 +83,7 @@ def test_force_is_found_with_the_position(layout):
     assert np.median(np.abs(fix.contact[:, 2] / contact[:, 2] - 1.0)[fix.found]) < 1e-5
 
 
-def test_closest_to_meeting_is_scipys_least_squares():
+def test_locate_with_force_agrees_with_least_squares_of_scipy():
     """Force unknown, four charges that fit no press: the same minimum as a general least-squares solver finds."""
     charge_map = round_map(CENTRES["four"])
     charge = charge_map.charges(np.array([[2.0, -1.0, 0.8]])) * (1.0 + 0.01 * np.array([1, 1, -1, -1.5]))
@@ -125,7 +125,7 @@ def test_round_trip_of_presses_of_a_triangle(triangle_map, on_film):
 # What has no answer
 
 
-def test_charges_that_no_contour_reaches_or_that_do_not_meet(triangle_map, on_film):
+def test_status_of_charges_without_a_contour_and_of_contours_that_do_not_meet(triangle_map, on_film):
     charge = triangle_map.charges(np.array([[1.0, 1.0, 1.0]]))
     fix = on_film.locate(np.concatenate([[[9e3, 9e3, 9e3], [1.0, 800.0, 800.0]], 1.3 * charge]), 1.0)
     assert fix.status.tolist() == [Meeting.no_contour, Meeting.no_contour, Meeting.apart]
@@ -133,7 +133,7 @@ def test_charges_that_no_contour_reaches_or_that_do_not_meet(triangle_map, on_fi
     assert "do not meet" in Meeting(fix.status[2]).summary
 
 
-def test_contours_that_meet_twice():
+def test_contours_that_meet_twice_are_ambiguous():
     """Electrodes on a line: the circles meet again in the mirror."""
     charge_map = round_map(np.array([[-9.0, 0.0], [0.0, 0.0], [9.0, 0.0]]))
     fix = Triangulation(charge_map).locate(charge_map.charges(np.array([[1.0, 3.0, 1.0]])), 1.0)
@@ -141,7 +141,7 @@ def test_contours_that_meet_twice():
     assert np.isnan(fix.contact[0, :2]).all()
 
 
-def test_a_map_with_folds_has_two_positions():
+def test_charge_map_with_folds_has_two_positions():
     """Three electrodes, uniaxial, force unknown: two contacts with the same charges, found from either."""
     charge_map = kept(ForwardMap.build, load_sensor("three-25um-uniaxial"), Circle(1.0), 8.0, FORCES, QUICK)
     contact = draw(100, seed=8)
@@ -160,7 +160,7 @@ def test_a_map_with_folds_has_two_positions():
         (np.ones((2, 3)), np.array([1.0, np.nan]), SceneError, "force of press 1: .* got nan N"),
     ],
 )
-def test_wrong_input_is_shown(charge, force, error, message):
+def test_wrong_input_is_shown_in_the_error(charge, force, error, message):
     with pytest.raises(error, match=message):
         Triangulation(round_map(CENTRES["three"])).locate(charge, force)
 
@@ -172,12 +172,12 @@ def test_wrong_input_is_shown(charge, force, error, message):
         (3, 0.0, SceneError, "tolerance: expected a positive length"),
     ],
 )
-def test_impossible_triangulations_are_refused(count, tolerance, error, message):
+def test_impossible_triangulation_raises_an_error(count, tolerance, error, message):
     with pytest.raises(error, match=message):
         Triangulation(round_map(CENTRES["three"][:count]), tolerance=tolerance)
 
 
-def test_no_presses_give_no_fixes():
+def test_triangulation_of_no_presses_is_empty():
     triangulation = Triangulation(round_map(CENTRES["three"]))
     assert triangulation.locate(np.zeros((0, 3)), 1.0).contact.shape == (0, 3)
     assert triangulation.locate_with_force(np.zeros((0, 3))).contact.shape == (0, 3)

@@ -73,7 +73,7 @@ def stopped(tmp_path) -> Path:
 
 
 @pytest.mark.parametrize(("phase", "count"), [("solving", 3), ("pressing", 0), ("pressing", 60)])
-def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, whole, phase, count):
+def test_stopped_run_is_resumed_with_the_same_bytes(tmp_path, whole, phase, count):
     target, first, second, reports = tmp_path / "presses", Counting(), Counting(), []
     sweep_until(target, phase, count, executor=first)
     assert [path.name for path in tmp_path.iterdir()] == ["presses.part"]
@@ -93,7 +93,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, whole, phase, count):
         ({"settings": SolveSettings()}, "solver.resolution is .*; solver.theory is"),
     ],
 )  # fmt: skip
-def test_a_draft_of_other_settings_is_left_alone(stopped, whole, changes, message):
+def test_draft_of_different_settings_is_not_changed(stopped, whole, changes, message):
     before = sorted(draft_of(stopped).rglob("*"))
     with pytest.raises(
         OutputExists, match=rf"presses\.part holds the unfinished run of other settings: {message}.*--fresh"
@@ -104,7 +104,7 @@ def test_a_draft_of_other_settings_is_left_alone(stopped, whole, changes, messag
 
 
 @pytest.mark.parametrize(("content", "fresh"), [(None, True), ("{", False)])
-def test_a_folder_in_the_way_is_left_alone(tmp_path, content, fresh):
+def test_existing_folder_is_not_changed(tmp_path, content, fresh):
     """Somebody's own folder, or a draft that cannot be recognised as one."""
     folder = tmp_path / "presses.part"
     folder.mkdir()
@@ -118,7 +118,7 @@ def test_a_folder_in_the_way_is_left_alone(tmp_path, content, fresh):
 
 
 @pytest.mark.parametrize(("name", "damage"), [("parts/solve-00-0001.npy", "flipped"), ("data/shard-00001.npz", "gone")])
-def test_a_damaged_part_is_reported_and_computed_again(stopped, whole, damage, name, caplog):
+def test_damaged_part_is_reported_and_computed_again(stopped, whole, damage, name, caplog):
     path = draft_of(stopped) / name
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
@@ -132,7 +132,7 @@ def test_a_damaged_part_is_reported_and_computed_again(stopped, whole, damage, n
     assert files(stopped) == whole[0]
 
 
-def test_a_part_without_its_checksum_is_not_trusted(stopped, whole):
+def test_part_without_checksum_is_computed_again(stopped, whole):
     """As after a kill between the two; nor does a file that was half written get into the dataset."""
     (draft_of(stopped) / "data" / ".0123abcd.draft").write_bytes(b"half")
     for name in ("solve-00-0001.npy", "shard-00001.npz"):
@@ -142,7 +142,7 @@ def test_a_part_without_its_checksum_is_not_trusted(stopped, whole):
     assert files(stopped) == whole[0]
 
 
-def test_two_runs_do_not_work_on_one_draft(tmp_path):
+def test_second_run_on_the_same_draft_is_refused(tmp_path):
     def other_run(*_):
         with pytest.raises(OutputExists, match=r"another process is at work in .*presses\.part; wait for it"):
             sweep_to(tmp_path / "presses", fresh=True)
@@ -152,7 +152,7 @@ def test_two_runs_do_not_work_on_one_draft(tmp_path):
         sweep_to(tmp_path / "presses")
 
 
-def test_killed_between_name_and_tidying(stopped):
+def test_run_killed_after_renaming_the_dataset_removes_the_draft_when_resumed(stopped):
     """The dataset is whole, its draft not yet removed: nothing is redone, and the rest goes."""
     draft_of(stopped).joinpath("data").rename(stopped)
     with pytest.raises(OutputExists, match="presses is already there"):
@@ -168,7 +168,7 @@ def save_and_raise(target: Path, error: BaseException) -> None:
 
 
 @pytest.mark.parametrize("error", [SceneError("no such press"), SolveError("no equilibrium")])
-def test_what_would_fail_again_leaves_nothing(tmp_path, error):
+def test_run_that_fails_before_the_first_result_leaves_no_draft(tmp_path, error):
     with pytest.raises(type(error)):
         save_and_raise(tmp_path / "new" / "out", error)
     assert list(tmp_path.iterdir()) == []
@@ -197,7 +197,7 @@ if __name__ == "__main__":
 """
 
 
-def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path, whole):
+def test_killed_run_is_resumed_with_the_same_bytes(tmp_path, whole):
     """SIGKILL between two shards; no worker outlives it."""
     script = tmp_path / "driver.py"
     script.write_text(DRIVER.format(path=sys.path))

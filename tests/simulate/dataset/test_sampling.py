@@ -25,7 +25,7 @@ sweeps = st.builds(
 
 @settings(deadline=None, max_examples=50)
 @given(sweeps, st.integers(1, 3))
-def test_every_press_is_inside_and_the_count_is_right(sweep, count):
+def test_presses_lie_within_the_ranges_and_have_the_requested_number(sweep, count):
     presses = sweep.over(PROBES[:count])
     low, high = sweep.force_range
     x, y, force = presses.contact.T
@@ -54,7 +54,7 @@ def test_presses_are_uniform_over_the_disk_and_in_the_logarithm_of_the_force(sam
     assert stats.chisquare(np.histogram2d(squared, angle, bins=(8, 8))[0].ravel()).pvalue > 0.05
 
 
-def test_sobol_presses_fill_gaps_better_than_chance():
+def test_sobol_presses_have_a_smaller_discrepancy_than_random_presses():
     """What the Sobol points are for: a tenth of the discrepancy of independent draws, for every probe by itself."""
     probes = 3
     presses = Sweep(samples=1024 * probes, seed=4).over(PROBES[:probes])
@@ -66,7 +66,7 @@ def test_sobol_presses_fill_gaps_better_than_chance():
 
 
 @pytest.mark.parametrize("sampling", ["sobol", "random"])
-def test_seed_and_probe_decide(sampling):
+def test_presses_depend_on_seed_and_probe(sampling):
     first, again, other = (Sweep(samples=100, seed=seed, sampling=sampling).contacts() for seed in (5, 5, 6))
     np.testing.assert_array_equal(first, again)
     assert np.all(first != other)
@@ -77,7 +77,7 @@ def test_seed_and_probe_decide(sampling):
 # Grid
 
 
-def test_a_grid_is_every_force_and_rotation_at_every_place():
+def test_grid_has_every_force_and_rotation_at_every_position():
     sweep = Sweep(samples=3000, orientation="random", sampling="grid")
     presses = sweep.over(PROBES)
     for number, probe in enumerate(PROBES):
@@ -93,7 +93,7 @@ def test_a_grid_is_every_force_and_rotation_at_every_place():
     assert not presses.rotation[presses.probe == 0].any()  # a circle would only press the same again
 
 
-def test_a_lattice_has_one_spacing_and_as_many_points_as_fit():
+def test_lattice_has_one_spacing_and_the_largest_possible_number_of_points():
     sizes = [lattice(most).size for most in range(1, 30)]
     expected = [1] * 4 + [5] * 4 + [9] * 4 + [13] * 8 + [21] * 4 + [25] * 4 + [29]
     assert sizes == expected
@@ -122,6 +122,6 @@ def test_a_lattice_has_one_spacing_and_as_many_points_as_fit():
         ({}, "probes: expected at least one, got none"),
     ],
 )
-def test_impossible_sweeps_are_refused(settings, message):
+def test_impossible_sweep_raises_scene_error(settings, message):
     with pytest.raises(SceneError, match=message):
         Sweep(**settings).over(PROBES if settings else ())

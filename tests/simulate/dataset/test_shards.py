@@ -58,7 +58,7 @@ def replace_shard(folder: Path, **columns) -> None:
 # Round trip
 
 
-def test_round_trip(dataset):
+def test_dataset_round_trip(dataset):
     read = read_dataset(dataset)
     assert read.sensor == SENSOR
     assert len(read.samples) == 8
@@ -67,7 +67,7 @@ def test_round_trip(dataset):
         np.testing.assert_array_equal(getattr(read.samples, name), both)
 
 
-def test_manifest_and_card_say_everything(dataset):
+def test_manifest_and_card_describe_the_dataset(dataset):
     manifest = read_dataset(dataset).manifest
     assert (manifest["format_version"], manifest["samples"], manifest["seed"]) == (1, 8, 3)
     assert (manifest["electrodes"], manifest["columns"]) == (["A", "B", "C"], COLUMNS)
@@ -82,7 +82,7 @@ def test_manifest_and_card_say_everything(dataset):
         assert part in card
 
 
-def test_measured_data_needs_no_solver(tmp_path):
+def test_dataset_of_measured_presses_needs_no_solver_entry(tmp_path):
     """A rig knows no seed and no mesh; integers are numbers too."""
     measured = replace(samples(2), force_N=np.array([1, 2]))
     assert len(read_dataset(write_dataset(tmp_path / "rig", SENSOR, [measured], {})).samples) == 2
@@ -91,14 +91,14 @@ def test_measured_data_needs_no_solver(tmp_path):
 # Damage
 
 
-def test_not_a_dataset(tmp_path):
+def test_read_dataset_of_another_folder_raises_dataset_error(tmp_path):
     (tmp_path / "file").write_text("")
     for path in (tmp_path, tmp_path / "nothing", tmp_path / "file"):
         with pytest.raises(DatasetError, match=f"{path} is not a dataset: it has no manifest.json; make one with"):
             read_dataset(path)
 
 
-def test_another_sensor_where_one_is_expected(dataset):
+def test_read_dataset_of_another_sensor_raises_dataset_error(dataset):
     assert read_dataset(dataset, SENSOR).sensor == SENSOR
     thicker = replace(SENSOR, film=replace(SENSOR.film, thickness=0.03), readout="edge")
     for other, got in (
@@ -213,7 +213,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("what", DAMAGE)
-def test_damage_is_told(dataset, what):
+def test_damaged_dataset_raises_dataset_error(dataset, what):
     """A manifest cannot point elsewhere, and nothing in a shard is run."""
     spoil, message = DAMAGE[what]
     spoil(dataset)
@@ -231,13 +231,13 @@ def test_damage_is_told(dataset, what):
         ({"x_mm": np.zeros(4)}, r"expected columns of shapes"),
     ],
 )
-def test_wrong_samples_are_not_written(tmp_path, changes, message):
+def test_invalid_samples_are_not_written(tmp_path, changes, message):
     with pytest.raises(DatasetError, match=rf"shard-00001\.npz: {message}"):
         write_dataset(tmp_path / "presses", SENSOR, [samples(), replace(samples(), **changes)], ABOUT)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
+def test_full_disk_leaves_no_partial_dataset(tmp_path, monkeypatch):
     """At every file of it."""
     for failing in range(1, 5):
         calls = []

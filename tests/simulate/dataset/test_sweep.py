@@ -62,7 +62,7 @@ def files(folder: Path) -> dict[str, bytes]:
 # What is written
 
 
-def test_samples_are_the_presses_and_their_charges(small_dataset):
+def test_samples_contain_the_presses_and_their_charges(small_dataset):
     read = read_dataset(small_dataset)
     x, y, force = Sweep(samples=500, seed=7).contacts().T
     for column, expected in ((read.samples.x_mm, x), (read.samples.y_mm, y), (read.samples.force_N, force)):
@@ -88,7 +88,7 @@ def test_manifest_of_a_sweep(small_dataset, three_map):
     }
 
 
-def test_a_run_writes_what_its_maps_write_and_reports_both_phases(tmp_path):
+def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp_path):
     """Whether or not a draft is kept on the way."""
     reports: dict[str, list] = {}
     with listening(lambda title, done, total, _: reports.setdefault(title, []).append((done, total))):
@@ -101,7 +101,7 @@ def test_a_run_writes_what_its_maps_write_and_reports_both_phases(tmp_path):
     assert done == total
 
 
-def test_orientation_is_the_whole_turn_against_the_notation(tmp_path):
+def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path):
     """The angle that the probe was given with and the press's own; the map is asked for the latter only."""
     probes = [parse_probe(text) for text in ("rectangle:4.0x2.0@30", "triangle:4.0@-30", "circle:1.0@50")]
     for orientation in ("fixed", "random"):
@@ -116,7 +116,7 @@ def test_orientation_is_the_whole_turn_against_the_notation(tmp_path):
     assert read_dataset(tmp_path / "fixed").samples.orientation_deg[:3].tolist() == [30.0, 330.0, 0.0]
 
 
-def test_shards_and_tasks_keep_the_order(tmp_path):
+def test_shards_and_tasks_keep_the_order_of_the_presses(tmp_path):
     """More than a shard, more than a task in one, and each press with its own charges."""
     sweep = Sweep(samples=SHARD + 10, orientation="random")
     maps = [Spy(Polygon.rectangle(side, 2.0)) for side in (3.0, 4.0, 5.0)]
@@ -132,7 +132,7 @@ def test_shards_and_tasks_keep_the_order(tmp_path):
 # Refused, and failed
 
 
-def test_a_folder_that_cannot_be_written(tmp_path):
+def test_unwritable_folder_raises_output_error(tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(
         OutputError, match=r"file/presses\.part cannot be written: Not a directory; choose another output"

@@ -25,7 +25,7 @@ MAP = FunctionMap(far_field, ("A", "B", "C", "D"), Domain(6.0, (0.05, 2.0)))
 CONTACT = np.array([[1.0, -2.0, 0.3], [4.0, 3.0, 1.5]])
 
 
-def test_information_of_a_reading_by_integration():
+def test_information_of_a_reading_agrees_with_numerical_integration():
     """Fisher's information is the mean square of the likelihood's slope; with a large gain sigma informs, too."""
     model, charge = NoiseModel("wild", 1.0, 0.4), 3.0
 
@@ -50,7 +50,7 @@ def test_linear_charges_give_the_covariance_of_least_squares():
     assert by_hand.force[0] == pytest.approx(0.2)
 
 
-def test_nuisances_are_noise_that_the_electrodes_share():
+def test_nuisances_are_equivalent_to_correlated_noise():
     """Unknowns with a prior, marginalised, are correlated noise: covariance diag(1/i) + N N' (Woodbury)."""
     rng = np.random.default_rng(3)
     charge, jacobian = rng.uniform(100.0, 1000.0, (20, 5)), rng.normal(size=(20, 5, 3)) * [100.0, 100.0, 1000.0]
@@ -62,7 +62,7 @@ def test_nuisances_are_noise_that_the_electrodes_share():
         np.testing.assert_allclose(limits.covariance[i, :3, :3], expected, rtol=1e-6)
 
 
-def test_what_the_charges_cannot_determine_has_a_huge_limit():
+def test_limit_of_an_unobservable_parameter_is_large():
     """Charges that do not depend on y."""
     blind = replace(MAP, function=lambda contact: far_field(contact * [1.0, 0.0, 1.0]))
     limits = limits_at(blind, CONTACT, REFERENCE)
@@ -81,7 +81,7 @@ def test_what_the_charges_cannot_determine_has_a_huge_limit():
         (((10.0, 0.0), (0.0, 10.0), (-10.0, 0.0), (0.0, -10.0)), 0.098, 0.046),
     ],
 )
-def test_layouts_whose_limits_are_known(three_map, places, worst, rms):
+def test_limits_of_layouts_agree_with_an_independent_search(three_map, places, worst, rms):
     """Within 8 mm at 1 N, from an independent search over layouts; the worst depends on the grid by 4 %."""
     electrodes = tuple(Electrode.of_square(name, place, 3.0) for name, place in zip("ABCD", places, strict=False))
     charges = ChargeSpline.of(replace(three_map, sensor=replace(three_map.sensor, electrodes=electrodes)), spacing=0.3)

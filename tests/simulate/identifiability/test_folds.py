@@ -1,4 +1,4 @@
-"""Folds, ambiguous pairs and the working area on maps whose folds are known, and on the real sensors."""
+"""Folds, ambiguous pairs and working areas of synthetic charge maps with known folds, and of built-in sensors."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -31,8 +31,8 @@ from isocharge.simulate.numerics.disk import Rings
 from kept import kept
 
 REFERENCE = noise_model("reference")
-CREASE = 3.0
-"""Where the synthetic maps fold, mm: x and 2 CREASE - x give the same charges."""
+FOLD_X = 3.0
+"""Position x of the fold line of the synthetic maps, mm: x and 2 FOLD_X - x give the same charges."""
 
 
 FORCES = (0.05, 2.0)
@@ -41,18 +41,18 @@ FINE_STEPS = (1e-3, 1e-3, 1e-3)
 
 @dataclass(frozen=True)
 class FineMap(FunctionMap):
-    """Differences over a tenth of a SEGMENT_LENGTH: these maps vary within some 0.1 mm."""
+    """Map with small steps of the differences, because the charges vary within about 0.1 mm."""
 
     def derivatives(self, contact):
         return differences(self.function, contact, FINE_STEPS)
 
 
-def creased(extra: float | None = None, radius: float = 5.0, forces: tuple[float, float] = FORCES) -> FunctionMap:
-    """Three charges that fold at x = CREASE; a fourth, if there is one, rises with x by so much (1/mm)."""
+def folded_map(extra: float | None = None, radius: float = 5.0, forces: tuple[float, float] = FORCES) -> FunctionMap:
+    """Three charges that fold at x = FOLD_X, and optionally a fourth whose slope along x is `extra`, 1/mm."""
 
     def charge(contact):
         x, y, force = contact.T
-        columns = [3.0 + (x - x**2 / (2.0 * CREASE)) / 3.0, 3.0 + 0.3 * y, np.full(len(x), 3.0)]
+        columns = [3.0 + (x - x**2 / (2.0 * FOLD_X)) / 3.0, 3.0 + 0.3 * y, np.full(len(x), 3.0)]
         if extra is not None:
             columns.append(3.0 + extra * x)
         return 300.0 * force[:, None] ** (2.0 / 3.0) * np.stack(columns, axis=1)
@@ -61,7 +61,7 @@ def creased(extra: float | None = None, radius: float = 5.0, forces: tuple[float
 
 
 def shaped_charges(*shapes, radius: float = 5.0) -> FunctionMap:
-    """Charges that follow functions of x and y, and one that depends on the force alone."""
+    """Charges that are functions of x and y, and one charge that depends only on the force."""
 
     def charge(contact):
         x, y, force = contact.T
@@ -72,46 +72,47 @@ def shaped_charges(*shapes, radius: float = 5.0) -> FunctionMap:
 
 
 def folds_of(charge_map, rings: Rings | None = None) -> np.ndarray:
-    """Where a map folds at 1 N, shape (n, 2)."""
+    """Positions on folds at 1 N, shape (n, 2), mm."""
     return find_folds(charge_map, rings or Rings.spread(charge_map.domain.radius), 1.0, REFERENCE).points
 
 
 def squares(film, *places):
-    """The film with electrodes of 3 mm at other places."""
+    """Forward map of the same film with square electrodes of 3 mm at given positions."""
     electrodes = [Electrode.of_square(name, place, 3.0) for name, place in zip("ABCDEFGH", places, strict=False)]
     return replace(film, sensor=replace(film.sensor, electrodes=tuple(electrodes)))
 
 
 INNER = ((-0.9, 1.4), (8.7, 11.4), (15.2, -18.1), (-14.7, -5.3))
-"""Places of four electrodes, mm, one of them within the area: no circle, no fold up to 15 mm."""
+"""Positions of four electrodes that do not lie on a circle, one of them within the area, mm. There is no fold up to
+15 mm."""
 
 
 @pytest.fixture(scope="module")
 def film():
-    """One family of presses: other layouts and coefficients are only read differently."""
+    """Forward map of one film. Other layouts and coefficients use the same solves."""
     return kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0), 11.5, FORCES)
 
 
 @pytest.fixture(scope="module")
 def charges(film):
-    """By sensor, each made once."""
+    """Function from the name of a sensor to its splines, which are computed once."""
     return cache(lambda name: ChargeSpline.of(replace(film, sensor=load_sensor(name)), spacing=0.4))
 
 
-@pytest.mark.parametrize("extra", [None, 0.0], ids=["three charges", "a fourth that tells nothing"])
-def test_a_known_crease_is_found(extra):
-    points = folds_of(creased(extra))
+@pytest.mark.parametrize("extra", [None, 0.0], ids=["three charges", "constant fourth charge"])
+def test_find_folds_finds_a_known_fold_line(extra):
+    points = folds_of(folded_map(extra))
     assert len(points) > 50
-    assert points[:, 0] == pytest.approx(CREASE, abs=0.1)
+    assert points[:, 0] == pytest.approx(FOLD_X, abs=0.1)
     assert np.ptp(points[:, 1]) > 7.0
 
 
-def test_without_a_crease_there_is_no_fold():
-    """A fourth charge distinguishes its sides; or it lies outside."""
-    assert len(folds_of(creased(0.3))) == len(folds_of(creased(radius=2.5))) == 0
+def test_find_folds_finds_nothing_without_a_fold_line():
+    """A fourth charge distinguishes both sides of the fold line, or the fold line is outside the disk."""
+    assert len(folds_of(folded_map(0.3))) == len(folds_of(folded_map(radius=2.5))) == 0
 
 
-def test_a_fold_smaller_than_the_grid_is_found():
+def test_find_folds_finds_a_fold_smaller_than_the_rings():
     """The slope of the first charge is negative within 0.1 mm of a point amid places that are 0.2 mm apart."""
     at, width = 1.5 * np.array([np.cos(np.pi * 0.225), np.sin(np.pi * 0.225)]), 0.1
 
@@ -128,7 +129,7 @@ def test_a_fold_smaller_than_the_grid_is_found():
     assert np.hypot(*(points - at).T).max() < 2.0 * width
 
 
-def test_a_weak_spot_between_the_rings_ends_the_area():
+def test_working_area_ends_at_a_large_error_between_the_rings():
     """Within 0.03 mm of a point between the rings' places the first charge hardly changes: 20 times the error."""
     at, width = 3.025 * np.array([np.cos(np.pi / 180.0), np.sin(np.pi / 180.0)]), 0.03
 
@@ -142,7 +143,7 @@ def test_a_weak_spot_between_the_rings_ends_the_area():
     assert working.error_radius == pytest.approx(3.025, abs=0.03)
 
 
-def test_no_ring_within_the_area_errs_more_than_is_allowed(film):
+def test_error_does_not_exceed_its_limit_on_finer_rings_within_the_working_area(film):
     """Beside an electrode within the area the error rises between one ring and the next."""
     charges = ChargeSpline.of(squares(film, *INNER), 9.0, 0.3)
     working = working_area(charges, REFERENCE, search_pairs=False, error=0.3)
@@ -150,7 +151,7 @@ def test_no_ring_within_the_area_errs_more_than_is_allowed(film):
     assert working.radius == pytest.approx(working.error_radius, abs=0.101)
 
 
-def test_four_charges_lose_rank_at_a_point():
+def test_derivative_of_four_charges_is_singular_at_a_point():
     """The cross-cap (u^2, u v, v) loses rank at u = v = 0 and nowhere else (Whitney 1944)."""
     model = shaped_charges(lambda x, _: (x - 1) ** 2, lambda x, y: (x - 1) * (y + 2), lambda _, y: y)
     points = folds_of(model)
@@ -158,7 +159,7 @@ def test_four_charges_lose_rank_at_a_point():
     assert points == pytest.approx(np.broadcast_to([1.0, -2.0], points.shape), abs=2.0 * SEGMENT_LENGTH)
 
 
-def test_a_map_that_bends_sharply_loses_no_rank():
+def test_find_folds_finds_nothing_in_a_sharply_bent_map():
     """A sheet bent round a cylinder of 0.2 mm: 0.4 mm apart it has turned over, and every place has its own charges."""
     bend = 0.2
     model = shaped_charges(lambda x, _: bend * np.cos(x / bend), lambda x, _: bend * np.sin(x / bend), lambda _, y: y)
@@ -168,7 +169,7 @@ def test_a_map_that_bends_sharply_loses_no_rank():
         assert len(folds_of(within(model, 0.5), rings)) == 0
 
 
-def test_an_electrode_within_the_area_is_no_fold(film):
+def test_find_folds_finds_nothing_beside_an_electrode(film):
     """Rings 0.3 mm apart seem to turn over beside it, 1.7 mm from the centre; ten times finer ones do not."""
     force, charges = 0.05, ChargeSpline.of(squares(film, *INNER), 4.0)
     for count, seems in ((13, True), (130, False)):
@@ -178,7 +179,7 @@ def test_an_electrode_within_the_area_is_no_fold(film):
     assert len(find_folds(charges, Rings.spread(4.0, 13, 60), force, REFERENCE).points) == 0
 
 
-def test_the_nearest_fold_is_that_of_a_grid_of_a_tenth_of_a_millimetre(charges):
+def test_nearest_fold_agrees_with_signs_of_the_determinant_on_a_fine_grid(charges):
     """Brute force, with derivatives by differences: signs of det J."""
     model = charges("three-25um-uniaxial")
     steps = 0.1 * np.arange(-50, 51)
@@ -191,10 +192,10 @@ def test_the_nearest_fold_is_that_of_a_grid_of_a_tenth_of_a_millimetre(charges):
 
 
 @pytest.mark.parametrize("forces", [FORCES, (0.5, 0.5)], ids=["a range", "one force"])
-def test_ambiguous_pairs_are_mirror_images_in_the_crease(forces):
-    pairs = find_ambiguous_pairs(creased(forces=forces), REFERENCE, 0.5, places=400)
+def test_ambiguous_pairs_are_mirror_images_in_the_fold_line(forces):
+    pairs = find_ambiguous_pairs(folded_map(forces=forces), REFERENCE, 0.5, places=400)
     assert len(pairs) > 20
-    assert pairs.first[:, 0] + pairs.second[:, 0] == pytest.approx(2.0 * CREASE, abs=0.5)
+    assert pairs.first[:, 0] + pairs.second[:, 0] == pytest.approx(2.0 * FOLD_X, abs=0.5)
     assert pairs.first[:, 1] == pytest.approx(pairs.second[:, 1], abs=0.5)
     assert (pairs.distance < 3.0).all()
     assert np.median(pairs.distance) < 0.01
@@ -202,12 +203,12 @@ def test_ambiguous_pairs_are_mirror_images_in_the_crease(forces):
 
 
 def test_no_ambiguous_pairs_where_a_charge_distinguishes_the_sides():
-    assert len(find_ambiguous_pairs(creased(0.3), REFERENCE, 0.5, places=400)) == 0
+    assert len(find_ambiguous_pairs(folded_map(0.3), REFERENCE, 0.5, places=400)) == 0
 
 
 @pytest.mark.parametrize(("force", "forces"), [(0.7, FORCES), (0.5, (0.5, 0.5))], ids=["a range", "one force"])
-def test_the_nearest_contact_is_the_right_one(force, forces):
-    charge_map = creased(0.3, forces=forces)
+def test_nearest_contact_finds_the_true_contact(force, forces):
+    charge_map = folded_map(0.3, forces=forces)
     truth = np.array([[1.0, -2.0, force], [-3.0, 1.0, force]])
     start = np.array([[0.0, 0.0, np.sqrt(np.prod(forces))]] * 2)
     contact, distance = nearest_contact(charge_map, REFERENCE, charge_map.charges(truth), start)
@@ -215,22 +216,22 @@ def test_the_nearest_contact_is_the_right_one(force, forces):
     assert distance == pytest.approx(0.0, abs=0.01)
 
 
-def test_the_crease_bounds_the_working_area():
-    working = working_area(creased(), REFERENCE, error=np.inf)
-    assert (working.bound, working.fold_radius) == ("fold", pytest.approx(CREASE, abs=0.06))
+def test_fold_line_bounds_the_working_area():
+    working = working_area(folded_map(), REFERENCE, error=np.inf)
+    assert (working.bound, working.fold_radius) == ("fold", pytest.approx(FOLD_X, abs=0.06))
     assert working.radius == working.unambiguous_radius == pytest.approx(2.9, abs=0.11)
 
 
-def test_the_allowed_error_bounds_it_earlier():
-    working = working_area(creased(), REFERENCE, error=0.2, search_pairs=False)
+def test_allowed_error_bounds_the_working_area():
+    working = working_area(folded_map(), REFERENCE, error=0.2, search_pairs=False)
     assert working.bound == "error"
     assert "exceeds 0.2 mm" in working.summary
     ring = working.error_radius * np.exp(2j * np.pi * np.arange(360) / 360)
     contact = np.stack([ring.real, ring.imag, np.full(360, 0.05)], axis=1)
-    assert limits_at(creased(), contact, REFERENCE).position.max() == pytest.approx(0.2, rel=0.01)
+    assert limits_at(folded_map(), contact, REFERENCE).position.max() == pytest.approx(0.2, rel=0.01)
 
 
 def test_where_nothing_ends_it_the_search_does():
-    working = working_area(creased(radius=1.0), REFERENCE, error=1000.0)
+    working = working_area(folded_map(radius=1.0), REFERENCE, error=1000.0)
     assert (working.radius, working.bound) == (1.0, "search")
     assert working.summary.endswith("The search ended at 1 mm.")

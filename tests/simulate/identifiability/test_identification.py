@@ -38,7 +38,7 @@ def identification(film):
     return Identification.of(film, REFERENCE)
 
 
-def test_numbers_are_ready_for_json(identification):
+def test_identification_to_dict_can_be_written_as_json(identification):
     numbers = json.loads(json.dumps(identification.to_dict(), allow_nan=False))
     assert numbers["probe"] == "circle:2.0"
     assert numbers["noise"] == {"name": "reference", "white_pC": 1.0, "gain": 0.002}
@@ -47,7 +47,7 @@ def test_numbers_are_ready_for_json(identification):
     assert len(numbers["by_distance"]["distance_mm"]) == len(numbers["by_distance"]["worst_position_mm_at_1_N"])
 
 
-def test_the_share_on_whichever_side_of_folds_is_that_of_random_places(film, identification):
+def test_determined_share_agrees_with_random_positions(film, identification):
     """Of 2,000 places drawn at random, those where the limits at all three forces are within the allowed error."""
     strict, rng = replace(identification.area, error=0.1), np.random.default_rng(0)
     found = replace(identification, area=strict)
@@ -63,7 +63,7 @@ def test_the_share_on_whichever_side_of_folds_is_that_of_random_places(film, ide
     np.testing.assert_allclose(medians, expected, rtol=0.05)
 
 
-def test_errors_are_ordered_and_fall_with_the_force(identification):
+def test_limit_statistics_are_ordered_and_decrease_with_the_force(identification):
     rows = identification.to_dict()["limits_in_working_area"]
     assert [row["force_N"] for row in rows] == [0.05, 1.0, 2.0]
     for row in rows:
@@ -72,19 +72,19 @@ def test_errors_are_ordered_and_fall_with_the_force(identification):
     assert rows[0]["position_rms_mm"] > 2.0 * rows[1]["position_rms_mm"] > rows[2]["position_rms_mm"]
 
 
-def test_the_condition_is_that_of_the_position_s_deviations(identification):
+def test_condition_is_the_ratio_of_the_standard_deviations_of_the_position(identification):
     limits = identification.maps[1]
     covariance = limits_at(identification.charges, limits.rings.contacts(limits.force), REFERENCE).covariance
     np.testing.assert_allclose(limits.condition.ravel(), np.sqrt(np.linalg.cond(covariance[:, :2, :2])), rtol=0.02)
 
 
-def test_what_frames_before_would_tell_is_said_where_the_map_folds(identification):
+def test_summary_states_the_determined_share_if_the_map_folds(identification):
     folded = replace(identification.area, folds=np.ones((1, 2)), radius=2.5)
     said = [replace(identification, area=area).summary for area in (identification.area, folded)]
     assert ["5 mm searched, of which the working area is 25 %" in text for text in said] == [False, True]
 
 
-def test_an_electrode_at_the_centre_leaves_a_small_area(film):
+def test_working_area_with_an_electrode_at_the_centre_is_small(film):
     """The area is smaller than the distance of the rings of the whole film."""
     places = ((0.0, 0.0), (8.66, 5.0), (-8.66, 5.0))
     electrodes = tuple(Electrode.of_square(name, at, 3.0) for name, at in zip("ABC", places, strict=True))
@@ -93,18 +93,18 @@ def test_an_electrode_at_the_centre_leaves_a_small_area(film):
     assert all(0.0 < row["position_median_mm"] <= 1.0 for row in numbers["limits_in_working_area"])
 
 
-def test_what_has_no_limits_is_refused_before_the_film_is_solved():
+def test_identify_without_noise_or_electrodes_raises_before_the_film_is_solved():
     with pytest.raises(SceneError, match="at least three electrodes, got 2"):
         identify(replace(SENSOR, electrodes=SENSOR.electrodes[:2]))
 
 
-def test_the_search_goes_over_the_electrodes_but_not_to_the_rim():
+def test_search_radius_covers_the_electrodes_but_not_the_rim():
     assert search_radius(SENSOR, Circle(1.0)) == pytest.approx(np.hypot(10.160254, 6.5))
     small = replace(SENSOR, film=replace(SENSOR.film, radius=14.0))
     assert search_radius(small, Circle(1.0)) == pytest.approx(9.5)
 
 
-def test_where_charges_are_too_rough_the_search_is_smaller(monkeypatch):
+def test_search_radius_is_reduced_if_charges_cannot_be_interpolated(monkeypatch):
     asked = []
 
     def build(_sensor, _probe, radius, *_, **__):

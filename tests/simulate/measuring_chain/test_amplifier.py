@@ -32,7 +32,7 @@ def step(n=2000, at=200, height=400.0, electrodes=3):
     ],
     ids=["1 s", "10 s", "clean"],
 )
-def test_held_step_decays_by_the_closed_form(part, tau):
+def test_held_charge_decays_exponentially(part, tau):
     readings, _ = measure(part, step())
     t = np.arange(1800) / RATE
     np.testing.assert_allclose(readings[200:], 400.0 * np.exp(-t / tau)[:, None] * np.ones(3), rtol=1e-12)
@@ -44,13 +44,13 @@ def test_bias_current_settles_at_current_times_tau():
     np.testing.assert_allclose(readings, np.broadcast_to(process.bias * 2.0, readings.shape), rtol=2e-3)
 
 
-def test_reference_is_the_memoryless_model():
+def test_amplifier_level_reference_is_memoryless():
     readings, _ = measure(load_amplifier("reference"), np.full((20_000, 2), 500.0))
     np.testing.assert_allclose(readings.std(axis=0), np.hypot(1.0, 1.0), rtol=0.03)
     np.testing.assert_allclose(readings.mean(axis=0), 500.0, atol=0.05)
 
 
-def test_blocks_do_not_matter_for_what_is_not_drawn():
+def test_deterministic_readings_do_not_depend_on_the_block_size():
     part = replace(load_amplifier("bench"), noise=CLEAN, temperature_rms=0.0)
     whole, many = (measure(part, step(), blocks=blocks)[0] for blocks in (1, 37))
     np.testing.assert_allclose(whole, many, atol=0.046)  # one step of the converter
@@ -63,7 +63,7 @@ def test_hum_has_its_amplitude_and_frequency():
     assert spectrum.max() == pytest.approx(1.0, rel=1e-6)
 
 
-def test_film_warms_smoothly_and_alike_on_all_electrodes():
+def test_temperature_drift_is_smooth_and_equal_on_all_electrodes():
     part = Amplifier(noise=CLEAN, temperature_rms=0.05, temperature_time=20.0, film_time=5.0)
     readings, _ = measure(part, np.zeros((400_000, 3)), rate=20.0)
     np.testing.assert_allclose(readings, readings[:, :1] * np.ones(3), atol=1e-8)
@@ -83,7 +83,7 @@ def test_temperature_step_gives_its_pyroelectric_charge():
 
 
 @pytest.mark.parametrize("blocks", [1, 41])
-def test_a_held_step_creeps_with_the_logarithm_of_time_and_cools(blocks):
+def test_held_charge_creeps_with_the_logarithm_of_time(blocks):
     part = Amplifier(noise=CLEAN, creep=0.08, thermoelastic=0.06, film_time=2.5)
     readings, _ = measure(part, step(n=40_000), blocks=blocks)
     t = np.arange(1, 39_800) / RATE
@@ -91,7 +91,7 @@ def test_a_held_step_creeps_with_the_logarithm_of_time_and_cools(blocks):
     np.testing.assert_allclose(readings[201:, 0], expected, rtol=1e-3)
 
 
-def test_a_hand_goes_again_and_electrodes_are_not_alike():
+def test_temperature_step_ends_and_pyro_mismatch_differs_between_electrodes():
     part = Amplifier(noise=CLEAN, step=2.0, step_at=2.0, step_time=0.005, step_for=10.0, pyro_mismatch=0.2)
     readings, process = measure(part, np.zeros((5000, 4)))
     warmest = 1.0 - np.exp(-10.0 / 2.67)
@@ -100,7 +100,7 @@ def test_a_hand_goes_again_and_electrodes_are_not_alike():
     assert np.ptp(process.pyro) > 20.0
 
 
-def test_converter_clips_and_has_steps_of_16_bits():
+def test_converter_clips_and_rounds_to_16_bits():
     part = Amplifier(noise=CLEAN, limit=1500.0, bits=16)
     readings, _ = measure(part, np.linspace(-2000.0, 2000.0, 5000)[:, None])
     assert readings.min() == pytest.approx(-1500.0)
@@ -116,7 +116,7 @@ def test_mismatch_is_drawn_once_for_each_channel():
     assert set(np.abs(process.bias)) == {0.5}
 
 
-def test_file_changes_what_it_says(tmp_path):
+def test_amplifier_file_changes_the_given_values(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('like = "bench"\nwhite_pC = 0.5\ntau_s = 1\ngain_mismatch = 0.002\nbits = 12\npyro_pC_per_K = 90\n')
     part = load_amplifier(str(path))
@@ -141,14 +141,14 @@ def test_file_changes_what_it_says(tmp_path):
         ("tau_s", "not a TOML file"),
     ],
 )
-def test_wrong_file_is_refused(tmp_path, text, said):
+def test_wrong_amplifier_file_raises_input_error(tmp_path, text, said):
     path = tmp_path / "mine.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=said):
         load_amplifier(str(path))
 
 
-def test_infinity_is_no_leak_and_no_limit(tmp_path):
+def test_infinite_tau_and_limit_mean_no_leak_and_no_limit(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('like = "bench"\ntau_s = inf\nlimit_pC = inf\nbits = 0\n')
     readings = load_amplifier(str(path)).start(3, 100.0, np.random.default_rng(1))(np.full((50, 3), 5e3))
@@ -156,7 +156,7 @@ def test_infinity_is_no_leak_and_no_limit(tmp_path):
     assert readings[-1].min() > 4.5e3
 
 
-def test_unknown_level_is_refused():
+def test_unknown_noise_level_raises_input_error():
     with pytest.raises(
         InputError, match=r"expected one of clean, reference, bench, surgery, or a TOML file, got 'lab'"
     ):

@@ -18,37 +18,37 @@ def test_sigma_of_the_reference_level(charge, sigma):
 
 
 @pytest.mark.parametrize("charge", [0.0, 848.0, -2000.0])
-def test_samples_are_gaussian_of_that_sigma(charge):
+def test_added_noise_is_gaussian_with_sigma(charge):
     model, rng = noise_model("reference"), np.random.default_rng(0)
     drawn = (model.add(np.full(20_000, charge), rng) - charge) / model.sigma(np.array(charge))
     assert stats.kstest(drawn, "norm").pvalue > 0.01
 
 
-def test_channels_and_readings_are_independent():
+def test_noise_is_independent_between_channels_and_readings():
     """No correlation between electrodes, nor from one reading to the next."""
     noise = noise_model("reference").add(np.zeros((20_000, 3)), np.random.default_rng(1))
     joined = np.concatenate([noise[1:], noise[:-1]], axis=1)
     assert np.abs(np.corrcoef(joined.T) - np.eye(6)).max() < 4.0 / np.sqrt(20_000)
 
 
-def test_clean_is_exact():
+def test_noise_level_clean_adds_nothing():
     charge = np.random.default_rng(2).normal(0.0, 1e3, (5, 3))
     np.testing.assert_array_equal(noise_model("clean").add(charge, np.random.default_rng(3)), charge)
 
 
 @pytest.mark.parametrize("level", AMPLIFIER_LEVELS)
-def test_level_is_the_same_noise_for_all(level):
+def test_noise_and_amplifier_levels_have_the_same_noise(level):
     """Training and limits take charges one by one, the virtual sensor in time: from one level the same noise."""
     assert noise_model(level) == load_amplifier(level).noise
 
 
-def test_noise_from_a_file(tmp_path):
+def test_noise_model_from_a_toml_file(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('like = "reference"\nwhite_pC = 0.5\ntau_s = 3.0\n')
     assert noise_model(str(path)).to_dict() == {"name": "mine", "white_pC": 0.5, "gain": 0.002}
 
 
 @pytest.mark.parametrize(("white", "gain"), [(np.inf, 0.0), (np.nan, 0.0), (-1.0, 0.0), (0.0, -1.0)])
-def test_noise_is_finite_and_not_negative(white, gain):
+def test_noise_that_is_negative_or_not_finite_raises_input_error(white, gain):
     with pytest.raises(InputError, match="expected a finite number from 0"):
         NoiseModel("mine", white, gain)

@@ -21,7 +21,7 @@ PRESSES = 4.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [0.5, 1.0], [0
     ("nuisances", "before", "known"),
     [(NO_NUISANCES, False, "everything else known"), (Nuisances(), True, "nobody knows")],
 )
-def test_a_design_is_drawn_with_its_worst_place(nuisances, before, known):
+def test_error_maps_picture_marks_the_position_of_the_largest_error(nuisances, before, known):
     errors = ErrorMap(PRESSES, np.ones(5), np.array([0.1, 0.2, 0.1, 3.0, 0.3]))
     case = DesignCase(SENSOR, 3, 4.0, nuisances=nuisances)
     figure = error_maps_picture(Design(case, SENSOR, 1.0, "", 0, errors if before else None, errors))
@@ -36,7 +36,7 @@ def test_a_design_is_drawn_with_its_worst_place(nuisances, before, known):
         assert (type(shades.norm), *shades.get_clim()) == (LogNorm, 0.1, 1.0)
 
 
-def test_an_identification_is_drawn_by_distance():
+def test_identification_picture_shows_the_error_against_distance():
     """Errors that grow with the distance and fall with the force; the worst of a ring is twice the median."""
     rings = Rings.spread(6.0)
     shape = rings.position.shape[:2]

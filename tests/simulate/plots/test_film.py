@@ -10,7 +10,7 @@ from isocharge.simulate import Calibration, Circle, Domain, Electrode, FunctionM
 from isocharge.simulate.plots.film import draw_charge_map, draw_electrodes, draw_probe, draw_section
 
 
-def test_all_metal_is_drawn_where_it_lies():
+def test_draw_electrodes_draws_front_and_back_at_their_positions():
     pad, back = Electrode.of_square("A", (5.0, 0.0), 3.0), ((0.0, -9.0), (9.0, -9.0), (9.0, 9.0))
     electrode = replace(pad.with_trace(((5.0, 0.0), (9.0, 0.0)), 0.5), back=(back,))
     sensor = replace(load_sensor("three-25um-biaxial"), electrodes=(electrode,))
@@ -23,7 +23,7 @@ def test_all_metal_is_drawn_where_it_lies():
     assert [(text.get_text(), *text.xy) for text in axes.texts] == [("A", *np.add(electrode.centre, [1.0, 0.0]))]
 
 
-def test_the_whole_film_is_shaded():
+def test_draw_charge_map_covers_the_whole_disk():
     """By charges that are the place itself: the shades reach to the rim on all sides."""
     charge_map = FunctionMap(lambda contact: contact[:, :1], ("A",), Domain(8.0, (0.1, 1.0)))
     axes = Figure().subplots()
@@ -31,14 +31,14 @@ def test_the_whole_film_is_shaded():
     assert axes.dataLim.extents == pytest.approx([-8.0, -8.0, 8.0, 8.0], abs=0.02)
 
 
-def test_a_footprint_lies_where_it_presses():
+def test_draw_probe_draws_the_footprint_at_its_position():
     axes, triangle = Figure().subplots(), Polygon.triangle(3.0, 0.3)
     draw_probe(axes, triangle, (2.0, -1.0))
     np.testing.assert_allclose(axes.patches[0].get_xy()[:-1] @ [1.0, 1.0j], 2.0 - 1.0j + triangle.outline)
 
 
 @pytest.mark.parametrize(("at", "distance"), [((3.0, -4.0), 5.0), ((0.0, 0.0), 0.0)])
-def test_a_section_goes_through_the_probe(at, distance):
+def test_draw_section_goes_through_the_probe(at, distance):
     """From rim to rim, deepest under the probe, below its mark."""
     axes = Figure().subplots()
     draw_section(axes, press(load_sensor("three-25um-biaxial").film, Circle(1.0), at, 1.0))

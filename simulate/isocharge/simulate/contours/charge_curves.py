@@ -1,7 +1,7 @@
 """Charge against distance on lines from an electrode: the mapping scheme of Mirbagheri et al. (2007, Fig. 2, 4 and 7).
 
-Lines leave the centre of an electrode at even angles and carry a press at even distances. The paper fits a polynomial
-to the charge along each line; `graphical_method` draws contours through their roots.
+Lines start at the centre of an electrode at equal angles, with presses at equal distances. The paper fits a polynomial
+to the charge along each line, and `graphical_method` draws contours through the roots of these polynomials.
 """
 
 from collections.abc import Sequence
@@ -15,18 +15,27 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.sensor.sensor import Sensor, electrode_index
 
-STEP, LENGTH, ANGLE_STEP, HALF_ANGLE = 4.0, 20.0, np.deg2rad(10.0), np.deg2rad(70.0)
-"""Distance between presses on a line, mm; length of the lines, mm; angle between lines, rad; largest angle to both
-sides of the film's centre, rad. Step and angle are the paper's, the others our choice."""
+STEP = 4.0
+"""Default distance between presses on a line, mm, as in the paper."""
+
+LENGTH = 20.0
+"""Default length of the lines, mm. The paper does not state a length."""
+
+ANGLE_STEP = np.deg2rad(10.0)
+"""Default angle between lines, rad, as in the paper."""
+
+HALF_ANGLE = np.deg2rad(70.0)
+"""Default of the largest angle between a line and the direction of the centre of the film, rad. The paper does not
+state an angle."""
 
 
 @dataclass(frozen=True)
 class Mapping:
-    """A mapping scheme: presses at even distances on lines from an electrode.
+    """Mapping scheme: presses at equal distances on lines from an electrode.
 
     Attributes:
-        electrode: Name of the electrode that the lines leave from.
-        origin: Its centre (x, y), mm.
+        electrode: Name of the electrode at which the lines start.
+        origin: Centre (x, y) of this electrode, mm.
         angle: Angle of each line from the drawn direction, anticlockwise, shape (n_line,), rad.
         distance: Distances of the presses from the origin, ascending, the same on each line, shape (n_step,), mm.
     """
@@ -46,19 +55,19 @@ class Mapping:
         step: float = STEP,
         length: float = LENGTH,
     ) -> "Mapping":
-        """Lines at even angles; the last angle always has a line, even between two steps.
+        """Create lines at equal angles. The last angle always has a line, even if it is not a multiple of the step.
 
         Args:
-            sensor: The sensor, whose calibration moves the electrodes.
-            electrode: Name of the electrode that the lines leave from.
-            angles: First and last angle, rad; HALF_ANGLE to both sides of the film's centre if absent.
+            sensor: Sensor, whose calibration determines the positions of the electrodes.
+            electrode: Name of the electrode at which the lines start.
+            angles: First and last angle, rad; `HALF_ANGLE` to both sides of the centre of the film if absent.
             angle_step: Angle between lines, rad.
-            step: Distance between presses on a line, and of the first from the electrode's centre, mm.
+            step: Distance between presses on a line, and of the first press from the centre of the electrode, mm.
             length: Length of the lines, mm.
 
         Raises:
             SensorError: If there is no such electrode.
-            SceneError: If angles, steps or length give no press.
+            SceneError: If there are no presses for the angles, steps and length.
         """
         centre = sensor.electrodes[electrode_index(sensor, electrode)].centre
         x, y = sensor.calibration.place(np.array(centre))
@@ -82,22 +91,22 @@ class Mapping:
 
     @property
     def radius(self) -> float:
-        """Distance of the farthest press from the film's centre, mm: the domain that a charge map needs."""
+        """Distance of the farthest press from the centre of the film, mm; smallest radius of a suitable charge map."""
         return float(np.linalg.norm(self.points, axis=-1).max())
 
     def finer(self, count: int) -> "Mapping":
-        """The same lines with `count` presses from the first to the last."""
+        """Return the same lines with `count` presses between the first and the last press of this mapping."""
         distance = np.linspace(self.distance[0], self.distance[-1], count)
         return Mapping(self.electrode, self.origin, self.angle, distance)
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Charges along the lines of a mapping.
+    """Charges along the lines of a mapping scheme.
 
     Attributes:
-        mapping: Where the presses are.
-        electrodes: Names, in the order of the charges.
+        mapping: Positions of the presses.
+        electrodes: Names of the electrodes in the order of the charges.
         force: Force of each press, N.
         charge: Touch charges, shape (n_line, n_step, n_electrode), pC.
     """
@@ -109,23 +118,34 @@ class Curves:
 
     @classmethod
     def of(cls, charge_map: ChargeMap, mapping: Mapping, force: float) -> "Curves":
-        """Charges of a map on the lines.
+        """Evaluate a charge map on the lines.
+
+        Args:
+            charge_map: Charges as a function of the contact.
+            mapping: Positions of the presses.
+            force: Force of each press, N.
 
         Raises:
-            SceneError: If the map does not cover a press or the force.
+            SceneError: If a press or the force is outside the domain of the map.
         """
         points = mapping.points
-        at = points.reshape(-1, 2)
-        charge = charge_map.charges(np.column_stack([at, np.full(len(at), force)]))
+        position = points.reshape(-1, 2)
+        charge = charge_map.charges(np.column_stack([position, np.full(len(position), force)]))
         return cls(mapping, charge_map.electrodes, force, charge.reshape(*points.shape[:2], -1))
 
     @property
-    def own(self) -> Array:
-        """Charge of the electrode that the lines leave from, shape (n_line, n_step), pC."""
+    def own_charge(self) -> Array:
+        """Charge of the electrode at which the lines start, shape (n_line, n_step), pC."""
         return np.asarray(self.charge[..., self.electrodes.index(self.mapping.electrode)])
 
     def polynomials(self, degree: int) -> Sequence[Polynomial]:
-        """The paper's fit: charge (pC) of the mapping's electrode as a polynomial of the distance (mm) on each line.
+        """Fit a polynomial to the charge of the electrode at which the lines start, as in the paper.
+
+        Args:
+            degree: Degree of the polynomials.
+
+        Returns:
+            Charge (pC) as a polynomial of the distance (mm) for each line.
 
         Raises:
             SceneError: If a line has fewer presses than the polynomial has coefficients.
@@ -135,4 +155,4 @@ class Curves:
             raise SceneError(
                 f"degree: expected 1 to {distance.size - 1} for {distance.size} presses on a line, got {degree}"
             )
-        return [Polynomial.fit(distance, line, degree) for line in self.own]
+        return [Polynomial.fit(distance, line, degree) for line in self.own_charge]

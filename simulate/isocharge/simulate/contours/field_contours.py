@@ -1,6 +1,7 @@
-"""Isocharge contours: where presses of one force give an electrode the same charge.
+"""Isocharge contours: curves on which presses of one force give an electrode the same charge.
 
-Contours are traced by marching squares; `graphical_method` draws the same contours as the paper does.
+Contours are traced by marching squares on a grid. The module `graphical_method` draws the same contours by the method
+of Mirbagheri et al. (2007).
 """
 
 from dataclasses import dataclass
@@ -13,23 +14,24 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate.forward.charge_map import ChargeMap, check_forces
 
-GRID = 0.2
-"""Largest side of the squares of the trace, mm: contours bend by some um within one."""
+GRID_SPACING = 0.2
+"""Largest distance between neighbouring points of the grid, mm. The deviation of a contour from a straight line within
+this distance is a few micrometres."""
 
-WITHIN = 1.0 - 5e-4
-"""Traced radius over the map's."""
+TRACED_RADIUS = 1.0 - 5e-4
+"""Radius within which contours are traced, in units of the radius of the charge map, dimensionless."""
 
 
 @dataclass(frozen=True)
 class ContourField:
-    """Contours of presses of one force over the disk of a map.
+    """Contours of presses of one force over the domain of a charge map.
 
     Attributes:
-        charge_map: The charges; with splines in place of a forward map it is faster.
+        charge_map: Charges as a function of the contact. Splines are faster than a forward map.
         force: Force of the presses, N.
 
     Raises:
-        SceneError: If the map does not cover the force.
+        SceneError: If the force is outside the range of the map.
     """
 
     charge_map: ChargeMap
@@ -39,10 +41,15 @@ class ContourField:
         check_forces(self.force, self.charge_map.domain.force_range, "charge map")
 
     def contours(self, electrode: str, charge: float) -> tuple[Array, ...]:
-        """The pieces of an electrode's contour of a charge (pC); an empty tuple if no press gives it.
+        """Trace the contour of one electrode.
+
+        Args:
+            electrode: Name of the electrode.
+            charge: Charge on the contour, pC.
 
         Returns:
-            (x, y) in order along each piece, shape (n, 2), mm; the first again at the end if it is closed.
+            Separate curves of the contour, each with points (x, y) in order, shape (n, 2), mm. The first point of a
+            closed curve is repeated at its end. The tuple is empty if no press gives the charge.
 
         Raises:
             SensorError: If there is no such electrode.
@@ -50,41 +57,54 @@ class ContourField:
         """
         if not np.isfinite(charge):
             raise SceneError(f"charge of {electrode!r}: expected a finite number, got {charge:g} pC")
-        (x, y), values = self._squares, self._charges(electrode)
-        unit = np.abs(values).max()
-        generator = contour_generator(x, y, values / unit, line_type=LineType.Separate)
-        return tuple(np.asarray(line, dtype=float) for line in generator.lines(charge / unit))
+        x, y = self._grid
+        values = self._charges(electrode)
+        scale = np.abs(values).max()
+        generator = contour_generator(x, y, values / scale, line_type=LineType.Separate)
+        return tuple(np.asarray(line, dtype=float) for line in generator.lines(charge / scale))
 
-    def reach(self, electrode: str) -> tuple[float, float]:
-        """Smallest and largest charge of an electrode on the corners of the squares, pC."""
+    def charge_range(self, electrode: str) -> tuple[float, float]:
+        """Return the smallest and the largest charge of an electrode on the grid, pC."""
         values = self._charges(electrode)
         return float(values.min()), float(values.max())
 
     def even_charges(self, electrode: str, count: int) -> list[float]:
-        """`count` charges between the smallest and the largest, pC: in even ratios, or steps if the sign changes."""
-        low, high = self.reach(electrode)
-        even = np.geomspace if low * high > 0.0 else np.linspace
-        return [float(charge) for charge in even(low, high, count + 2)[1:-1]]
+        """Return charges between the smallest and the largest charge of an electrode.
+
+        The charges have equal ratios, or equal differences if the charge changes its sign.
+
+        Args:
+            electrode: Name of the electrode.
+            count: Number of charges.
+
+        Returns:
+            Charges in pC, without the smallest and the largest one.
+        """
+        low, high = self.charge_range(electrode)
+        has_one_sign = low * high > 0.0
+        charges = np.geomspace(low, high, count + 2) if has_one_sign else np.linspace(low, high, count + 2)
+        return [float(charge) for charge in charges[1 : count + 1]]
 
     @cached_property
-    def _squares(self) -> tuple[Array, Array]:
-        """Corners x and y of a grid of squares, bent into the disk, shape (n, n), mm.
+    def _grid(self) -> tuple[Array, Array]:
+        """Coordinates x and y of a square grid that is mapped onto the disk, each of shape (n, n), mm.
 
-        The bent grid ends on the disk's edge, so a contour that leaves the disk ends there, too.
+        The boundary of the mapped grid is the edge of the disk, so that contours that leave the disk end on its edge.
         """
-        radius = WITHIN * self.charge_map.domain.radius
-        line = np.linspace(-1.0, 1.0, 2 * int(np.ceil(radius / GRID)) + 1)
+        radius = TRACED_RADIUS * self.charge_map.domain.radius
+        line = np.linspace(-1.0, 1.0, 2 * int(np.ceil(radius / GRID_SPACING)) + 1)
         u, v = np.meshgrid(line, line)
         return radius * u * np.sqrt(1.0 - 0.5 * v**2), radius * v * np.sqrt(1.0 - 0.5 * u**2)
 
     @cached_property
     def _every_charge(self) -> Array:
-        """Charges on the corners, shape (n, n, n_electrode), pC."""
-        x, y = self._squares
+        """Charges on the grid, shape (n, n, n_electrode), pC."""
+        x, y = self._grid
         contact = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, self.force)])
         return self.charge_map.charges(contact).reshape(*x.shape, -1)
 
     def _charges(self, electrode: str) -> Array:
+        """Return the charges of one electrode on the grid, shape (n, n), pC."""
         names = self.charge_map.electrodes
         if electrode not in names:
             raise SensorError(f"no electrode {electrode!r}: the map has {', '.join(names)}")

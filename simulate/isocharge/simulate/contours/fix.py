@@ -1,4 +1,4 @@
-"""The result of triangulation: positions, or the reason why a press has none."""
+"""Result of a triangulation: positions of presses, or the reason why a press has no position."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -9,18 +9,21 @@ from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import SceneError, SensorError
 
 TOLERANCE = 1.0
-"""Largest distance of three crossings from their mean at which the contours count as meeting there, mm."""
+"""Default of the largest distance of three crossings from their mean at which contours count as meeting, mm."""
 
-APART = 0.2
-"""Smallest distance between two meetings, mm: nearer ones count as one."""
+MIN_DISTANCE = 0.2
+"""Distance below which two meetings of contours count as the same, mm."""
 
-AMBIGUOUS, RESOLVED = 2.0, 0.01
-"""A second meeting makes a fix ambiguous if its spread is at most AMBIGUOUS times that of the first (dimensionless), or
-below RESOLVED, mm."""
+AMBIGUOUS_RATIO = 2.0
+"""Ratio of the spread of the second-best meeting to that of the best meeting up to which a fix is ambiguous,
+dimensionless."""
+
+AMBIGUOUS_SPREAD = 0.01
+"""Spread of the second-best meeting up to which a fix is ambiguous in any case, mm."""
 
 
 class Meeting(IntEnum):
-    """Whether contours meet in one point."""
+    """Result of the search for the meeting of contours of one press."""
 
     met = 0
     no_contour = 1
@@ -29,7 +32,7 @@ class Meeting(IntEnum):
 
     @property
     def summary(self) -> str:
-        """One sentence."""
+        """Description of the result."""
         return {
             Meeting.met: "the contours meet",
             Meeting.no_contour: "no press within the radius gives one of the charges",
@@ -40,13 +43,13 @@ class Meeting(IntEnum):
 
 @dataclass(frozen=True)
 class Fix:
-    """Positions of presses; NaN for those without one, and `status` says why.
+    """Positions of presses. Presses without a position have NaN, and `status` contains the reason.
 
     Attributes:
-        contact: (x, y, F), shape (n, 3), mm and N; the force as it was given, or estimated.
-        spread: Largest distance of a crossing from the mean of its triple, or, with the force unknown, root mean square
-            distance of the contours from the position; shape (n,), mm.
-        status: A `Meeting` for each press, shape (n,).
+        contact: Contacts (x, y, F), shape (n, 3), mm and N. The force is the given force or the estimated force.
+        spread: Largest distance of a crossing from the mean of its triple if the force is given; root mean square
+            distance of the contours from the position if the force is estimated; shape (n,), mm.
+        status: Value of `Meeting` for each press, shape (n,).
     """
 
     contact: Array
@@ -60,11 +63,17 @@ class Fix:
 
 
 def check_triangulation(electrodes: tuple[str, ...], tolerance: float) -> None:
-    """Refuse fewer than three electrodes: two contours cross wherever they cross, nothing tells which crossing it is.
+    """Check the number of electrodes and the tolerance of a triangulation.
+
+    At least three electrodes are necessary, because two contours may cross in several points.
+
+    Args:
+        electrodes: Names of the electrodes.
+        tolerance: Largest distance of three crossings from their mean, mm.
 
     Raises:
-        SensorError: If there are fewer than three.
-        SceneError: If the tolerance (mm) is not positive.
+        SensorError: If there are fewer than three electrodes.
+        SceneError: If the tolerance is not positive.
     """
     if len(electrodes) < 3:
         raise SensorError(f"triangulation needs at least three electrodes, got {electrodes}")

@@ -1,9 +1,10 @@
-"""Contours and triangulation as Mirbagheri et al. (2007) draw them.
+"""Contours and triangulation by the graphical method of Mirbagheri et al. (2007).
 
-A polynomial is fitted to the charge along each line of a mapping scheme, its root is one point of the contour, and the
-points are joined by a spline (AutoCAD's SPLINE: cubic, through its points, parameter the length of the chords, free
-ends). Two contours are intersected as splines; the three crossings that lie together most closely are averaged.
-`field_contours` and `triangulation` do the same from the field, without the error of the drawing.
+A polynomial is fitted to the charge along each line of a mapping scheme. The root of the polynomial is one point of the
+contour, and the points are joined by a spline (the SPLINE of AutoCAD: a cubic spline through its points with free ends
+and the chord length as its parameter). Contours are intersected as splines, and the position is the mean of the three
+crossings that are nearest to each other. The modules `field_contours` and `triangulation` compute contours and
+positions directly from the charge map, without the errors of the drawing.
 """
 
 from collections.abc import Sequence
@@ -12,31 +13,35 @@ from functools import cached_property
 from itertools import combinations, product
 
 import numpy as np
-import scipy  # loads a part when it is used
+import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.contours.charge_curves import Curves
-from isocharge.simulate.contours.fix import AMBIGUOUS, APART, TOLERANCE, Fix, Meeting, check_triangulation
+from isocharge.simulate.contours.fix import AMBIGUOUS_RATIO, MIN_DISTANCE, TOLERANCE, Fix, Meeting, check_triangulation
 from isocharge.simulate.forward.charge_map import as_charges
 
 DEGREE = 4
-"""Degree of the polynomial along a line: our choice, since lower degrees miss the charge near the electrode."""
+"""Default degree of the polynomial along a line. The paper does not state a degree; polynomials of lower degree do not
+describe the charge near the electrode."""
 
 NOWHERE = np.full(2, np.nan)
 """Position of a press whose contours do not meet."""
 
-PER_SPAN = 8
-"""Number of chords of each span of the spline, on which crossings are located before they are refined."""
+CHORDS_PER_SPAN = 8
+"""Number of chords for each span of the spline. The search for a crossing of splines starts at a crossing of chords."""
+
+NEWTON_STEPS = 4
+"""Number of steps of Newton's method from a crossing of chords to the crossing of the splines."""
 
 
 @dataclass(frozen=True)
 class DrawnContour:
-    """A contour by the graphical method: a spline through the roots on the lines.
+    """Contour of the graphical method: a spline through the roots on the lines.
 
     Attributes:
         electrode: Name of the electrode.
-        charge: Its charge on the contour, pC.
-        knots: Roots on the lines, in the order of their angle, shape (n, 2), mm; n >= 2.
+        charge: Charge of the electrode on the contour, pC.
+        knots: Roots on the lines in the order of the angles of the lines, shape (n, 2), mm, with n >= 2.
     """
 
     electrode: str
@@ -50,21 +55,24 @@ class DrawnContour:
 
     @cached_property
     def _spline(self) -> "scipy.interpolate.CubicSpline":
-        chords = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.knots, axis=0), axis=1))])
-        return scipy.interpolate.CubicSpline(chords, self.knots, bc_type="natural")
+        """Spline from the cumulative chord length (mm) to the position (mm)."""
+        chord_lengths = np.linalg.norm(np.diff(self.knots, axis=0), axis=1)
+        parameter = np.concatenate([[0.0], np.cumsum(chord_lengths)])
+        return scipy.interpolate.CubicSpline(parameter, self.knots, bc_type="natural")
 
     @property
     def _parameters(self) -> Array:
+        """Parameters of the ends of the chords, ascending, shape (n,), mm."""
         knots = self._spline.x
-        inner = np.linspace(knots[:-1], knots[1:], PER_SPAN, endpoint=False, axis=1).ravel()
+        inner = np.linspace(knots[:-1], knots[1:], CHORDS_PER_SPAN, endpoint=False, axis=1).ravel()
         return np.asarray(np.append(inner, knots[-1]))
 
     def crossings(self, other: "DrawnContour") -> Array:
-        """Positions where two contours cross, shape (n, 2), mm."""
+        """Find the positions at which this contour crosses another contour, shape (n, 2), mm."""
         crossings = []
-        for mine, theirs in _chord_crossings(self.points, other.points):
-            at = np.array([self._parameters[mine], other._parameters[theirs]])
-            for _ in range(4):  # Newton's method on the splines, from where the chords begin
+        for own_chord, other_chord in _chord_crossings(self.points, other.points):
+            at = np.array([self._parameters[own_chord], other._parameters[other_chord]])
+            for _ in range(NEWTON_STEPS):
                 gap = self._spline(at[0]) - other._spline(at[1])
                 matrix = np.stack([self._spline(at[0], 1), -other._spline(at[1], 1)], axis=1)
                 at = at - np.linalg.lstsq(matrix, gap, rcond=None)[0]
@@ -73,8 +81,13 @@ class DrawnContour:
 
 
 def _chord_crossings(first: Array, second: Array) -> Integers:
-    """Chords of two polylines that cross: index along the first, index along the second, shape (n, 2)."""
-    a, b = np.diff(first, axis=0)[:, None], np.diff(second, axis=0)[None]
+    """Find the pairs of chords of two polylines, each of shape (m, 2), that cross.
+
+    Returns:
+        Indices of the chord of the first and of the second polyline, shape (n, 2).
+    """
+    a = np.diff(first, axis=0)[:, None]
+    b = np.diff(second, axis=0)[None]
     between = second[None, :-1] - first[:-1, None]
     with np.errstate(divide="ignore", invalid="ignore"):  # parallel chords do not cross
         area = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
@@ -84,12 +97,15 @@ def _chord_crossings(first: Array, second: Array) -> Integers:
 
 
 def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnContour | None:
-    """The contour of the mapping's electrode, or None if fewer than two lines reach the charge.
+    """Draw a contour of the electrode at which the lines of the mapping start.
 
     Args:
         curves: Charges along the lines of a mapping.
         charge: Charge on the contour, pC.
         degree: Degree of the polynomial along each line.
+
+    Returns:
+        The contour, or None if the charge occurs on fewer than two lines.
 
     Raises:
         SceneError: If a line has too few presses for the degree.
@@ -103,9 +119,16 @@ def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnCo
 
 
 def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) -> float:
-    """Smallest distance at which a line's polynomial has the charge, mm; NaN if it has it nowhere.
+    """Find the smallest distance at which the polynomial of a line has the charge.
 
-    Distances from half of the first press's count.
+    Args:
+        polynomial: Charge (pC) as a function of the distance (mm).
+        charge: Charge, pC.
+        distance: Distances of the presses on the line, ascending, mm. The root must lie between half of the first and
+            the last distance.
+
+    Returns:
+        Distance, mm; NaN if there is no root.
     """
     roots = (polynomial - charge).roots()
     real = roots.real[np.abs(roots.imag) < 1e-9 * np.abs(distance[-1])]
@@ -118,9 +141,9 @@ class DrawnTriangulation:
     """Triangulation with contours of the graphical method.
 
     Attributes:
-        curves: One set for each electrode, each from that electrode, in the order of the charges.
+        curves: Curves for each electrode, whose lines start at this electrode, in the order of the charges.
         degree: Degree of the polynomials.
-        tolerance: Largest distance of three crossings from their mean at which contours meet, mm.
+        tolerance: Largest distance of three crossings from their mean at which contours count as meeting, mm.
     """
 
     curves: Sequence[Curves]
@@ -136,17 +159,17 @@ class DrawnTriangulation:
         return tuple(curves.mapping.electrode for curves in self.curves)
 
     def contours(self, charge: Array) -> tuple[DrawnContour | None, ...]:
-        """The contour of each charge, shape (n_electrode,), pC."""
+        """Draw the contour of each charge, shape (n_electrode,), pC. Contours that cannot be drawn are None."""
         return tuple(draw_contour(c, float(q), self.degree) for c, q in zip(self.curves, charge, strict=True))
 
     def locate(self, charge: Array) -> Fix:
-        """Positions of presses; their force must be that of the curves.
+        """Locate presses whose force is that of the curves.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
 
         Raises:
-            ChargeError: If the charges are not finite or not one for each electrode.
+            ChargeError: If the charges are not finite, or their number is not that of the electrodes.
         """
         charge = as_charges(charge, self.electrodes)
         rows = [self._locate_one(row) for row in charge]
@@ -155,7 +178,7 @@ class DrawnTriangulation:
         return Fix(contact, spread, status.astype(np.intp))
 
     def _locate_one(self, charge: Array) -> tuple[Array, float, Meeting]:
-        """Position, spread, and whether the contours meet."""
+        """Locate one press from its charges, shape (n_electrode,), pC: position (mm), spread (mm) and status."""
         contours = [contour for contour in self.contours(charge) if contour is not None]
         if len(contours) < len(charge):
             return NOWHERE, np.nan, Meeting.no_contour
@@ -164,18 +187,26 @@ class DrawnTriangulation:
         meetings = [self._meeting([pairs[pair] for pair in combinations(triple, 2)]) for triple in triples]
         good = [(mean, spread) for mean, spread, status in meetings if status is Meeting.met]
         if not good:
-            return NOWHERE, np.nan, max(status for _, _, status in meetings)  # twice rather than apart
+            return NOWHERE, np.nan, max(status for _, _, status in meetings)  # `twice` has priority over `apart`
         return np.mean([mean for mean, _ in good], axis=0), max(spread for _, spread in good), Meeting.met
 
     def _meeting(self, pairs: list[Array]) -> tuple[Array, float, Meeting]:
-        """Mean and spread of those crossings of three pairs of contours that lie together most closely."""
+        """Find the three crossings, one for each pair of contours, that are nearest to each other.
+
+        Args:
+            pairs: Crossings of each of the three pairs of contours, each of shape (m, 2), mm.
+
+        Returns:
+            Mean of the three crossings (mm), their largest distance from the mean (mm), and the status.
+        """
         corners = np.array([*product(*pairs)]).reshape(-1, 3, 2)
         means = corners.mean(axis=1)
         spreads = np.linalg.norm(corners - means[:, None], axis=2).max(axis=1)
         if spreads.min(initial=np.inf) > self.tolerance:
             return NOWHERE, np.nan, Meeting.apart
         best = spreads.argmin()
-        rivals = spreads[np.linalg.norm(means - means[best], axis=1) > APART]
-        if rivals.min(initial=np.inf) <= AMBIGUOUS * spreads[best]:
+        is_elsewhere = np.linalg.norm(means - means[best], axis=1) > MIN_DISTANCE
+        second_best = spreads[is_elsewhere].min(initial=np.inf)
+        if second_best <= AMBIGUOUS_RATIO * spreads[best]:
             return NOWHERE, np.nan, Meeting.twice
         return means[best], float(spreads[best]), Meeting.met
