@@ -186,9 +186,9 @@ class SeedGrid:
         Returns:
             Numbers of the presses and numbers of the nodes, each of shape (m,).
         """
-        square = np.full((len(distance), self.side**2), np.inf)
-        square[:, self.index] = distance
-        square = square.reshape(-1, self.side, self.side)
+        flat = np.full((len(distance), self.side**2), np.inf)
+        flat[:, self.index] = distance
+        square = flat.reshape(-1, self.side, self.side)
         neighbourhood_minimum = scipy.ndimage.minimum_filter(square, (1, 3, 3), mode="constant", cval=np.inf)
         is_minimum = (square == neighbourhood_minimum).reshape(len(distance), -1)[:, self.index]
         ranked = np.where(is_minimum, distance, np.inf)

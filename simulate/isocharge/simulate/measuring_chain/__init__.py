@@ -1,1 +1,1 @@
-"""From true charges to readings: noise, the charge amplifier, their named levels and TOML file."""
+"""Models of the measuring chain: noise of single readings, and an amplifier with memory."""

@@ -1,18 +1,23 @@
-"""The measuring chain forwards: what film, amplifier and converter make of touch charges, in time.
+"""Simulation of the measuring chain: effect of film, amplifier and converter on touch charges over time.
 
-A charge amplifier is a leaky integrator, tau = R C: a step of charge decays by 1/e within tau. So reading n is
+A charge amplifier is a leaky integrator with the time constant tau = R C, so that a step of the charge decays by a
+factor of e within tau. The output of reading n is
 
     v[n] = exp(-dt / tau) v[n-1] + g (q[n] - q[n-1]) + b dt,
 
-with q the film's charge (touch, and pyroelectricity), g the gain and b the bias current; then come offset, hum, white
-noise, clipping and the converter's steps. A film that creeps answers a step of touch charge with that step times
+where q is the charge of the film (touch charge and pyroelectric charge), g the gain and b the bias current. Offset,
+hum, white noise, clipping and the rounding of the converter follow. A film with creep responds to a unit step of the
+touch charge with
 
-    h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / film_time):
+    h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / film_time).
 
-the logarithm from some milliseconds to days (Boltzmann's superposition, a Prony series with two terms in each decade),
-and what is stretched cools, until the film has its temperature again. The sizes in the levels that the film does not
-give - hum, offset, bias, mismatch - are engineering choices for a tidy and a bad electric neighbourhood, not
-measurements. The memoryless part is `measuring_chain.noise`, and the levels `clean` and `reference` are nothing else.
+The logarithm is valid from some milliseconds to days. It is approximated by a Prony series with two terms per decade,
+according to Boltzmann's superposition principle. The exponential describes the cooling of the stretched film, which
+lasts until the film has its initial temperature again.
+
+The values of hum, offset, bias and mismatch in the built-in levels are engineering choices for a tidy and for a noisy
+electric environment; they are not measurements. The memoryless noise is defined in `measuring_chain.noise`; the levels
+`clean` and `reference` contain only this noise.
 """
 
 import math
@@ -20,7 +25,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-import scipy  # loads a part when it is used
+import scipy  # loads each of its subpackages on first use
 from msgspec import Meta
 
 from isocharge.common.arrays import Array
@@ -29,47 +34,53 @@ from isocharge.common.structs import Finite, NotNegative, Positive
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 PVDF_PYRO = -30.0 * 9.0
-"""Pyroelectric charge per temperature of a PVDF electrode of 9 mm^2, pC/K: -30 uC/(m^2 K).
+"""Pyroelectric charge of a PVDF electrode of 9 mm^2 per temperature change, pC/K, for -30 uC/(m^2 K).
 
-Negative where a press gives positive charges (d31 > 0): warming thickens the film, a press thins it."""
+It is negative if a press gives positive charges (d31 > 0), because warming makes the film thicker and a press makes it
+thinner."""
 
 FILM_TIME = 1.78e-3 * 1.2 * 0.025 / (2.0 * 1e-5)
-"""Time in which a PVDF film of 25 um follows the temperature of the air at both faces, s: 2.7.
+"""Time constant with which a PVDF film of 25 um follows the temperature of the air at both faces, s.
 
-Density times specific heat times thickness over twice the heat transfer: 1.78 g/cm^3, 1.2 J/(g K) and 10 W/(m^2 K),
-free convection and radiation."""
+It is density times specific heat times thickness divided by twice the heat transfer coefficient, for 1.78 g/cm^3,
+1.2 J/(g K) and 10 W/(m^2 K), which is typical of free convection and radiation."""
 
 
 CREEP_TIMES = 10.0 ** np.arange(-3.0, 6.1, 0.5)
-"""Time constants of creep, s; the ripple of their sum about the logarithm is below 1e-5 of a decade."""
+"""Time constants of the Prony series of creep, s."""
 
 
 PositiveOrInfinite = Annotated[float, Meta(gt=0.0, description="a positive number or inf")]
+"""Type of a parameter that may be infinite."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Amplifier:
-    """A measuring chain of any number of channels; the bounds are those of a file (`measuring_chain.noise_file`).
+    """Parameters of a measuring chain with any number of channels.
+
+    The bounds of the parameters apply to files (`measuring_chain.noise_file`).
 
     Attributes:
         noise: Memoryless noise of each reading.
-        tau: Time constant of the leak, s; infinite for none.
-        tau_mismatch, gain_mismatch: Standard deviation of a channel's relative error.
-        hum: Amplitude of the mains hum, pC; its phase differs between channels.
-        hum_frequency: Hz.
-        offset: Standard deviation of a channel's constant output, pC.
-        bias: Current that every channel integrates, pC/s; its sign differs.
-        pyro: Charge of warming, pC/K, on every electrode; negative for PVDF with d31 > 0.
-        pyro_mismatch: Standard deviation of that charge on a channel, relative.
-        creep: Share of a charge that is lost in each decade of time.
-        thermoelastic: Share that a touch has more at first.
-        temperature_rms: Root mean square of the film's temperature drift, K.
-        temperature_time: Time constant of the air's drift, s: a calm room wanders over minutes.
+        tau: Time constant of the leak, s; infinite for no leak.
+        tau_mismatch: Standard deviation of the relative error of the time constant of a channel, dimensionless.
+        gain_mismatch: Standard deviation of the relative error of the gain of a channel, dimensionless.
+        hum: Amplitude of the mains hum, pC. The phase of the hum differs between channels.
+        hum_frequency: Frequency of the mains hum, Hz.
+        offset: Standard deviation of the constant offset of a channel, pC.
+        bias: Magnitude of the bias current that every channel integrates, pC/s. Its sign differs between channels.
+        pyro: Pyroelectric charge of each electrode per temperature change, pC/K; negative for PVDF with d31 > 0.
+        pyro_mismatch: Standard deviation of the relative error of the pyroelectric charge of a channel, dimensionless.
+        creep: Share of a touch charge that is lost in each decade of time, dimensionless.
+        thermoelastic: Share by which a touch charge is initially increased, dimensionless.
+        temperature_rms: Root mean square of the temperature drift of the film, K.
+        temperature_time: Time constant of the temperature drift of the air, s.
         step: Temperature step of the air, K.
-        step_at, step_time: Start of the temperature step, and time that it takes, s.
-        step_for: Time from its start after which the temperature goes back, s.
-        film_time: Time constant with which the film follows the air, s.
-        limit: Largest charge that can be read, pC; infinite for any.
+        step_at: Start of the temperature step, s.
+        step_time: Duration of the rise of the temperature step, s.
+        step_for: Time from the start of the temperature step until the temperature is back at its initial value, s.
+        film_time: Time constant with which the film follows the temperature of the air, s.
+        limit: Largest magnitude of a charge that can be read, pC; infinite for no limit.
         bits: Resolution of the converter between both limits; 0 for no converter.
     """
 
@@ -103,29 +114,38 @@ class Amplifier:
             )
 
     def start(self, electrodes: int, rate: float, rng: np.random.Generator) -> "Measurement":
-        """Switch the amplifier on: draw its mismatches and let it settle.
+        """Start a measurement with random mismatches after the amplifier has settled.
 
         Args:
             electrodes: Number of channels.
             rate: Readings per second, Hz.
-            rng: Random numbers of the mismatches and of all readings.
+            rng: Generator of the mismatches and of the noise of all readings.
         """
         tau = self.tau * (1.0 + self.tau_mismatch * rng.standard_normal(electrodes))
         gain = 1.0 + self.gain_mismatch * rng.standard_normal(electrodes)
         bias = self.bias * rng.choice([-1.0, 1.0], electrodes)
         offset = self.offset * rng.standard_normal(electrodes)
         phase = rng.uniform(0.0, 2.0 * np.pi, electrodes)
-        spread = self.pyro_mismatch * rng.standard_normal(electrodes) if self.pyro_mismatch else np.zeros(electrodes)
-        return Measurement(self, rate, rng, tau, gain, bias, offset, phase, self.pyro * (1.0 + spread))
+        pyro = np.full(electrodes, self.pyro)
+        if self.pyro_mismatch:
+            pyro = self.pyro * (1.0 + self.pyro_mismatch * rng.standard_normal(electrodes))
+        return Measurement(self, rate, rng, tau, gain, bias, offset, phase, pyro)
 
 
 @dataclass
 class Measurement:
-    """A running amplifier: call it with the charges block by block.
+    """Running measurement, which is called with successive blocks of touch charges.
 
     Attributes:
-        amplifier, rate, rng: As given to `Amplifier.start`.
-        tau, gain, bias, offset, phase, pyro: Values drawn for each channel, shape (electrodes,).
+        amplifier: Parameters of the measuring chain.
+        rate: Readings per second, Hz.
+        rng: Generator of the noise.
+        tau: Time constant of the leak of each channel, shape (electrodes,), s.
+        gain: Gain of each channel, shape (electrodes,), dimensionless.
+        bias: Bias current of each channel, shape (electrodes,), pC/s.
+        offset: Offset of each channel, shape (electrodes,), pC.
+        phase: Phase of the hum of each channel, shape (electrodes,), rad.
+        pyro: Pyroelectric charge of each electrode per temperature change, shape (electrodes,), pC/K.
     """
 
     amplifier: Amplifier
@@ -138,83 +158,114 @@ class Measurement:
     phase: Array
     pyro: Array
     _readings: int = 0
-    _charge: Array = field(init=False)
+    _film_charge: Array = field(init=False)
     _output: Array = field(init=False)
-    _warmth: tuple[float, float] = field(init=False)
-    _memory: Array = field(init=False)
-    _touch: Array = field(init=False)
+    _air_temperature: float = field(init=False)
+    _film_temperature: float = field(init=False)
+    _relaxation: Array = field(init=False)
+    _touch_charge: Array = field(init=False)
 
     def __post_init__(self) -> None:
         first, second = self.amplifier.temperature_rms * self.rng.standard_normal(2)
-        share = self._share_of_air
-        self._warmth = first / math.sqrt(share), math.sqrt(share) * first + math.sqrt(1.0 - share) * second
-        self._charge = self.pyro * self._warmth[1]
-        self._touch = np.zeros_like(self.gain)
-        self._memory = np.zeros((CREEP_TIMES.size + 1, 1, self.gain.size))
+        variance_ratio = self._variance_ratio
+        correlation = math.sqrt(variance_ratio)  # between the stationary temperatures of the film and the air
+        self._air_temperature = first / correlation
+        self._film_temperature = correlation * first + math.sqrt(1.0 - variance_ratio) * second
+        self._film_charge = self.pyro * self._film_temperature
+        self._touch_charge = np.zeros_like(self.gain)
+        self._relaxation = np.zeros((CREEP_TIMES.size + 1, 1, self.gain.size))
         self._output = np.zeros_like(self.gain)
         if math.isfinite(self.amplifier.tau):
             self._output = self.bias / (1.0 - np.exp(-1.0 / (self.rate * self.tau))) / self.rate
 
     def __call__(self, charge: Array) -> Array:
-        """Readings of the next touch charges, both of shape (n, electrodes), pC."""
+        """Simulate the readings of the next block of touch charges.
+
+        Args:
+            charge: Touch charges, shape (n, electrodes), pC.
+
+        Returns:
+            Readings, shape (n, electrodes), pC.
+        """
         time = (self._readings + np.arange(len(charge))) / self.rate
         self._readings += len(charge)
-        film = self._remembered(charge) + self.pyro * self._temperature(time)[:, np.newaxis]
-        output = self._integrate(film) + self.offset
-        turn = 2.0 * np.pi * self.amplifier.hum_frequency * time[:, np.newaxis] + self.phase
-        noisy = self.amplifier.noise.add(output + self.amplifier.hum * np.sin(turn), self.rng)
+        film_charge = self._relaxed(charge) + self.pyro * self._temperature(time)[:, np.newaxis]
+        output = self._integrate(film_charge) + self.offset
+        hum_angle = 2.0 * np.pi * self.amplifier.hum_frequency * time[:, np.newaxis] + self.phase
+        noisy = self.amplifier.noise.add(output + self.amplifier.hum * np.sin(hum_angle), self.rng)
         return self._convert(noisy)
 
-    def _remembered(self, charge: Array) -> Array:
-        """What creep and the thermoelastic step make of touch charges, shape (n, electrodes), pC."""
-        part = self.amplifier
-        if not part.creep and not part.thermoelastic:
+    def _relaxed(self, charge: Array) -> Array:
+        """Apply creep and the thermoelastic effect to touch charges, shape (n, electrodes), pC."""
+        chain = self.amplifier
+        if not chain.creep and not chain.thermoelastic:
             return charge
-        steps = np.diff(charge, axis=0, prepend=self._touch[np.newaxis])
-        self._touch = charge[-1]
-        film: Array = (1.0 - 0.5 * part.creep * np.exp(-1.0 / CREEP_TIMES).sum()) * charge
-        shares = np.append(np.full(CREEP_TIMES.size, 0.5 * part.creep), part.thermoelastic)
-        for k, (lag, share) in enumerate(zip(np.append(CREEP_TIMES, part.film_time), shares, strict=True)):
-            keep = math.exp(-1.0 / (self.rate * lag))
-            term, self._memory[k] = scipy.signal.lfilter([share], [1.0, -keep], steps, axis=0, zi=self._memory[k])
-            film = film + term
-        return film
+        changes = np.diff(charge, axis=0, prepend=self._touch_charge[np.newaxis])
+        self._touch_charge = charge[-1]
+        relaxed: Array = (1.0 - 0.5 * chain.creep * np.exp(-1.0 / CREEP_TIMES).sum()) * charge
+        time_constants = np.append(CREEP_TIMES, chain.film_time)
+        shares = np.append(np.full(CREEP_TIMES.size, 0.5 * chain.creep), chain.thermoelastic)
+        for number, (time_constant, share) in enumerate(zip(time_constants, shares, strict=True)):
+            decay = math.exp(-1.0 / (self.rate * time_constant))
+            term, self._relaxation[number] = scipy.signal.lfilter(
+                [share], [1.0, -decay], changes, axis=0, zi=self._relaxation[number]
+            )
+            relaxed = relaxed + term
+        return relaxed
 
     @property
-    def _share_of_air(self) -> float:
-        """Variance of the film's drift over the air's, by the stationary law of a lag behind a lag."""
+    def _variance_ratio(self) -> float:
+        """Stationary variance of the temperature of the film divided by that of the air, dimensionless."""
         return self.amplifier.temperature_time / (self.amplifier.temperature_time + self.amplifier.film_time)
 
     def _temperature(self, time: Array) -> Array:
-        """Temperature of the film above its mean, shape (n,), K: a lag behind the air, whose drift is one, too."""
-        part = self.amplifier
-        of_air, of_film = (math.exp(-1.0 / (self.rate * lag)) for lag in (part.temperature_time, part.film_time))
-        kick = math.sqrt((1.0 - of_air * of_air) / self._share_of_air) * part.temperature_rms
-        kicks = kick * self.rng.standard_normal(time.size)
-        drift = scipy.signal.lfilter([1.0], [1.0, -of_air], kicks, zi=[of_air * self._warmth[0]])[0]
-        since = time - part.step_at
-        rise = np.clip(np.minimum(since, part.step_for - since) / part.step_time, 0.0, 1.0)
-        air = drift + part.step * rise
-        film: Array = scipy.signal.lfilter([1.0 - of_film], [1.0, -of_film], air, zi=[of_film * self._warmth[1]])[0]
-        self._warmth = float(drift[-1]), float(film[-1])
+        """Simulate the temperature of the film relative to its mean.
+
+        The drift of the air is a first-order autoregressive process, and the film is a first-order low-pass filter.
+
+        Args:
+            time: Times of the readings, shape (n,), s.
+
+        Returns:
+            Temperature, shape (n,), K.
+        """
+        chain = self.amplifier
+        air_decay = math.exp(-1.0 / (self.rate * chain.temperature_time))
+        film_decay = math.exp(-1.0 / (self.rate * chain.film_time))
+        innovation_std = math.sqrt((1.0 - air_decay * air_decay) / self._variance_ratio) * chain.temperature_rms
+        innovations = innovation_std * self.rng.standard_normal(time.size)
+        air_start = [air_decay * self._air_temperature]
+        drift = scipy.signal.lfilter([1.0], [1.0, -air_decay], innovations, zi=air_start)[0]
+        time_since_step = time - chain.step_at
+        rise = np.clip(np.minimum(time_since_step, chain.step_for - time_since_step) / chain.step_time, 0.0, 1.0)
+        air = drift + chain.step * rise
+        film_start = [film_decay * self._film_temperature]
+        film: Array = scipy.signal.lfilter([1.0 - film_decay], [1.0, -film_decay], air, zi=film_start)[0]
+        self._air_temperature = float(drift[-1])
+        self._film_temperature = float(film[-1])
         return film
 
-    def _integrate(self, film: Array) -> Array:
-        """The amplifier's output, shape (n, electrodes), pC."""
-        steps = self.gain * np.diff(film, axis=0, prepend=self._charge[np.newaxis]) + self.bias / self.rate
-        self._charge = film[-1]
-        keep = np.exp(-1.0 / (self.rate * self.tau))
-        output = np.empty_like(steps)
-        for k, share in enumerate(keep):
-            output[:, k] = scipy.signal.lfilter([1.0], [1.0, -share], steps[:, k], zi=[share * self._output[k]])[0]
+    def _integrate(self, film_charge: Array) -> Array:
+        """Compute the output of the charge amplifier for film charges; both have the shape (n, electrodes), pC."""
+        changes = np.diff(film_charge, axis=0, prepend=self._film_charge[np.newaxis])
+        inputs = self.gain * changes + self.bias / self.rate
+        self._film_charge = film_charge[-1]
+        decay = np.exp(-1.0 / (self.rate * self.tau))
+        output = np.empty_like(inputs)
+        for channel, channel_decay in enumerate(decay):
+            start = [channel_decay * self._output[channel]]
+            output[:, channel] = scipy.signal.lfilter([1.0], [1.0, -channel_decay], inputs[:, channel], zi=start)[0]
         self._output = output[-1]
         return output
 
     def _convert(self, output: Array) -> Array:
-        """The output clipped, and rounded to the converter's steps."""
-        limit, bits = self.amplifier.limit, self.amplifier.bits
+        """Clip the output (pC) at the limit, and round it to the steps of the converter."""
+        limit = self.amplifier.limit
+        bits = self.amplifier.bits
         clipped = np.clip(output, -limit, limit)
         if not bits:
             return clipped
         step = 2.0 * limit / (1 << bits)
-        return np.asarray(np.clip(np.round(clipped / step), -(1 << bits - 1), (1 << bits - 1) - 1) * step)
+        lowest_code = -(1 << (bits - 1))
+        highest_code = (1 << (bits - 1)) - 1
+        return np.asarray(np.clip(np.round(clipped / step), lowest_code, highest_code) * step)

@@ -1,10 +1,10 @@
-"""The noise model: what the measuring chain adds to the charges. Training, limits and the virtual sensor use this one.
+"""Noise model of the measuring chain, used for training, for Cramer-Rao limits and for the virtual sensor.
 
-This is its memoryless part, independent between channels and readings:
+The noise is independent between channels and readings, with the variance
 
     sigma^2 = white^2 + (gain * Q)^2.
 
-What has a memory - leak, hum, drift, temperature, mismatch, clipping - is `measuring_chain.amplifier`.
+Leak, hum, drift, temperature, mismatch and clipping are modelled by `measuring_chain.amplifier`.
 """
 
 import math
@@ -22,8 +22,8 @@ class NoiseModel:
 
     Attributes:
         name: Name of the level.
-        white: Standard deviation that every reading has, pC.
-        gain: Standard deviation in proportion to the charge, dimensionless.
+        white: Standard deviation that does not depend on the charge, pC.
+        gain: Standard deviation proportional to the charge, divided by the charge, dimensionless.
     """
 
     name: str
@@ -37,26 +37,33 @@ class NoiseModel:
                 raise InputError(f"noise {self.name!r}: {name}: expected a finite number from 0, got {value}")
 
     def sigma(self, charge: Array) -> Array:
-        """Standard deviation for charges of any shape, pC; the same shape."""
+        """Compute the standard deviation (pC) for charges (pC) of any shape; the result has the same shape."""
         return np.hypot(self.white, self.gain * np.asarray(charge))
 
     def variance(self, charge: Array) -> Array:
-        """Square of `sigma`, pC^2; faster where there are many."""
+        """Compute the variance (pC^2) for charges (pC) of any shape, which is faster than to square `sigma`."""
         return self.white**2 + (self.gain * np.asarray(charge)) ** 2
 
     def information(self, charge: Array) -> Array:
-        """Fisher information of a reading, 1/pC^2: one over the variance of the best unbiased estimate of its charge.
+        """Compute the Fisher information that one reading provides about its charge.
 
-        Of a Gaussian whose mean and standard deviation both depend on the charge (Kay 1993, eq. 3.31),
-        (1 + 2 (d sigma / dQ)^2) / sigma^2.
+        For a Gaussian whose mean and standard deviation both depend on the charge, the information is
+        (1 + 2 (d sigma / dQ)^2) / sigma^2 (Kay 1993, eq. 3.31). Its inverse is the smallest variance of an unbiased
+        estimate of the charge.
+
+        Args:
+            charge: Charges of any shape, pC.
+
+        Returns:
+            Information, 1/pC^2, of the same shape.
         """
         variance = self.variance(charge)
         return (1.0 + 2.0 * (self.gain**2 * np.asarray(charge)) ** 2 / variance) / variance
 
     def add(self, charge: Array, rng: np.random.Generator) -> Array:
-        """Noisy readings of charges of any shape, pC."""
+        """Add noise to charges (pC) of any shape."""
         return charge + self.sigma(charge) * rng.standard_normal(np.shape(charge))
 
     def to_dict(self) -> dict[str, float | str]:
-        """For metadata."""
+        """Return name and parameters for metadata."""
         return {"name": self.name, "white_pC": self.white, "gain": self.gain}

@@ -1,4 +1,4 @@
-"""Noise and amplifiers by the name of their level - clean, reference, bench, surgery - or from a TOML file."""
+"""Noise models and amplifiers of the levels clean, reference, bench and surgery, or from a TOML file."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,7 @@ NOISE_LEVELS = {
     "bench": NoiseModel("bench", 0.3, 0.0),
     "surgery": NoiseModel("surgery", 1.0, 0.0),
 }
-"""Noise levels by name. For `bench` and `surgery` this is the memoryless part of their amplifiers below."""
+"""Noise models of the levels. For `bench` and `surgery`, they are the memoryless part of the amplifiers."""
 
 BENCH = Amplifier(
     noise=NOISE_LEVELS["bench"],
@@ -31,6 +31,7 @@ BENCH = Amplifier(
     limit=1500.0,
     bits=16,
 )
+"""Amplifier of the level `bench`: a tidy electric environment."""
 
 AMPLIFIER_LEVELS = {
     "clean": Amplifier(noise=NOISE_LEVELS["clean"]),
@@ -38,9 +39,9 @@ AMPLIFIER_LEVELS = {
     "bench": BENCH,
     "surgery": replace(BENCH, noise=NOISE_LEVELS["surgery"], hum=5.0, step=0.5),
 }
-"""Amplifiers by the same names."""
+"""Amplifiers of the levels."""
 
-KEYS = {
+KEY_NAMES = {
     "tau": "tau_s",
     "hum": "hum_pC",
     "hum_frequency": "hum_Hz",
@@ -56,7 +57,7 @@ KEYS = {
     "film_time": "film_time_s",
     "limit": "limit_pC",
 }
-"""Keys of the file that are not called as the attributes of `Amplifier`."""
+"""Keys of the TOML file that differ from the names of the attributes of `Amplifier`, because they contain the unit."""
 
 AmplifierFile = defstruct(
     "AmplifierFile",
@@ -72,45 +73,53 @@ AmplifierFile = defstruct(
     ],
     bases=(Settings,),
     frozen=True,
-    rename=KEYS,
+    rename=KEY_NAMES,
 )
-"""The file: noise, and the attributes of `Amplifier` with their bounds; what is None is that of the level `like`."""
+"""Content of the TOML file: noise, and the attributes of `Amplifier` with their bounds. Keys that are absent have the
+value of the level `like`."""
 
 
 def load_amplifier(level: str) -> Amplifier:
-    """An amplifier by the name of its level, or from a TOML file.
+    """Return the amplifier of a level, or read it from a TOML file such as
 
-        like = "bench"       # optional: the level that missing keys are taken from
+        like = "bench"       # optional: level with the values of absent keys
         white_pC = 0.5
         tau_s = 1.0          # inf for no leak
 
+    Args:
+        level: Name of a level, or path of a TOML file.
+
     Raises:
-        InputError: If there is no such level or file, a key is unknown or not a number in its range, or the converter
-            has bits and no limit.
+        InputError: If the level or the file does not exist, if a key is unknown or its value out of range, or if a
+            resolution of the converter is given without a limit.
     """
     if level in AMPLIFIER_LEVELS:
         return AMPLIFIER_LEVELS[level]
     if not level.endswith(".toml"):
         raise InputError(f"noise level: expected one of {', '.join(AMPLIFIER_LEVELS)}, or a TOML file, got {level!r}")
     file = read_toml(Path(level), "the description of noise", InputError, AmplifierFile)
-    given: dict[str, Any] = {name: value for name, value in structs.asdict(file).items() if value is not None}
-    like = AMPLIFIER_LEVELS[given.pop("like")]
-    white, gain = given.pop("white_pC", like.noise.white), given.pop("proportional", like.noise.gain)
+    changes: dict[str, Any] = {name: value for name, value in structs.asdict(file).items() if value is not None}
+    base = AMPLIFIER_LEVELS[changes.pop("like")]
+    white = changes.pop("white_pC", base.noise.white)
+    gain = changes.pop("proportional", base.noise.gain)
     with error_prefix(f"{level}: ", InputError):
-        return replace(like, noise=NoiseModel(Path(level).stem, white, gain), **given)
+        return replace(base, noise=NoiseModel(Path(level).stem, white, gain), **changes)
 
 
 def noise_model(level: str) -> NoiseModel:
-    """Noise by the name of its level, or from a TOML file, for all that takes charges one by one.
+    """Return the noise model of a level, or read it from a TOML file such as
 
-        like = "reference"      # optional: the level that missing keys are taken from, by default "clean"
+        like = "reference"      # optional: level with the values of absent keys, by default "clean"
         white_pC = 0.5
-        proportional = 0.001    # standard deviation over charge
+        proportional = 0.001    # standard deviation divided by the charge
 
-    The file may describe a whole measuring chain (`load_amplifier`); only its memoryless part counts here.
+    The file may describe a complete measuring chain (`load_amplifier`). Only the memoryless noise is returned.
+
+    Args:
+        level: Name of a level, or path of a TOML file.
 
     Raises:
-        InputError: If there is no such level or file, or a key is unknown or not a number in its range.
+        InputError: If the level or the file does not exist, or if a key is unknown or its value out of range.
     """
     if level in NOISE_LEVELS:
         return NOISE_LEVELS[level]
