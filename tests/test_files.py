@@ -7,8 +7,8 @@ import signal
 import pytest
 
 from isocharge.common.errors import OutputError, OutputExists
-from isocharge.common.files import WholeWrites, bounded_lines, new_file, read_whole
-from isocharge.common.number_text import number_of
+from isocharge.common.files import AtomicWriter, bounded_lines, new_file, read_whole
+from isocharge.common.number_text import parse_number
 
 
 def test_a_file_is_read_whole(tmp_path):
@@ -29,7 +29,7 @@ def test_what_is_no_file_is_not_read(tmp_path):
 
 def test_nothing_of_an_interrupted_write_stays(tmp_path, monkeypatch):
     """Ctrl-C just after the bytes went out."""
-    file, write = WholeWrites(tmp_path / "file"), os.write
+    file, write = AtomicWriter(tmp_path / "file"), os.write
     monkeypatch.setattr("os.write", lambda *words: write(*words) and signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         file.write(b"long enough")
@@ -68,8 +68,8 @@ def test_lines_are_bounded():
 @pytest.mark.parametrize("text", ["1_0", "\u0663", "", "0x10", "1,5"])
 def test_what_is_no_number(text):
     with pytest.raises(ValueError, match=r"number|float"):
-        number_of(text)
+        parse_number(text)
 
 
 def test_what_is_a_number():
-    assert [number_of(text) for text in ("10", " 1e3 ", "-.5", "+7.")] == [10.0, 1000.0, -0.5, 7.0]
+    assert [parse_number(text) for text in ("10", " 1e3 ", "-.5", "+7.")] == [10.0, 1000.0, -0.5, 7.0]

@@ -9,9 +9,9 @@ import msgspec
 import pytest
 from msgspec import Meta
 
-from isocharge.common.errors import LONGEST_VALUE, DeviceError, SensorError
+from isocharge.common.errors import MAX_VALUE_CHARACTERS, DeviceError, SensorError
 from isocharge.common.structs import (
-    MOST_TOML_BYTES,
+    MAX_TOML_BYTES,
     Finite,
     NotNegative,
     Positive,
@@ -77,7 +77,10 @@ def test_a_value_that_fits_is_taken():
         ({"radius": True}, "board.radius: expected a positive number, got True"),
         ({"share": "x"}, "board.share: expected a number from 0, got 'x'"),
         ({"offset": math.inf}, "board.offset: expected a finite number, got inf"),
-        ({"offset": 10**400}, f"board.offset: expected a finite number, got {'1' + '0' * (LONGEST_VALUE - 1)}..."),
+        (
+            {"offset": 10**400},
+            f"board.offset: expected a finite number, got {'1' + '0' * (MAX_VALUE_CHARACTERS - 1)}...",
+        ),
         ({"poisson": 0.6}, "board.poisson: expected a number above -1 and at most 0.5, got 0.6"),
         ({"low": 1.5}, "board.low: expected a whole number, got 1.5"),
         ({"low": 3, "high": 2}, "board.low: expected at most high (2), got 3"),
@@ -121,7 +124,7 @@ def test_messages_stay_short():
     for value in ("x" * 1_000_000, nested, {f"key{i}": i for i in range(10_000)}):
         with pytest.raises(SensorError) as caught:
             convert({"board": value}, File, "", SensorError)
-        assert len(str(caught.value)) < 3 * LONGEST_VALUE
+        assert len(str(caught.value)) < 3 * MAX_VALUE_CHARACTERS
 
 
 TOML = partial(read_toml, what="a device file", error=DeviceError, kind=dict)
@@ -133,7 +136,7 @@ JSON = partial(read_json, what="a list", error=DeviceError, kind=list)
     [
         (TOML, b"a = x", "not a TOML file: .*line 1"),
         (TOML, b"\xff", "not a TOML file: not text in UTF-8"),
-        (TOML, b"#" * (MOST_TOML_BYTES + 1), r"cannot be read \(larger than 262144 bytes\); expected a device file in"),
+        (TOML, b"#" * (MAX_TOML_BYTES + 1), r"cannot be read \(larger than 262144 bytes\); expected a device file in"),
         (TOML, b"a = " + b"[" * 100_000, "not a TOML file"),
         (TOML, b"a." * 100_000 + b"a = 1", "not a TOML file: a key of more than 32 parts"),
         (TOML, b"'a b' . " * 30_000 + b"a = 1", "not a TOML file: a key of more than 32 parts"),

@@ -10,19 +10,19 @@ from contextlib import contextmanager
 
 from isocharge.common.printable_text import printable, printable_lines
 
-LONGEST_VALUE = 200
+MAX_VALUE_CHARACTERS = 200
 """Largest number of characters of a wrong value, or of a list of keys, in a message."""
 
 
 def cut(text: str) -> str:
-    """Return a text for a message: printable, and cut after `LONGEST_VALUE` characters."""
-    if len(text) <= LONGEST_VALUE:
+    """Return a text for a message: printable, and cut after `MAX_VALUE_CHARACTERS` characters."""
+    if len(text) <= MAX_VALUE_CHARACTERS:
         return printable(text)
-    return printable(text[:LONGEST_VALUE]) + "..."
+    return printable(text[:MAX_VALUE_CHARACTERS]) + "..."
 
 
 def shown(value: object) -> str:
-    """Return the repr of a value for a message, cut after `LONGEST_VALUE` characters."""
+    """Return the repr of a value for a message, cut after `MAX_VALUE_CHARACTERS` characters."""
     try:
         return cut(repr(value))
     except (RecursionError, ValueError):  # nested too deeply, or an int with more digits than Python prints

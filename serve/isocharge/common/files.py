@@ -1,4 +1,4 @@
-"""Files and folders that exist whole or not at all."""
+"""Reading and writing of files, so that a file or folder exists either completely or not at all."""
 
 import errno
 import hashlib
@@ -13,22 +13,21 @@ from typing import BinaryIO, TextIO
 
 from isocharge.common.errors import IsochargeError, OutputError, OutputExists
 
-MOST_BYTES = 64 << 20
-"""Largest file that is read whole, bytes: far more than any file of ours has."""
+MAX_FILE_BYTES = 64 << 20
+"""Largest size of a file that is read by `read_whole`, bytes."""
 
-LONGEST_LINE = 1 << 20
-"""Longest line of a text that is read line by line, characters."""
-
+MAX_LINE_CHARACTERS = 1 << 20
+"""Largest number of characters of a line in a text that is read line by line."""
 
 READ_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
-"""To open a file without waiting for a pipe's writer, and without changing line ends; each system has its part."""
+"""Flags for opening a file without waiting for the writer of a pipe. Flags that a system does not have are left out."""
 
 WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
-"""To open a new file, without changing line ends."""
+"""Flags for creating a file that must not exist."""
 
 
 def sha256_of(data: bytes) -> str:
-    """Hexadecimal SHA-256."""
+    """Return the SHA-256 checksum in hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()
 
 
@@ -45,52 +44,63 @@ def open_regular(path: Path) -> BinaryIO:
     return os.fdopen(descriptor, "rb")
 
 
-def read_whole(path: Path, most: int = MOST_BYTES) -> bytes:
+def read_whole(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
     """Read the bytes of a regular file.
 
     Args:
-        path: The file. A pipe or a device is refused, because to read one may never end.
-        most: Largest size, bytes.
+        path: The file. A pipe or a device is refused, because reading it might never end.
+        max_bytes: Largest size, bytes.
 
     Raises:
-        OSError: If the file cannot be read, is not a regular file, or is larger; `strerror` says which.
+        OSError: If the file cannot be read, is not a regular file, or is larger; `strerror` states the reason.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        data = file.read(most + 1) if size <= most else b""
-        if max(len(data), size) > most:
-            raise OSError(errno.EFBIG, f"larger than {most} bytes", str(path))
+        data = file.read(max_bytes + 1) if size <= max_bytes else b""
+        if max(len(data), size) > max_bytes:
+            raise OSError(errno.EFBIG, f"larger than {max_bytes} bytes", str(path))
         return data
 
 
-def bounded_lines(file: TextIO, longest: int = LONGEST_LINE) -> Iterator[str]:
-    """The lines of a text, each with its end, none longer than can be held.
+def bounded_lines(file: TextIO, max_characters: int = MAX_LINE_CHARACTERS) -> Iterator[str]:
+    """Yield the lines of a text, each with its line end.
+
+    Args:
+        file: The text.
+        max_characters: Largest number of characters of a line.
 
     Raises:
-        ValueError: If a line has more than `longest` characters, or is no text in the encoding of the file.
+        ValueError: If a line is longer, or cannot be decoded.
     """
-    while line := file.readline(longest + 1):
-        if len(line) > longest:
-            raise ValueError(f"a line is longer than {longest} characters")
+    while line := file.readline(max_characters + 1):
+        if len(line) > max_characters:
+            raise ValueError(f"a line is longer than {max_characters} characters")
         yield line
 
 
-def read_needed(path: Path, error: type[IsochargeError], advice: str, most: int = MOST_BYTES) -> bytes:
-    """As `read_whole`, but raises `error`, with advice on what to do."""
+def read_needed(path: Path, error: type[IsochargeError], advice: str, max_bytes: int = MAX_FILE_BYTES) -> bytes:
+    """Read the bytes of a regular file, and raise an error with advice if this is not possible.
+
+    Args:
+        path: The file.
+        error: Class of the error.
+        advice: What the user can do, for the error message.
+        max_bytes: Largest size, bytes.
+    """
     try:
-        return read_whole(path, most)
+        return read_whole(path, max_bytes)
     except OSError as cause:
         raise error(f"{path}: cannot be read ({cause.strerror}); {advice}") from cause
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise OutputExists if there is something at `path` already."""
+    """Raise OutputExists if a file or folder exists at the path."""
     if path.exists():
         raise OutputExists(f"{path} is already there and is not overwritten; choose another output or remove it")
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name, bring it to disk, and only then give it its name."""
+    """Write a file under a temporary name, flush it to disk, and then rename it. An existing file is replaced."""
     draft = _draft_of(path)
     try:
         with draft.open("wb") as file:
@@ -102,23 +112,26 @@ def write_whole(path: Path, data: bytes) -> None:
         draft.unlink(missing_ok=True)
 
 
-class WholeWrites:
-    """A new file that takes data whole or not at all: as much of a file as its writers use."""
+class AtomicWriter:
+    """Writer of a new file that appends data completely or not at all.
+
+    It has the methods of a binary file that MCAP and text writers use.
+    """
 
     def __init__(self, path: Path) -> None:
-        """Create it.
+        """Create the file.
 
         Raises:
-            OutputExists: If it is already there.
-            OutputError: If it cannot be created.
+            OutputExists: If the file exists already.
+            OutputError: If the file cannot be created.
         """
         refuse_existing(path)
-        with refusals_explained(path):
+        with as_output_errors(path):
             self._descriptor = os.open(path, WRITE_FLAGS, 0o666)
         self._size = 0
 
     def write(self, data: bytes) -> int:
-        """Write, over what an interruption left of a write; after an OSError the file is as it was before."""
+        """Append data. After an OSError the file is unchanged, and data of an interrupted call are overwritten."""
         unwritten = memoryview(data)
         try:
             os.lseek(self._descriptor, self._size, os.SEEK_SET)
@@ -131,36 +144,36 @@ class WholeWrites:
         return len(data)
 
     def tell(self) -> int:
-        """Bytes that were written."""
+        """Return the number of bytes that were written."""
         return self._size
 
     def flush(self) -> None:
-        """Nothing waits here."""
+        """Do nothing, because no data are buffered."""
 
     def close(self) -> None:
-        """Close it, without what an interruption left of a write."""
+        """Remove the data of an interrupted call, and close the file."""
         os.ftruncate(self._descriptor, self._size)
         os.close(self._descriptor)
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Fill a file under a temporary name and give it its own when the block ends well; on an error nothing remains.
+    """Create a file under a temporary name, and rename it at the end of the block. After an error nothing remains.
 
     Yields:
-        The temporary name, a sibling; the block creates the file, or a folder.
+        The temporary path in the same folder, at which the block creates a file or a folder.
 
     Raises:
-        OutputExists: If `path` is already there, or another process creates it meanwhile.
-        OutputError: If the file system refuses.
+        OutputExists: If `path` exists already, or another process creates it in the meantime.
+        OutputError: If the file cannot be written.
     """
     refuse_existing(path)
     draft = _draft_of(path)
     try:
-        with refusals_explained(path):
+        with as_output_errors(path):
             yield draft
             sync_folder(draft)
-            refuse_existing(path)  # another process may have been faster
+            refuse_existing(path)  # another process may have created it in the meantime
             draft.rename(path)
             sync_folder(path.parent)
     finally:
@@ -171,16 +184,17 @@ def new_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Fill a folder out of sight and give it its name when the block ends well; on an error nothing remains.
+    """Create a folder under a temporary name, and rename it at the end of the block. After an error nothing remains.
 
     Args:
-        path: The folder to create, with its parents.
+        path: The folder. Missing parent folders are created, too.
 
     Yields:
-        A temporary sibling to write into.
+        The temporary folder, in which the block writes.
 
     Raises:
-        As `new_file`.
+        OutputExists: If `path` exists already, or another process creates it in the meantime.
+        OutputError: If the folder cannot be written.
     """
     missing = [parent for parent in path.parents if not parent.exists()]
     try:
@@ -196,27 +210,32 @@ def _draft_of(path: Path) -> Path:
 
 
 @contextmanager
-def refusals_explained(path: Path, advice: str = "choose another output") -> Iterator[None]:
-    """Turn the file system's errors into OutputError."""
+def as_output_errors(path: Path, advice: str = "choose another output") -> Iterator[None]:
+    """Convert an OSError of the block to an OutputError.
+
+    Args:
+        path: The output, for the error message.
+        advice: What the user can do, for the error message.
+    """
     try:
         yield
     except OSError as error:
-        if isinstance(error, IsochargeError | BrokenPipeError):  # a pipe is no matter of this file
+        if isinstance(error, IsochargeError | BrokenPipeError):  # a broken pipe is not an error of this output
             raise
         raise OutputError(f"{path} cannot be written: {error.strerror or error}; {advice}") from error
 
 
 def remove_empty(folders: Iterable[Path]) -> None:
-    """Remove the folders that are empty, the innermost first."""
+    """Remove those of the folders that are empty. Inner folders must come before outer folders."""
     for folder in folders:
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
 
 
 def sync_folder(folder: Path) -> None:
-    """Make sure that renames in a folder, or the content of a file, survive a power cut.
+    """Flush a folder or a file to disk, so that renames or contents survive a power failure.
 
-    Windows opens no folders, and is left to itself.
+    Nothing is done on Windows, which cannot open folders.
     """
     if not hasattr(os, "O_DIRECTORY"):
         return

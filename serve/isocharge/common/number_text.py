@@ -1,13 +1,14 @@
-"""Numbers as people and devices write them in text."""
+"""Parsing of numbers in texts from people and devices."""
 
 
-def number_of(text: str) -> float:
-    """The number that a text says, in the notation of other programs: `1_0` and digits of other scripts are none.
+def parse_number(text: str) -> float:
+    """Parse a number in ASCII notation, including infinity and NaN.
 
-    Infinity and NaN are numbers here.
+    Unlike `float`, the function refuses underscores, as in `1_0`, and digits of other scripts, because other programs
+    do not write numbers in this way.
 
     Raises:
-        ValueError: If it says none.
+        ValueError: If the text is not a number.
     """
     if "_" in text or not text.isascii():
         raise ValueError(f"expected a number, got {text[:100]!r}")

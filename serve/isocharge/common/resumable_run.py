@@ -26,9 +26,9 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, OutputExists, SolveError, TrainingError, cut
 from isocharge.common.files import (
+    as_output_errors,
     new_folder,
     read_whole,
-    refusals_explained,
     refuse_existing,
     remove_empty,
     sha256_of,
@@ -41,7 +41,7 @@ Content = TypeVar("Content")
 
 _log = logging.getLogger(__name__)
 
-MOST_PART_BYTES = 1 << 30
+MAX_PART_BYTES = 1 << 30
 """Largest part of a run, bytes."""
 
 
@@ -84,7 +84,7 @@ class ResumableRun:
             return None
         path = self._place(name, final)
         try:
-            data = read_whole(path, MOST_PART_BYTES)
+            data = read_whole(path, MAX_PART_BYTES)
             if sha256_of(data) != checksum:
                 raise ValueError(f"expected sha256 {checksum[:12]}..., got {sha256_of(data)[:12]}...")
             return decode(data)
@@ -261,7 +261,7 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
 
 def output_errors(target: Path) -> AbstractContextManager[None]:
     """Turn the file system's errors into OutputError."""
-    return refusals_explained(target, f"the same command goes on with what {draft_of(target)} has, or choose another")
+    return as_output_errors(target, f"the same command goes on with what {draft_of(target)} has, or choose another")
 
 
 @contextmanager

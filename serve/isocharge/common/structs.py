@@ -1,7 +1,7 @@
-"""Settings and messages as typed structs, decoded by msgspec from TOML and JSON; errors name the key.
+"""Decoding of TOML and JSON into typed structs with msgspec, with error messages that name the key.
 
-A file's keys are the attributes of a `Settings` class, their types and bounds say what a value may be, and a key that
-is not there takes the attribute's default:
+The attributes of a `Settings` class are the keys of a file. Their types and bounds define the allowed values, and a
+missing key has the default of its attribute:
 
     class FilmTable(Settings, frozen=True):
         radius_mm: Positive
@@ -9,14 +9,14 @@ is not there takes the attribute's default:
 
     film = read_toml(path, "a film", SensorError, FilmTable)
 
-Whatever does not fit is an error of one form:
+All error messages have the same form:
 
     mine.toml: film.radius_mm: expected a positive number, got -45
     mine.toml: unknown key 'film.radius'; did you mean 'radius_mm'? Known are radius_mm, poisson
     mine.toml: key 'film.radius_mm' is missing
 
-`Meta(description="[x, y] in mm")` replaces the words after "expected". What a type cannot say is checked in
-`__post_init__`, which raises `WrongKey`.
+`Meta(description="[x, y] in mm")` replaces the words after "expected". Conditions that a type cannot express are
+checked in `__post_init__`, which raises `WrongKey`.
 """
 
 import difflib
@@ -36,33 +36,40 @@ from isocharge.common.files import read_needed
 
 T = TypeVar("T")
 
-LARGEST_FLOAT = sys.float_info.max
+MAX_FLOAT = sys.float_info.max
+"""Largest finite number."""
 
-MOST_TOML_BYTES, MOST_JSON_BYTES = 1 << 18, 1 << 22
-"""Largest file of settings, bytes; Python reads TOML a hundred times slower than JSON."""
+MAX_TOML_BYTES = 1 << 18
+"""Largest size of a TOML file, bytes. It is small, because Python reads TOML a hundred times slower than JSON."""
 
-MOST_EXAMINED = 1000
-"""Items of a list in which a fault is looked for; of one in a later item msgspec's own message is given."""
+MAX_JSON_BYTES = 1 << 22
+"""Largest size of a JSON file, bytes."""
 
-_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
-_DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_PART}\.[ \t]*+){{32}}")
-"""A key with more dots than a table has levels: Python needs memory as the square of their number to read it."""
+MAX_EXAMINED_ITEMS = 1000
+"""Number of items of a list in which an error is searched. For later items, the message of msgspec is used."""
 
-Finite = Annotated[float, Meta(ge=-LARGEST_FLOAT, le=LARGEST_FLOAT)]
-NotNegative = Annotated[float, Meta(ge=0.0, le=LARGEST_FLOAT)]
-Positive = Annotated[float, Meta(gt=0.0, le=LARGEST_FLOAT)]
+_KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
+_DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY_PART}\.[ \t]*+){{32}}")
+"""Dotted key of more than 32 parts, which is refused because Python's memory grows with the square of their number."""
+
+Finite = Annotated[float, Meta(ge=-MAX_FLOAT, le=MAX_FLOAT)]
+NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_FLOAT)]
+Positive = Annotated[float, Meta(gt=0.0, le=MAX_FLOAT)]
 Text = Annotated[str, Meta(min_length=1, max_length=1000)]
-"""Neither empty nor endless: names stand in messages, records and pages."""
+"""Text of 1 to 1000 characters, because names appear in messages, records and pages."""
 
 
 class Settings(Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of a file; an unknown key is an error. Type checkers want `frozen=True` again in each class."""
+    """A table of a file in which unknown keys are errors. Type checkers need `frozen=True` again in each subclass."""
 
 
 class WrongKey(ValueError):
-    """Raised in the `__post_init__` of a struct: the value of a key does not go with those of others.
+    """Error of `__post_init__` in a struct: a value is wrong, or a key is missing.
 
-    Without an expectation, the key is missing beside those that are there.
+    Args:
+        key: Name of the key.
+        expected: Description of the expected value; empty if the key is missing.
+        got: The given value.
     """
 
     def __init__(self, key: str, expected: str = "", got: object = None) -> None:
@@ -71,24 +78,32 @@ class WrongKey(ValueError):
 
 
 def read_toml(path: Path, what: str, error: type[InputError], kind: type[T]) -> T:
-    """The content of a TOML file.
+    """Read a TOML file.
 
     Args:
         path: The file.
-        what: What the file should be, for messages: "a device file".
-        error: Raised if it cannot be read, or does not fit.
-        kind: The type of its content; `dict[str, Any]` for a table as it stands.
+        what: Description of the expected file for error messages, such as "a device file".
+        error: Class of the error if the file cannot be read or its content is wrong.
+        kind: Type of the content; `dict[str, Any]` for any table.
     """
-    return parse_toml(_text(path, MOST_TOML_BYTES, what, "TOML", error), str(path), error, kind)
+    return parse_toml(_text(path, MAX_TOML_BYTES, what, "TOML", error), str(path), error, kind)
 
 
 def read_json(path: Path, what: str, error: type[InputError], kind: type[T]) -> T:
-    """The content of a JSON file; the arguments are those of `read_toml`."""
-    return parse_json(_text(path, MOST_JSON_BYTES, what, "JSON", error), str(path), error, kind)
+    """Read a JSON file.
+
+    Args:
+        path: The file.
+        what: Description of the expected file for error messages, such as "a device file".
+        error: Class of the error if the file cannot be read or its content is wrong.
+        kind: Type of the content; `dict[str, Any]` for any object.
+    """
+    return parse_json(_text(path, MAX_JSON_BYTES, what, "JSON", error), str(path), error, kind)
 
 
-def _text(path: Path, most: int, what: str, language: str, error: type[InputError]) -> str:
-    data = read_needed(path, error, f"expected {what} in {language}", most)
+def _text(path: Path, max_bytes: int, what: str, language: str, error: type[InputError]) -> str:
+    """Read a text file in UTF-8."""
+    data = read_needed(path, error, f"expected {what} in {language}", max_bytes)
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as cause:
@@ -96,7 +111,14 @@ def _text(path: Path, most: int, what: str, language: str, error: type[InputErro
 
 
 def parse_toml(text: str, where: str, error: type[InputError], kind: type[T]) -> T:
-    """The content of a text in TOML; `where` opens the message of the error."""
+    """Parse a text in TOML.
+
+    Args:
+        text: The text.
+        where: Name of the file, with which the error message begins.
+        error: Class of the error if the text is wrong.
+        kind: Type of the content.
+    """
     if _DEEP_KEY.search(text):
         raise error(f"{where}: not a TOML file: a key of more than 32 parts")
     try:
@@ -107,71 +129,88 @@ def parse_toml(text: str, where: str, error: type[InputError], kind: type[T]) ->
 
 
 def parse_json(text: str | bytes, where: str, error: type[InputError], kind: type[T]) -> T:
-    """The content of a text in JSON; `where`, if not empty, opens the message of the error."""
+    """Parse a text in JSON.
+
+    Args:
+        text: The text.
+        where: Name of the file, with which the error message begins; empty if there is none.
+        error: Class of the error if the text is wrong.
+        kind: Type of the content.
+    """
     try:
         return msgspec.json.decode(text, type=kind)
-    except (ValueError, RecursionError) as cause:
-        fault = cause
+    except (ValueError, RecursionError) as decoding_error:
+        cause = decoding_error
     try:
         content = msgspec.json.decode(text)
     except (ValueError, RecursionError):
-        raise error(f"{_opening(where)}expected JSON, got {shown(text)} ({cut(str(fault))})") from fault
-    raise error(_opening(where) + _explained(content, kind, fault)) from fault
+        raise error(f"{_prefix(where)}expected JSON, got {shown(text)} ({cut(str(cause))})") from cause
+    raise error(_prefix(where) + _first_mistake(content, kind, cause)) from cause
 
 
 def convert(value: object, kind: type[T], where: str, error: type[InputError]) -> T:
-    """A value of tables, lists, texts and numbers as a type.
+    """Convert a value of tables, lists, texts and numbers to a type.
 
     Args:
-        value: From TOML or JSON.
-        kind: A struct, or another type that msgspec knows.
-        where: Opens the message of the error, if not empty.
-        error: Raised if the value does not fit.
+        value: Value from TOML or JSON.
+        kind: A struct, or another type that msgspec supports.
+        where: Name of the file, with which the error message begins; empty if there is none.
+        error: Class of the error if the value is wrong.
     """
     try:
         return msgspec.convert(value, kind)
     except (msgspec.ValidationError, RecursionError) as cause:
-        raise error(_opening(where) + _explained(value, kind, cause)) from cause
+        raise error(_prefix(where) + _first_mistake(value, kind, cause)) from cause
 
 
-def _opening(where: str) -> str:
+def _prefix(where: str) -> str:
     return f"{where}: " if where else ""
 
 
-def _explained(value: object, kind: Any, cause: Exception) -> str:
-    """The first fault of a value; msgspec's own message, which shows no value, if there is none to be found."""
+def _first_mistake(value: object, kind: Any, cause: Exception) -> str:
+    """Return a description of the first mistake in a value; if none is found, the message of msgspec."""
     try:
-        return next(_faults(value, kind, ""), cut(str(cause)))
+        return next(_mistakes(value, kind, ""), cut(str(cause)))
     except RecursionError:
         return "nested too deeply"
 
 
-def _faults(value: object, kind: Any, path: str) -> Iterator[str]:
-    """Sentences on what does not fit in a value, the innermost first."""
-    options = list(_options(kind))
-    yield from _faults_of_tag(value, options, path)
-    for option in options:
-        yield from _faults_inside(value, option, path)
+def _mistakes(value: object, kind: Any, path: str) -> Iterator[str]:
+    """Yield descriptions of the mistakes in a value, the innermost first.
+
+    Args:
+        value: Value from TOML or JSON.
+        kind: Expected type.
+        path: Names of the keys that lead to the value, such as "film.radius_mm".
+    """
+    members = list(_union_members(kind))
+    yield from _mistakes_in_tag(value, members, path)
+    for member in members:
+        yield from _mistakes_inside(value, member, path)
     try:
         msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
-        wrong = error.__cause__
-        if isinstance(wrong, WrongKey):
-            name = _join(path, wrong.key)
-            yield f"{name}: {wrong}" if str(wrong) else f"key {name!r} is missing"
-        elif wrong is not None:
-            yield f"{_opening(path)}{wrong}"
+        cause = error.__cause__
+        if isinstance(cause, WrongKey):
+            name = _join(path, cause.key)
+            yield f"{name}: {cause}" if str(cause) else f"key {name!r} is missing"
+        elif cause is not None:
+            yield f"{_prefix(path)}{cause}"
         else:
-            words = get_args(options[0]) if get_origin(options[0]) is Literal else None  # msgspec sorts them
-            expected = _one_of(words) if words else _described(inspect.type_info(kind))
-            yield f"{_opening(path)}expected {expected}, got {shown(value)}"
+            yield f"{_prefix(path)}expected {_expected_value(kind, members[0])}, got {shown(value)}"
 
 
-def _faults_of_tag(value: object, options: list[Any], path: str) -> Iterator[str]:
-    """The key that chooses one of several structs."""
-    configs = [
-        option.__struct_config__ for option in options if isinstance(option, type) and issubclass(option, Struct)
-    ]
+def _expected_value(kind: Any, first_member: Any) -> str:
+    """Return a description of the values of a type."""
+    if get_origin(first_member) is Literal:
+        return _one_of(get_args(first_member))  # in the declared order, which msgspec does not keep
+    return _describe_type(inspect.type_info(kind))
+
+
+def _mistakes_in_tag(value: object, members: list[Any], path: str) -> Iterator[str]:
+    """Yield mistakes in the key that selects one of several structs."""
+    structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
+    configs = [struct.__struct_config__ for struct in structs]
     tags = {config.tag: config.tag_field for config in configs if config.tag is not None}
     if isinstance(value, Mapping) and tags:
         field = str(next(iter(tags.values())))
@@ -181,54 +220,66 @@ def _faults_of_tag(value: object, options: list[Any], path: str) -> Iterator[str
             yield f"{_join(path, field)}: expected {_one_of(tags)}, got {shown(value[field])}"
 
 
-def _faults_inside(value: object, kind: Any, path: str) -> Iterator[str]:
-    """Faults of the parts of a table or list."""
+def _mistakes_inside(value: object, kind: Any, path: str) -> Iterator[str]:
+    """Yield mistakes in the parts of a table or list."""
     if isinstance(value, Mapping) and isinstance(kind, type) and issubclass(kind, Struct):
-        yield from _faults_of_keys(value, kind, path)
+        yield from _mistakes_in_keys(value, kind, path)
     elif isinstance(value, Mapping) and get_origin(kind) is dict:
+        _, item_kind = get_args(kind)
         for key, item in value.items():
-            yield from _faults(item, get_args(kind)[1], _join(path, key))
+            yield from _mistakes(item, item_kind, _join(path, key))
     elif isinstance(value, list | tuple) and get_origin(kind) in (list, tuple):
-        kinds = [item for item in get_args(kind) if item is not Ellipsis]
-        if len(kinds) in (1, len(value)):
-            for number, item in enumerate(value[:MOST_EXAMINED]):
-                yield from _faults(item, kinds[number % len(kinds)], f"{path}[{number}]")
+        item_kinds = [item_kind for item_kind in get_args(kind) if item_kind is not Ellipsis]
+        if len(item_kinds) in (1, len(value)):
+            for number, item in enumerate(value[:MAX_EXAMINED_ITEMS]):
+                yield from _mistakes(item, item_kinds[number % len(item_kinds)], f"{path}[{number}]")
 
 
-def _faults_of_keys(table: Mapping[str, Any], kind: type[Struct], path: str) -> Iterator[str]:
-    """Unknown keys, missing ones, and those whose value does not fit."""
-    config, hints = kind.__struct_config__, get_type_hints(kind, include_extras=True)
+def _mistakes_in_keys(table: Mapping[str, Any], kind: type[Struct], path: str) -> Iterator[str]:
+    """Yield unknown keys, missing keys, and mistakes in the values of the keys."""
+    config = kind.__struct_config__
     if config.tag is not None and table.get(str(config.tag_field)) != config.tag:
         return
-    known = {item.encode_name: hints[item.name] for item in msgspec.structs.fields(kind)}
-    for key in table if config.forbid_unknown_fields else ():
-        if key not in known and key != config.tag_field:
-            yield unknown_key(_join(path, key), key, [*filter(None, [config.tag_field]), *known])
-    for item in msgspec.structs.fields(kind):
-        if item.encode_name in table:
-            yield from _faults(table[item.encode_name], known[item.encode_name], _join(path, item.encode_name))
-        elif item.required:
-            yield f"key {_join(path, item.encode_name)!r} is missing"
+    hints = get_type_hints(kind, include_extras=True)
+    fields = msgspec.structs.fields(kind)
+    known_keys = [field.encode_name for field in fields]
+    if config.tag_field:
+        known_keys.insert(0, config.tag_field)
+    if config.forbid_unknown_fields:
+        for key in table:
+            if key not in known_keys:
+                yield unknown_key(_join(path, key), key, known_keys)
+    for field in fields:
+        key = field.encode_name
+        if key in table:
+            yield from _mistakes(table[key], hints[field.name], _join(path, key))
+        elif field.required:
+            yield f"key {_join(path, key)!r} is missing"
 
 
 def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
-    """A sentence on a key that nobody knows, with the nearest one that is known."""
-    keys = list(known)
-    nearest = difflib.get_close_matches(cut(key), keys, n=1)
-    return (
-        f"unknown key {shown(name)}; "
-        + (f"did you mean {nearest[0]!r}? Known" if nearest else "known")
-        + (f" are {cut(', '.join(keys))}")
-    )
+    """Return an error message about an unknown key, which suggests the most similar known key.
+
+    Args:
+        name: The key with the names of the tables that contain it.
+        key: The key.
+        known: The known keys.
+    """
+    known_keys = list(known)
+    known_list = cut(", ".join(known_keys))
+    similar = difflib.get_close_matches(cut(key), known_keys, n=1)
+    if similar:
+        return f"unknown key {shown(name)}; did you mean {similar[0]!r}? Known are {known_list}"
+    return f"unknown key {shown(name)}; known are {known_list}"
 
 
-def _options(kind: Any) -> Iterator[Any]:
-    """The members of a union, without annotations."""
+def _union_members(kind: Any) -> Iterator[Any]:
+    """Yield the members of a union without their annotations; for any other type, the type itself."""
     if get_origin(kind) is Annotated:
-        yield from _options(get_args(kind)[0])
+        yield from _union_members(get_args(kind)[0])
     elif get_origin(kind) in (Union, UnionType):
         for member in get_args(kind):
-            yield from _options(member)
+            yield from _union_members(member)
     else:
         yield kind
 
@@ -237,30 +288,31 @@ def _join(path: str, key: str) -> str:
     return cut(f"{path}.{key}" if path else str(key))
 
 
-def _described(kind: inspect.Type) -> str:
-    """What a value of a type is, for people."""
+def _describe_type(kind: inspect.Type) -> str:
+    """Return a description of the values of a type for error messages."""
     match kind:
         case inspect.Metadata(type=inner, extra_json_schema=extra):
-            return (extra or {}).get("description") or _described(inner)
-        case inspect.FloatType(gt=above, ge=least, le=most):
-            return _number("number", above, least, most)
-        case inspect.IntType(gt=above, ge=least, le=most):
-            return _number("whole number", above, least, most)
+            return (extra or {}).get("description") or _describe_type(inner)
+        case inspect.FloatType(gt=above, ge=minimum, le=maximum):
+            return _describe_number("number", above, minimum, maximum)
+        case inspect.IntType(gt=above, ge=minimum, le=maximum):
+            return _describe_number("whole number", above, minimum, maximum)
         case inspect.BoolType():
             return "true or false"
-        case inspect.StrType(max_length=int(longest)):
-            return f"a text of 1 to {longest} characters"
+        case inspect.StrType(max_length=int(max_length)):
+            return f"a text of 1 to {max_length} characters"
         case inspect.LiteralType(values=values):
             return _one_of(values)
         case inspect.EnumType(cls=cls):
             return _one_of(member.value for member in cls)
         case inspect.UnionType(types=types):
-            options = [_described(item) for item in types if not isinstance(item, inspect.NoneType)]
-            return " or ".join(dict.fromkeys(options))
+            descriptions = [_describe_type(item) for item in types if not isinstance(item, inspect.NoneType)]
+            return " or ".join(dict.fromkeys(descriptions))
         case inspect.TupleType(item_types=items):
             return f"a list of {len(items)} {_noun(items[0])}s"
-        case inspect.CollectionType(item_type=item, min_length=least):
-            return f"a list of {_noun(item)}s" + (f", {least} or more" if least else "")
+        case inspect.CollectionType(item_type=item, min_length=min_length):
+            description = f"a list of {_noun(item)}s"
+            return f"{description}, {min_length} or more" if min_length else description
     return f"a {_noun(kind)}"
 
 
@@ -271,10 +323,11 @@ _NOUNS: tuple[tuple[Any, str], ...] = (
     ((inspect.TupleType, inspect.CollectionType), "list"),
     (inspect.BytesType, "text in base64"),
 )
+"""Types of msgspec and the noun for their values."""
 
 
 def _noun(kind: inspect.Type) -> str:
-    """What a value of a type is, in a word."""
+    """Return the noun for the values of a type."""
     plain = kind.type if isinstance(kind, inspect.Metadata) else kind
     return next((noun for kinds, noun in _NOUNS if isinstance(plain, kinds)), "value")
 
@@ -283,19 +336,33 @@ def _one_of(words: Iterable[object]) -> str:
     return f"one of {', '.join(map(str, words))}"
 
 
-def _number(noun: str, above: float | None, least: float | None, most: float | None) -> str:
-    least, most = (None if bound is None or abs(bound) == LARGEST_FLOAT else bound for bound in (least, most))
-    if above == 0 and most is None:
+def _describe_number(noun: str, above: float | None, minimum: float | None, maximum: float | None) -> str:
+    """Return a description of numbers with bounds.
+
+    Args:
+        noun: Noun for the numbers.
+        above: Exclusive lower bound; None if there is none.
+        minimum: Inclusive lower bound; None if there is none.
+        maximum: Inclusive upper bound; None if there is none.
+    """
+    if minimum is not None and abs(minimum) == MAX_FLOAT:
+        minimum = None
+    if maximum is not None and abs(maximum) == MAX_FLOAT:
+        maximum = None
+
+    if above == 0 and maximum is None:
         return f"a positive {noun}"
     if above is not None:
-        return f"a {noun} above {_plain(above)}" + ("" if most is None else f" and at most {_plain(most)}")
-    if least is not None:
-        return f"a {noun} from {_plain(least)}" + ("" if most is None else f" to {_plain(most)}")
-    if most is not None:
-        return f"a {noun} of at most {_plain(most)}"
+        description = f"a {noun} above {_bound_text(above)}"
+        return description if maximum is None else f"{description} and at most {_bound_text(maximum)}"
+    if minimum is not None:
+        description = f"a {noun} from {_bound_text(minimum)}"
+        return description if maximum is None else f"{description} to {_bound_text(maximum)}"
+    if maximum is not None:
+        return f"a {noun} of at most {_bound_text(maximum)}"
     return f"a {noun}" if noun == "whole number" else f"a finite {noun}"
 
 
-def _plain(bound: float) -> str:
-    """A bound as people write it: whole numbers with all their digits."""
+def _bound_text(bound: float) -> str:
+    """Return a bound as a text; whole numbers have all their digits."""
     return f"{bound:g}" if isinstance(bound, float) else str(bound)

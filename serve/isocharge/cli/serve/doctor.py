@@ -15,7 +15,7 @@ from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption
 from isocharge.cli.shared.terminal import say, show, show_json
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.files import refuse_existing, write_whole
-from isocharge.common.number_text import number_of
+from isocharge.common.number_text import parse_number
 from isocharge.common.printable_text import printable
 from isocharge.serve import Examination, Port, Predictor, device_from_table, examine, load_device
 from isocharge.serve.examination.channel_health import ChannelHealth
@@ -200,9 +200,9 @@ def _setting(key: str, text: str) -> Any:
     """
     try:
         if "=" not in text:
-            return number_of(text)
+            return parse_number(text)
         pairs = (part.partition("=") for part in text.split(","))
-        return {name.strip(): number_of(number.strip()) for name, _, number in pairs}
+        return {name.strip(): parse_number(number.strip()) for name, _, number in pairs}
     except ValueError as error:
         option = f"--{key.replace('_', '-').lower()}"
         raise InputError(f"{option}: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}") from error

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from isocharge.common.errors import InputError
-from isocharge.common.number_text import number_of
+from isocharge.common.number_text import parse_number
 
 SensorArgument = Annotated[
     str, typer.Argument(metavar="SENSOR", help="Name of a built-in sensor, or a TOML file that describes one.")
@@ -119,7 +119,7 @@ def parse_position(text: str) -> tuple[float, float]:
         InputError: If the text is not two numbers separated by a comma.
     """
     try:
-        x, y = (number_of(part.strip()) for part in text.split(","))
+        x, y = (parse_number(part.strip()) for part in text.split(","))
     except ValueError as error:
         raise InputError(f"--at: expected two numbers in mm like '3,-2', got {text!r}") from error
     return x, y
@@ -132,6 +132,6 @@ def parse_radius_mm(text: str) -> float:
         InputError: If the text is not a number.
     """
     try:
-        return number_of(text)
+        return parse_number(text)
     except ValueError as error:
         raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error

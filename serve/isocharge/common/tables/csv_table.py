@@ -16,7 +16,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, shown
-from isocharge.common.number_text import number_of
+from isocharge.common.number_text import parse_number
 from isocharge.common.tables.number_table import ColumnRule, NumberColumns, NumberTable
 
 _SEPARATORS = {";": "tr ',;' '.,'", "\t": r"tr '\t' ','"}
@@ -179,7 +179,7 @@ def _number(cell: str) -> float | None:
     if not text:
         return math.nan
     try:
-        number = number_of(text)
+        number = parse_number(text)
     except ValueError:
         return None
     return number if math.isfinite(number) else None

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, IsochargeError
-from isocharge.common.files import bounded_lines, open_regular, refusals_explained, write_whole
+from isocharge.common.files import bounded_lines, open_regular, as_output_errors, write_whole
 from isocharge.common.tables.csv_table import CsvTable, csv_text
 from isocharge.common.tables.number_table import NumberTable
 from isocharge.common.tables.parquet_table import SUFFIX, ParquetTable, parquet_bytes, require_pyarrow
@@ -48,7 +48,7 @@ def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
         MissingExtra: If the file is to be Parquet and pyarrow is not installed.
     """
     data = parquet_bytes(columns) if is_parquet(path) else csv_text(columns).encode()
-    with refusals_explained(path):
+    with as_output_errors(path):
         write_whole(path, data)
 
 

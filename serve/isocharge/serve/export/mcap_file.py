@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Self
 
 from isocharge.common.extras import require
-from isocharge.common.files import WholeWrites, refusals_explained
+from isocharge.common.files import AtomicWriter, as_output_errors
 from isocharge.serve.export.record_messages import (
     POSE,
     POSE_DEFINITION,
@@ -92,10 +92,10 @@ class McapFile:
             OutputExists: If the file exists already.
             OutputError: If the file cannot be created.
         """
-        self._file = WholeWrites(self.path)
+        self._file = AtomicWriter(self.path)
         self._writer = Writer(self._file)  # type: ignore[arg-type]  # it uses only write, tell and flush
         self._flushed = self._now()
-        with refusals_explained(self.path):
+        with as_output_errors(self.path):
             self._writer.start(profile="ros2", library="isocharge")
             self._channels = {
                 RECORD_TOPIC: self._record_channel(),

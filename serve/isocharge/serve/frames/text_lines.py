@@ -19,7 +19,7 @@ from functools import reduce
 from operator import xor
 from typing import Any, NamedTuple
 
-from isocharge.common.number_text import number_of
+from isocharge.common.number_text import parse_number
 from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame
 
 TELEPLOT_TIME = "t_ms"
@@ -89,7 +89,7 @@ def _csv(text: str) -> Line:
     """Read numbers between separators, or the header of such columns."""
     cells = _SEPARATOR.split(text.rstrip(",; \t"))
     try:
-        return Line(Notation.csv, (), tuple(map(number_of, cells)))
+        return Line(Notation.csv, (), tuple(map(parse_number, cells)))
     except ValueError:
         are_names = all(map(_NAME.fullmatch, cells))
         if are_names and len(set(cells)) == len(cells):
@@ -108,7 +108,7 @@ def _sentence(text: str) -> Line:
     _, *cells = _SEPARATOR.split(content.rstrip(",; \t"))
     if not cells:
         raise ValueError(f"expected numbers after the first word, got {text[:100]!r}")
-    return Line(Notation.sentence, (), tuple(map(number_of, cells)))
+    return Line(Notation.sentence, (), tuple(map(parse_number, cells)))
 
 
 def _pairs(text: str) -> Line:
@@ -119,7 +119,7 @@ def _pairs(text: str) -> Line:
         match = _PAIR.match(text, position)
         if match is None or match[1] in pairs:
             raise ValueError(f"expected name:value, got {text[position:]!r}")
-        pairs[match[1]] = number_of(match[2])
+        pairs[match[1]] = parse_number(match[2])
         position = match.end()
     return Line(Notation.pairs, tuple(pairs), tuple(pairs.values()))
 
@@ -139,8 +139,8 @@ def _teleplot(text: str) -> Line:
         raise ValueError(f"expected >name:time:value, got {text!r}")
     pairs = {}
     if time:
-        pairs[TELEPLOT_TIME] = number_of(time[0])
-    pairs[name.strip()] = number_of(value)
+        pairs[TELEPLOT_TIME] = parse_number(time[0])
+    pairs[name.strip()] = parse_number(value)
     return Line(Notation.teleplot, tuple(pairs), tuple(pairs.values()))
 
 

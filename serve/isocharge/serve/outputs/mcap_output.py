@@ -4,7 +4,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from isocharge.common.errors import OutputError
-from isocharge.common.files import new_file, refusals_explained
+from isocharge.common.files import as_output_errors, new_file
 from isocharge.serve.export.record_messages import RecordEncoding
 from isocharge.serve.outputs.output import Output, OutputContext, OutputKind
 from isocharge.serve.record.record import PredictionRecord
@@ -48,12 +48,12 @@ class McapOutput:
             InputError: If ROS 2 has no time stamp for the time of the record.
             OutputError: If the disk is full.
         """
-        with refusals_explained(self._path):
+        with as_output_errors(self._path):
             self._file.write(record)
 
     def close(self) -> None:
         """Write the index and close the file; in a replay it gets its name now."""
-        with refusals_explained(self._path):
+        with as_output_errors(self._path):
             self._stack.close()
 
     def discard(self) -> None:

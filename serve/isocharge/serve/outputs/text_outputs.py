@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from isocharge.common.errors import OutputError
-from isocharge.common.files import WholeWrites, new_file, refusals_explained
+from isocharge.common.files import AtomicWriter, as_output_errors, new_file
 from isocharge.serve.outputs.output import Output, OutputContext, OutputKind
 from isocharge.serve.record.csv_rows import csv_header, csv_row
 from isocharge.serve.record.record import PredictionRecord
@@ -62,7 +62,7 @@ class TextFile:
         self._line_of = line_of
         self._stack = ExitStack()
         draft = path if is_live else self._stack.enter_context(new_file(path))
-        self._file = WholeWrites(draft)
+        self._file = AtomicWriter(draft)
         self._stack.callback(self._file.close)
         if header is not None:
             self._write_line(header)
@@ -85,7 +85,7 @@ class TextFile:
                 raise
 
     def _write_line(self, line: str) -> None:
-        with refusals_explained(self._path):
+        with as_output_errors(self._path):
             self._file.write(f"{line}\n".encode())
 
 

@@ -24,7 +24,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 from msgspec import Meta, Struct
 
 from isocharge.common.errors import RecordingError, cut
-from isocharge.common.files import WholeWrites, bounded_lines
+from isocharge.common.files import AtomicWriter, bounded_lines
 from isocharge.common.model_labels import ModelLabel
 from isocharge.common.printable_text import is_printable
 from isocharge.common.progress import report
@@ -96,7 +96,7 @@ class Recorder:
             OutputExists: If it is already there.
             OutputError: If it cannot be created.
         """
-        self._file = WholeWrites(self.path)
+        self._file = AtomicWriter(self.path)
         self._write(json.dumps(self._header))
         return self
 

@@ -23,7 +23,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, SensorError, cut, error_prefix, shown
 from isocharge.common.files import new_folder, read_needed, sha256_of, write_whole
 from isocharge.common.npz import npz_arrays
-from isocharge.common.structs import MOST_JSON_BYTES, Text, convert, parse_json
+from isocharge.common.structs import MAX_JSON_BYTES, Text, convert, parse_json
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
@@ -281,7 +281,7 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
         raise DatasetError(
             f"{folder} is not a dataset: it has no manifest.json; make one with 'isocharge simulate sweep'"
         )
-    data = read_needed(path, DatasetError, "make the dataset again", MOST_JSON_BYTES)
+    data = read_needed(path, DatasetError, "make the dataset again", MAX_JSON_BYTES)
     with error_prefix(f"{path}: not a manifest of a dataset: ", DatasetError):
         manifest = parse_json(data, "", DatasetError, dict[str, Any])
         if "format_version" not in manifest:

@@ -26,7 +26,7 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from isocharge.common.errors import ModelError, PressError
-from isocharge.common.files import refusals_explained, remove_empty, write_whole
+from isocharge.common.files import as_output_errors, remove_empty, write_whole
 from isocharge.common.json_values import plain_values
 from isocharge.common.measured_presses import presses_text
 from isocharge.common.resumable_run import locked
@@ -70,7 +70,7 @@ def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[No
     """
     check_calibration_folder(folder, problem.electrodes)
     missing = [folder, *(parent for parent in folder.parents if not parent.exists())]
-    with refusals_explained(folder):
+    with as_output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             with locked(folder):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from isocharge.common.errors import OutputError, PressError
-from isocharge.common.files import refusals_explained, write_whole
+from isocharge.common.files import as_output_errors, write_whole
 from isocharge.common.measured_presses import MeasuredPresses, read_presses, write_presses
 from isocharge.common.resumable_run import locked
 from isocharge.common.structs import read_json
@@ -64,7 +64,7 @@ class PressFile:
         if len(presses):
             write_presses(self.path, presses)
             return
-        with refusals_explained(self.path):
+        with as_output_errors(self.path):
             self.path.unlink(missing_ok=True)
 
 
@@ -89,7 +89,7 @@ def open_press_file(path: Path, sensor: Sensor, probe: Probe, *, fresh: bool = F
     subject = json.loads(json.dumps({"sensor": sensor_to_dict(sensor), "probe": probe.notation}))
     content = json.dumps(subject).encode()
     session_path = path.with_name(f".{path.name}.session.json")
-    with refusals_explained(path):
+    with as_output_errors(path):
         if not session_path.exists():
             write_whole(session_path, content)
         with locked(session_path):
