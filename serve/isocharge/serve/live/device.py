@@ -1,17 +1,17 @@
-"""The device file: what is known about a board and its amplifier, in TOML.
+"""The device file: the settings of a board and its amplifiers, in TOML.
 
     name = "bench board 3"         # optional
 
-    [frames]                       # optional; without it the format is recognised
+    [frames]                       # optional; without this section the format is recognised
     format = "described"           # or "auto", "binary", "text"; the keys of "described" are those of
-                                   # isocharge.serve.frames.frame_layout, of the others those of .formats
-    request = "3F 0A"              # what the board has to be asked, hexadecimal; optional
+                                   # isocharge.serve.frames.frame_layout, the keys of the others those of .formats
+    request = "3F 0A"              # bytes that request a frame from the board, hexadecimal; optional
 
-    [channels]                     # electrode -> name or number in the frame; without it the same names, or the same
-    A = "adc0"                     # order
+    [channels]                     # name or number of each electrode's channel; without this section, channels are
+    A = "adc0"                     # assigned by the names of the electrodes, or by their order
 
-    [gain]                         # optional; a number for all channels, or one for each electrode
-    offset = 8388608               # what the board shows without charge, in its unit; optional
+    [gain]                         # optional; each setting is a number, or a number for each electrode
+    offset = 8388608               # value of the board without charge, in its unit; optional
     pC_per_unit = {A = 0.0457, B = -0.0459, C = 0.0457}     # negative where the amplifier inverts; or
     # V_per_unit = 0.000045        # with the amplifier's feedback capacitance:
     # feedback_pF = 1000.0
@@ -22,9 +22,10 @@
     [leak]
     tau_s = {A = 10.0, B = 10.2, C = 9.9}
 
-`[hum]`, `[tare]`, `[leak]`, `[memory]`, `[touch]` and `[common_mode]` take the settings of their rules (see
-`isocharge.serve.signal_chain`), `[track]` and `[follow]` those of `isocharge.serve.tracking`, and every stage
-`on = false`, which switches it off. Tare and touch are on without a section. An unknown key is an error.
+The sections `[hum]`, `[tare]`, `[leak]`, `[memory]`, `[touch]` and `[common_mode]` contain the settings of the rules in
+`isocharge.serve.signal_chain`, and `[track]` and `[follow]` those of the rules in `isocharge.serve.tracking`. The key
+`on = false` switches the stage of a section off. Tare and touch are switched on without a section. An unknown key is an
+error.
 """
 
 from collections.abc import Mapping
@@ -51,18 +52,18 @@ from isocharge.serve.signal_chain.thermal import ThermalRule
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule
 
-LEAST_ELECTRODES_FOR_WARMING = 4
-"""Number of electrodes from which warming can be separated from force: a contact alone has three unknowns."""
+MIN_ELECTRODES_FOR_WARMING = 4
+"""Smallest number of electrodes with which warming can be distinguished from force. A contact has three unknowns."""
 
 
 class Gain(Rule, frozen=True, kw_only=True):
-    """From the unit of a board to charge; each setting is one number, or one for each electrode.
+    """Conversion of the unit of a board to charge. Each setting is a number, or a number for each electrode.
 
     Attributes:
         pC_per_unit: Charge of one unit, pC.
-        V_per_unit: In its place, the voltage of one unit, V, with the feedback capacitance of the amplifiers.
-        feedback_pF: That capacitance, pF: 1 V is that number of pC.
-        offset: What a board shows without charge, in its unit.
+        V_per_unit: Voltage of one unit, V; an alternative to `pC_per_unit` that requires `feedback_pF`.
+        feedback_pF: Feedback capacitance of the amplifiers, pF. It is the charge in pC that causes 1 V.
+        offset: Value of the board without charge, in its unit.
     """
 
     pC_per_unit: Finite | dict[str, Finite] | None = None
@@ -81,38 +82,60 @@ class Gain(Rule, frozen=True, kw_only=True):
             raise WrongKey("feedback_pF")
         if self.per_unit is None:
             raise WrongKey("pC_per_unit")
-        key = "pC_per_unit" if self.V_per_unit is None else "V_per_unit"
-        if 0.0 in (self.per_unit.values() if isinstance(self.per_unit, dict) else (self.per_unit,)):
+        numbers = self.per_unit.values() if isinstance(self.per_unit, dict) else [self.per_unit]
+        if 0.0 in numbers:
+            key = "pC_per_unit" if self.V_per_unit is None else "V_per_unit"
             raise WrongKey(key, "a finite number that is not 0, or one for each electrode", self.per_unit)
 
     @property
     def per_unit(self) -> float | dict[str, float] | None:
-        """Charge of one unit, pC; or its voltage, V, where there is a feedback capacitance."""
+        """Charge of one unit, pC, or its voltage, V, if there is a feedback capacitance."""
         return self.pC_per_unit if self.V_per_unit is None else self.V_per_unit
 
     def charge_pC(self, electrode: str, values: Array) -> Array:
-        """Values of one electrode, of any shape, as charges, pC; as they are where there is no setting for it."""
-        per_unit, feedback, offset = (
-            setting.get(electrode, default) if isinstance(setting, dict) else default if setting is None else setting
-            for setting, default in ((self.per_unit, 1.0), (self.feedback_pF, 1.0), (self.offset, 0.0))
-        )
-        return (values - offset) * (per_unit * feedback)
+        """Convert values of one electrode to charges; a setting that does not exist has no effect.
+
+        Args:
+            electrode: Name of the electrode.
+            values: Values in the unit of the board, of any shape.
+
+        Returns:
+            The charges, in the same shape, pC.
+        """
+        per_unit = _setting_of(self.per_unit, electrode, default=1.0)
+        feedback_pF = _setting_of(self.feedback_pF, electrode, default=1.0)
+        offset = _setting_of(self.offset, electrode, default=0.0)
+        return (values - offset) * (per_unit * feedback_pF)
+
+
+def _setting_of(setting: float | Mapping[str, float] | None, electrode: str, default: float) -> float:
+    """Return the value of a setting for an electrode; the default if there is none."""
+    if setting is None:
+        return default
+    if isinstance(setting, Mapping):
+        return setting.get(electrode, default)
+    return setting
 
 
 class Saturation(Rule, frozen=True, kw_only=True):
-    """The converter's range: the largest charge that it can show, pC."""
+    """Range of the converter: the largest charge that it can represent, pC."""
 
     limit_pC: Setting
 
 
 class LeakSection(LeakRule, frozen=True, kw_only=True):
-    """The amplifiers' decay: their time constant, s, one for all or one for each electrode."""
+    """Decay of the charge amplifiers: their time constant, s, a number or a number for each electrode."""
 
     tau_s: Positive | dict[str, Positive]
 
 
 class CommonMode(ThermalRule, frozen=True, kw_only=True):
-    """How warming is followed, and its charge on each electrode, pC/K, whose ratios and signs count; None for alike."""
+    """Estimation of the warming of the film.
+
+    Attributes:
+        pC_per_K: Charge of each electrode when the film warms, pC/K. Only the ratios and the signs matter. None if all
+            electrodes are alike.
+    """
 
     pC_per_K: dict[str, Finite] | None = None
 
@@ -136,11 +159,11 @@ class DeviceSections(Settings, frozen=True):
 
 
 class Device(DeviceSections, frozen=True):
-    """What is known about a board; the other attributes are the sections of its file, None for what is switched off.
+    """The settings of a board. The other attributes are the sections of its file; None if a section is switched off.
 
     Attributes:
-        table: The content of the device file as it came; recordings keep it.
-        where: The file, for messages.
+        table: Unchanged content of the device file, which is stored in recordings.
+        where: Name of the file, for messages.
     """
 
     table: Mapping[str, Any] = field(default_factory=dict)
@@ -148,69 +171,96 @@ class Device(DeviceSections, frozen=True):
 
     @property
     def request(self) -> Request | None:
-        """What the board has to be asked; None if it sends unasked."""
+        """Request after which the board sends a frame; None if the board sends frames by itself."""
         if self.frames.request is None:
             return None
         return Request(bytes.fromhex(self.frames.request), self.frames.request_Hz, self.frames.echo)
 
     def parser(self) -> Parser:
-        """A new parser for its frames."""
+        """Return a new parser for the frames of the board."""
         return self.frames.parser()
 
     def chain(self, electrodes: tuple[str, ...]) -> Chain:
-        """The signal chain for these electrodes.
+        """Return the settings of the signal chain.
+
+        Args:
+            electrodes: Names of the electrodes of the model, in the order of the charges.
 
         Raises:
-            DeviceError: If a setting is for other electrodes, or they are too few to follow warming.
+            DeviceError: If a setting is for other electrodes, or there are too few electrodes to estimate warming.
         """
-        if self.common_mode is not None and len(electrodes) < LEAST_ELECTRODES_FOR_WARMING:
+        if self.common_mode is not None and len(electrodes) < MIN_ELECTRODES_FOR_WARMING:
             raise DeviceError(
                 f"{self.where}: common_mode: expected four electrodes or more, the model has {electrodes}; with three "
                 "every set of charges fits some contact, and warming cannot be separated from force: remove the section"
             )
-        gain, leak = self.gain, self.leak
+        gain_pC = None
+        zero = None
+        if self.gain is not None:
+            gain_pC = self._gain_pC(self.gain, electrodes)
+            zero = self._for_each_electrode("gain.offset", self.gain.offset, electrodes)
+        limit_pC = None
+        if self.saturation is not None:
+            limit_pC = self.saturation.limit_pC
+        tau_s = None
+        if self.leak is not None:
+            tau_s = self._for_each_electrode("leak.tau_s", self.leak.tau_s, electrodes)
         return Chain(
-            gain_pC=None if gain is None else self._gain_pC(gain, electrodes),
-            zero=None if gain is None else self._of_each("gain.offset", gain.offset, electrodes),
-            limit_pC=None if self.saturation is None else self.saturation.limit_pC,
+            gain_pC=gain_pC,
+            zero=zero,
+            limit_pC=limit_pC,
             hum=self.hum,
             tare=self.tare,
-            tau_s=None if leak is None else self._of_each("leak.tau_s", leak.tau_s, electrodes),
-            leak=leak or LeakRule(),
+            tau_s=tau_s,
+            leak=self.leak or LeakRule(),
             memory=self.memory,
             touch=self.touch,
             thermal=self.common_mode,
-            pyro=self._pyro(electrodes),
+            pyro=self._warming_ratio(electrodes),
         )
 
-    def _pyro(self, electrodes: tuple[str, ...]) -> Array | float:
-        """Charges of warming over their mean magnitude, shape (electrodes,), dimensionless."""
+    def _warming_ratio(self, electrodes: tuple[str, ...]) -> Array | float:
+        """Return the charge of each electrode over the mean magnitude of all when the film warms, shape (n_electrode,).
+
+        The result is 1 if all electrodes are alike.
+        """
         per_K = None if self.common_mode is None else self.common_mode.pC_per_K
-        charges = self._of_each("common_mode.pC_per_K", per_K, electrodes)
+        charges = self._for_each_electrode("common_mode.pC_per_K", per_K, electrodes)
         if charges is None:
             return 1.0
-        size = float(np.abs(charges).mean())
-        if not size > 0.0:
+        mean_magnitude = float(np.abs(charges).mean())
+        if not mean_magnitude > 0.0:
             raise DeviceError(f"{self.where}: common_mode.pC_per_K: expected a number other than 0, got {per_K}")
-        return charges / size
+        return charges / mean_magnitude
 
     def check_gain(self, electrodes: tuple[str, ...]) -> None:
-        """Raise DeviceError if the gain is for other electrodes than these."""
+        """Raise DeviceError if the gain is for other electrodes."""
         if self.gain is not None:
             self._gain_pC(self.gain, electrodes)
 
     def _gain_pC(self, gain: Gain, electrodes: tuple[str, ...]) -> Array | None:
-        """Charge of one unit with its sign, shape (electrodes,), pC."""
+        """Return the charge of one unit with its sign, shape (n_electrode,), pC; None if the gain is 1 pC."""
         if gain.V_per_unit is None:
-            return self._of_each("gain.pC_per_unit", gain.pC_per_unit, electrodes)
-        volts = self._of_each("gain.V_per_unit", gain.V_per_unit, electrodes)
-        feedback_pF = self._of_each("gain.feedback_pF", gain.feedback_pF, electrodes)
-        return None if volts is None or feedback_pF is None else volts * feedback_pF
+            return self._for_each_electrode("gain.pC_per_unit", gain.pC_per_unit, electrodes)
+        volts = self._for_each_electrode("gain.V_per_unit", gain.V_per_unit, electrodes)
+        feedback_pF = self._for_each_electrode("gain.feedback_pF", gain.feedback_pF, electrodes)
+        if volts is None or feedback_pF is None:
+            return None
+        return volts * feedback_pF
 
-    def _of_each(
+    def _for_each_electrode(
         self, key: str, setting: float | Mapping[str, float] | None, electrodes: tuple[str, ...]
     ) -> Array | None:
-        """A setting for each electrode, shape (electrodes,)."""
+        """Return the value of a setting for each electrode, shape (n_electrode,); None if there is no setting.
+
+        Args:
+            key: Section and key of the setting, for messages.
+            setting: A number for all electrodes, or a number for each electrode.
+            electrodes: Names of the electrodes.
+
+        Raises:
+            DeviceError: If the setting is for other electrodes.
+        """
         if setting is None:
             return None
         numbers = setting if isinstance(setting, Mapping) else dict.fromkeys(electrodes, setting)
@@ -222,14 +272,14 @@ class Device(DeviceSections, frozen=True):
 
 
 ANY_BOARD = Device(name="any board")
-"""The board of which nothing is known."""
+"""A board without a device file."""
 
 
 def load_device(path: str | Path | None) -> Device:
-    """Read a device file; without one, it is any board.
+    """Read a device file; return `ANY_BOARD` if the path is None.
 
     Raises:
-        DeviceError: If it cannot be read, or a key is unknown, missing or wrong.
+        DeviceError: If the file cannot be read, or a key is unknown, missing or wrong.
     """
     if path is None:
         return ANY_BOARD
@@ -237,24 +287,33 @@ def load_device(path: str | Path | None) -> Device:
 
 
 def device_from_table(table: Mapping[str, Any], where: str) -> Device:
-    """Read the content of a device file.
+    """Convert the content of a device file to settings.
 
     Args:
-        table: Sections and keys as above.
-        where: The file, for messages.
+        table: Sections and keys as in the description of this module.
+        where: Name of the file, for messages.
 
     Raises:
         DeviceError: If a key is unknown, missing or wrong.
     """
     frames = table.get("frames")
-    tagged = {**table, "frames": {"format": "auto", **frames}} if isinstance(frames, Mapping) else table
-    sections = structs.asdict(convert(tagged, DeviceSections, where, DeviceError))
-    on: dict[str, Any] = {name: None if isinstance(one, Rule) and not one.on else one for name, one in sections.items()}
-    return Device(**on, table=table, where=where)
+    complete_table = dict(table)
+    if isinstance(frames, Mapping):
+        complete_table["frames"] = {"format": "auto", **frames}
+    sections: dict[str, Any] = structs.asdict(convert(complete_table, DeviceSections, where, DeviceError))
+    for name, section in sections.items():
+        if isinstance(section, Rule) and not section.on:
+            sections[name] = None
+    return Device(**sections, table=table, where=where)
 
 
 def with_settings(device: Device, section: str, **settings: Any) -> Device:
-    """A board with other settings in a section; in its table too, so that a recording keeps them.
+    """Return the settings of a board with changes in one section, which also change its table for recordings.
+
+    Args:
+        device: The settings of the board.
+        section: Name of the section.
+        settings: New values of keys of the section.
 
     Raises:
         DeviceError: If a setting is out of its range.
