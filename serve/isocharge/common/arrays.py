@@ -1,4 +1,4 @@
-"""The array types of public signatures: float64 unless a docstring says otherwise."""
+"""Types of arrays in signatures."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ Integers = NDArray[np.intp]
 """Array of indices."""
 
 Booleans = NDArray[np.bool_]
-"""Array of yes and no, often of rows to take."""
+"""Array of truth values, often a mask of rows."""
 
 Complexes = NDArray[np.complex128]
 """Points of the plane as x + iy."""

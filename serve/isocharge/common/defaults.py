@@ -18,4 +18,4 @@ DEFAULT_STRESS_LIMIT = 45.0
 """Largest stress of a film under a probe, MPa: drawn PVDF yields at 45 to 55."""
 
 MAX_BATCH = 4096
-"""Presses in one request, and the largest batch that Triton may form; the model's graph itself takes any."""
+"""Largest number of presses in one request or in a batch of Triton. The graph of a model has no limit."""

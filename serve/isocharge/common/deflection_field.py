@@ -1,13 +1,14 @@
-"""How a round film deflects under a round probe: a small table over force and distance from the centre, and its file.
+"""Deflection of a round film under a round probe: a table of force and distance from the centre, and its file.
 
-The film is round and its elasticity isotropic, so a press beside the centre is a press on the x axis, turned. A disk
-automorphism carries rings about the origin onto rings about the probe,
+The film is round and elastically isotropic, so that every press is a rotated press on the x axis. A disk automorphism
+maps rings around the origin to rings around the probe,
 
     z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
 
-p the distance of the probe and r its radius, in film radii. On these rings the deflection is smooth, and a few hundred
-numbers hold it. Between two forces, the deflection over the cube root of the force is interpolated over the logarithm
-of the force: that of a membrane is constant. simulate writes the file, serve shows what is in it.
+where p is the distance of the probe from the centre and r is its radius, both in film radii. The deflection is smooth
+on these rings, so that a few hundred numbers describe it. Between two forces, the deflection divided by the cube root
+of the force, which is constant for a membrane, is interpolated over the logarithm of the force. The package `simulate`
+writes the file, and the live page of `serve` shows the deflection.
 """
 
 import base64
@@ -26,16 +27,16 @@ from isocharge.common.errors import InputError
 from isocharge.common.structs import Finite, Positive, WrongKey, read_json
 
 VERSION = 1
-"""Version of the file's format."""
+"""Version of the file format."""
 
 FILM_KEYS = ("radius_mm", "thickness_um", "young_GPa", "poisson", "pretension_MPa")
-"""What of a film decides how it deflects."""
+"""Properties of a film on which its deflection depends."""
 
-STEPS = (1 << 16) - 1
-"""Steps into which the largest deflection is divided."""
+N_STEPS = (1 << 16) - 1
+"""Number of steps into which the largest deflection is divided."""
 
-MOST_NUMBERS = 1 << 18
-"""Largest table."""
+MAX_NUMBERS = 1 << 18
+"""Largest number of deflections in a table."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +44,13 @@ class DeflectionField:
     """Deflection of one film under one probe.
 
     Attributes:
-        film: Values of `FILM_KEYS`.
+        film: Properties of the film by `FILM_KEYS`.
         probe_radius_mm: Radius of the round probe, mm.
-        force_N: Forces, increasing, N.
-        distance_mm: Distances of the probe from the centre, increasing from 0, mm.
-        rings: Radii of the rings about the probe before the automorphism, from 0 to 1, in film radii.
-        deflection_mm: Shape (forces, distances, rings, angles), mm, positive in the direction of the push. The
-            angles go from 0, outwards, to pi, and the other half is the mirror image.
+        force_N: Forces in increasing order, N.
+        distance_mm: Distances of the probe from the centre in increasing order from 0, mm.
+        rings: Radii of the rings before the automorphism, from 0 to 1, in film radii.
+        deflection_mm: Deflections, shape (forces, distances, rings, angles), mm, positive in the direction of the push.
+            The angles range from 0 (outwards) to pi. The other half is the mirror image.
     """
 
     film: Mapping[str, float]
@@ -60,14 +61,14 @@ class DeflectionField:
     deflection_mm: Array
 
     def fits(self, film: Any) -> bool:
-        """Whether a film, as a sensor file describes it, is the one of this field."""
+        """Return whether a film, as a sensor file describes it, has the properties of this field's film."""
         given = {"pretension_MPa": 0.0, **film} if isinstance(film, Mapping) else {}
         return all(_is_close(given.get(key), self.film[key]) for key in FILM_KEYS)
 
     def to_json(self) -> dict[str, Any]:
-        """The content of the file."""
+        """Return the content of the file."""
         scale_mm = float(np.max(self.deflection_mm)) or 1.0
-        steps = np.round(np.clip(self.deflection_mm / scale_mm, 0.0, 1.0) * STEPS).astype("<u2")
+        steps = np.round(np.clip(self.deflection_mm / scale_mm, 0.0, 1.0) * N_STEPS).astype("<u2")
         return {
             "isocharge_deflection": VERSION,
             "film": dict(self.film),
@@ -82,41 +83,54 @@ class DeflectionField:
 
 
 def _is_close(given: object, value: float) -> bool:
-    """Whether a value is a number, and this one."""
+    """Return whether a value is a number that equals another number up to rounding."""
     return isinstance(given, int | float) and math.isclose(given, value, rel_tol=1e-6, abs_tol=1e-12)
 
 
 def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, rings: Array, angles: int) -> Complexes:
-    """Points x + i y of a field's rings under a probe on the x axis, mm, shape (rings, angles)."""
-    p, r = distance_mm / radius_mm, probe_radius_mm / radius_mm
+    """Compute the points of a field under a probe on the x axis.
+
+    Args:
+        radius_mm: Radius of the film, mm.
+        probe_radius_mm: Radius of the probe, mm.
+        distance_mm: Distance of the probe from the centre, mm.
+        rings: Radii of the rings before the automorphism, shape (rings,), in film radii.
+        angles: Number of angles from 0 to pi.
+
+    Returns:
+        Points x + i y, shape (rings, angles), mm.
+    """
+    p = distance_mm / radius_mm
+    r = probe_radius_mm / radius_mm
     c = math.tanh(0.5 * (math.atanh(p + r) + math.atanh(p - r)))
     z = rings[:, None] * np.exp(1j * np.linspace(0.0, math.pi, angles))
     return np.asarray(radius_mm * (z + c) / (1.0 + c * z))
 
 
 def read_deflection_field(path: Path) -> DeflectionField:
-    """Read the file.
+    """Read a deflection field from its file.
 
     Raises:
-        InputError: If it cannot be read, or is no field of this version.
+        InputError: If the file cannot be read, is damaged, or has an unsupported version.
     """
     file = read_json(path, "a deflection field", InputError, _File)
-    shares = np.frombuffer(file.deflection, "<u2").reshape(file.shape) / STEPS
+    ratio = np.frombuffer(file.deflection, "<u2").reshape(file.shape) / N_STEPS
     return DeflectionField(
-        file.film,
-        file.probe_radius_mm,
-        file.force_N,
-        file.distance_mm,
-        file.rings,
-        shares * file.scale_mm,
+        film=file.film,
+        probe_radius_mm=file.probe_radius_mm,
+        force_N=file.force_N,
+        distance_mm=file.distance_mm,
+        rings=file.rings,
+        deflection_mm=ratio * file.scale_mm,
     )
 
 
 Increasing = Annotated[tuple[Finite, ...], Meta(min_length=1)]
+"""Increasing numbers; `_File` checks their order."""
 
 
 class _File(Struct):
-    """The content of the file; `deflection` are shares of the largest, in base64."""
+    """Content of the file. The numbers in `deflection` are ratios to the largest deflection, in base64."""
 
     isocharge_deflection: Annotated[int, Meta(ge=VERSION, le=VERSION, description=f"the version {VERSION}")]
     film: dict[str, Finite]
@@ -135,11 +149,11 @@ class _File(Struct):
             if any(a >= b for a, b in pairwise(getattr(self, key))):
                 raise WrongKey(key, "increasing numbers", list(getattr(self, key)))
         count = math.prod(self.shape)
-        if count > MOST_NUMBERS or len(self.deflection) != 2 * count:
-            expected = f"{count} numbers of 16 bits in base64, {MOST_NUMBERS} at most"
+        if count > MAX_NUMBERS or len(self.deflection) != 2 * count:
+            expected = f"{count} numbers of 16 bits in base64, {MAX_NUMBERS} at most"
             raise WrongKey("deflection", expected, len(self.deflection))
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Of the numbers: forces, distances, rings, angles."""
+        """Shape of the table: numbers of forces, distances, rings and angles."""
         return len(self.force_N), len(self.distance_mm), len(self.rings), self.angles

@@ -38,7 +38,7 @@ class IsochargeError(Exception):
 
 
 class InputError(IsochargeError, ValueError):
-    """What the caller gave cannot be used as it is; nothing was computed."""
+    """The input of the caller cannot be used. Nothing was computed."""
 
 
 class SensorError(InputError):
@@ -66,11 +66,11 @@ class DeviceError(InputError):
 
 
 class RecordingError(InputError):
-    """A file is no recording, or a damaged one."""
+    """A file is not a recording, or is damaged."""
 
 
 class DatasetError(InputError):
-    """A folder is not a dataset, or a damaged one."""
+    """A folder is not a dataset, or is damaged."""
 
 
 class ModelError(InputError):
@@ -78,19 +78,23 @@ class ModelError(InputError):
 
 
 class ModelNotFound(ModelError):
-    """No model of that name and version is served."""
+    """The server has no model with this name and version."""
 
 
 class RequestError(InputError):
-    """A request to the server is not one that it understands."""
+    """A request to the server is not valid."""
 
 
 class UnknownPath(RequestError):
-    """Nothing is served under this path."""
+    """The server has no resource with this path."""
 
 
 class WrongMethod(RequestError):
-    """This path is asked for in another way; `allowed` says how."""
+    """The method of a request is not allowed for its path.
+
+    Attributes:
+        allowed: Names of the allowed methods, for the header `Allow`.
+    """
 
     def __init__(self, message: str, allowed: str) -> None:
         super().__init__(message)
@@ -98,43 +102,43 @@ class WrongMethod(RequestError):
 
 
 class TooLarge(RequestError):
-    """A request is larger than the server's limits."""
+    """A request is larger than the limits of the server."""
 
 
 class TooMany(RequestError):
-    """More calls are open than the server's limits allow."""
+    """More calls are open than the limits of the server allow."""
 
 
 class UnknownEncoding(RequestError):
-    """A body is compressed in a way that the server does not read."""
+    """The body of a request has a compression that the server does not support."""
 
 
 class TokenError(IsochargeError, PermissionError):
-    """A request does not carry the server's token."""
+    """A request does not contain the token of the server."""
 
 
 class OriginError(IsochargeError, PermissionError):
-    """A request comes from a page of another site."""
+    """A request was sent by a page of another site."""
 
 
 class ListenError(IsochargeError, OSError):
-    """The server cannot listen where it was asked to."""
+    """The server cannot listen on the requested address."""
 
 
 class OutputExists(IsochargeError, FileExistsError):
-    """The output is already there; nothing is overwritten unasked."""
+    """The output exists already and is not overwritten."""
 
 
 class OutputError(IsochargeError, OSError):
-    """The file system refuses an output; nothing is left of it."""
+    """An output cannot be written. No part of it remains."""
 
 
 class SolveError(IsochargeError, ArithmeticError):
-    """No equilibrium was found to the asked tolerance."""
+    """The solver found no equilibrium within the requested tolerance."""
 
 
 class WorkersLost(IsochargeError, ConnectionError):
-    """Processes or a cluster that did the work ended, do not answer, or run another isocharge."""
+    """Worker processes or a cluster have ended, do not respond, or run another version of isocharge."""
 
 
 class TrainingError(IsochargeError, ArithmeticError):

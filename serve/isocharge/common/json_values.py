@@ -1,4 +1,4 @@
-"""Numbers for JSON, which has no notation for NaN and infinity: None takes their place."""
+"""Conversion of values for JSON, which has no notation for NaN and infinity. Such numbers become None."""
 
 import math
 
@@ -6,14 +6,17 @@ import numpy as np
 
 
 def finite_or_none(value: float | None) -> float | None:
-    """The number as a plain float; None if it is NaN, infinite or absent."""
-    return float(value) if value is not None and math.isfinite(value) else None
+    """Return a number as a float; None if it is NaN, infinite or None."""
+    if value is None or not math.isfinite(value):
+        return None
+    return float(value)
 
 
 def plain_values(value: object) -> object:
-    """A value that `json.dumps(..., allow_nan=False)` writes.
+    """Convert a value so that `json.dumps(..., allow_nan=False)` accepts it.
 
-    Keys become texts, arrays and tuples lists, NumPy's numbers Python's, and numbers that are not finite None.
+    Keys become texts, arrays and tuples become lists, NumPy numbers become Python numbers, and numbers that are not
+    finite become None.
     """
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()

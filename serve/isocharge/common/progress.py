@@ -1,4 +1,8 @@
-"""Progress of long work: who works reports, who shows it listens; nothing is handed through the layers between."""
+"""Progress of long computations.
+
+A computation reports its progress to a listener in a context variable, so that the functions between them need no
+additional argument.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -8,7 +12,7 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 Listener = Callable[[str, int, int, str], None]
-"""Called with (title, done, total, note): the work, finished and planned steps, and its latest figure for people."""
+"""Function that is called with (title, done, total, note); see `report` for the arguments."""
 
 _listener: ContextVar[Listener | None] = ContextVar("progress", default=None)
 

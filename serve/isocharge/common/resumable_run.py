@@ -1,12 +1,12 @@
-"""A run that can be killed and go on: its finished parts are kept next to the folder that it will write.
+"""Runs that can be stopped and resumed. The finished parts of a run are stored next to the folder that it writes.
 
     presses.part/
-        run.json           identity of the run: another run does not touch the folder
-        lock               held by the process at work; released by the system if that is killed
-        parts/<name>       finished work, and <name>.sha256
-        data/<name>        what becomes the folder in the end; its checksums are in parts/
+        run.json           settings of the run; a run with other settings does not use the folder
+        lock               locked by the running process; the operating system unlocks it if the process is killed
+        parts/<name>       finished part, and <name>.sha256
+        data/<name>        file of the final folder; its checksum is in parts/
 
-A part counts only if its checksum exists and matches; all other parts are computed again.
+A part is used only if its checksum exists and matches. All other parts are computed again.
 """
 
 import fcntl
@@ -42,41 +42,50 @@ Content = TypeVar("Content")
 _log = logging.getLogger(__name__)
 
 MAX_PART_BYTES = 1 << 30
-"""Largest part of a run, bytes."""
+"""Largest size of a part, bytes."""
 
 
 class ResumableRun:
-    """Finished parts of a run; see `resume_folder`.
+    """Stored parts of a run; see `resume_folder`.
 
     Attributes:
-        target: The folder that the run writes.
-        folder: The draft: the folder that holds the parts until the run is done.
-        data: The folder in the draft that becomes the target.
+        target: Folder that the run writes.
+        folder: Draft folder, which contains the parts until the run is finished.
+        data: Folder in the draft that becomes the target.
     """
 
     def __init__(self, target: Path) -> None:
-        self.target, self.folder = target, draft_of(target)
-        self.data, self._parts = self.folder / "data", self.folder / "parts"
+        self.target = target
+        self.folder = draft_of(target)
+        self.data = self.folder / "data"
+        self._parts = self.folder / "parts"
 
     def save(self, name: str, data: bytes, *, final: bool = False) -> None:
-        """Keep a finished part; a `final` one belongs to the target.
+        """Store a finished part.
+
+        Args:
+            name: Name of the part.
+            data: Content of the part.
+            final: Whether the part is a file of the target.
 
         Raises:
-            OutputError: If the file system refuses; what was saved before stays.
+            OutputError: If the part cannot be written. Parts that were saved before remain.
         """
         with output_errors(self.target):
             write_whole(self._place(name, final), data)
             write_whole(self._parts / f"{name}.sha256", sha256_of(data).encode())
 
     def load(self, name: str, decode: Callable[[bytes], Content], *, final: bool = False) -> Content | None:
-        """A finished part, or None if it must be computed; a damaged part gives a warning and None.
-
-        A part that cannot be decoded is damaged, too, whatever its checksum says.
+        """Load a finished part.
 
         Args:
-            name: Of the part.
-            decode: From its bytes to its content; may raise any error.
-            final: Whether it belongs to the target.
+            name: Name of the part.
+            decode: Function from the bytes of the part to its content. It may raise any error if the part is damaged.
+            final: Whether the part is a file of the target.
+
+        Returns:
+            The content; None if the part is not finished. If the part is damaged, a warning is logged and the result
+            is None.
         """
         try:
             checksum = read_whole(self._parts / f"{name}.sha256").decode()
@@ -88,23 +97,24 @@ class ResumableRun:
             if sha256_of(data) != checksum:
                 raise ValueError(f"expected sha256 {checksum[:12]}..., got {sha256_of(data)[:12]}...")
             return decode(data)
-        except Exception as error:  # decoders of other packages raise what they like
+        except Exception as error:  # decoders of other packages may raise any exception
             _log.warning("%s is damaged: %s; computed again", path, cut(str(error) or type(error).__name__))
             return None
 
     def keeping(self, name: str, executor: Executor | None = None) -> Executor:
-        """An executor whose results, arrays of numbers, are parts of the run: those that it has are not computed again.
+        """Return an executor that stores the results of its tasks as parts of the run, and loads finished parts.
 
-        Tasks are numbered as they are submitted: a run that goes on must submit the same tasks in the same order.
+        The results must be arrays of numbers. The tasks are numbered in the order in which they are submitted, so that
+        a resumed run must submit the same tasks in the same order.
 
         Args:
-            name: First part of the file names.
-            executor: Runs the tasks; None runs them in this process.
+            name: Beginning of the names of the parts.
+            executor: Executor that runs the tasks; None runs the tasks in this process.
         """
-        return _Keeping(self, name, executor)
+        return _StoringExecutor(self, name, executor)
 
     def is_empty(self) -> bool:
-        """Whether no part is finished yet."""
+        """Return whether no part is finished."""
         return not any(self._parts.glob("*.sha256"))
 
     def _place(self, name: str, final: bool) -> Path:
@@ -115,16 +125,16 @@ class ResumableRun:
         with output_errors(self.target):
             for folder in (self._parts, self.data):
                 folder.mkdir(exist_ok=True)
-                for torn in folder.glob(".*.draft"):
-                    torn.unlink()
+                for incomplete in folder.glob(".*.draft"):
+                    incomplete.unlink()
 
     def publish(self) -> None:
-        """Give the data the target's name, in a way that survives a power cut, and remove the draft."""
+        """Rename the data to the target, so that the renaming survives a power failure, and remove the draft."""
         with output_errors(self.target):
             sync_folder(self.data)
             refuse_existing(self.target)
             self.data.rename(self.target)
-            with suppress(OSError):  # the data are safe; only their name might not outlive a power cut
+            with suppress(OSError):  # the data are complete; only the renaming might not survive a power failure
                 sync_folder(self.target.parent)
         self.remove()
 
@@ -133,84 +143,96 @@ class ResumableRun:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-class _Keeping(Executor):
-    """See `ResumableRun.keeping`."""
+class _StoringExecutor(Executor):
+    """Executor of `ResumableRun.keeping`."""
 
     def __init__(self, run: ResumableRun, name: str, executor: Executor | None) -> None:
-        self._run, self._name, self._executor, self._submitted = run, name, executor, 0
+        self._run = run
+        self._name = name
+        self._executor = executor
+        self._submitted = 0
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         part = f"{self._name}-{self._submitted:04d}.npy"
         self._submitted += 1
-        kept: Future[Any] = Future()
-        if (saved := self._run.load(part, _array)) is not None:
-            kept.set_result(saved)
+        stored: Future[Any] = Future()
+        loaded = self._run.load(part, _decode_array)
+        if loaded is not None:
+            stored.set_result(loaded)
         elif self._executor is None:
             result = function(*args, **kwargs)
-            self._run.save(part, _npy(result))
-            kept.set_result(result)
+            self._run.save(part, _encode_array(result))
+            stored.set_result(result)
         else:
             computed = self._executor.submit(function, *args, **kwargs)
-            computed.add_done_callback(lambda _: self._keep(part, computed, kept))
-            kept.add_done_callback(lambda _: computed.cancel())
-        return kept
+            computed.add_done_callback(lambda _: self._store(part, computed, stored))
+            stored.add_done_callback(lambda _: computed.cancel())
+        return stored
 
-    def _keep(self, part: str, computed: Future[Any], kept: Future[Any]) -> None:
+    def _store(self, part: str, computed: Future[Any], stored: Future[Any]) -> None:
+        """Store the result of a computed future, and set the result of the returned future."""
         if computed.cancelled():
-            kept.cancel()
-        if not kept.set_running_or_notify_cancel():
+            stored.cancel()
+        if not stored.set_running_or_notify_cancel():
             return
         try:
             result = computed.result()
-            self._run.save(part, _npy(result))
-            kept.set_result(result)
-        except BaseException as error:  # as an executor does: it is raised where the result is taken
-            kept.set_exception(error)
+            self._run.save(part, _encode_array(result))
+            stored.set_result(result)
+        except BaseException as error:  # the error is raised where the result is requested
+            stored.set_exception(error)
 
 
-def _array(data: bytes) -> Array:
+def _decode_array(data: bytes) -> Array:
+    """Return the array of numbers in the bytes of an npy file; raise ValueError if there is none."""
     array = np.load(io.BytesIO(data), allow_pickle=False)
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         raise ValueError(f"expected an array of numbers, got {getattr(array, 'dtype', 'an archive')}")
     return array
 
 
-def _npy(array: Array) -> bytes:
+def _encode_array(array: Array) -> bytes:
+    """Return the bytes of an npy file with an array."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()
 
 
 def draft_of(target: Path) -> Path:
-    """Folder of a target's draft."""
-    named = target if target.name else target.absolute()  # "."
+    """Return the draft folder of a target."""
+    named = target if target.name else target.absolute()  # the path "." has no name
     return named.parent / f"{named.name}.part"
 
 
 def refuse_finished(target: Path) -> None:
-    """Raise OutputExists if the target is already there."""
+    """Raise OutputExists if the target exists.
+
+    A draft whose data have already become the target is removed. It remains if its process is killed between the
+    renaming of the data and the removal of the draft.
+    """
     draft = ResumableRun(target)
     if target.exists() and (draft.folder / "run.json").is_file() and not draft.data.exists():
-        draft.remove()  # its process was killed after the target had its name and before the draft was gone
+        draft.remove()
     refuse_existing(target)
 
 
 @contextmanager
 def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
-    """Begin a run, or go on with one that was stopped; the target appears when the block ends well.
+    """Begin a run, or resume a run that was stopped. The target is created when the block ends without an error.
+
+    After an error the draft remains, unless no part is finished or the same error would occur again.
 
     Args:
-        target: The folder to write.
-        identity: Everything that the result depends on, as JSON.
-        fresh: Throw an earlier draft away.
+        target: Folder that the run writes.
+        identity: All settings on which the result depends, as JSON.
+        fresh: Whether to delete an earlier draft.
 
     Yields:
-        The draft; fill `data`. If the block fails, the draft stays, unless nothing is finished or the same error would
-        come again.
+        The draft. The block writes the files of the target into its folder `data`.
 
     Raises:
-        OutputExists: If the target is already there, or the draft is another run's or in use.
-        OutputError: If the file system refuses.
+        OutputExists: If the target exists, or the draft belongs to a run with other settings or is in use.
+        OutputError: If a file cannot be written.
     """
     with resume_parts(target, identity, fresh=fresh) as draft:
         yield draft
@@ -219,7 +241,10 @@ def resume_folder(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fa
 
 @contextmanager
 def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = False) -> Iterator[ResumableRun]:
-    """Like `resume_folder`, but the block writes the target itself; the draft is removed when the block ends well."""
+    """Begin or resume a run whose block writes the target itself; see `resume_folder` for the arguments.
+
+    The draft is removed when the block ends without an error.
+    """
     refuse_finished(target)
     draft = ResumableRun(target)
     parents = [parent for parent in target.parents if not parent.exists()]
@@ -239,37 +264,40 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
 
 @contextmanager
 def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterator[None]:
-    """Hold the draft of this run; create it if necessary."""
+    """Lock the draft of a run during the block, and create the draft if necessary."""
     folder = draft.folder
     if fresh and (folder / "run.json").is_file():
         with locked(folder / "lock"):
             draft.remove()
-    begins = not folder.exists()
+    is_new = not folder.exists()
     try:
-        if begins:
-            with new_folder(folder) as new:
-                (new / "lock").touch()
-                write_whole(new / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
+        if is_new:
+            with new_folder(folder) as temporary:
+                (temporary / "lock").touch()
+                write_whole(temporary / "run.json", (json.dumps(identity, indent=2) + "\n").encode())
         with locked(folder / "lock"):
             _check_same_run(folder, identity)
             yield
     except KeyboardInterrupt:
-        if begins and draft.is_empty():  # stopped before the run had its draft in hand
+        if is_new and draft.is_empty():  # the user has stopped the run before `resume_parts` could remove the draft
             draft.remove()
         raise
 
 
 def output_errors(target: Path) -> AbstractContextManager[None]:
-    """Turn the file system's errors into OutputError."""
+    """Convert an OSError of the block to an OutputError, whose message states how to resume the run."""
     return as_output_errors(target, f"the same command goes on with what {draft_of(target)} has, or choose another")
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Keep other processes out of a folder, by a file in it or by itself; the system lets go if this one is killed.
+    """Lock a folder against other processes during the block. The system unlocks it if this process is killed.
+
+    Args:
+        path: The folder, or a lock file in the folder.
 
     Raises:
-        OutputExists: If another process holds it.
+        OutputExists: If another process has locked the folder.
     """
     folder = path if path.is_dir() else path.parent
     handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT)
@@ -286,6 +314,7 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
+    """Raise OutputExists if a draft belongs to a run with other settings."""
     try:
         saved = read_json(folder / "run.json", "the settings of a run", InputError, dict[str, Any])
     except InputError as error:
@@ -301,6 +330,7 @@ def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
 
 
 def _differences(saved: Any, current: Any, name: str = "") -> Iterator[str]:
+    """Yield descriptions of the settings in which two runs differ."""
     if isinstance(saved, dict) and isinstance(current, dict):
         for key in sorted(saved.keys() | current.keys()):
             if saved.get(key) != current.get(key):

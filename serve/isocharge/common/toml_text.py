@@ -1,7 +1,7 @@
-"""Tables of settings to TOML: the writer beside `isocharge.common.structs`, which reads them.
+"""Writing of settings as TOML; `isocharge.common.structs` reads them.
 
-Not a library's: tomli-w gives each number of a list a line, so that the position of an electrode takes four, and writes
-no comments; tomlkit is made to change files and keep their style.
+No library is used, because tomli-w writes each number of a list on its own line and writes no comments, and tomlkit is
+made for changing existing files.
 """
 
 import json
@@ -11,22 +11,24 @@ from typing import Any
 
 from isocharge.common.printable_text import printable
 
-_BARE = re.compile(r"[A-Za-z0-9_-]+")
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+"""Key that needs no quotation marks."""
 
 
 def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
-    """The text of a TOML file: comments, keys without a table, then a section for each table.
+    """Return the text of a TOML file: comments, keys without a table, and a section for each table.
 
     Args:
-        tables: Texts, finite or infinite numbers, true and false, lists and tables, by names that may be any text. A
-            table in a section, or in a list, stands on one line.
-        comment: Lines for the head of the file, without #.
+        tables: Texts, numbers, truth values, lists and tables by name. A table in a section or in a list is written on
+            one line.
+        comment: Lines of the comment at the head of the file, without #.
 
     Raises:
         TypeError: If a value is of another type.
     """
     lines = [f"# {printable(line)}".rstrip() for text in comment for line in text.splitlines() or [""]]
-    lines += [""] * bool(lines)
+    if lines:
+        lines.append("")
     lines += [_pair(key, value) for key, value in tables.items() if not isinstance(value, Mapping)]
     for name, table in tables.items():
         if isinstance(table, Mapping):
@@ -39,7 +41,7 @@ def _pair(key: str, value: object) -> str:
 
 
 def _key(key: str) -> str:
-    return key if _BARE.fullmatch(key) else _text(key)
+    return key if _BARE_KEY.fullmatch(key) else _text(key)
 
 
 def _value(value: object) -> str:
@@ -57,5 +59,5 @@ def _value(value: object) -> str:
 
 
 def _text(text: str) -> str:
-    """A basic string: that of JSON, which leaves one control character bare that TOML does not."""
+    """Return a text as a basic string of TOML: the string of JSON with the escaped character U+007F."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,4 +1,4 @@
-"""The version of the installed package, looked up only when somebody asks: importlib.metadata is slow to import."""
+"""The version of the installed package. It is looked up only when it is needed, because the import is slow."""
 
 from collections.abc import Callable
 from functools import cache
@@ -6,17 +6,20 @@ from functools import cache
 
 @cache
 def package_version() -> str:
-    """The version of isocharge, as pip knows it; kept, because it is read from files, which a busy server may lack."""
-    from importlib.metadata import version  # late, see above
+    """Return the version of isocharge from the metadata of the installed package.
+
+    The result is cached, because a busy server may have no file descriptor left to read the metadata again.
+    """
+    from importlib.metadata import version  # imported late, because the import is slow
 
     return version("isocharge")
 
 
 def version_attribute(module: str) -> Callable[[str], str]:
-    """The `__getattr__` of a module that gives it a `__version__`.
+    """Return a function `__getattr__` for a module that provides the attribute `__version__`.
 
     Args:
-        module: Its name, for the error of every other attribute.
+        module: Name of the module, for the error message about any other attribute.
     """
 
     def look_up(name: str) -> str:
