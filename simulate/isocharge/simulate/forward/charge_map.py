@@ -40,6 +40,19 @@ class Domain:
         low, high = np.log(self.force_range)
         return np.array([self.radius, self.radius, max(0.5 * (high - low), 0.05)])
 
+    def is_outside(self, contact: Array) -> Booleans:
+        """Return which contacts are farther from the centre than the radius, or have a force outside the range.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N. A coordinate that is NaN counts as inside.
+
+        Returns:
+            Shape (n,).
+        """
+        x, y, force = contact.T
+        low, high = self.force_range
+        return np.asarray((np.hypot(x, y) > self.radius) | (force < low) | (force > high))
+
     def to_unit(self, contact: Array) -> Array:
         """Scale contacts to [-1, 1]^3, with the logarithm of the force.
 

@@ -15,7 +15,7 @@ from isocharge.simulate import Circle, Sensor
 from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
 from isocharge.train.calibration.cross_validation import HeldOutAnswers, cross_validate
-from isocharge.train.calibration.diagnosis import check_channels, check_places, explain, find_mistakes, misfit, outside
+from isocharge.train.calibration.diagnosis import check_channels, check_places, explain, find_mistakes, misfit
 from isocharge.train.calibration.film_fit import MISTAKEN, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.hypotheses import Hypothesis
 from isocharge.train.calibration.nuisances import NUISANCES, NuisanceEstimate
@@ -300,7 +300,7 @@ def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tup
         PressError: If most presses lie outside.
     """
     domain = problem.charges.domain
-    is_outside = outside(presses.contact, domain)
+    is_outside = domain.is_outside(presses.contact)
     if not is_outside.any():
         return presses, []
     low, high = domain.force_range

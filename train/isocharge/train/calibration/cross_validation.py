@@ -13,7 +13,6 @@ from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Booleans
 from isocharge.common.measured_presses import MeasuredPresses
-from isocharge.train.calibration.diagnosis import outside
 from isocharge.train.calibration.film_fit import FilmPosterior, refit_film
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.calibration.problem import CalibrationProblem
@@ -69,7 +68,7 @@ def cross_validate(
         The presses that can be judged and their answers; None if there are fewer than `FEWEST_MEASURED`. A press can be
         judged if its place, force and charges are known, and the networks answer there.
     """
-    is_judged = complete(presses) & ~posterior.bad & ~outside(presses.contact, problem.domain)
+    is_judged = complete(presses) & ~posterior.bad & ~problem.domain.is_outside(presses.contact)
     if is_judged.sum() < FEWEST_MEASURED:
         return None
     fold = np.full(len(presses), -1)

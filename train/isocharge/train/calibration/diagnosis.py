@@ -10,10 +10,9 @@ from functools import partial
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import MeasuredPresses
-from isocharge.simulate.forward.charge_map import Domain
 from isocharge.train.calibration.film_charges import FilmCharges
 
 DEAD_SHARE = 0.02
@@ -135,13 +134,6 @@ def _expected(charges: FilmCharges, contact: Array) -> Array:
         parameters[prior.index("pretension")] = share * prior.spread.pretension
         expected.append(charges.charges(parameters, contact))
     return np.array(expected)
-
-
-def outside(contact: Array, domain: Domain) -> Booleans:
-    """Return which contacts, shape (n, 3), lie beyond the radius or the forces of a domain; NaN does not."""
-    x, y, force = contact.T
-    low, high = domain.force_range
-    return np.asarray((np.hypot(x, y) > domain.radius) | (force < low) | (force > high))
 
 
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:

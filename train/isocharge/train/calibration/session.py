@@ -17,7 +17,6 @@ from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.train.calibration.calibrate import FEW, CalibrationResult, calibrate, no_presses
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
-from isocharge.train.calibration.diagnosis import outside
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 
 MIN_PRESSES = 2
@@ -208,7 +207,7 @@ class PressSession:
         if math.isnan(x) != math.isnan(y):
             raise PressError("expected both x and y, or ? for both, got one of them")
         domain = self.problem.charges.domain
-        if outside(contact[None], domain).any():
+        if domain.is_outside(contact[None]).any():
             low, high = domain.force_range
             raise PressError(
                 f"expected a press within {domain.radius:.3g} mm of the centre and of {low:.2g} to {high:.2g} N, "

@@ -90,6 +90,10 @@ class PressedArea(Domain):
         (left, bottom), (right, top) = np.min(self.corners, axis=0), np.max(self.corners, axis=0)
         return f"a place in the pressed area, x from {left:g} to {right:g} mm and y from {bottom:g} to {top:g} mm,"
 
+    def is_outside(self, contact: Array) -> Booleans:
+        """Return which contacts, shape (n, 3), are outside the area or the range of forces; NaN counts as outside."""
+        return np.asarray(~self.contains(contact))
+
     def contains(self, contact: Array) -> Booleans:
         """Return which contacts (x, y, F), shape (n, 3), mm and N, lie in the domain, shape (n,); NaN does not."""
         has_force = Domain(np.inf, self.force_range).contains(contact)

@@ -1,7 +1,8 @@
-"""Presses to learn from and presses to measure by, split by position: none is seen twice under another force.
+"""Presses for training and presses for measuring errors, split by position.
 
-Of measured presses there is one split for all: a fifth of the positions, chosen by their coordinates alone. So a model
-that was trained on a file of presses is judged, by whatever command, on presses of the file that it never saw.
+All presses at one position belong to the same part, because presses with other forces at the same position would make
+the errors too small. Measured presses are always split in the same way: the coordinates determine which fifth of the
+positions is held out. Every command therefore measures errors on the same presses of a file.
 """
 
 from collections.abc import Sequence
@@ -17,17 +18,19 @@ from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
 from isocharge.train.data.channel_noise import Noise
 
 LOWEST_CHARGE, HIGHEST_CHARGE = 1.0, 1e6
-"""Charges are brought between these, pC, before the logarithm: what is negative or absurd still gives a finite answer.
-"""
+"""Limits to which charges are clipped before the logarithm, pC, so that every charge gives a finite answer."""
 
 SOLVER = "solver"
-"""Entry of the manifest that every simulated dataset has, and no measured one."""
+"""Entry of the manifest of every simulated dataset. Measured datasets do not have it."""
 
 FEWEST = 500
-"""Presses below which a fit makes no sense."""
+"""Smallest number of presses for a fit."""
+
+ROUNDING = 1.0 + 1e-9
+"""Ratio by which a sample may exceed the ranges of its manifest because of rounding."""
 
 FEWEST_POSITIONS = 50
-"""The same for positions."""
+"""Smallest number of positions for a fit."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class LabelledPresses:
 
     @classmethod
     def of(cls, dataset: Dataset) -> "LabelledPresses":
-        """All presses of a dataset, unchecked."""
+        """Return all presses of a dataset without checks."""
         samples = dataset.samples
         contact = np.stack([samples.x_mm, samples.y_mm, samples.force_N], axis=1)
         return cls(contact, samples.charge_pC, is_measured(dataset))
@@ -59,54 +62,68 @@ class LabelledPresses:
 
     @property
     def signed(self) -> bool:
-        """Whether some charge is not positive, so that it has no logarithm."""
+        """Whether at least one charge is not positive, so that it has no logarithm."""
         return bool((self.charge <= 0.0).any())
 
     def within(self, radius: float) -> "LabelledPresses":
-        """Those up to a distance from the centre, mm."""
+        """Return the presses whose distance from the centre is at most `radius`, mm."""
         return self[np.hypot(self.contact[:, 0], self.contact[:, 1]) <= radius]
 
     def noisy(self, noise: Noise, seed: int) -> Array:
-        """The charges with noise added, shape (n, n_electrode), pC."""
+        """Return the charges with added noise, shape (n, n_electrode), pC."""
         return noise.add(self.charge, np.random.default_rng(seed))
 
 
 def is_measured(dataset: Dataset) -> bool:
-    """Whether a dataset was measured: its manifest has no settings of a simulator."""
+    """Return whether a dataset was measured, that is, whether its manifest has no settings of a simulator."""
     return SOLVER not in dataset.manifest
 
 
 def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array:
-    """Contacts (x, y, F), shape (count, 3), mm and N: uniform over the disk, forces log-uniform."""
-    radius, angle = domain.radius * np.sqrt(rng.random(count)), 2.0 * np.pi * rng.random(count)
+    """Draw contacts (x, y, F), shape (count, 3), mm and N, uniform over the disk, with log-uniform forces."""
+    radius = domain.radius * np.sqrt(rng.random(count))
+    angle = 2.0 * np.pi * rng.random(count)
     low, high = np.log(domain.force_range)
     force = np.exp(rng.uniform(low, high, count))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), force], axis=1)
 
 
 def domain_of(dataset: Dataset) -> Domain:
-    """The working area and forces that the dataset covers: as its manifest says, or else as its samples show.
+    """Return the working area and the range of forces of a dataset.
+
+    The manifest states them. If it does not, they are those of the samples.
 
     Raises:
-        DatasetError: If the manifest's ranges are no numbers or do not hold the samples.
+        DatasetError: If the ranges of the manifest are not numbers or do not contain the samples.
     """
-    samples, ranges = dataset.samples, dataset.manifest.get("ranges", {})
-    reach, forces = np.hypot(samples.x_mm, samples.y_mm).max(), (samples.force_N.min(), samples.force_N.max())
+    samples = dataset.samples
+    ranges = dataset.manifest.get("ranges", {})
+    sample_radius = np.hypot(samples.x_mm, samples.y_mm).max()
+    sample_forces = (samples.force_N.min(), samples.force_N.max())
     try:
-        radius = float(ranges.get("radius_mm", reach))
-        low, high = (float(force) for force in ranges.get("force_N", forces))
+        radius = float(ranges.get("radius_mm", sample_radius))
+        low, high = (float(force) for force in ranges.get("force_N", sample_forces))
     except (AttributeError, TypeError, ValueError) as error:
         raise DatasetError(f"manifest ranges: expected radius_mm and force_N [MIN, MAX], got {ranges!r}") from error
-    if not (reach <= radius * (1 + 1e-9) and 0.0 < low <= forces[0] * (1 + 1e-9) and forces[1] <= high * (1 + 1e-9)):
+    smallest, largest = sample_forces
+    holds_places = sample_radius <= radius * ROUNDING
+    holds_forces = 0.0 < low <= smallest * ROUNDING and largest <= high * ROUNDING
+    if not (holds_places and holds_forces):
         raise DatasetError(
             f"manifest ranges: radius_mm {radius:g} and force_N [{low:g}, {high:g}] do not hold the samples, which "
-            f"reach {reach:g} mm and {forces[0]:g} to {forces[1]:g} N"
+            f"reach {sample_radius:g} mm and {smallest:g} to {largest:g} N"
         )
     return Domain(radius, (low, high))
 
 
 def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tuple[LabelledPresses, LabelledPresses]:
-    """The presses at all but a share of the positions, and those at the share."""
+    """Split presses at random into those at most positions and those at a share of the positions.
+
+    Args:
+        presses: The presses.
+        share: Share of the positions in the second part, 0 to 1.
+        seed: Seed of the choice.
+    """
     _, position = np.unique(np.round(presses.contact[:, :2], 6), axis=0, return_inverse=True)
     order = np.random.default_rng(seed).permutation(position.max() + 1)
     held = np.isin(position.ravel(), order[: max(1, round(share * order.size))])
@@ -114,11 +131,11 @@ def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tupl
 
 
 def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
-    """A dataset's presses, checked.
+    """Return the presses of a dataset after checking them.
 
     Args:
         dataset: The dataset.
-        fewest: Presses that it must have at least.
+        fewest: Smallest number of presses that is accepted.
 
     Raises:
         DatasetError: If the dataset has too few presses or positions, fewer than three electrodes or one whose charge
@@ -151,7 +168,7 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
 
 
 def position_error(contact: Array, truth: Array) -> Array:
-    """Distance between estimated and true position, mm, shape (n,), from contacts of shape (n, 3)."""
+    """Return the distances between estimated and true positions, shape (n,), mm, from contacts of shape (n, 3)."""
     return np.asarray(np.hypot(contact[:, 0] - truth[:, 0], contact[:, 1] - truth[:, 1]))
 
 
@@ -159,28 +176,37 @@ HELD_SHARE = 0.2
 """Share of measured presses that is held out, dimensionless."""
 
 FEWEST_HELD = 10
-"""Held-out presses at least, however few there are: fewer give no figure worth its name."""
+"""Smallest number of presses that are held out, because the errors of fewer presses are too uncertain."""
 
 FEWEST_MEASURED = 50
-"""Measured presses at least for a training or a report."""
+"""Smallest number of measured presses for a training, a report or held-out errors."""
 
 
 def held_out(contact: Array) -> Booleans:
-    """Which measured presses are held out, shape (n,), from contacts (x, y, F), shape (n, 3), mm and N.
+    """Choose the measured presses that are held out.
 
-    Presses at one position are held out together: neighbours in force would tell too much. The order in which positions
-    are taken follows from their coordinates, so that it is the same in every part of the presses.
+    Presses at one position are held out together. The order in which positions are chosen follows from their
+    coordinates alone, so that it is the same in every part of the presses.
+
+    Args:
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Whether each press is held out, shape (n,).
     """
     return _before(contact) < max(HELD_SHARE * len(contact), min(FEWEST_HELD, 0.5 * len(contact)))
 
 
 def folds_by_place(contact: Array, count: int) -> Integers:
-    """Numbers from 0 to `count` - 1 of measured presses, shape (n,), in the order of `held_out`: a place has one."""
+    """Return the fold of each measured press, from 0 to `count` - 1, shape (n,).
+
+    Presses at one place are in the same fold. Places are assigned in the order of `held_out`.
+    """
     return np.asarray(_before(contact) * count // len(contact), dtype=np.intp)
 
 
 def _before(contact: Array) -> Integers:
-    """Number of presses at positions that are taken before each press's own, shape (n,)."""
+    """Return, for each press, the number of presses at positions that are chosen before its own, shape (n,)."""
     positions, number, counts = np.unique(
         np.round(contact[:, :2], 3) + 0.0, axis=0, return_inverse=True, return_counts=True
     )
@@ -191,7 +217,7 @@ def _before(contact: Array) -> Integers:
 
 
 def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Dataset:
-    """Measured presses as a dataset; those with an unknown place, force or charge are left out.
+    """Return measured presses as a dataset, without presses whose place, force or charges are unknown.
 
     Raises:
         PressError: If fewer than `FEWEST_MEASURED` remain.
@@ -205,12 +231,18 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
 
 
 def complete(presses: MeasuredPresses) -> Booleans:
-    """Presses of which place, force and every charge are known, shape (n,)."""
+    """Return which presses have a known place, force and charge of every electrode, shape (n,)."""
     return presses.placed & np.isfinite(presses.charge_pC).all(axis=1)
 
 
 def check_enough(count: int, of: int, sensor: str) -> None:
-    """Raise PressError if there are too few measured presses to train on and to measure by."""
+    """Raise PressError if there are too few measured presses for training and for measuring errors.
+
+    Args:
+        count: Number of presses that can be used.
+        of: Number of all presses.
+        sensor: Name of the sensor, for the message.
+    """
     if count < FEWEST_MEASURED:
         raise PressError(
             f"expected at least {FEWEST_MEASURED} presses with known place, force and charges, within the "
@@ -220,6 +252,6 @@ def check_enough(count: int, of: int, sensor: str) -> None:
 
 
 def presses_sha256(presses: MeasuredPresses) -> str:
-    """Checksum of the presses' numbers."""
+    """Return the checksum of all numbers of the presses."""
     columns: Sequence[Array] = (presses.contact, presses.charge_pC, presses.position_std_mm, presses.force_std)
     return sha256_of(np.column_stack(columns).tobytes())

@@ -107,10 +107,9 @@ def _usable_presses(rig: Rig, domain: Domain) -> MeasuredPresses:
         PressError: If too few presses remain.
     """
     presses = rig.presses.of_electrodes(rig.sensor.electrode_names, rig.sensor.name)
-    x, y, force = presses.contact.T
     low, high = domain.force_range
     is_incomplete = ~complete(presses)
-    is_outside = ~is_incomplete & ((np.hypot(x, y) > domain.radius) | (force < low) | (force > high))
+    is_outside = ~is_incomplete & domain.is_outside(presses.contact)
     is_usable = ~(is_incomplete | is_outside)
     check_enough(int(is_usable.sum()), len(presses), rig.sensor.name)
 
