@@ -91,8 +91,9 @@ class PressedArea(Domain):
         return f"a place in the pressed area, x from {left:g} to {right:g} mm and y from {bottom:g} to {top:g} mm,"
 
     def is_outside(self, contact: Array) -> Booleans:
-        """Return which contacts, shape (n, 3), are outside the area or the range of forces; NaN counts as outside."""
-        return np.asarray(~self.contains(contact))
+        """Return which contacts, shape (n, 3), are outside the area or the range of forces; with NaN, none is."""
+        is_known = ~np.isnan(contact).any(axis=1)
+        return np.asarray(is_known & ~self.contains(contact))
 
     def contains(self, contact: Array) -> Booleans:
         """Return which contacts (x, y, F), shape (n, 3), mm and N, lie in the domain, shape (n,); NaN does not."""
