@@ -96,18 +96,18 @@ def test_channels_are_assigned_for_any_order_and_gain(order):
     assert [order[column] for column in assign_channels(answers, "ABCD")] == [0, 1, 2, 3]
 
 
-def test_presses_that_do_not_tell_the_channels_apart():
+def test_presses_that_do_not_distinguish_the_channels_raise_an_error():
     with pytest.raises(PressCheckError, match="moves two channels alike; press closer"):
         assign_channels(np.ones((3, 3)), "ABC")
 
 
-def test_no_press_comes(film):
+def test_missing_press_raises_an_error_after_the_timeout(film):
     sensor = sensor_with_wiring(film.charges, film.directions[:2], (0, 1, 2))
     with pytest.raises(PressCheckError, match="electrode C: no press came within 3 s"):
         check(sensor, "ABC", timeout_s=3.0)
 
 
-def test_a_press_that_does_not_end(film):
+def test_press_that_does_not_end_raises_an_error(film):
     force_N = np.where(np.arange(6000) < 250, 0.0, 0.3)
     position_mm = np.where(force_N > 0.0, 0.0, np.nan)
     script = Script(position_mm, position_mm, force_N, RATE_HZ)
@@ -131,7 +131,7 @@ def test_settings_of_single_electrodes_move_with_their_channels():
     }
 
 
-def test_doctor_writes_the_order_that_the_presses_show(film, models, command, tmp_path):
+def test_doctor_writes_the_order_of_the_channels_found_by_presses(film, models, command, tmp_path):
     """From swapped wires to the right contact, with nothing but the file that doctor writes."""
     path = tmp_path / "board.toml"
     with sensor_with_wiring(film.charges, film.directions, (1, 0, 2), first_rest_s=4.0) as sensor:

@@ -59,7 +59,7 @@ def still(t):
         (lambda t: 1.0 + 0.1 * np.sin(t), 0.0, {}, "by no law that is clear"),
     ],
 )
-def test_what_a_held_press_says(law, drift, sections, said, scale):
+def test_held_press_finds_leak_creep_or_drift(law, drift, sections, said, scale):
     held = held_press(board(law, drift, scale=scale), T_S)
     assert held.begin_s == pytest.approx(5.0, abs=0.2)
     assert held.sections == {name: pytest.approx(keys, rel=0.15) for name, keys in sections.items()}
@@ -67,12 +67,12 @@ def test_what_a_held_press_says(law, drift, sections, said, scale):
 
 
 @pytest.mark.parametrize("until_s", [0.0, 7.0])
-def test_no_press_and_a_short_one_say_nothing(until_s):
+def test_no_press_or_a_short_press_has_no_result(until_s):
     assert held_press(board(still, until_s=until_s), T_S) is None
     assert held_press(board(still)[:300], T_S[:300]) is None
 
 
-def test_the_file_has_the_time_constant_and_the_rest_before_the_press():
+def test_proposed_file_has_the_leak_and_the_offset_before_the_press():
     values = board(lambda t: np.exp(-t / 10.0)) - 300.0
     chunks = [
         Chunk(encode_frame(Frame(k % 65536, 5000 * k, tuple(row.tolist()))), 1e9 + t, 0)

@@ -86,7 +86,7 @@ def opened(monkeypatch):
     ],
     ids=["found", "none is right", "one is not tried"],
 )
-def test_the_speed_is_found(opened, bauds, tried, good):
+def test_baud_rate_is_found(opened, bauds, tried, good):
     report = examine("/dev/ttyUSB9", bauds=bauds, seconds=2.0)
     assert (report.baud, report.good, report.seconds) == (tried[-1], pytest.approx(good, abs=3), pytest.approx(2.0))
     assert [baud for _, baud, _ in opened] == tried
@@ -94,7 +94,7 @@ def test_the_speed_is_found(opened, bauds, tried, good):
 
 
 @pytest.mark.parametrize("echo", [True, False])
-def test_an_echo_is_found_out(run, pty, echo):
+def test_echo_of_a_request_is_detected(run, pty, echo):
     board, url = pty
 
     def answer():
@@ -110,7 +110,7 @@ def test_an_echo_is_found_out(run, pty, echo):
     assert lines.count(b"?") < lines.count(b"1,2")  # one of a late answer, on a busy machine
 
 
-def test_datagrams_are_chunks(run):
+def test_each_datagram_is_a_chunk(run):
     with socket.socket(type=socket.SOCK_DGRAM) as sender:
         sender.bind(("127.0.0.1", 0))
         url = f"udp://127.0.0.1:{sender.getsockname()[1] + 1}"
@@ -125,7 +125,7 @@ def test_datagrams_are_chunks(run):
         assert set(heard.data) == {b"\x01\x02\x03"}
 
 
-def test_span_of_a_burst():
+def test_time_span_of_a_burst():
     chunks = [Chunk(b"x", 100.0 + 0.1 * k, 0) for k in range(5)]
     assert Heard("x", 1, chunks=chunks, seconds=3.0).span_s == pytest.approx(0.5)
     assert Heard("x", 1, chunks=chunks[:1], seconds=3.0).span_s == 3.0

@@ -95,17 +95,17 @@ def test_check_of_a_channel_without_a_number():
         (lambda k: f"{1e-3 * (k % 7):.4f};{1.65 + 1e-3 * (k % 5):.4f}\n".encode(), "feedback capacitance"),
     ],
 )
-def test_check_says_what_is_missing(board, said):
+def test_check_reports_missing_settings(board, said):
     assert said in missing(findings(heard(board), electrodes=FOUR))
 
 
-def test_no_clock_is_missing_only_where_the_leak_is_undone():
+def test_missing_clock_is_reported_only_with_leak():
     lines = heard(charges(encode=partial(encode_text, notation="csv")))
     reports = findings(lines, device=AT_REST), findings(lines), findings(heard(charges()), device=AT_REST)
     assert ["a device clock" in missing(report) for report in reports] == [True, False, False]
 
 
-def test_inputs_that_do_not_live_are_ignored():
+def test_unused_inputs_are_ignored():
     report = findings(heard(row), electrodes=FOUR)
     assert report.device["channels"] == {"A": "1", "B": "3", "C": "4", "D": "6"}
     assert (report.unused, report.unit) == (("2", "5"), "counts")
@@ -116,27 +116,27 @@ def test_inputs_that_do_not_live_are_ignored():
     assert "pC" not in text.partition("channel ")[2].splitlines()[0]
 
 
-def test_four_channels_of_six_that_are_too_few():
+def test_too_few_used_channels_for_the_model():
     report = findings(heard(row), electrodes=("A", "B", "C", "D", "E"))
     assert "6 channels, but the model has the electrodes" in missing(report)
     assert "channels" not in report.device
 
 
-def test_the_channels_of_most_similar_noise_are_chosen():
+def test_channels_of_most_similar_noise_are_proposed():
     """Side by side; the first input is a temperature, far quieter in pC than the film."""
     rng = np.random.default_rng(0)
     board = lambda _: ",".join(f"{x:.3f}" for x in rng.normal(0.0, [0.05, 3.0, 3.0, 3.0])).encode() + b"\n"  # noqa: E731
     assert findings(heard(board), electrodes=("A", "B", "C")).device["channels"] == {"A": "2", "B": "3", "C": "4"}
 
 
-def test_channels_that_a_file_leaves_out_are_ignored():
+def test_channels_that_the_device_file_omits_are_ignored():
     board = {"channels": {"A": "ch1", "B": "3", "C": "4"}, "gain": {"pC_per_unit": 0.5, "offset": 300}}
     report = findings(heard(row), device=device_from_table(board, "test"))
     assert ([channel.name for channel in report.channels], report.unused) == (["1", "3", "4"], ("2", "5", "6"))
     assert all(abs(channel.offset_pC) < 10 for channel in report.channels)
 
 
-def test_the_proposal_is_a_device_that_reads_the_same():
+def test_proposed_device_file_reads_the_same_charges():
     """What doctor says of the board, its file says again."""
     gain = {"pC_per_unit": {"A": 0.5, "B": -0.5, "C": 0.5, "D": 0.5}}
     first = findings(heard(row), electrodes=FOUR, gain=gain)
@@ -162,13 +162,13 @@ def test_the_proposal_is_a_device_that_reads_the_same():
         ({"V_per_unit": 0.1, "feedback_pF": 100.0}, (700, 700), 700),
     ],
 )
-def test_the_rest_is_an_offset_where_a_tare_would_not_take_it(gain, rests, offset):
+def test_offset_is_proposed_if_the_rest_is_too_large_for_a_tare(gain, rests, offset):
     board = lambda k: b"%d,%d\n" % tuple(rest + (k * 7) % 5 - 2 for rest in rests)  # noqa: E731
     proposed = findings(heard(board), electrodes=("A", "B"), gain=gain).device["gain"]
     assert proposed == gain | ({} if offset is None else {"offset": offset})
 
 
-def test_a_board_that_rests_far_from_zero_gets_a_file_that_works():
+def test_proposed_file_of_a_board_far_from_zero_works():
     rng = np.random.default_rng(0)
     board = lambda _: b"%.2f;%.2f;%.2f\n" % tuple(rng.normal((312.0, -128.0, 3.0), 1.0))  # noqa: E731
     report = findings(heard(board))
@@ -178,7 +178,7 @@ def test_a_board_that_rests_far_from_zero_gets_a_file_that_works():
     assert not findings(heard(row)).works  # counts of which nobody has said what they are
 
 
-def test_a_request_goes_into_the_file():
+def test_proposed_file_has_the_request():
     frames = findings(heard(row, request=Request(b"?\n", 50.0, echo=True))).device["frames"]
     assert (frames["request"], frames["request_Hz"], frames["echo"]) == ("3F 0A", 50.0, True)
 
@@ -190,7 +190,7 @@ def test_a_request_goes_into_the_file():
         ({"pC_per_unit": 0.5}, ["[gain]", "pC_per_unit = 0.5"]),
     ],
 )
-def test_the_file_says_what_is_to_be_filled_in(gain, lines):
+def test_device_text_has_lines_to_fill_in(gain, lines):
     board = lambda k: b"%d,%d,0\n" % (303 + k % 5, 307 - k % 5)  # noqa: E731
     text = device_text(findings(heard(board), electrodes=("A", "B"), gain=gain))
     assert all(f"\n{line}" in text for line in lines)
@@ -199,7 +199,7 @@ def test_the_file_says_what_is_to_be_filled_in(gain, lines):
     assert "channels that no electrode uses: 3" in text
 
 
-def test_a_file_that_does_not_fit_is_no_reason_to_be_silent():
+def test_check_with_a_wrong_device_file_still_reports():
     fields = [{"name": "A", "type": "f32"}]
     table = {"frames": {"format": "described", "sync": "AA", "length": 5, "fields": fields}}
     report = findings(heard(row), device=device_from_table(table, "test"))

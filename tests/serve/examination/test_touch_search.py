@@ -34,7 +34,7 @@ PRESSES = {
 
 @pytest.mark.parametrize("level", ["clean", "reference", "bench", "surgery"])
 @pytest.mark.parametrize("seconds", [1.0, 20.0])
-def test_noise_drift_and_warming_are_no_touch(level, seconds):
+def test_noise_drift_and_warming_are_not_taken_for_a_touch(level, seconds):
     for seed in range(5):
         charges, times_s = measured(level, seed, no_press, seconds)
         assert find_touch(charges, times_s, unit_is_pC=True) is None
@@ -43,7 +43,7 @@ def test_noise_drift_and_warming_are_no_touch(level, seconds):
 
 @pytest.mark.parametrize("level", ["reference", "bench"])
 @pytest.mark.parametrize("press", PRESSES)
-def test_a_press_of_0_05_N_is_noticed(level, press):
+def test_press_of_0_05_N_is_found(level, press):
     """A slow press needs the unit, because a slow change may be a drift."""
     for seed in range(5):
         charges, times_s = measured(level, seed, PRESSES[press])
@@ -58,20 +58,20 @@ def test_a_press_of_0_05_N_is_noticed(level, press):
             assert touch.time_s == pytest.approx(2.5, abs=0.3)
 
 
-def test_a_press_that_is_held_all_the_time_is_not_noticed():
+def test_press_that_is_held_all_the_time_is_not_found():
     """The limit of the search: constant charges may be the rest of an amplifier."""
     charges, times_s = measured("reference", 0, np.ones_like)
     assert find_touch(charges, times_s, unit_is_pC=True) is None
 
 
-def test_a_damaged_value_is_no_touch():
+def test_damaged_value_is_not_taken_for_a_touch():
     charges, times_s = measured("reference", 0, no_press)
     charges[300] = 1e6
     charges[500, 1] = np.nan
     assert find_touch(charges, times_s, unit_is_pC=True) is None
 
 
-def test_too_few_blocks():
+def test_too_few_blocks_have_no_touch():
     charges, times_s = measured("reference", 0, PRESSES["begins"], seconds=0.5)
     assert find_touch(charges, times_s, unit_is_pC=True) is None
     assert len(block_medians(charges, times_s)) == 4

@@ -68,7 +68,7 @@ def played(path, predictor):
     return [record.to_json() for record in replay(recording, stream, clock)]
 
 
-def test_replay_is_the_same_bit_for_bit(tmp_path, film, predictor):
+def test_replay_repeats_the_records_bit_for_bit(tmp_path, film, predictor):
     path = tmp_path / "touch.rec"
     lines = record(path, film, predictor)
     assert len(lines) > 60
@@ -80,7 +80,7 @@ def test_replay_is_the_same_bit_for_bit(tmp_path, film, predictor):
 
 
 @pytest.mark.parametrize("leak", [{}, {"leak": {"tau_s": 10.0}}])
-def test_replay_of_a_warming_film_is_the_same_bit_for_bit(tmp_path, leak):
+def test_replay_of_a_warming_film_repeats_the_records_bit_for_bit(tmp_path, leak):
     """A released model of four electrodes; the common charge rises to 60 pC while one press is held."""
     path, model = tmp_path / "touch.rec", load_model(find_model("four-25um-uniaxial"))
     predictor, press = Predictor("four-25um-uniaxial"), model.golden.charge_pC[0].astype(float)
@@ -93,9 +93,7 @@ def test_replay_of_a_warming_film_is_the_same_bit_for_bit(tmp_path, leak):
 
 
 @pytest.mark.parametrize("where", ["base64.b64encode", "json.dumps", "os.lseek", "os.write"])
-def test_replay_ends_with_the_last_record_wherever_the_recorder_was_interrupted(
-    tmp_path, film, predictor, monkeypatch, where
-):
+def test_replay_of_an_interrupted_recording_ends_with_the_last_record(tmp_path, film, predictor, monkeypatch, where):
     """Ctrl-C while the thirtieth chunk is written: before a part of it, or after."""
     path, calls = tmp_path / "touch.rec", count()
     module, name = where.split(".")
@@ -116,7 +114,7 @@ def test_replay_ends_with_the_last_record_wherever_the_recorder_was_interrupted(
     assert played(path, predictor) == lines
 
 
-def test_recording_on_a_full_disk_stays_readable(tmp_path, film, predictor, fill_disk, caplog):
+def test_recording_on_a_full_disk_remains_readable(tmp_path, film, predictor, fill_disk, caplog):
     """The disk takes half a line and then no more; the live path goes on."""
     path = tmp_path / "touch.rec"
     fill_disk(9000)
@@ -132,7 +130,7 @@ def test_recording_on_a_full_disk_stays_readable(tmp_path, film, predictor, fill
 
 
 @pytest.mark.parametrize("real_time", [False, True])
-def test_replay_in_real_time_waits_as_long_as_it_took(tmp_path, film, predictor, monkeypatch, real_time):
+def test_replay_in_real_time_waits_between_chunks(tmp_path, film, predictor, monkeypatch, real_time):
     path, now = tmp_path / "touch.rec", [5e9]
     record(path, film, predictor)
     recording, clock = Recording(path), RecordedClock()
@@ -145,7 +143,7 @@ def test_replay_in_real_time_waits_as_long_as_it_took(tmp_path, film, predictor,
 
 
 @pytest.mark.parametrize(("asked_for", "taken_since"), [("linear/1", []), ("linear/2", [NewModel("linear/1")])])
-def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, tmp_path, asked_for, taken_since):
+def test_recording_that_begins_later_restarts_the_stream(film, predictor, tmp_path, asked_for, taken_since):
     """Begun and ended on request, with a marker: its replay gives its records, and the totals go on."""
     path, device = tmp_path / "later.rec", device_from_table(DEVICE, "test")
     stream, pieces = TouchStream(predictor, device), chunks(film)
@@ -174,7 +172,7 @@ def test_a_recording_that_begins_later_is_a_stream_of_its_own(film, predictor, t
 
 
 @pytest.mark.parametrize("marker", ['["x", "y"]', "[1.0]", "[1.0, 2]", '[1e300, "y"]', "1", f'[1.0, "{"x" * 2000}"]'])
-def test_a_damaged_marker_says_why(film, predictor, tmp_path, marker):
+def test_damaged_marker_raises_an_error_with_the_reason(film, predictor, tmp_path, marker):
     path = tmp_path / "touch.rec"
     record(path, film, predictor)
     path.write_text(path.read_text() + f'{{"marker": {marker}}}\n')

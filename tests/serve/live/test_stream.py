@@ -49,7 +49,7 @@ def pressed(film, x_mm=2.0, y_mm=-3.0, force_N=0.5):
     return film.charge_pC(np.array([x_mm]), np.array([y_mm]), np.array([force_N]))[0]
 
 
-def test_times_of_a_file_follow_the_clock_of_the_board(predictor, tmp_path):
+def test_timestamps_of_a_file_follow_the_clock_of_the_board(predictor, tmp_path):
     path = tmp_path / "frames"
     path.write_bytes(chunk(*frames(np.tile(OFFSET, (600, 1)))).data)
     with open_source(str(path)) as source:
@@ -57,7 +57,7 @@ def test_times_of_a_file_follow_the_clock_of_the_board(predictor, tmp_path):
     np.testing.assert_allclose(np.diff(times), 0.005, atol=1e-6)
 
 
-def test_the_board_of_a_device_file_is_followed(predictor):
+def test_device_file_of_the_board_is_used(predictor):
     """Numbers of another unit, whose tare is two frames."""
     device = device_from_table({"gain": {"pC_per_unit": 2.0}, "tare": {"frames": 2}}, "test")
     *_, record = stream([chunk(*frames(np.tile(OFFSET, (3, 1))))], predictor, device)
@@ -77,7 +77,7 @@ def test_record_of_a_press(film, play):
     assert 0.0 < record.latency_us < 5e6
 
 
-def test_latest_alone_tells_what_happened_before_it(predictor):
+def test_policy_latest_passes_flags_of_skipped_frames_on(predictor):
     """Frames without a record pass on what they say of the stream; what they say of themselves goes with them."""
     touch = TouchStream(predictor, chain=CHAIN, policy=Policy.latest)
     list(touch.feed(chunk(*frames(np.tile(OFFSET, (10, 1))))))
@@ -90,7 +90,7 @@ def test_latest_alone_tells_what_happened_before_it(predictor):
     assert (record.flags, touch.counts.skipped) == (("reconnected", "gap", "tare"), 9 + 4 + 1 + 2)
 
 
-def test_another_model_of_the_same_electrodes(film, make_film, predictor, tmp_path):
+def test_use_another_model_of_the_same_electrodes(film, make_film, predictor, tmp_path):
     touch = TouchStream(predictor, chain=CHAIN, frame_id="left")
     rest = list(touch.feed(chunk(*frames(np.tile(OFFSET, (10, 1))))))
     touch.use(Predictor(film.write(tmp_path, version=2)))
@@ -137,7 +137,7 @@ def test_flags_of_the_frame_are_in_the_record(film, play):
 
 
 @pytest.mark.parametrize("damaged", [1.01e9, -1e38, 1e300, -1.7e308, math.inf])
-def test_absurd_number_costs_its_frame_only(film, predictor, damaged):
+def test_value_that_is_no_charge_makes_only_its_frame_invalid(film, predictor, damaged):
     """Text has no checksum: a digit more in the exponent must stop neither the stream nor the sums of the chain."""
     device = device_from_table(
         {"gain": {"pC_per_unit": 2.0}, "leak": {"tau_s": 1.0}, "hum": {"frequency_Hz": 50.0}}, ""
@@ -159,18 +159,18 @@ def test_absurd_number_costs_its_frame_only(film, predictor, damaged):
 
 
 @pytest.mark.parametrize("data", [b"", b"hello, film\n"])
-def test_file_without_a_frame_is_refused(predictor, data):
+def test_file_without_a_frame_raises_an_error(predictor, data):
     """However short it is: silence must not be taken for a film that is left alone."""
     with pytest.raises(PortError, match=f"no intact frame among the first {len(data)} bytes"):
         list(stream([Chunk(data, 1e9, 0)] if data else [], predictor))
 
 
-def test_other_number_of_charges_is_refused(play):
+def test_wrong_number_of_charges_raises_an_error(play):
     with pytest.raises(ChargeError, match=r"model linear/1 expects 3 charges \('A', 'B', 'C'\), frame 10 has 4"):
         play(Frame(10, 0, (1.0, 2.0, 3.0, 4.0)))
 
 
-def test_bytes_that_are_no_frames_are_refused(predictor):
+def test_bytes_without_frames_raise_an_error(predictor):
     noise = [Chunk(bytes(range(128, 256)) * 4, 0.0, 0)] * 50
     with pytest.raises(
         PortError, match=r"no intact frame among the first \d+ bytes .*nothing recognised yet: check baud"

@@ -1,6 +1,6 @@
-"""Chunks of bytes in, touch charges out: parser, clock, channels and signal chain put in order; no model in it.
+"""Path from chunks of bytes to touch charges: parser, clock, assignment of the channels, and signal chain.
 
-`ChannelPicker` knows which channel of a frame is which electrode.
+No model of a film is needed for these readings, unless the signal chain estimates warming.
 """
 
 from collections.abc import Iterator, Mapping
@@ -20,43 +20,56 @@ from isocharge.serve.port.source import Chunk
 from isocharge.serve.signal_chain.chain import Chain, Reading, SignalChain
 from isocharge.serve.signal_chain.thermal import Misfit
 
+MAX_CHANNEL_DIGITS = 4
+"""Largest number of digits in the number of a channel."""
+
+BYTES_TO_RECOGNISE = 8192
+"""Number of bytes without an intact frame after which an error is raised."""
+
 
 class ChannelPicker:
-    """Picks the value of each electrode out of frames; the order is looked up again only when a frame's names change.
+    """Selects the value of each electrode from frames.
 
-    The device file's `[channels]` decides, by the names or numbers of `channel_names`. Without it, channels are matched
-    by the names of the electrodes (`A`, `A_pC` or `charge.A`); without such names by their order, if their number is
-    that of the electrodes.
+    The section `[channels]` of the device file assigns a channel to each electrode, by a name or number of
+    `channel_names`. Without this section, channels are assigned by the names of the electrodes (`A`, `A_pC` or
+    `charge.A`). If the channels have no such names, they are assigned by their order, provided that there are as many
+    channels as electrodes. The assignment is only computed again when the names in a frame change.
     """
 
     def __init__(
         self, electrodes: tuple[str, ...], channels: Mapping[str, str], reader: str, where: str = "device file"
     ) -> None:
-        """Set up the look-up.
+        """Set the assignment.
 
         Args:
             electrodes: Names of the electrodes, in the order of the charges.
-            channels: Electrode to the channel's name; empty where nothing is known.
-            reader: Who expects these electrodes, for messages: "model three/1".
-            where: The device file, for messages.
+            channels: Name or number of the channel of each electrode; empty if the device file has no such section.
+            reader: Reader that expects these electrodes, for messages, such as "model three/1".
+            where: Name of the device file, for messages.
         """
-        self._electrodes, self._channels, self._reader, self._where = electrodes, channels, reader, where
+        self._electrodes = electrodes
+        self._channels = channels
+        self._reader = reader
+        self._where = where
         self._names: tuple[str, ...] | None = None
-        self._width = -1
-        self._order: tuple[int, ...] = ()
+        self._n_values = -1
+        self._positions: tuple[int, ...] = ()
 
     def pick(self, frame: Frame) -> Array:
-        """Values in the order of the electrodes, shape (electrodes,), in the device's unit.
+        """Return the values in the order of the electrodes, shape (n_electrode,), in the unit of the device.
 
         Raises:
             ChargeError: If a frame has no value for an electrode.
         """
-        if frame.names != self._names or len(frame.values) != self._width:
-            self._order = self._look_up(frame)
-            self._names, self._width = frame.names, len(frame.values)
-        return np.array(itemgetter(*self._order)(frame.values), dtype=float).reshape(-1)
+        if frame.names != self._names or len(frame.values) != self._n_values:
+            self._positions = self._look_up(frame)
+            self._names = frame.names
+            self._n_values = len(frame.values)
+        values = itemgetter(*self._positions)(frame.values)
+        return np.array(values, dtype=float).reshape(-1)
 
     def _look_up(self, frame: Frame) -> tuple[int, ...]:
+        """Return the position of each electrode's channel among the values of a frame."""
         if self._channels:
             return tuple(self._position(electrode, frame) for electrode in self._electrodes)
         positions = {electrode_of(name): position for position, name in enumerate(frame.names)}
@@ -71,7 +84,7 @@ class ChannelPicker:
         )
 
     def _position(self, electrode: str, frame: Frame) -> int:
-        """The position of an electrode's channel among the values of a frame."""
+        """Return the position of the channel that the device file assigns to an electrode."""
         name = self._channels.get(electrode, electrode)
         position = position_of(name, frame)
         if position is None:
@@ -83,30 +96,38 @@ class ChannelPicker:
 
 
 def channel_names(frame: Frame) -> tuple[str, ...]:
-    """Names of the channels as `[channels]` takes them; their numbers from 1 on where the board gives none."""
-    return frame.names or tuple(map(str, range(1, len(frame.values) + 1)))
+    """Return the names of the channels as in the section `[channels]`; numbers from 1 if the frames have no names."""
+    if frame.names:
+        return frame.names
+    return tuple(str(number) for number in range(1, len(frame.values) + 1))
 
 
 def position_of(name: str, frame: Frame) -> int | None:
-    """The position of a channel by its name, or by its number from 1 as `2` or `ch2`; None if there is none."""
+    """Return the position of a channel among the values of a frame; None if there is no such channel.
+
+    Args:
+        name: Name of the channel, or its number from 1, such as `2` or `ch2`.
+        frame: A frame of the board.
+    """
     if name in frame.names:
         return frame.names.index(name)
     digits = name.removeprefix("ch")
-    number = int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 5 else 0
-    return number - 1 if 1 <= number <= len(frame.values) else None
+    is_number = digits.isascii() and digits.isdigit() and len(digits) <= MAX_CHANNEL_DIGITS
+    if not is_number:
+        return None
+    number = int(digits)
+    if not 1 <= number <= len(frame.values):
+        return None
+    return number - 1
 
 
 def electrode_of(name: str) -> str:
-    """`A` of `A`, `A_pC`, `charge.A` and `charge_raw_pC.A`."""
+    """Return the electrode that a channel is named after: `A` for `A`, `A_pC`, `charge.A` and `charge_raw_pC.A`."""
     return name.rpartition(".")[2].removesuffix("_pC")
 
 
-BYTES_TO_RECOGNISE = 8192
-"""Bytes without one intact frame after which a stream counts as no frames at all."""
-
-
 class TimedReading(NamedTuple):
-    """A frame after the signal chain, and when it was taken."""
+    """A frame after the signal chain, with its time."""
 
     reading: Reading
     time: ReadingTime
@@ -116,7 +137,9 @@ class ReadingStream:
     """The path from chunks to readings, with its state; belongs to one thread.
 
     Attributes:
-        parser, gaps, clock: The parts that read the frames, with their counters.
+        parser: Parser of the frames, with its counters.
+        gaps: Counter of missing frame numbers.
+        clock: Clock of the device.
     """
 
     def __init__(
@@ -130,16 +153,16 @@ class ReadingStream:
         misfit: Misfit | None = None,
         reader: str = "the sensor",
     ) -> None:
-        """Put the path together.
+        """Connect the parts of the path.
 
         Args:
-            electrodes: Names, in the order of the charges.
-            device: What is known about the board.
-            chain: Rules of the signal chain; by default those of the device.
-            parser: By default that of the device.
-            gaps: Follows the frame numbers.
-            misfit: Of a model of the film; a chain that follows warming needs it, others do not.
-            reader: Who expects these electrodes, for messages: "model three/1".
+            electrodes: Names of the electrodes, in the order of the charges.
+            device: Settings of the board.
+            chain: Settings of the signal chain; by default those of the device.
+            parser: Parser of the frames; by default that of the device.
+            gaps: Counter of missing frame numbers.
+            misfit: Misfit of a model of the film. Only a signal chain that estimates warming needs it.
+            reader: Reader that expects these electrodes, for messages, such as "model three/1".
 
         Raises:
             DeviceError: If the device file has other electrodes.
@@ -147,7 +170,8 @@ class ReadingStream:
         self.parser = parser or device.parser()
         self.gaps = gaps or SequenceGaps()
         self.clock = DeviceClock()
-        self._device, self._electrodes = device, electrodes
+        self._device = device
+        self._electrodes = electrodes
         self._settings = chain or device.chain(electrodes)
         self._picker = ChannelPicker(electrodes, device.channels, reader, device.where)
         self._misfit = misfit
@@ -156,10 +180,11 @@ class ReadingStream:
 
     @property
     def warming_ratio(self) -> Array | float:
-        """Charge of each electrode over the mean magnitude of all when the film warms, shape (electrodes,)."""
+        """Charge of each electrode over the mean magnitude of all when the film warms, shape (n_electrode,)."""
         return self._settings.pyro
 
     def _new_chain(self) -> SignalChain:
+        """Return a signal chain without any state."""
         return SignalChain(self._settings, len(self._electrodes), self._misfit)
 
     def tare(self) -> None:
@@ -167,18 +192,20 @@ class ReadingStream:
         self._chain.reset_tare()
 
     def restart(self) -> None:
-        """Begin as a new stream does: format, frame numbers, clock, tare and all counters are forgotten."""
-        self.parser, self.gaps, self.clock = self._device.parser(), SequenceGaps(), DeviceClock()
+        """Begin as a new stream does: discard the format, the frame numbers, the clock, the tare and all counters."""
+        self.parser = self._device.parser()
+        self.gaps = SequenceGaps()
+        self.clock = DeviceClock()
         self._chain = self._new_chain()
         self._pending_flags = ()
 
     def feed(self, chunk: Chunk) -> Iterator[TimedReading]:
-        """The readings of the frames that end in this chunk.
+        """Yield the readings of the frames that end in this chunk.
 
         Raises:
             ChargeError: If a frame has another number of charges.
-            TareError: If the film is not left alone to tare.
-            NoFramesError: If the bytes are no frames.
+            TareError: If the film is touched during the whole search for a tare.
+            NoFramesError: If the bytes contain no frames.
         """
         frames = self.frames(chunk)
         for frame in frames:
@@ -186,13 +213,13 @@ class ReadingStream:
         self.arrived(frames, chunk)
 
     def frames(self, chunk: Chunk) -> list[Frame]:
-        """The frames that end in a chunk; after an outage everything begins anew."""
+        """Return the frames that end in a chunk. After an outage, start over before."""
         if chunk.outage_s > 0.0:
             self._reconnect()
         return self.parser.feed(chunk.data)
 
     def advance(self, frame: Frame, chunk: Chunk) -> TimedReading:
-        """Take the next frame of a chunk through clock and chain."""
+        """Compute the time and the touch charges of the next frame of a chunk."""
         time_of_reading = self.clock.read(frame.t_us, self.parser.t_us_modulus, chunk.timestamp)
         flags = self._pending_flags + self.gaps.update(frame.seq, self.parser.seq_modulus)
         self._pending_flags = ()
@@ -206,8 +233,8 @@ class ReadingStream:
                 flags=flags,
             )
         except TareError as error:
-            rests = zip(self._electrodes, values.tolist(), strict=True)
-            offsets = ", ".join(f"{name} = {value:.10g}" for name, value in rests)
+            electrode_values = zip(self._electrodes, values.tolist(), strict=True)
+            offsets = ", ".join(f"{name} = {value:.10g}" for name, value in electrode_values)
             raise TareError(
                 f"{error}; if the board rests there without a touch, say so in a device file: [gain] offset = "
                 f"{{{offsets}}}"
@@ -215,10 +242,14 @@ class ReadingStream:
         return TimedReading(reading, time_of_reading)
 
     def arrived(self, frames: list[Frame], chunk: Chunk) -> None:
-        """A chunk is over: its arrival sets the clock; bytes that are no frames are refused.
+        """End a chunk: adjust the clock to its arrival.
+
+        Args:
+            frames: The frames that ended in the chunk.
+            chunk: The chunk.
 
         Raises:
-            NoFramesError: If there was not one intact frame among many bytes.
+            NoFramesError: If there has been no intact frame among many bytes.
         """
         if frames:
             self.clock.arrived(chunk.timestamp)
@@ -229,12 +260,12 @@ class ReadingStream:
         """End the stream, as at the end of a file.
 
         Raises:
-            NoFramesError: If there was not one intact frame.
+            NoFramesError: If there has been no intact frame.
         """
-        _check_recognised(self.parser, allowed=-1)
+        _check_recognised(self.parser, max_bytes=-1)
 
     def _reconnect(self) -> None:
-        """Start over after an outage: frames are missing, and the film may have been touched meanwhile."""
+        """Start over after an outage, because frames are missing and the film may have been touched meanwhile."""
         self.parser.reset()
         self.gaps.reset()
         self.clock.reset()
@@ -242,9 +273,10 @@ class ReadingStream:
         self._pending_flags = (RECONNECTED,)
 
 
-def _check_recognised(parser: Parser, allowed: int = BYTES_TO_RECOGNISE) -> None:
+def _check_recognised(parser: Parser, max_bytes: int = BYTES_TO_RECOGNISE) -> None:
+    """Raise NoFramesError if there has been no intact frame among more than `max_bytes` bytes."""
     counts = parser.counts
-    if counts.frames == 0 and counts.bytes_dropped > allowed:
+    if counts.frames == 0 and counts.bytes_dropped > max_bytes:
         raise NoFramesError(
             f"no intact frame among the first {counts.bytes_dropped} bytes ({counts.crc_errors} with a wrong CRC, "
             f"{counts.malformed} of another form); {parser.format}: check baud rate and device"

@@ -1,7 +1,7 @@
-"""A touch stream with its recording: chunks and records are written as they come, and played again.
+"""A touch stream whose chunks and records are written to a recording, and the replay of such a recording.
 
-A recording holds what `RecordedStream` passed on; `replay` takes it through the same stream. The same models give the
-same records, bit for bit.
+`replay` feeds the chunks of a recording to a stream with the same settings. With the same models, its records are the
+same, bit for bit.
 """
 
 import logging
@@ -19,29 +19,31 @@ from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import PredictionRecord
 
 Load = Callable[[], Predictor]
+"""A function that loads a model."""
 
 log = logging.getLogger(__name__)
 
 
 class RecordedStream:
-    """Records of a touch stream, which go into a recording if there is one; belongs to one thread.
+    """A touch stream that writes its chunks and records to a recording; belongs to one thread.
 
-    What is requested, from any thread, is done before the next chunk.
+    The methods `request_...` may be called from any thread. The requests are executed before the next chunk.
 
     Attributes:
-        recorder: The recording that is under way.
+        recorder: The recording that is being written; None if there is none.
     """
 
     def __init__(self, stream: TouchStream, recorder: Recorder | None = None) -> None:
-        """Put stream and recording together.
+        """Set the stream and its recording.
 
         Args:
-            stream: From chunks to records.
-            recorder: Open while `follow` runs; None for no recording.
+            stream: The stream from chunks to records.
+            recorder: A recording that is open while `follow` runs; None for no recording.
         """
-        self._stream, self.recorder = stream, recorder
-        self._borrowed = recorder  # whoever opened it closes it
-        self._under_way: tuple[Chunk, list[str]] | None = None
+        self._stream = stream
+        self.recorder = recorder
+        self._given_recorder = recorder  # The caller opened this recording and closes it.
+        self._current_chunk: tuple[Chunk, list[str]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
         self._recording_requested: deque[Recorder | None] = deque(maxlen=1)
         self._load_requested: Load | None = None
@@ -49,44 +51,49 @@ class RecordedStream:
 
     @property
     def predictor(self) -> Predictor:
-        """The model of the next record."""
+        """The model that computes the next record."""
         return self._stream.predictor
 
     def request_tare(self) -> None:
-        """Tare again; may be called from a signal handler."""
+        """Request a new tare. The method may also be called from a signal handler."""
         self._requests.append(self._tare)
 
     def request_film_reset(self) -> None:
-        """Go back to the film as it was calibrated; may be called as `request_tare`."""
+        """Request to go back to the film as it was calibrated. It may also be called from a signal handler."""
         self._requests.append(self._reset_film)
 
     def request_recording(self, recorder: Recorder | None) -> None:
-        """End the recording that is under way; begin another one, in the place of one that still waits for data.
+        """Request to end the present recording and to begin another one.
 
-        A recording begins with a new stream, tare included: its replay has nothing but its bytes to go by.
+        The request replaces an earlier request that has not been executed yet. The stream is restarted, including its
+        tare, when a recording begins, because a replay only has the bytes of the recording.
 
         Args:
-            recorder: It is opened then, and closed at the end. None for no recording.
+            recorder: The next recording, which the stream opens and closes; None for no recording.
         """
         self._recording_requested.append(recorder)
         self._requests.append(self._record)
 
     def request_marker(self, marker: Marker) -> None:
-        """Note a moment in the recording, if there is one."""
+        """Request to write a marker to the recording, if there is one."""
         self._requests.append(partial(self._mark, marker))
 
     def request_model(self, load: Load) -> None:
-        """Load a model meanwhile, and go on with it from the first chunk after that; may be called as `request_tare`.
+        """Request another model, which is loaded in the background and used from the next chunk after that.
 
-        A model that cannot be loaded, or has other electrodes, is refused with a word, and the one before serves on.
+        If the model cannot be loaded, or has other electrodes, an error is logged and the present model is kept. The
+        method may also be called from a signal handler.
+
+        Args:
+            load: Function that loads the model.
         """
         self._load_requested = load
 
     def follow(self, chunks: Iterable[Chunk]) -> Generator[PredictionRecord]:
         """Yield the records until the chunks end.
 
-        A chunk is recorded when its last record was taken. Close the generator before the recorder: so the chunk that
-        is under way is written, too, wherever Ctrl-C came.
+        A chunk is recorded after its last record has been yielded. Close the generator before the recorder. The
+        present chunk is then recorded, too, even if the program is interrupted.
 
         Raises:
             As `isocharge.serve.live.stream.stream`.
@@ -98,7 +105,7 @@ class RecordedStream:
                 while self._requests:
                     self._requests.popleft()()
                 lines: list[str] = []
-                self._under_way = (chunk, lines)
+                self._current_chunk = (chunk, lines)
                 for record in self._stream.feed(chunk):
                     lines.append(record.to_json())
                     yield record
@@ -109,12 +116,14 @@ class RecordedStream:
             self._end_recording()
 
     def _record_chunk(self) -> None:
-        if self.recorder is not None and self._under_way is not None:
-            self.recorder.chunk(*self._under_way)
-        self._under_way = None
+        """Write the present chunk and its records to the recording."""
+        if self.recorder is not None and self._current_chunk is not None:
+            self.recorder.chunk(*self._current_chunk)
+        self._current_chunk = None
 
     def _record(self) -> None:
-        if not self._recording_requested:  # a later request was done in the place of this one
+        """Begin the recording that was requested."""
+        if not self._recording_requested:  # A later request was executed instead of this one.
             return
         self._end_recording()
         recorder = self._recording_requested.pop()
@@ -125,35 +134,40 @@ class RecordedStream:
                 log.error("no recording: %s", error)
                 return
             self._stream.restart()
-            if recorder.model_label != self.predictor.metadata.label:  # it was taken since the request
+            if recorder.model_label != self.predictor.metadata.label:  # The model changed after the request.
                 recorder.model(self.predictor.metadata.label)
 
     def _end_recording(self) -> None:
-        recorder, self.recorder = self.recorder, None
-        if recorder is not None and recorder is not self._borrowed:
+        """End the present recording, and close it if this object opened it."""
+        recorder = self.recorder
+        self.recorder = None
+        if recorder is not None and recorder is not self._given_recorder:
             recorder.close()
 
     def _mark(self, marker: Marker) -> None:
+        """Write a marker to the recording."""
         if self.recorder is not None:
             self.recorder.mark(marker)
 
     def _take_model(self) -> None:
-        """Use the model whose loading is done; begin to load the next one."""
+        """Use a model that has been loaded, and begin to load the next one that was requested."""
         if self._loading is not None and self._loading.done():
             self._use(self._loading)
             self._loading = None
         if self._load_requested and self._loading is None:
-            load, self._load_requested = self._load_requested, None
+            load = self._load_requested
+            self._load_requested = None
             loader = ThreadPoolExecutor(1, "model")
             self._loading = loader.submit(load)
             loader.shutdown(wait=False)
 
     def _use(self, loaded: "Future[Predictor]") -> None:
+        """Continue with a loaded model; log an error and keep the present model if that fails."""
         before = self._stream.predictor.metadata.label
         try:
             predictor = loaded.result()
             self._stream.use(predictor)
-        except Exception as error:  # whatever is wrong with a new model, the old one serves
+        except Exception as error:  # Any error of a new model keeps the present one.
             log.error("%s serves on, because the new model is refused: %s: %s", before, type(error).__name__, error)
             return
         if self.recorder is not None:
@@ -161,11 +175,13 @@ class RecordedStream:
         log.warning("%s serves from now on, after %s", predictor.metadata.label, before)
 
     def _tare(self) -> None:
+        """Measure the tare again, and record that."""
         self._stream.tare()
         if self.recorder is not None:
             self.recorder.tare()
 
     def _reset_film(self) -> None:
+        """Go back to the film as it was calibrated, and record that."""
         self._stream.reset_film()
         if self.recorder is not None:
             self.recorder.back()
@@ -180,15 +196,16 @@ def replay(
     load: Callable[[str], Predictor] | None = None,
     on_marker: Callable[[Marker], object] = lambda _: None,
 ) -> Iterator[PredictionRecord]:
-    """Yield the records of a recording: for each chunk as many as were taken when it was recorded.
+    """Yield the records of a recording; of each chunk as many records as were used when it was recorded.
 
     Args:
-        recording: What was recorded.
-        stream: A new stream of the same model, device and policy, whose `now_ns` is the clock.
+        recording: The recording.
+        stream: A new stream with the same model, device and policy, whose `now_ns` is `clock`.
         clock: The clock of the replay.
-        real_time: Whether to wait as long between two chunks as it took then.
-        load: Gives the model of a label, where the recording went on with another one; None stays with the first.
-        on_marker: Called with each marker, between the records before and after it.
+        real_time: Whether to wait between two chunks for the time that had passed in the recording.
+        load: Function that loads a model by its label, for recordings in which the model changes. None keeps the first
+            model.
+        on_marker: Function that is called with each marker, between the records before and after it.
 
     Raises:
         RecordingError: If a line other than the last one is damaged.
@@ -210,7 +227,8 @@ def replay(
             case Event(chunk=Chunk() as chunk, latencies_us=latencies_us):
                 clock.set(event)
                 if real_time:
-                    delay_s = time.time() - chunk.timestamp if delay_s is None else delay_s
+                    if delay_s is None:
+                        delay_s = time.time() - chunk.timestamp
                     time.sleep(max(0.0, chunk.timestamp + delay_s - time.time()))
                 for number, record in enumerate(stream.feed(chunk)):
                     if number < len(latencies_us):
