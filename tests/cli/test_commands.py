@@ -286,6 +286,7 @@ BAD = [
             (f"{__file__} --sensor {SENSOR} --radius auto", "--radius: expected a number of mm with measured presses"),
             (f"{__file__} --sensor {SENSOR} --probe circle:1 --probe circle:2", "--probe: expected the one that made"),
             (f"none.csv --sensor {SENSOR}", "none.csv: expected a dataset folder, or a CSV file"),
+            ("/dev/null", "/dev/null: expected --sensor SENSOR for presses that are not in a regular file"),
         ]
     ),
     (("train", "fit", ".", "-o", "OUT"), 2, "DatasetError: . is not a dataset: it has no manifest.json"),

@@ -1,7 +1,8 @@
-"""The command `isocharge`: the composition root, the only part that sees all stages.
+"""The command `isocharge`, which contains the commands of all stages.
 
-Each stage brings its commands, one module each, as `isocharge.cli.simulate.sweep`. Data go to stdout, messages for
-people to stderr. Exit codes: 0 done, 1 failed, 2 wrong usage or input.
+This module is the only one that imports the commands of all stages: simulate, train and serve. Each command has its own
+module, such as `isocharge.cli.simulate.sweep`. Commands write data to standard output and messages to standard error.
+The exit code is 0 for success, 1 for a failure, and 2 for wrong usage or input.
 """
 
 import signal
@@ -18,11 +19,19 @@ from isocharge.cli.train.app import train_app
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.common.versions import package_version
 
+EXIT_CODE_FAILURE = 1
+"""Exit code of a command that failed."""
+
+EXIT_CODE_WRONG_INPUT = 2
+"""Exit code of a command with wrong usage or wrong input."""
+
 app = lazy_group(
-    "Find where a piezoelectric tactile film is touched, and how hard, from the charges of three to eight electrodes.",
+    "Compute the position and the force of a contact on a piezoelectric tactile film from the charges of three to eight "
+    "electrodes.",
     {
         "demo": LazyCommand(
-            "isocharge.cli.demo.command:demo_command", "Simulate, train, follow a virtual sensor, draw: all once."
+            "isocharge.cli.demo.command:demo_command",
+            "Run all stages once: simulate a film, train a network, track a virtual sensor, draw a picture.",
         )
     },
 )
@@ -31,8 +40,9 @@ app.add_typer(train_app, name="train")
 app.add_typer(serve_app, name="serve")
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
+def _print_version(is_requested: bool) -> None:
+    """Print the version and end the command, if `--version` was given."""
+    if is_requested:
         show(f"isocharge {package_version()}")
         raise typer.Exit
 
@@ -40,14 +50,17 @@ def _print_version(asked: bool) -> None:
 @app.callback()
 def root(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version, and exit.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """What stands before a command."""
+    """Accept the options that are given before the name of a command."""
 
 
 def main() -> None:
-    """Run the command line; the one place that maps errors to exit codes. SIGTERM ends a command as Ctrl-C does."""
+    """Run the command line, and end the process with its exit code.
+
+    All errors are turned into exit codes here. SIGTERM ends a command in the same way as Ctrl-C.
+    """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     open_closed_streams()
     try:
@@ -55,4 +68,6 @@ def main() -> None:
             app()
     except (IsochargeError, OSError, MemoryError) as error:
         say(f"{type(error).__name__}: {error}")
-        sys.exit(2 if isinstance(error, InputError) else 1)
+        if isinstance(error, InputError):
+            sys.exit(EXIT_CODE_WRONG_INPUT)
+        sys.exit(EXIT_CODE_FAILURE)

@@ -1,4 +1,4 @@
-"""`isocharge train distil`: a model to a small student for microcontrollers."""
+"""`isocharge train distil`: train a small network for microcontrollers on the answers of a model."""
 
 from typing import Annotated
 
@@ -7,11 +7,16 @@ import typer
 from isocharge.cli.shared.forward_maps import simulated_presses
 from isocharge.cli.shared.options import ConfigOption, FreshOption, JsonOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.terminal import shown_progress
-from isocharge.cli.train.fit import ModelFolderOption, VersionOption, release_resumably
+from isocharge.cli.train.resumable_release import (
+    ModelFolderOption,
+    ReleaseOptions,
+    VersionOption,
+    train_and_release,
+)
 from isocharge.common.errors import InputError
+from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve import find_model, load_model
-from isocharge.serve.model.model_folder import check_target
-from isocharge.train import StudentCase, fit, load_config, release, student_config, student_data
+from isocharge.train import Fitted, StudentCase, fit, load_config, release, student_config, student_data
 from isocharge.train.training.fit import fit_identity
 
 
@@ -28,24 +33,33 @@ def distil_command(
     fresh: FreshOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Train a small network on the answers of MODEL, for microcontrollers: some 5,000 weights and biases.
+    """Train a small network on the answers of MODEL, for microcontrollers: about 5,000 weights and biases.
 
-    It has the inputs and outputs of MODEL: contact, standard deviations and misfit. Presses within MODEL's working area
-    and forces are simulated first. `isocharge train export-c` turns the student into C.
+    The small network, called the student, has the inputs and outputs of MODEL: contact, standard deviations and misfit.
+    It is trained on presses within the working area and the forces of MODEL, which are simulated first. `isocharge
+    train export-c` writes the student as C source.
 
-    A run that was stopped or killed leaves models/NAME/VERSION.part; the same command goes on from there and makes the
-    same student.
+    A run that was stopped leaves models/NAME/VERSION.part. The same command continues it and makes the same student.
 
     Example: isocharge train distil four-25um-biaxial -o models/four-25um-biaxial-student
     """
-    if config and int8:
-        raise InputError('--int8: expected no --config beside it; write weights = "int8" under [network] in the file')
-    folder = find_model(model, models)
-    settings = load_config(config) if config else student_config("int8" if int8 else "float32")
-    case = StudentCase.of(load_model(folder).metadata)
-    target = check_target(output, version, case.sensor.electrode_names)
+    if config is not None and int8:
+        raise InputError(
+            f'--int8: expected no --config beside it, got {config}; write weights = "int8" under [network] in this '
+            "file instead"
+        )
+    model_folder = find_model(model, models)
+    fit_config = student_config("int8" if int8 else "float32")
+    if config is not None:
+        fit_config = load_config(config)
+    case = StudentCase.of(load_model(model_folder).metadata)
+    options = ReleaseOptions(output, version, fresh=fresh, json=json)
+    version_folder = options.check_version_folder(case.sensor.electrode_names)
     with shown_progress():
         presses = simulated_presses(case.sensor, case.probes, case.domain.radius, case.domain.force_range)
-    data = student_data(folder, presses)
-    identity = fit_identity(data, settings)
-    release_resumably(lambda run: fit(data, settings, run=run), identity, target, release, fresh=fresh, json=json)
+    data = student_data(model_folder, presses)
+
+    def train(run: ResumableRun) -> Fitted:
+        return fit(data, fit_config, run=run)
+
+    train_and_release(train, fit_identity(data, fit_config), version_folder, options, release)

@@ -1,31 +1,33 @@
-"""`isocharge train fit`: a dataset, measured presses, or a sensor, to a model."""
+"""`isocharge train fit`: make a model from a dataset, from measured presses, or from the description of a sensor."""
 
-from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import shown_run, simulated_presses, sweep_radius, warn_of_stress
-from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_press_file
+from isocharge.cli.shared.forward_maps import caution_of_stress, simulated_presses, sweep_radius
+from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
 from isocharge.cli.shared.options import (
     ConfigOption,
     FreshOption,
     JsonOption,
     ModelsOption,
     RadiusOption,
-    parse_radius_mm,
-    refuse,
-    worker_count,
+    most_workers,
+    radius_mm_of,
 )
-from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
+from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.cli.train.calibrate import calibrate_into
+from isocharge.cli.train.resumable_release import (
+    ModelFolderOption,
+    ReleaseOptions,
+    VersionOption,
+    train_and_release,
+)
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, ModelError, SceneError
-from isocharge.common.resumable_run import ResumableRun, resume_parts
+from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve import MeasuredPresses
-from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import Circle, FilmPrior, load_sensor, local_workers, parse_probe, read_dataset
 from isocharge.simulate.sensor.probe import PROBE_HELP
 from isocharge.train import (
@@ -33,7 +35,7 @@ from isocharge.train import (
     FilmsConfig,
     FilmsModel,
     FitConfig,
-    Release,
+    Fitted,
     Rig,
     TrainingData,
     fit,
@@ -48,18 +50,11 @@ from isocharge.train.films.fit import films_identity
 from isocharge.train.training.cross_fit import presses_identity, usable_presses
 from isocharge.train.training.fit import fit_identity
 
-Trained = TypeVar("Trained")
-"""What training gives, and a release is made of."""
+DEFAULT_PROBE = "circle:1.0"
+"""Notation of the probe if `--probe` is not given."""
 
-DEFAULT_TEXT = f"{DEFAULT_RADIUS}"
-"""Radius of the working area where no other is asked for, mm."""
-
-ModelFolderOption = Annotated[
-    Path,
-    typer.Option("--output", "-o", metavar="models/NAME", help="Model folder; its name becomes the model's name."),
-]
-
-VersionOption = Annotated[int, typer.Option("--version", min=1, help="Version of the model: the folder in NAME.")]
+DEFAULT_RADIUS_TEXT = f"{DEFAULT_RADIUS}"
+"""Radius of the working area if `--radius` is not given, mm, as text."""
 
 
 def fit_command(
@@ -68,9 +63,9 @@ def fit_command(
         Path | None,
         typer.Argument(
             metavar="DATASET|PRESSES.csv",
-            help="Dataset folder of `isocharge simulate sweep` or of measured presses; or a CSV file of measured "
-            "presses, three or more with --sensor, 500 without: x_mm, y_mm, force_N and the electrodes' names (pC). "
-            "(default: --sensor)",
+            help="A dataset folder of `isocharge simulate sweep` or of measured presses, or a CSV file of measured "
+            "presses with the columns x_mm, y_mm, force_N and the names of the electrodes (pC). The file needs three "
+            "or more presses with --sensor, 500 without. (default: --sensor)",
         ),
     ] = None,
     sensor: Annotated[
@@ -78,23 +73,23 @@ def fit_command(
         typer.Option(
             "--sensor",
             metavar="SENSOR",
-            help="The sensor of PRESSES.csv; without a file, 24,000 presses are simulated on it, from 0.05 to 2 N; a "
-            "built-in name or a TOML file. (default: DATASET's)",
+            help="Sensor of PRESSES.csv: the name of a built-in sensor or a TOML file. Without a file, 24,000 presses "
+            "from 0.05 to 2 N are simulated on this sensor. (default: the sensor of DATASET)",
         ),
     ] = None,
     probe: Annotated[
         list[str] | None,
         typer.Option(
-            "--probe", metavar="SHAPE", help=f"With --sensor: {PROBE_HELP} May be repeated. (default: circle:1.0)"
+            "--probe", metavar="SHAPE", help=f"With --sensor: {PROBE_HELP} May be repeated. (default: {DEFAULT_PROBE})"
         ),
     ] = None,
-    radius: RadiusOption = DEFAULT_TEXT,
+    radius: RadiusOption = DEFAULT_RADIUS_TEXT,
     films: Annotated[
         bool,
         typer.Option(
             "--films",
-            help="With --sensor: train one network for every film that the sensor may be, for `isocharge train "
-            "calibrate`; some 20 minutes on 2 cores. (default: the film as described)",
+            help="With --sensor: train one network for all films that the sensor may have, which `isocharge train "
+            "calibrate` uses. This takes about 20 minutes on 2 cores. (default: only the film as described)",
         ),
     ] = False,
     position_std_mm: PositionStdOption = 0.1,
@@ -107,19 +102,20 @@ def fit_command(
 ) -> None:
     """Train a network on charges, measure its errors, and write a model folder: ONNX file, card, golden vectors.
 
-    The presses come from DATASET, or are simulated first: --probe and --radius say how, and belong to --sensor.
+    The presses come from DATASET. With --sensor and no DATASET the presses are simulated first, with the probes of
+    --probe and within the radius of --radius.
 
-    From measured presses with --sensor the film is calibrated, as by `isocharge train calibrate`. If no network for all
-    films fits the sensor, the presses correct the sensor as described, and a fifth of them is held out for the errors.
-    Without --sensor the presses alone are learned, of any sensor with three to eight channels: every other column is
-    one. Their errors are of networks that left out the presses' places.
+    From measured presses with --sensor the film is calibrated, as by `isocharge train calibrate`. If there is no
+    network for all films of this sensor, the presses correct the charges of the sensor as described, and a fifth of the
+    presses is held out to measure the errors. From measured presses without --sensor a network is trained on the
+    presses alone. The sensor can then be any sensor with three to eight channels, and every other column of the file is
+    a channel. The errors are measured by cross-validation, in which all presses at a place are left out together.
 
-    With --films the sensor's film is not taken as described: pretension, stiffness, coefficients, gains and the place
-    of the electrodes are drawn as they spread between films, and the folder also gets films.npz, the network for all of
-    them.
+    With --films the pretension, the stiffness, the piezoelectric coefficients, the gains and the positions of the
+    electrodes are drawn at random, as they vary between films. The model folder then also contains films.npz, the
+    network for all these films.
 
-    A run that was stopped or killed leaves models/NAME/VERSION.part; the same command goes on from there and makes the
-    same model.
+    A run that was stopped leaves models/NAME/VERSION.part. The same command continues it and makes the same model.
 
     Example: isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
 
@@ -127,94 +123,173 @@ def fit_command(
 
     Example: isocharge train fit presses.csv -o models/pad
     """
-    probes = probe or ["circle:1.0"]
+    notations = probe or [DEFAULT_PROBE]
+    options = ReleaseOptions(output, version, fresh=fresh, json=json)
     if films:
-        prior, sizes = _films(dataset, sensor, probes, radius, config)
-        target = check_target(output, version, prior.sensor.electrode_names)
-        warn_of_stress(prior.sensor.film, [prior.probe], sizes.force_range[1])
-
-        def train_films(run: ResumableRun) -> FilmsModel:
-            with local_workers(worker_count(None)) as executor:
-                return fit_films(prior, sizes, executor=executor, run=run)
-
-        identity = films_identity(prior, sizes)
-        release_resumably(train_films, identity, target, release_films, fresh=fresh, json=json)
+        film_prior = _film_prior(dataset, sensor, notations, radius, config)
+        _release_films_model(film_prior, FilmsConfig(radius=radius_mm_of(radius)), options)
         return
-    if sensor and not (dataset and dataset.is_file()):  # before anything is simulated
-        check_target(output, version, load_sensor(sensor).electrode_names)
-    settings = load_config(config) if config else FitConfig()
-    if dataset and dataset.is_file() and not sensor:
-        presses = _measured(dataset, radius, (position_std_mm, force_std))
-        target = check_target(output, version, presses.electrodes)
-        train = partial(fit_presses, presses, output.resolve().name, settings, probes=tuple(probe or ["unknown"]))
-        release_resumably(
-            lambda run: train(run=run), presses_identity(presses, settings), target, release, fresh=fresh, json=json
-        )
+
+    press_file = dataset if dataset is not None and dataset.is_file() else None
+    if sensor is not None and press_file is None:
+        # Refuse an unsuitable model folder before the simulation, which takes a while.
+        options.check_version_folder(load_sensor(sensor).electrode_names)
+    fit_config = load_config(config) if config else FitConfig()
+    if press_file is not None and sensor is None:
+        presses = _read_presses_of_unknown_sensor(press_file, radius, position_std_mm, force_std)
+        pressing_probes = tuple(probe or ["unknown"])
+        _release_presses_model(presses, pressing_probes, fit_config, options)
         return
-    rig = None
-    if dataset and not dataset.is_dir():
-        rig = _rig(dataset, sensor, probes, radius, (position_std_mm, force_std))
+
+    if dataset is not None and not dataset.is_dir():
+        rig = _read_rig(dataset, sensor, notations, radius, position_std_mm, force_std)
         problem = calibration_problem(rig, models)
         if problem is not None:
             refuse_training_options(config, version, radius)
             calibrate_into(rig.presses, problem, output, json=json)
             return
-    with shown_progress():
-        if rig is not None:
-            data = rig_data(rig, seed=settings.training.seed)
-        else:
-            data = _presses(dataset, sensor, probes, radius)
-    target = check_target(output, version, data.sensor.electrode_names)
-    warn_of_stress(data.sensor.film, map(parse_probe, data.probes), data.domain.force_range[1])
-    identity = fit_identity(data, settings)
-    release_resumably(lambda run: fit(data, settings, run=run), identity, target, release, fresh=fresh, json=json)
+        with shown_progress():
+            data = rig_data(rig, seed=fit_config.training.seed)
+    else:
+        with shown_progress():
+            data = _read_or_simulate_data(dataset, sensor, notations, radius)
+    _release_data_model(data, fit_config, options)
 
 
-UNSEEN = "that training never saw"
-"""What is said of measured presses that were held out."""
+def _release_films_model(film_prior: FilmPrior, films_config: FilmsConfig, options: ReleaseOptions) -> None:
+    """Train a network for all films of a sensor, and release it."""
+    version_folder = options.check_version_folder(film_prior.sensor.electrode_names)
+    caution_of_stress(film_prior.sensor.film, [film_prior.probe], films_config.force_range[1])
+
+    def train(run: ResumableRun) -> FilmsModel:
+        with local_workers(most_workers(None)) as executor:
+            return fit_films(film_prior, films_config, executor=executor, run=run)
+
+    train_and_release(train, films_identity(film_prior, films_config), version_folder, options, release_films)
 
 
-def _presses(dataset: Path | None, sensor: str | None, probes: list[str], radius: str) -> TrainingData:
-    """A dataset, read or simulated."""
-    if dataset and not sensor:
+def _release_presses_model(
+    presses: MeasuredPresses, notations: tuple[str, ...], fit_config: FitConfig, options: ReleaseOptions
+) -> None:
+    """Train a network on measured presses alone, and release it.
+
+    Args:
+        presses: Measured presses of a sensor without a description.
+        notations: Notations of the probes, or "unknown".
+        fit_config: Settings of the network and its training.
+        options: Options of the command.
+    """
+    version_folder = options.check_version_folder(presses.electrodes)
+    sensor_name = options.model_folder.resolve().name
+
+    def train(run: ResumableRun) -> Fitted:
+        return fit_presses(presses, sensor_name, fit_config, probes=notations, run=run)
+
+    train_and_release(train, presses_identity(presses, fit_config), version_folder, options, release)
+
+
+def _release_data_model(data: TrainingData, fit_config: FitConfig, options: ReleaseOptions) -> None:
+    """Train a network on the training data of a known sensor, and release it."""
+    version_folder = options.check_version_folder(data.sensor.electrode_names)
+    probes = [parse_probe(notation) for notation in data.probes]
+    caution_of_stress(data.sensor.film, probes, data.domain.force_range[1])
+
+    def train(run: ResumableRun) -> Fitted:
+        return fit(data, fit_config, run=run)
+
+    train_and_release(train, fit_identity(data, fit_config), version_folder, options, release)
+
+
+def _read_or_simulate_data(dataset: Path | None, sensor: str | None, notations: list[str], radius: str) -> TrainingData:
+    """Return training data from a dataset folder, or from presses that are simulated on a sensor.
+
+    Args:
+        dataset: Dataset folder; None to simulate presses.
+        sensor: Name or file of the sensor; None to read the dataset.
+        notations: Notations of the probes of the simulated presses.
+        radius: Largest distance of the simulated presses from the centre: a number of mm, or "auto".
+
+    Raises:
+        InputError: If both the dataset and the sensor are given, or neither.
+    """
+    if dataset is not None and sensor is not None:
+        raise InputError("expected either a DATASET folder or --sensor SENSOR, got both; leave one of them out")
+    if dataset is not None:
         return TrainingData.of(read_dataset(dataset))
-    if dataset or not sensor:
-        raise InputError(f"expected either a DATASET folder or --sensor SENSOR, got {'both' if dataset else 'neither'}")
-    film_sensor, pressing, forces = load_sensor(sensor), [parse_probe(text) for text in probes], DEFAULT_FORCE_RANGE
-    reach = sweep_radius(radius, film_sensor, pressing, forces)
-    return TrainingData.of(simulated_presses(film_sensor, pressing, reach, forces))
+    if sensor is None:
+        raise InputError("expected either a DATASET folder or --sensor SENSOR, got neither")
+    described_sensor = load_sensor(sensor)
+    probes = [parse_probe(notation) for notation in notations]
+    radius_mm = sweep_radius(radius, described_sensor, probes, DEFAULT_FORCE_RANGE)
+    return TrainingData.of(simulated_presses(described_sensor, probes, radius_mm, DEFAULT_FORCE_RANGE))
 
 
-def _measured(file: Path, radius: str, stds: tuple[float, float]) -> MeasuredPresses:
-    """Measured presses of any sensor; the columns that are taken for channels are said."""
-    refuse({"--radius: belongs to --sensor; without it, the area is where the presses are": radius != DEFAULT_TEXT})
-    presses = usable_presses(read_press_file(file, None, *stds))
+def _read_presses_of_unknown_sensor(
+    file: Path, radius: str, position_std_mm: float, force_std: float
+) -> MeasuredPresses:
+    """Read the measured presses of a sensor without a description, and print which columns are its channels.
+
+    Args:
+        file: CSV file of the presses.
+        radius: Value of `--radius`, which must be the default.
+        position_std_mm: Standard deviation of the positions if the file contains none, mm.
+        force_std: Relative standard deviation of the forces if the file contains none.
+
+    Raises:
+        InputError: If `--radius` is given.
+        PressError: If the presses are too few or not usable.
+    """
+    if radius != DEFAULT_RADIUS_TEXT:
+        raise InputError(
+            f"--radius: belongs to --sensor, got {radius} without --sensor; leave it out, because the working area is "
+            "then the area of the presses"
+        )
+    presses = usable_presses(read_presses_of(file, None, position_std_mm, force_std))
     say(f"{file}: {len(presses)} presses of the channels {', '.join(presses.electrodes)}")
     return presses
 
 
-def _rig(file: Path, sensor: str | None, probes: list[str], radius: str, stds: tuple[float, float]) -> Rig:
-    """Measured presses of a file."""
-    refuse(
-        {
-            f"{file}: expected a dataset folder, or a CSV file of measured presses; there is neither": (
-                not file.exists()
-            ),
-            "--radius: expected a number of mm with measured presses, got auto": radius == "auto",
-            f"--probe: expected the one that made the presses, got {', '.join(probes)}": len(probes) != 1,
-        }
-    )
-    described = load_sensor(str(sensor))
-    presses = read_press_file(file, described.electrode_names, *stds)
-    return Rig(presses, described, parse_probe(probes[0]), parse_radius_mm(radius))
+def _read_rig(
+    file: Path, sensor: str | None, notations: list[str], radius: str, position_std_mm: float, force_std: float
+) -> Rig:
+    """Read the measured presses of a sensor with a description.
+
+    Args:
+        file: CSV file of the presses.
+        sensor: Name or file of the sensor.
+        notations: Notations of the probes; exactly one.
+        radius: Radius of the working area: a number of mm.
+        position_std_mm: Standard deviation of the positions if the file contains none, mm.
+        force_std: Relative standard deviation of the forces if the file contains none.
+
+    Raises:
+        InputError: If the file or the sensor is missing, the radius is "auto", or there are several probes.
+        PressError: If the file cannot be read.
+    """
+    if not file.exists():
+        raise InputError(f"{file}: expected a dataset folder, or a CSV file of measured presses; there is neither")
+    if sensor is None:
+        raise InputError(
+            f"{file}: expected --sensor SENSOR for presses that are not in a regular file, got no sensor; add the option"
+        )
+    if radius == "auto":
+        raise InputError("--radius: expected a number of mm with measured presses, got auto")
+    if len(notations) != 1:
+        raise InputError(f"--probe: expected the one probe that made the presses, got {', '.join(notations)}")
+    described_sensor = load_sensor(sensor)
+    presses = read_presses_of(file, described_sensor.electrode_names, position_std_mm, force_std)
+    return Rig(presses, described_sensor, parse_probe(notations[0]), radius_mm_of(radius))
 
 
 def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | None:
-    """Return how to calibrate the film of measured presses; None, with a warning, if no network for all films fits.
+    """Return the problem of calibrating the film of measured presses.
 
     Args:
         rig: The presses, the sensor and the probe.
         models: Folder of models that is searched first.
+
+    Returns:
+        The calibration problem. None, with a warning on the terminal, if no network for all films fits the sensor.
     """
     try:
         return CalibrationProblem.of(rig.sensor, rig.probe, models)
@@ -224,64 +299,58 @@ def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | N
 
 
 def refuse_training_options(config: Path | None, version: int, radius: str) -> None:
-    """Refuse options that have no meaning if the film is calibrated, because no network is trained then."""
-    refuse(
-        {
-            "--config: this film is calibrated by the presses, and no network is trained; leave it out": config,
-            "--version: each calibration is the next version in its folder; leave it out": version != 1,
-            "--radius: the model of a calibrated film has the working area of the network for all films; leave it "
-            "out": radius != DEFAULT_TEXT,
-        }
-    )
+    """Refuse options that have no meaning if the film is calibrated, because no network is trained then.
+
+    Raises:
+        InputError: If one of the options is given.
+    """
+    if config is not None:
+        raise InputError(
+            "--config: the presses calibrate this film and no network is trained, so training settings have no effect, "
+            f"got {config}; leave the option out"
+        )
+    if version != 1:
+        raise InputError(
+            f"--version: each calibration is the next version in its folder, got {version}; leave the option out"
+        )
+    if radius != DEFAULT_RADIUS_TEXT:
+        raise InputError(
+            "--radius: the model of a calibrated film has the working area of the network for all films, got "
+            f"{radius}; leave the option out"
+        )
 
 
-def _films(
-    dataset: Path | None, sensor: str | None, probes: list[str], radius: str, config: Path | None
-) -> tuple[FilmPrior, FilmsConfig]:
-    """The films that a sensor may be, and how a network for all of them is fitted."""
-    refuse(
-        {
-            "--films: expected --sensor SENSOR alone, got presses, which are of one film": dataset,
-            "--films: expected no --config: its settings are for one film; leave it out": config,
-            "expected either a DATASET folder or --sensor SENSOR, got neither": not sensor,
-            "--films: expected --radius in mm, got auto: the working area differs from film to film": radius == "auto",
-        }
-    )
-    probe = parse_probe(probes[0])
-    if len(probes) != 1 or not isinstance(probe, Circle):
-        raise InputError(f"--films: expected one round probe (circle:RADIUS), got {', '.join(probes)}")
-    return FilmPrior(load_sensor(str(sensor)), probe), FilmsConfig(radius=parse_radius_mm(radius))
-
-
-def release_resumably(
-    train: Callable[[ResumableRun], Trained],
-    identity: Mapping[str, Any],
-    target: Path,
-    release: Callable[..., Release],
-    *,
-    fresh: bool,
-    json: bool,
-) -> None:
-    """Fit into a version folder and print the errors; stopped, say how to go on.
+def _film_prior(
+    dataset: Path | None, sensor: str | None, notations: list[str], radius: str, config: Path | None
+) -> FilmPrior:
+    """Return the distribution of the films of a sensor for `--films`, after a check of the other options.
 
     Args:
-        train: The work; it keeps its state in the run.
-        identity: All that decides about the weights.
-        target: The version folder.
-        release: Writes what `train` gives.
-        fresh: Throw away what an earlier run left.
-        json: Print the folder and the errors as one JSON object.
+        dataset: Dataset or file of presses, which must be None.
+        sensor: Name or file of the sensor.
+        notations: Notations of the probes; exactly one, which must be round.
+        radius: Radius of the working area, which must be a number of mm.
+        config: File with settings of the training, which must be None.
+
+    Raises:
+        InputError: If an option does not fit `--films`.
     """
-    with shown_run(target), resume_parts(target, identity, fresh=fresh) as run:
-        made = release(train(run), target.parent, version=int(target.name), command=this_command())
-    errors = made.metadata.errors
-    if json:
-        show_json({"folder": str(made.folder), "errors": dict(errors)})
-    measured = errors.get("measured_presses")
-    unseen = "at places that were left out" if "folds" in made.metadata.made_with.get("measured", {}) else UNSEEN
-    presses = f"on {measured:.0f} measured presses {unseen}, " if measured else ""
-    say(
-        f"{made.folder}: {presses}position error {errors['position_median_mm']:g} mm median, "
-        f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "
-        f"force {errors['force_rms_percent']:g} % rms"
-    )
+    if dataset is not None:
+        raise InputError(
+            f"--films: expected --sensor SENSOR alone, got presses ({dataset}), which belong to a single film; leave "
+            "them out"
+        )
+    if config is not None:
+        raise InputError(
+            f"--films: expected no --config, got {config}, whose settings are for a single film; leave it out"
+        )
+    if sensor is None:
+        raise InputError("expected either a DATASET folder or --sensor SENSOR, got neither; --films needs --sensor")
+    if radius == "auto":
+        raise InputError(
+            "--films: expected --radius in mm, got auto, which is different for each film; give a number of mm"
+        )
+    probe = parse_probe(notations[0])
+    if len(notations) != 1 or not isinstance(probe, Circle):
+        raise InputError(f"--films: expected one round probe (circle:RADIUS), got {', '.join(notations)}")
+    return FilmPrior(load_sensor(sensor), probe)

@@ -1,4 +1,4 @@
-"""`isocharge train report`: speed against error, all methods, with the limits."""
+"""`isocharge train report`: compare a model with other methods by error, speed and memory."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.measured_presses import read_press_file
+from isocharge.cli.shared.measured_presses import read_presses_of
 from isocharge.cli.shared.options import FreshOption, JsonOption, NewFolderOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
@@ -23,8 +23,8 @@ def report_command(
         list[Path],
         typer.Argument(
             metavar="DATASET|PRESSES.csv...",
-            help="Dataset folders of `isocharge simulate sweep` or of measured presses; or with --sensor CSV files of "
-            "50 measured presses or more.",
+            help="Dataset folders of `isocharge simulate sweep` or of measured presses. With --sensor also CSV files "
+            "of 50 or more measured presses.",
         ),
     ],
     output: NewFolderOption,
@@ -33,7 +33,8 @@ def report_command(
         typer.Option(
             "--model",
             metavar="MODEL",
-            help="Model to compare, name or path; once for each DATASET. (default: the one named as the sensor)",
+            help="Name or path of the model to compare, once for each DATASET. (default: the model with the name of "
+            "the sensor)",
         ),
     ] = None,
     student: Annotated[
@@ -41,18 +42,21 @@ def report_command(
         typer.Option(
             "--student",
             metavar="MODEL",
-            help="Small model to compare too; may be repeated. (default: the released one named MODEL-student)",
+            help="Name or path of a small model to compare as well; may be repeated. (default: the model named "
+            "MODEL-student, if there is one)",
         ),
     ] = None,
     sensor: Annotated[
         str | None,
-        typer.Option("--sensor", metavar="SENSOR", help="The sensor of PRESSES.csv. (default: DATASET's)"),
+        typer.Option("--sensor", metavar="SENSOR", help="Sensor of PRESSES.csv. (default: the sensor of DATASET)"),
     ] = None,
     probe: ProbeOption = "circle:1.0",
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="Try it on little data, in half a minute; the figures mean nothing. (default: all data)"
+            "--quick",
+            help="Write a trial report from little data in half a minute; its results are not meaningful. (default: "
+            "all data)",
         ),
     ] = False,
     fresh: FreshOption = False,
@@ -60,24 +64,35 @@ def report_command(
 ) -> None:
     """Compare a model with other methods: error (mm, % of force) against time (us), throughput and memory (bytes).
 
-    All methods answer the same noisy presses. Measured presses are judged as they are, by a fifth that no method has
-    seen: no simulator has a say, and what needs one is left out. --probe is what made the presses of PRESSES.csv.
+    All methods predict the same presses with noise. If DATASET was measured, the methods are tested on a fifth of its
+    presses, to which no method was fitted. No noise is added, and everything that needs a simulation is left out. The
+    option --probe states the probe that made the presses of PRESSES.csv.
 
-    It takes some minutes for a dataset of 24,000 presses. Let nothing else run meanwhile: times are measured. A report
-    that was stopped leaves DIR.part with its solves and limits; the same command goes on. --json prints report.json.
+    The report takes some minutes for a dataset of 24,000 presses. Durations are measured, so do not run other programs
+    at the same time. A report that was stopped leaves DIR.part with its solves and limits, and the same command
+    continues it. The option --json prints report.json.
 
     Example: isocharge train report presses -o report
     """
     refuse_finished(output)
     if model and len(model) != len(datasets):
         raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
-    loaded = [_read(path, sensor, probe) for path in datasets]
-    names = model or [dataset.sensor.name for dataset in loaded]
-    subjects = [(dataset, find_model(name)) for dataset, name in zip(loaded, names, strict=True)]
-    students = [find_model(name) for name in student] if student else _students_of(names)
-    settings, command = QUICK if quick else Settings(), this_command()
+    loaded_datasets = [_read_dataset(path, sensor, probe) for path in datasets]
+    model_names = model or [dataset.sensor.name for dataset in loaded_datasets]
+    model_folders = [find_model(name) for name in model_names]
+    if student:
+        student_folders = [find_model(name) for name in student]
+    else:
+        student_folders = _default_students(model_names)
     with shown_progress():
-        record = write_report(output, subjects, settings, students=students, command=command, fresh=fresh)
+        record = write_report(
+            output,
+            list(zip(loaded_datasets, model_folders, strict=True)),
+            QUICK if quick else Settings(),
+            students=student_folders,
+            command=this_command(),
+            fresh=fresh,
+        )
     for section in record["datasets"]:
         for sentence in section["verdict"]["sentences"]:
             say(f"{section['sensor']}: {sentence}")
@@ -86,20 +101,30 @@ def report_command(
         show_json(record)
 
 
-def _students_of(models: list[str]) -> list[Path]:
-    """The students that are there, by name."""
-    students = []
-    for model in models:
+def _default_students(model_names: list[str]) -> list[Path]:
+    """Return the version folders of the models named MODEL-student; models without a student are skipped."""
+    folders = []
+    for name in model_names:
         with suppress(ModelError):
-            students.append(find_model(f"{model}-student"))
-    return students
+            folders.append(find_model(f"{name}-student"))
+    return folders
 
 
-def _read(path: Path, sensor: str | None, probe: str) -> Dataset:
-    """A dataset folder, or a file of measured presses."""
+def _read_dataset(path: Path, sensor: str | None, probe: str) -> Dataset:
+    """Read a dataset folder or a CSV file of measured presses.
+
+    Args:
+        path: The folder or the file.
+        sensor: Name or file of the sensor that measured the presses of a CSV file; not used for a folder.
+        probe: Notation of the probe that made the presses of a CSV file; not used for a folder.
+
+    Raises:
+        InputError: If `path` is a file and no sensor is given.
+    """
     if not path.is_file():
         return read_dataset(path)
     if sensor is None:
-        raise InputError(f"{path}: a file of measured presses needs --sensor SENSOR, which says what was pressed")
-    described = load_sensor(sensor)
-    return dataset_of(read_press_file(path, described.electrode_names), described, parse_probe(probe))
+        raise InputError(f"{path}: expected --sensor SENSOR with a file of measured presses, got no sensor; add it")
+    described_sensor = load_sensor(sensor)
+    presses = read_presses_of(path, described_sensor.electrode_names)
+    return dataset_of(presses, described_sensor, parse_probe(probe))

@@ -1,0 +1,126 @@
+"""Resumable training and release of a model: the common part of `isocharge train fit` and `isocharge train distil`."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Protocol, TypeVar
+
+import typer
+
+from isocharge.cli.shared.forward_maps import shown_run
+from isocharge.cli.shared.terminal import say, show_json, this_command
+from isocharge.common.resumable_run import ResumableRun, resume_parts
+from isocharge.serve import ModelMetadata
+from isocharge.serve.model.model_folder import check_target
+from isocharge.train import Release
+
+Trained = TypeVar("Trained")
+"""Result of a training, from which a model is released."""
+
+TrainedToRelease = TypeVar("TrainedToRelease", contravariant=True)
+"""Result of a training that a `WriteRelease` accepts."""
+
+ModelFolderOption = Annotated[
+    Path,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="models/NAME",
+        help="Folder of the model. The name of the folder becomes the name of the model.",
+    ),
+]
+
+VersionOption = Annotated[
+    int,
+    typer.Option("--version", min=1, help="Version of the model, which is the name of the folder in models/NAME."),
+]
+
+
+class WriteRelease(Protocol[TrainedToRelease]):
+    """Function that writes a version folder from the result of a training, like `isocharge.train.release`."""
+
+    def __call__(self, trained: TrainedToRelease, folder: Path, /, *, version: int, command: str) -> Release:
+        """Write the version folder.
+
+        Args:
+            trained: The result of the training.
+            folder: Folder of the model, `models/NAME`.
+            version: Number of the version folder.
+            command: Command that makes this model again, for the model card.
+        """
+
+
+@dataclass(frozen=True)
+class ReleaseOptions:
+    """Options of a command that trains and releases a model.
+
+    Attributes:
+        model_folder: Folder of the model, `models/NAME`.
+        version: Number of the version folder.
+        fresh: Whether to delete the state of a stopped run and begin again.
+        json: Whether to print the folder and the errors as one JSON object.
+    """
+
+    model_folder: Path
+    version: int
+    fresh: bool
+    json: bool
+
+    def check_version_folder(self, electrodes: tuple[str, ...]) -> Path:
+        """Return the version folder that the command writes.
+
+        Args:
+            electrodes: Names of the electrodes of the new model.
+
+        Raises:
+            OutputExists: If the version exists.
+            ModelError: If the name of the model is not allowed, or other versions have other electrodes.
+        """
+        return check_target(self.model_folder, self.version, electrodes)
+
+
+def train_and_release(
+    train: Callable[[ResumableRun], Trained],
+    identity: Mapping[str, Any],
+    version_folder: Path,
+    options: ReleaseOptions,
+    write_release: WriteRelease[Trained],
+) -> None:
+    """Train a network, release it as a version folder, and print its errors.
+
+    If the command is stopped, the state of the training is kept, and the same command continues it.
+
+    Args:
+        train: Function that trains the network and saves its state in the given run.
+        identity: Everything that determines the weights. A stopped run is only continued if it has the same identity.
+        version_folder: Folder to write, as `ReleaseOptions.check_version_folder` returned it.
+        options: Options of the command.
+        write_release: Function that writes the version folder.
+    """
+    with shown_run(version_folder), resume_parts(version_folder, identity, fresh=options.fresh) as run:
+        trained = train(run)
+        released = write_release(trained, version_folder.parent, version=options.version, command=this_command())
+    if options.json:
+        show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})
+    say(f"{released.folder}: {_errors_sentence(released.metadata)}")
+
+
+def _errors_sentence(metadata: ModelMetadata) -> str:
+    """Return the errors of a model in words."""
+    errors = metadata.errors
+    return (
+        f"{_measured_presses_words(metadata)}position error {errors['position_median_mm']:g} mm median, "
+        f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "
+        f"force {errors['force_rms_percent']:g} % rms"
+    )
+
+
+def _measured_presses_words(metadata: ModelMetadata) -> str:
+    """Return on which measured presses the errors were measured; empty if the presses were simulated."""
+    press_count = metadata.errors.get("measured_presses")
+    if not press_count:
+        return ""
+    is_cross_validated = "folds" in metadata.made_with.get("measured", {})
+    if is_cross_validated:
+        return f"on {press_count:.0f} measured presses at places that were left out, "
+    return f"on {press_count:.0f} measured presses that were not used for training, "
