@@ -284,7 +284,7 @@ BAD = [
         for words, said in [
             (f"{__file__} --radius 5", "--radius: belongs to --sensor"),
             (f"{__file__} --sensor {SENSOR} --radius auto", "--radius: expected a number of mm with measured presses"),
-            (f"{__file__} --sensor {SENSOR} --probe circle:1 --probe circle:2", "--probe: expected the one that made"),
+            (f"{__file__} --sensor {SENSOR} --probe circle:1 --probe circle:2", "--probe: expected the one probe that"),
             (f"none.csv --sensor {SENSOR}", "none.csv: expected a dataset folder, or a CSV file"),
             ("/dev/null", "/dev/null: expected --sensor SENSOR for presses that are not in a regular file"),
         ]

@@ -26,8 +26,8 @@ EXIT_CODE_WRONG_INPUT = 2
 """Exit code of a command with wrong usage or wrong input."""
 
 app = lazy_group(
-    "Compute the position and the force of a contact on a piezoelectric tactile film from the charges of three to eight "
-    "electrodes.",
+    "Compute the position and the force of a contact on a piezoelectric tactile film from the charges of three to "
+    "eight electrodes.",
     {
         "demo": LazyCommand(
             "isocharge.cli.demo.command:demo_command",

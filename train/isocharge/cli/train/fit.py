@@ -270,7 +270,8 @@ def _read_rig(
         raise InputError(f"{file}: expected a dataset folder, or a CSV file of measured presses; there is neither")
     if sensor is None:
         raise InputError(
-            f"{file}: expected --sensor SENSOR for presses that are not in a regular file, got no sensor; add the option"
+            f"{file}: expected --sensor SENSOR for presses that are not in a regular file, got no sensor; add this "
+            "option"
         )
     if radius == "auto":
         raise InputError("--radius: expected a number of mm with measured presses, got auto")

@@ -80,10 +80,7 @@ def report_command(
     loaded_datasets = [_read_dataset(path, sensor, probe) for path in datasets]
     model_names = model or [dataset.sensor.name for dataset in loaded_datasets]
     model_folders = [find_model(name) for name in model_names]
-    if student:
-        student_folders = [find_model(name) for name in student]
-    else:
-        student_folders = _default_students(model_names)
+    student_folders = _find_students(student, model_names)
     with shown_progress():
         record = write_report(
             output,
@@ -101,8 +98,18 @@ def report_command(
         show_json(record)
 
 
-def _default_students(model_names: list[str]) -> list[Path]:
-    """Return the version folders of the models named MODEL-student; models without a student are skipped."""
+def _find_students(student_names: list[str] | None, model_names: list[str]) -> list[Path]:
+    """Return the version folders of the small models to compare.
+
+    Args:
+        student_names: Names or paths from `--student`; None for the models named MODEL-student that exist.
+        model_names: Names or paths of the compared models.
+
+    Raises:
+        ModelError: If a model of `student_names` does not exist.
+    """
+    if student_names:
+        return [find_model(name) for name in student_names]
     folders = []
     for name in model_names:
         with suppress(ModelError):
