@@ -5,16 +5,16 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import caution_of_stress, simulated_presses, sweep_radius
-from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_presses_of
+from isocharge.cli.shared.forward_maps import simulated_presses, sweep_radius, warn_of_stress
+from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption, read_press_file
 from isocharge.cli.shared.options import (
     ConfigOption,
     FreshOption,
     JsonOption,
     ModelsOption,
     RadiusOption,
-    most_workers,
-    radius_mm_of,
+    parse_radius_mm,
+    worker_count,
 )
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.cli.train.calibrate import calibrate_into
@@ -127,7 +127,7 @@ def fit_command(
     options = ReleaseOptions(output, version, fresh=fresh, json=json)
     if films:
         film_prior = _film_prior(dataset, sensor, notations, radius, config)
-        _release_films_model(film_prior, FilmsConfig(radius=radius_mm_of(radius)), options)
+        _release_films_model(film_prior, FilmsConfig(radius=parse_radius_mm(radius)), options)
         return
 
     press_file = dataset if dataset is not None and dataset.is_file() else None
@@ -159,10 +159,10 @@ def fit_command(
 def _release_films_model(film_prior: FilmPrior, films_config: FilmsConfig, options: ReleaseOptions) -> None:
     """Train a network for all films of a sensor, and release it."""
     version_folder = options.check_version_folder(film_prior.sensor.electrode_names)
-    caution_of_stress(film_prior.sensor.film, [film_prior.probe], films_config.force_range[1])
+    warn_of_stress(film_prior.sensor.film, [film_prior.probe], films_config.force_range[1])
 
     def train(run: ResumableRun) -> FilmsModel:
-        with local_workers(most_workers(None)) as executor:
+        with local_workers(worker_count(None)) as executor:
             return fit_films(film_prior, films_config, executor=executor, run=run)
 
     train_and_release(train, films_identity(film_prior, films_config), version_folder, options, release_films)
@@ -192,7 +192,7 @@ def _release_data_model(data: TrainingData, fit_config: FitConfig, options: Rele
     """Train a network on the training data of a known sensor, and release it."""
     version_folder = options.check_version_folder(data.sensor.electrode_names)
     probes = [parse_probe(notation) for notation in data.probes]
-    caution_of_stress(data.sensor.film, probes, data.domain.force_range[1])
+    warn_of_stress(data.sensor.film, probes, data.domain.force_range[1])
 
     def train(run: ResumableRun) -> Fitted:
         return fit(data, fit_config, run=run)
@@ -244,7 +244,7 @@ def _read_presses_of_unknown_sensor(
             f"--radius: belongs to --sensor, got {radius} without --sensor; leave it out, because the working area is "
             "then the area of the presses"
         )
-    presses = usable_presses(read_presses_of(file, None, position_std_mm, force_std))
+    presses = usable_presses(read_press_file(file, None, position_std_mm, force_std))
     say(f"{file}: {len(presses)} presses of the channels {', '.join(presses.electrodes)}")
     return presses
 
@@ -278,8 +278,8 @@ def _read_rig(
     if len(notations) != 1:
         raise InputError(f"--probe: expected the one probe that made the presses, got {', '.join(notations)}")
     described_sensor = load_sensor(sensor)
-    presses = read_presses_of(file, described_sensor.electrode_names, position_std_mm, force_std)
-    return Rig(presses, described_sensor, parse_probe(notations[0]), radius_mm_of(radius))
+    presses = read_press_file(file, described_sensor.electrode_names, position_std_mm, force_std)
+    return Rig(presses, described_sensor, parse_probe(notations[0]), parse_radius_mm(radius))
 
 
 def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | None:

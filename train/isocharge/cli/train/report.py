@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.measured_presses import read_presses_of
+from isocharge.cli.shared.measured_presses import read_press_file
 from isocharge.cli.shared.options import FreshOption, JsonOption, NewFolderOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
@@ -133,5 +133,5 @@ def _read_dataset(path: Path, sensor: str | None, probe: str) -> Dataset:
     if sensor is None:
         raise InputError(f"{path}: expected --sensor SENSOR with a file of measured presses, got no sensor; add it")
     described_sensor = load_sensor(sensor)
-    presses = read_presses_of(path, described_sensor.electrode_names)
+    presses = read_press_file(path, described_sensor.electrode_names)
     return dataset_of(presses, described_sensor, parse_probe(probe))
