@@ -24,7 +24,7 @@ from isocharge.simulate import (
     run_sweep,
     touch_charge,
 )
-from isocharge.simulate.dataset.sweep import SHARD, TASK, write_sweep
+from isocharge.simulate.dataset.sweep import SHARD_SIZE, TASK_SIZE, write_sweep
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(stretching=True, bending=False, pretensioned=False)
@@ -118,11 +118,11 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path):
 
 def test_shards_and_tasks_keep_the_order_of_the_presses(tmp_path):
     """More than a shard, more than a task in one, and each press with its own charges."""
-    sweep = Sweep(samples=SHARD + 10, orientation="random")
+    sweep = Sweep(samples=SHARD_SIZE + 10, orientation="random")
     maps = [Spy(Polygon.rectangle(side, 2.0)) for side in (3.0, 4.0, 5.0)]
     read = read_dataset(write_sweep(tmp_path / "large", maps, sweep))
-    assert SHARD > TASK
-    assert [shard["samples"] for shard in read.manifest["shards"]] == [SHARD, 10]
+    assert SHARD_SIZE > TASK_SIZE
+    assert [shard["samples"] for shard in read.manifest["shards"]] == [SHARD_SIZE, 10]
     presses = sweep.over([made.probe for made in maps])
     np.testing.assert_array_equal(read.samples.x_mm, presses.contact[:, 0])
     np.testing.assert_array_equal(read.samples.charge_pC[:, :2], presses.contact[:, :2])

@@ -1,1 +1,1 @@
-"""Datasets of presses and charges: sampling plans, sweeps, and the file format."""
+"""Datasets of presses: sampling, simulation of a sweep, and the file format."""

@@ -1,10 +1,12 @@
-"""Where the presses of a sweep lie: spread over probes, the disk, the forces and, if asked, the orientations.
+"""Sampling of the presses of a sweep: probes, positions, forces and, optionally, orientations.
 
-    sobol   scrambled Sobol points: fewer gaps and clumps than independent draws (Owen 1998); each probe has its own
+    sobol   scrambled Sobol points, which cover the domain more evenly than independent draws (Owen 1998), with a
+            separate sequence for each probe
     random  independent draws
-    grid    every force at every orientation at every place of a square lattice: no more presses than asked for
+    grid    every force with every orientation at every position of a square lattice, at most the requested number
 
-Sobol and random presses are uniform over the disk and in the logarithm of the force; the probes take turns.
+Sobol and random presses are uniformly distributed over the disk and in the logarithm of the force. The probes
+alternate.
 """
 
 from collections.abc import Sequence
@@ -12,7 +14,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-import scipy  # loads a part when it is used
+import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
@@ -20,31 +22,34 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate.numerics.disk import lattice
 from isocharge.simulate.sensor.probe import Probe
 
-MOST_SAMPLES = 10_000_000
-"""Largest sweep: about 600 MB on disk."""
+MAX_SAMPLES = 10_000_000
+"""Largest number of presses of a sweep. The files of such a dataset occupy about 600 MB."""
 
 FULL_TURN = 2.0 * np.pi
+"""Angle of a full turn, rad."""
 
-PLANS = {
+SAMPLING_DESCRIPTIONS = {
     "sobol": "scrambled Sobol, uniform over the disk, log-uniform in force",
     "random": "independent, uniform over the disk, log-uniform in force",
     "grid": "grid: square lattice over the disk, forces in equal steps of the logarithm, evenly spread orientations",
 }
-"""What the manifest says of a sampling."""
+"""Description of each sampling in the manifest."""
 
 Sampling = Literal["sobol", "random", "grid"]
+"""Name of a sampling."""
 
 Orientation = Literal["fixed", "random"]
+"""Whether the orientation of the probe is fixed or random."""
 
 
 @dataclass(frozen=True)
 class SweepPresses:
-    """Presses of a sweep, in its order.
+    """Presses of a sweep, in the order of the sweep.
 
     Attributes:
-        probe: Number of the probe, shape (n,).
-        contact: (x, y, F), shape (n, 3), mm and N.
-        rotation: Angle by which the probe is turned against its notation, shape (n,), rad.
+        probe: Number of the probe of each press, shape (n,).
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        rotation: Rotation of the probe relative to its notation, anticlockwise, shape (n,), rad.
     """
 
     probe: Integers
@@ -60,15 +65,15 @@ class SweepPresses:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What to sample.
+    """Definition of the presses of a sweep.
 
     Attributes:
         radius: Largest distance of a press from the centre, mm.
         force_range: Smallest and largest force, N.
-        samples: Number of presses, shared equally among the probes; a grid may have fewer, see `sampling`.
-        seed: Seed of the sequence; a grid uses none.
-        orientation: "fixed" (as the probe is given) or "random": spread over a full turn, or, in a grid, evenly over
-            the turn after which the probe looks the same.
+        samples: Number of presses, divided equally among the probes. A grid may have fewer presses.
+        seed: Seed of the random numbers. A grid does not depend on the seed.
+        orientation: "fixed" for the orientation of the given probes, or "random" for orientations over a full turn. A
+            grid has orientations at equal angles within the period of the probe instead of random ones.
         sampling: "sobol", "random" or "grid".
     """
 
@@ -82,8 +87,8 @@ class Sweep:
     def __post_init__(self) -> None:
         if not 0.0 < self.radius < np.inf:
             raise SceneError(f"radius: expected a positive number of mm, got {self.radius:g}")
-        if not 1 <= self.samples <= MOST_SAMPLES:
-            bound = "at least 1" if self.samples < 1 else f"at most {MOST_SAMPLES}"
+        if not 1 <= self.samples <= MAX_SAMPLES:
+            bound = "at least 1" if self.samples < 1 else f"at most {MAX_SAMPLES}"
             raise SceneError(f"samples: expected {bound}, got {self.samples}")
         low, high = self.force_range
         if not 0.0 < low <= high < np.inf:
@@ -94,11 +99,14 @@ class Sweep:
             raise SceneError(f"sampling: expected 'sobol', 'random' or 'grid', got {self.sampling!r}")
 
     def contacts(self) -> Array:
-        """(x, y, F) of every press of a sweep with one probe, shape (n, 3), mm and N."""
+        """Return the contacts (x, y, F) of a sweep with one probe, shape (n, 3), mm and N."""
         return self._of_probe(0, 1, FULL_TURN).contact
 
     def over(self, probes: Sequence[Probe]) -> SweepPresses:
-        """Every press of a sweep with these probes, which take turns.
+        """Return the presses of a sweep with several probes, which alternate.
+
+        Args:
+            probes: Probes of the sweep.
 
         Raises:
             SceneError: If there are no probes, or a grid has fewer samples than probes.
@@ -109,21 +117,33 @@ class Sweep:
             raise SceneError(f"samples: expected at least one for each of {len(probes)} probes, got {self.samples}")
         parts = [self._of_probe(number, len(probes), probe.period) for number, probe in enumerate(probes)]
         order = np.argsort(np.concatenate([np.arange(len(part)) for part in parts]), kind="stable")
-        columns = ([getattr(part, name) for part in parts] for name in ("probe", "contact", "rotation"))
-        return SweepPresses(*(np.concatenate(column) for column in columns))[order]
+        presses = SweepPresses(
+            probe=np.concatenate([part.probe for part in parts]),
+            contact=np.concatenate([part.contact for part in parts]),
+            rotation=np.concatenate([part.rotation for part in parts]),
+        )
+        return presses[order]
 
     def _of_probe(self, number: int, probes: int, period: float) -> SweepPresses:
+        """Return the presses of one probe.
+
+        Args:
+            number: Number of the probe.
+            probes: Number of probes in the sweep.
+            period: Smallest rotation that maps the probe onto itself, rad.
+        """
         if self.sampling == "grid":
-            at, force, rotation = self._grid(self.samples // probes, period)
+            position, force, rotation = self._grid(self.samples // probes, period)
         else:
-            unit = self._unit(len(range(number, self.samples, probes)), number)
-            at = self.radius * np.sqrt(unit[:, 0]) * np.exp(1j * FULL_TURN * unit[:, 1])
+            unit = self._unit_cube(len(range(number, self.samples, probes)), number)
+            position = self.radius * np.sqrt(unit[:, 0]) * np.exp(1j * FULL_TURN * unit[:, 1])
             force = self._force(unit[:, 2])
             rotation = FULL_TURN * unit[:, 3] if self.orientation == "random" else np.zeros(len(unit))
-        return SweepPresses(np.full(at.size, number), np.stack([at.real, at.imag, force], axis=1), rotation)
+        contact = np.stack([position.real, position.imag, force], axis=1)
+        return SweepPresses(np.full(position.size, number), contact, rotation)
 
-    def _unit(self, count: int, number: int) -> Array:
-        """Points of the unit cube (distance, angle, force, rotation), shape (count, 4)."""
+    def _unit_cube(self, count: int, number: int) -> Array:
+        """Draw points (distance, angle, force, rotation) of the unit cube for one probe, shape (count, 4)."""
         rng = np.random.default_rng([self.seed, number])
         if self.sampling == "random":
             return rng.random((count, 4))
@@ -131,19 +151,34 @@ class Sweep:
         return np.asarray(scipy.stats.qmc.Sobol(4, rng=rng).random_base2(bits)[:count])
 
     def _force(self, share: Array) -> Array:
-        """Forces (N) at shares of the range in ln F."""
+        """Return the forces (N) at shares (0 to 1) of the range in ln F."""
         low, high = np.log(self.force_range)
         return np.asarray(np.clip(np.exp(low + (high - low) * share), *self.force_range))
 
-    def _grid(self, most: int, period: float) -> tuple[Complexes, Array, Array]:
-        """At most `most` positions, forces and rotations: equal numbers of steps in each direction, then all forces
-        that still fit."""
-        forces, rotations = self.force_range[0] < self.force_range[1], self.orientation == "random" and period > 0.0
-        side = max(1, round(most ** (1.0 / (2 + forces + rotations))))
-        n_rotation = side if rotations else 1
-        place: Complexes = self.radius * lattice(most // (n_rotation * (side if forces else 1)))
-        n_force = most // (place.size * n_rotation) if forces else 1
-        force = self._force(np.linspace(0.0, 1.0, n_force) if n_force > 1 else np.array([0.5]))
-        rotation: Array = period * np.arange(n_rotation) / n_rotation
-        at, pushed, rotated = np.indices((place.size, n_force, n_rotation)).reshape(3, -1)
-        return place[at], force[pushed], rotation[rotated]
+    def _grid(self, max_count: int, period: float) -> tuple[Complexes, Array, Array]:
+        """Return the presses of a grid.
+
+        The number of steps in each direction is chosen equal at first. The number of forces is then increased as far as
+        the number of presses allows.
+
+        Args:
+            max_count: Largest number of presses.
+            period: Smallest rotation that maps the probe onto itself, rad; 0 for a circle.
+
+        Returns:
+            Positions x + iy (mm), forces (N) and rotations (rad), each of shape (n,).
+        """
+        has_forces = self.force_range[0] < self.force_range[1]
+        has_rotations = self.orientation == "random" and period > 0.0
+        dimensions = 2 + has_forces + has_rotations
+        steps = max(1, round(max_count ** (1.0 / dimensions)))
+        rotation_count = steps if has_rotations else 1
+        force_steps = steps if has_forces else 1
+        positions: Complexes = self.radius * lattice(max_count // (rotation_count * force_steps))
+        force_count = max_count // (positions.size * rotation_count) if has_forces else 1
+        force_shares = np.linspace(0.0, 1.0, force_count) if force_count > 1 else np.array([0.5])
+        forces = self._force(force_shares)
+        rotations: Array = period * np.arange(rotation_count) / rotation_count
+        shape = (positions.size, force_count, rotation_count)
+        position_index, force_index, rotation_index = np.indices(shape).reshape(3, -1)
+        return positions[position_index], forces[force_index], rotations[rotation_index]

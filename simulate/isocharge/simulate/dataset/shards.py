@@ -1,11 +1,11 @@
-"""The dataset format: a folder of shards with a manifest and a data card. One reader and one writer for all producers.
+"""Dataset format: reader and writer of a folder with shards, a manifest and a data card.
 
     manifest.json     format version, sensor, probes, ranges, seed, solver, columns, shards with sha256
-    README.md         the data card, for people
+    README.md         data card, a description for readers
     shard-00000.npz   x_mm, y_mm, force_N, probe, orientation_deg, charge_pC[n, electrode]
 
-A dataset appears whole: it is written under another name and renamed at the end. Data measured on a rig fits the same
-format; it has no solver and no seed.
+A dataset is written under a temporary name and renamed when it is complete. Data that was measured on a rig has the
+same format without the entries `solver` and `seed`.
 """
 
 import io
@@ -28,6 +28,7 @@ from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
 FORMAT_VERSION = 1
+"""Version of the format in the manifest."""
 
 COLUMNS = {
     "x_mm": "position of the press along the drawn direction, mm",
@@ -37,9 +38,10 @@ COLUMNS = {
     "orientation_deg": "angle by which the probe is turned against its notation, deg, anticlockwise",
     "charge_pC": "touch charge of each electrode, pC, electrodes in the manifest's order",
 }
+"""Columns of a shard and their descriptions in the manifest and the data card."""
 
-MOST_SHARD_BYTES = 1 << 26
-"""Largest shard, bytes: a sweep's have a twentieth."""
+MAX_SHARD_BYTES = 1 << 26
+"""Largest size of a shard, bytes."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,12 @@ class Samples:
     """Presses and their charges.
 
     Attributes:
-        x_mm: Shape (n,).
-        y_mm: Shape (n,).
-        force_N: Shape (n,).
-        probe: Notation of the probe, shape (n,), text.
-        orientation_deg: Shape (n,).
-        charge_pC: Shape (n, n_electrode).
+        x_mm: Position along the drawn direction, shape (n,), mm.
+        y_mm: Position across the drawn direction, shape (n,), mm.
+        force_N: Force, positive for a push, shape (n,), N.
+        probe: Notation of the probe without the angle, shape (n,), text.
+        orientation_deg: Rotation of the probe relative to its notation, anticlockwise, shape (n,), degrees.
+        charge_pC: Touch charge of each electrode, shape (n, n_electrode), pC.
     """
 
     x_mm: Array
@@ -66,19 +68,20 @@ class Samples:
         return len(self.x_mm)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Column name to array."""
+        """Return the arrays by the names of the columns."""
         return {name: getattr(self, name) for name in COLUMNS}
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """A dataset in memory.
+    """Dataset in memory.
 
     Attributes:
-        sensor: The sensor that the charges belong to.
-        samples: All samples, shards in order.
-        manifest: The manifest as it was read.
-        sha256: Checksum of the manifest, which holds those of the shards: the dataset's identity.
+        sensor: Sensor to which the charges belong.
+        samples: Samples of all shards in order.
+        manifest: Content of the manifest.
+        sha256: Checksum of the manifest. It identifies the dataset, because the manifest contains the checksums of the
+            shards.
     """
 
     sensor: Sensor
@@ -91,17 +94,17 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
     """Write a dataset.
 
     Args:
-        folder: Where; must not exist yet.
-        sensor: The sensor.
-        shards: Samples, a shard at a time; consumed as they are written.
-        about: Origin of the samples, for the manifest: probes, ranges, seed, solver.
+        folder: Folder to create. It must not exist yet.
+        sensor: Sensor to which the charges belong.
+        shards: Samples of each shard. The iterable is consumed while the shards are written.
+        about: Entries of the manifest about the origin of the samples, such as probes, ranges, seed and solver.
 
     Returns:
-        The folder.
+        Path of the folder.
 
     Raises:
-        OutputExists: If the folder is already there.
-        DatasetError: If a shard's columns disagree or hold numbers that are not finite.
+        OutputExists: If the folder already exists.
+        DatasetError: If the columns of a shard have different lengths or contain numbers that are not finite.
     """
     with new_folder(folder) as partial:
         entries = []
@@ -114,35 +117,48 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
 
 
 def pack_shard(number: int, samples: Samples, sensor: Sensor) -> tuple[str, bytes]:
-    """A shard's file name and content.
+    """Convert samples into the file name and the content of a shard.
+
+    Args:
+        number: Number of the shard.
+        samples: Samples of the shard.
+        sensor: Sensor to which the charges belong.
 
     Raises:
-        DatasetError: If the columns disagree or hold numbers that are not finite.
+        DatasetError: If the columns have different lengths or contain numbers that are not finite.
     """
     name = shard_name(number)
     _check_samples(samples, len(sensor.electrodes), name)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **samples.columns())
     data = buffer.getvalue()
-    if len(data) > MOST_SHARD_BYTES:
-        raise DatasetError(f"{name}: expected at most {MOST_SHARD_BYTES} bytes, got {len(data)}; make smaller shards")
+    if len(data) > MAX_SHARD_BYTES:
+        raise DatasetError(f"{name}: expected at most {MAX_SHARD_BYTES} bytes, got {len(data)}; make smaller shards")
     return name, data
 
 
 def shard_name(number: int) -> str:
-    """File name of a shard."""
+    """Return the file name of a shard."""
     return f"shard-{number:05d}.npz"
 
 
 def shard_entry(name: str, samples: int, data: bytes) -> dict[str, Any]:
-    """What the manifest says of a shard."""
+    """Return the entry of the manifest for a shard."""
     return {"file": name, "samples": samples, "sha256": sha256_of(data)}
 
 
 def write_manifest(
     folder: Path, name: str, sensor: Sensor, entries: Sequence[dict[str, Any]], about: dict[str, Any]
 ) -> None:
-    """Manifest and card of a dataset whose shards are in `folder` and which will be called `name`."""
+    """Write the manifest and the data card of a dataset.
+
+    Args:
+        folder: Folder that contains the shards.
+        name: Name of the dataset, which may differ from that of the folder.
+        sensor: Sensor to which the charges belong.
+        entries: Entries of the manifest for the shards.
+        about: Entries of the manifest about the origin of the samples.
+    """
     manifest = {
         "format_version": FORMAT_VERSION,
         "package_version": metadata.version("isocharge"),
@@ -158,10 +174,11 @@ def write_manifest(
 
 
 def data_card(name: str, manifest: dict[str, Any]) -> str:
-    """The README.md of a dataset, from its manifest."""
-    ranges, solver = manifest.get("ranges", {}), manifest.get("solver", {})
+    """Return the text of the data card, README.md, of a dataset with a given name and manifest."""
+    ranges = manifest.get("ranges", {})
+    solver = manifest.get("solver", {})
     lines = [
-        "---",  # what data hubs read: https://huggingface.co/docs/hub/datasets-cards
+        "---",  # metadata for data hubs: https://huggingface.co/docs/hub/datasets-cards
         f"pretty_name: {json.dumps(name)}",
         "task_categories: [tabular-regression]",
         "tags: [isocharge, tactile-sensing, piezoelectric]",
@@ -193,6 +210,7 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
 
 
 def _flat(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the entries of nested tables, with the names of nested keys joined by a space."""
     for key, value in table.items():
         if isinstance(value, dict):
             yield from ((f"{key} {inner}", deep) for inner, deep in _flat(value))
@@ -201,6 +219,16 @@ def _flat(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
+    """Check shapes, types and values of the columns.
+
+    Args:
+        samples: Samples of a shard.
+        n_electrode: Number of electrodes of the sensor.
+        where: Name of the shard for error messages.
+
+    Raises:
+        DatasetError: If a column has a wrong shape or type, or contains a number that is not finite.
+    """
     shapes = {name: column.shape for name, column in samples.columns().items()}
     count = len(samples) if samples.x_mm.ndim else 0
     expected = dict.fromkeys(COLUMNS, (count,)) | {"charge_pC": (count, n_electrode)}
@@ -221,12 +249,12 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
     """Read a dataset and check every shard against the manifest.
 
     Args:
-        folder: Where it is.
-        sensor: The sensor that is expected; any if absent.
+        folder: Folder of the dataset.
+        sensor: Expected sensor; any sensor if absent.
 
     Raises:
-        DatasetError: If the folder is not a dataset, of another format version or sensor, damaged or incomplete; the
-            message names the file and what to do.
+        DatasetError: If the folder is not a dataset, has a different format version or sensor, or is damaged or
+            incomplete. The message names the file and a remedy.
     """
     folder = Path(folder)
     expected = sensor
@@ -254,21 +282,24 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
 
 
 def _differs(sensor: Sensor, expected: Sensor) -> str:
-    """Name of a sensor that is not the expected one; under the same name, what differs."""
+    """Describe how a sensor differs from the expected sensor, by its name or by the keys that differ."""
     if sensor.name != expected.name:
         return repr(sensor.name)
-    actual, target = sensor_to_dict(sensor), sensor_to_dict(expected)
+    actual = sensor_to_dict(sensor)
+    target = sensor_to_dict(expected)
     keys = sorted(key for key in actual.keys() | target.keys() if actual.get(key) != target.get(key))
     return f"one of that name with another {', '.join(keys)}"
 
 
 class _Shard(Struct):
+    """Entry of the manifest for a shard."""
+
     file: Text
     sha256: Text
 
 
 class _Manifest(Struct):
-    """What a reader needs of a manifest."""
+    """Entries of the manifest that the reader uses."""
 
     sensor: dict[str, Any]
     electrodes: list[str]
@@ -276,6 +307,7 @@ class _Manifest(Struct):
 
 
 def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
+    """Read the manifest and compute its checksum, and check the format version."""
     path = folder / "manifest.json"
     if not path.is_file():
         raise DatasetError(
@@ -286,7 +318,8 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
         manifest = parse_json(data, "", DatasetError, dict[str, Any])
         if "format_version" not in manifest:
             raise DatasetError("key 'format_version' is missing")
-    if (version := manifest["format_version"]) != FORMAT_VERSION:
+    version = manifest["format_version"]
+    if version != FORMAT_VERSION:
         raise DatasetError(
             f"{path}: format version {shown(version)} is not supported (this version reads {FORMAT_VERSION}); "
             f"make the dataset again or upgrade isocharge"
@@ -295,11 +328,13 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
 
 
 def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
+    """Read a shard, and check its checksum and its columns."""
     path = folder / Path(entry.file).name
     if not path.is_file():
         raise DatasetError(f"{path}: the manifest lists this shard, but the file is missing; make the dataset again")
-    data = read_needed(path, DatasetError, "make the dataset again", MOST_SHARD_BYTES)
-    checksum, expected = sha256_of(data), entry.sha256
+    data = read_needed(path, DatasetError, "make the dataset again", MAX_SHARD_BYTES)
+    checksum = sha256_of(data)
+    expected = entry.sha256
     if checksum != expected:
         raise DatasetError(
             f"{path} is damaged: expected sha256 {expected[:12]}..., got {checksum[:12]}...; make the dataset again"
@@ -310,9 +345,9 @@ def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
 
 
 def _unpacked(data: bytes, where: str) -> Samples:
-    """The columns in the bytes of a shard; nothing in them is executed."""
+    """Convert the bytes of a shard into columns without executing any code in them."""
     try:
         return Samples(**npz_arrays(data, COLUMNS))
-    except Exception as error:  # zipfile, zlib and NumPy raise what they like
-        said = cut(str(error) or type(error).__name__)
-        raise DatasetError(f"{where}: not a shard with the columns {', '.join(COLUMNS)}: {said}") from error
+    except Exception as error:  # zipfile, zlib and NumPy raise many types of exceptions
+        reason = cut(str(error) or type(error).__name__)
+        raise DatasetError(f"{where}: not a shard with the columns {', '.join(COLUMNS)}: {reason}") from error

@@ -1,8 +1,8 @@
-"""A sweep: many presses spread over the working area and the forces, and their charges.
+"""Simulation of a sweep: many presses over a range of positions and forces, and their charges.
 
-A forward map is solved for every probe and evaluated for every press. Both are cut into tasks that do not depend on the
-executor, so neither do the bytes. Finished parts are kept in a folder next to the dataset, so that a run that was
-killed goes on.
+A forward map is solved for every probe and evaluated for every press. Both are divided into tasks that do not depend on
+the executor, so that the files do not depend on the executor either. Finished parts are saved in a folder next to the
+dataset, from which an interrupted run is resumed.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,7 +17,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.progress import report
 from isocharge.common.resumable_run import ResumableRun, output_errors, refuse_finished, resume_folder
-from isocharge.simulate.dataset.sampling import PLANS, Sweep, SweepPresses
+from isocharge.simulate.dataset.sampling import SAMPLING_DESCRIPTIONS, Sweep, SweepPresses
 from isocharge.simulate.dataset.shards import (
     Samples,
     pack_shard,
@@ -35,11 +35,12 @@ from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.simulate.solver.load_case import SolveSettings
 
-SHARD = 16384
-"""Samples per shard."""
+SHARD_SIZE = 16384
+"""Default number of samples in a shard."""
 
-TASK = 8192
-"""Presses per task: a second of work, long compared with sending the map to the worker (12 MB)."""
+TASK_SIZE = 8192
+"""Largest number of presses in a task. A task then takes about a second, which is long compared with the time for
+sending the forward map (12 MB) to the worker."""
 
 
 def run_sweep(
@@ -50,35 +51,38 @@ def run_sweep(
     settings: SolveSettings = SolveSettings(),
     *,
     executor: Executor | None = None,
-    shard: int = SHARD,
+    shard: int = SHARD_SIZE,
     fresh: bool = False,
 ) -> Path:
-    """Simulate a sweep and write it as a dataset. Killed and called again with the same arguments, it goes on.
+    """Simulate a sweep and write it as a dataset.
+
+    If a run is interrupted, a call with the same arguments resumes it.
 
     Args:
-        folder: Folder to write; must not exist yet.
-        sensor: The sensor.
-        probes: The objects that press, in turn.
-        sweep: Which presses to sample.
-        settings: How the film is solved.
-        executor: Does the work: a process pool, the executor of a Dask cluster; this process if absent. The bytes
-            written do not depend on it.
-        shard: Samples per shard.
-        fresh: Throw away the parts of an earlier run.
+        folder: Folder to create. It must not exist yet.
+        sensor: Sensor.
+        probes: Probes, which alternate.
+        sweep: Definition of the presses.
+        settings: Settings of the solver.
+        executor: Executor that runs the tasks, such as a process pool or the executor of a Dask cluster; this process
+            if absent. The files do not depend on the executor.
+        shard: Number of samples in a shard.
+        fresh: Whether to delete the saved parts of an earlier run instead of resuming it.
 
     Returns:
-        The folder.
+        Path of the folder.
 
     Raises:
-        SceneError: If a press cannot exist.
-        OutputExists: If the folder is already there, or an unfinished run of other settings; raised before the work
-            begins.
-        OutputError: If the file system refuses; the finished work is kept.
-        WorkersLost: If the executor's workers end; the finished work is kept.
+        SceneError: If the film cannot be pressed as required.
+        OutputExists: If the folder already exists, or if there is an unfinished run with different settings. The error
+            is raised before the computation starts.
+        OutputError: If a file cannot be written. The finished parts remain saved.
+        WorkersLost: If the workers of the executor end. The finished parts remain saved.
     """
-    folder, probes = Path(folder), tuple(probes)
+    folder = Path(folder)
+    probes = tuple(probes)
     refuse_finished(folder)
-    presses = sweep.over(probes)  # before anything is written: scipy's Sobol tables swallow an interrupt
+    presses = sweep.over(probes)  # before files are written, because SciPy ignores an interrupt here
     identity = {
         "made_by": code_fingerprint(),
         "sensor": sensor_to_dict(sensor),
@@ -101,7 +105,7 @@ def run_sweep(
         ]
         entries = _finish_shards(run, maps, presses, executor, shard)
         with output_errors(folder):
-            write_manifest(run.data, folder.name, sensor, entries, _about(maps, sweep))
+            write_manifest(run.data, folder.name, sensor, entries, _manifest_entries(maps, sweep))
     return folder
 
 
@@ -113,7 +117,7 @@ def solve_maps(
     *,
     executor: Executor | None = None,
 ) -> tuple[ForwardMap, ...]:
-    """A forward map for each probe, over the sweep's ranges."""
+    """Solve a forward map for each probe over the ranges of a sweep; see `run_sweep` for the arguments."""
     return tuple(
         ForwardMap.build(sensor, probe, sweep.radius, sweep.force_range, settings, executor=executor)
         for probe in probes
@@ -121,13 +125,24 @@ def solve_maps(
 
 
 def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
-    """Write a sweep's presses and charges, given the solved maps, in this process; see `run_sweep`."""
+    """Write the dataset of a sweep in this process from forward maps that have already been solved.
+
+    Args:
+        folder: Folder to create.
+        maps: Forward map of each probe.
+        sweep: Definition of the presses.
+
+    Returns:
+        Path of the folder.
+    """
     presses = sweep.over([forward_map.probe for forward_map in maps])
-    return write_dataset(folder, maps[0].sensor, _samples(maps, _cut(presses, SHARD), None), _about(maps, sweep))
+    return write_dataset(
+        folder, maps[0].sensor, _samples(maps, _split(presses, SHARD_SIZE), None), _manifest_entries(maps, sweep)
+    )
 
 
-def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
-    """The manifest's entries about the sweep."""
+def _manifest_entries(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
+    """Return the entries of the manifest that describe the sweep."""
     return {
         "probes": list(dict.fromkeys(forward_map.probe.notation for forward_map in maps)),
         "ranges": {
@@ -135,7 +150,7 @@ def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
             "force_N": list(sweep.force_range),
             "orientation": sweep.orientation,
         },
-        "sampling": PLANS[sweep.sampling],
+        "sampling": SAMPLING_DESCRIPTIONS[sweep.sampling],
         "seed": sweep.seed,
         "noise": "clean",
         "solver": {
@@ -150,16 +165,18 @@ def _about(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any]:
 def _finish_shards(
     run: ResumableRun, maps: Sequence[ForwardMap], presses: SweepPresses, executor: Executor | None, shard: int
 ) -> list[dict[str, Any]]:
-    """Write the shards that the run does not have yet; the manifest's entry of each shard, in order."""
-    parts = list(_cut(presses, shard))
+    """Compute and write the shards that are not saved yet, and return the manifest entries of all shards in order."""
+    parts = list(_split(presses, shard))
     entries: dict[int, dict[str, Any]] = {}
     for number, part in enumerate(parts):
-        if (data := run.load(shard_name(number), bytes, final=True)) is not None:
+        data = run.load(shard_name(number), bytes, final=True)
+        if data is not None:
             entries[number] = shard_entry(shard_name(number), len(part), data)
     done = sum(entry["samples"] for entry in entries.values())
     missing = [number for number in range(len(parts)) if number not in entries]
     report("pressing", done, len(presses))
-    for number, samples in zip(missing, _samples(maps, (parts[each] for each in missing), executor), strict=True):
+    missing_samples = _samples(maps, (parts[number] for number in missing), executor)
+    for number, samples in zip(missing, missing_samples, strict=True):
         name, data = pack_shard(number, samples, maps[0].sensor)
         run.save(name, data, final=True)
         entries[number] = shard_entry(name, len(samples), data)
@@ -168,7 +185,8 @@ def _finish_shards(
     return [entry for _, entry in sorted(entries.items())]
 
 
-def _cut(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
+def _split(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
+    """Split presses into parts of equal size."""
     for start in range(0, len(presses), size):
         yield presses[start : start + size]
 
@@ -176,11 +194,11 @@ def _cut(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
 def _samples(
     maps: Sequence[ForwardMap], shards: Iterable[SweepPresses], executor: Executor | None
 ) -> Iterator[Samples]:
-    """Samples of each shard, in order; the workers run ahead of the one that is taken."""
-    shards, coming = tee(shards)
+    """Compute the samples of each shard in order. The workers compute later shards in advance."""
+    shards, shards_for_tasks = tee(shards)
     tasks = (
         (maps[number], part.contact[rows], part.rotation[rows])
-        for part in coming
+        for part in shards_for_tasks
         for number, rows in _tasks(part, len(maps))
     )
     charges = in_order(executor, _charges, tasks)
@@ -196,14 +214,14 @@ def _samples(
 
 
 def _tasks(part: SweepPresses, probes: int) -> Iterator[tuple[int, Integers]]:
-    """Tasks of a shard: number of the probe and rows of the shard."""
+    """Return the tasks of a shard as the number of the probe and the rows of the shard."""
     for number in range(probes):
         rows = np.flatnonzero(part.probe == number)
-        for start in range(0, rows.size, TASK):
-            yield number, rows[start : start + TASK]
+        for start in range(0, rows.size, TASK_SIZE):
+            yield number, rows[start : start + TASK_SIZE]
 
 
 def _charges(task: tuple[ForwardMap, Array, Array]) -> Array:
-    """Touch charges of a task's presses, shape (n, n_electrode), pC."""
+    """Compute the touch charges of the presses of a task, shape (n, n_electrode), pC."""
     forward_map, contact, rotation = task
     return forward_map.charges(contact, rotation)
