@@ -20,7 +20,7 @@ from isocharge.cli.train.press_dialogue import Dialogue, Screen
 from isocharge.cli.train.press_events import PressEvents, SessionEnd
 from isocharge.common.errors import OutputExists, PortLost, PressError
 from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_frame, read_presses
-from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, Watched
+from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, WatchResult
 from isocharge.simulate import Circle, load_amplifier, load_sensor
 from isocharge.train import CalibrationProblem, next_presses
 from isocharge.train.calibration.press_file import open_press_file
@@ -78,13 +78,13 @@ class Script:
         return event
 
 
-STEADY = Watched(Phase.taken, press=SteadyPress(np.full(4, 500.0), np.ones(4), np.ones(4), 0.7, 0.5, 100, ()))
-TARED = Watched(Phase.waiting, np.zeros(4))
-HELD, LATER, LATE = (Watched(Phase.settling, np.full(4, 400.0), held_s) for held_s in (0.3, 0.8, 1.4))
+STEADY = WatchResult(Phase.taken, press=SteadyPress(np.full(4, 500.0), np.ones(4), np.ones(4), 0.7, 0.5, 100, ()))
+TARED = WatchResult(Phase.waiting, np.zeros(4))
+HELD, LATER, LATE = (WatchResult(Phase.settling, np.full(4, 400.0), held_s) for held_s in (0.3, 0.8, 1.4))
 
 
 def refused(reason):
-    return Watched(Phase.refused, reason=reason)
+    return WatchResult(Phase.refused, reason=reason)
 
 
 def dialogue(*events, asks=True, contacts=None):

@@ -1,4 +1,4 @@
-"""A press that was held while somebody listened: what it says, of charges that follow a law by closed form."""
+"""Description of a held press whose charge follows a law in closed form: constant, leak, creep or drift."""
 
 import re
 
@@ -7,7 +7,7 @@ import pytest
 
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame
 from isocharge.serve.examination.held_press import LEARNING_TAU_s, held_press
-from isocharge.serve.examination.listening import Heard
+from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import findings
 
 T_S = np.arange(0.0, 20.0, 0.005)
@@ -63,7 +63,7 @@ def test_held_press_finds_leak_creep_or_drift(law, drift, sections, said, scale)
     held = held_press(board(law, drift, scale=scale), T_S)
     assert held.begin_s == pytest.approx(5.0, abs=0.2)
     assert held.sections == {name: pytest.approx(keys, rel=0.15) for name, keys in sections.items()}
-    assert re.search(said, held.says)
+    assert re.search(said, held.description)
 
 
 @pytest.mark.parametrize("until_s", [0.0, 7.0])
@@ -78,7 +78,7 @@ def test_proposed_file_has_the_leak_and_the_offset_before_the_press():
         Chunk(encode_frame(Frame(k % 65536, 5000 * k, tuple(row.tolist()))), 1e9 + t, 0)
         for k, (t, row) in enumerate(zip(T_S, values, strict=True))
     ]
-    report = findings(Heard("/dev/ttyACM0", 115200, chunks=chunks, seconds=20.0))
+    report = findings(ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=20.0))
     assert device_from_table(report.device, "board").leak.tau_s == pytest.approx(10.0, rel=0.05)
     assert max(abs(channel.offset_pC) for channel in report.channels) < 1.0
     assert report.works

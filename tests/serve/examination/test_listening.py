@@ -10,7 +10,7 @@ import pytest
 
 from isocharge.serve import examine
 from isocharge.serve.examination import listening
-from isocharge.serve.examination.listening import Heard, listen
+from isocharge.serve.examination.listening import ReceivedData, listen
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.port.source import Chunk
 
@@ -103,9 +103,9 @@ def test_echo_of_a_request_is_detected(run, pty, echo):
             os.write(board, (asked if echo else b"") + b"1,2\n")
 
     run(answer, 0.001)
-    heard = listen(url, (115200,), 0.3, Request(b"?\n", 100.0), lambda _: True)
-    assert heard.request == Request(b"?\n", 100.0, echo=echo)
-    lines = b"".join(heard.data).split(b"\n")
+    received = listen(url, (115200,), 0.3, Request(b"?\n", 100.0), lambda _: True)
+    assert received.request == Request(b"?\n", 100.0, echo=echo)
+    lines = b"".join(received.data).split(b"\n")
     assert set(lines) <= {b"1,2", b"", b"?"}
     assert lines.count(b"?") < lines.count(b"1,2")  # one of a late answer, on a busy machine
 
@@ -120,12 +120,12 @@ def test_each_datagram_is_a_chunk(run):
                 sender.sendto(b"\x01\x02\x03", ("127.0.0.1", int(url.rpartition(":")[2])))
 
         run(send, 0.01)
-        heard = listen(url, (115200,), 0.3, None, lambda _: True)
-        assert heard.are_datagrams
-        assert set(heard.data) == {b"\x01\x02\x03"}
+        received = listen(url, (115200,), 0.3, None, lambda _: True)
+        assert received.are_datagrams
+        assert set(received.data) == {b"\x01\x02\x03"}
 
 
 def test_time_span_of_a_burst():
     chunks = [Chunk(b"x", 100.0 + 0.1 * k, 0) for k in range(5)]
-    assert Heard("x", 1, chunks=chunks, seconds=3.0).span_s == pytest.approx(0.5)
-    assert Heard("x", 1, chunks=chunks[:1], seconds=3.0).span_s == 3.0
+    assert ReceivedData("x", 1, chunks=chunks, seconds=3.0).span_s == pytest.approx(0.5)
+    assert ReceivedData("x", 1, chunks=chunks[:1], seconds=3.0).span_s == 3.0

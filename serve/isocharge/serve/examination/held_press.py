@@ -1,8 +1,8 @@
-"""A press that is held while a board is listened to: whether its charge stays, leaks, creeps, or drifts as at rest.
+"""Description of a press that is held during the port check: its charge is constant, leaks, creeps or drifts.
 
-Nothing is known about the board, so no level in pC defines a press. The press is the first of the largest steps that
-the channels make within two tenths of a second. Its size is the component of the channels along that step, above the
-straight line that the rest before the step follows.
+The gain of the board may be unknown, so a press is not defined by a charge in pC. The press is the first of the largest
+changes of the channels within 0.2 s. Its size is the component of the channels along this change, minus a straight line
+that is fitted to the rest before.
 """
 
 from dataclasses import dataclass
@@ -42,17 +42,17 @@ LEARNING_TAU_s = 1e5
 
 @dataclass(frozen=True)
 class HeldPress:
-    """What a held press shows about the board.
+    """Result of a held press.
 
     Attributes:
         begin_s: Time at which the press began, s since the first frame.
         sections: Sections for a device file.
-        says: Description of the press, a sentence.
+        description: Description of the press, a sentence.
     """
 
     begin_s: float
     sections: dict[str, dict[str, float]]
-    says: str
+    description: str
 
 
 def held_press(values: Array, times_s: Array) -> HeldPress | None:
@@ -92,10 +92,10 @@ def held_press(values: Array, times_s: Array) -> HeldPress | None:
     if has_drift:
         rest = level + slope * block_times_s
     held_s = block_times_s[settled:end] - BLOCK_S * begin
-    says, sections = _describe(held_s, (component - rest)[settled:end])
+    description, sections = _describe(held_s, (component - rest)[settled:end])
     if has_drift:
-        says, sections = _with_drift(says, sections, percent_per_s=100.0 * slope / step_size)
-    return HeldPress(BLOCK_S * begin, sections, says)
+        description, sections = _with_drift(description, sections, percent_per_s=100.0 * slope / step_size)
+    return HeldPress(BLOCK_S * begin, sections, description)
 
 
 def _block_means(values: Array, times_s: Array) -> Array | None:
@@ -120,13 +120,13 @@ def _end_of_press(component: Array, settled: int, step_size: float) -> int:
 
 
 def _with_drift(
-    says: str, sections: dict[str, dict[str, float]], percent_per_s: float
+    description: str, sections: dict[str, dict[str, float]], percent_per_s: float
 ) -> tuple[str, dict[str, dict[str, float]]]:
     """Add the drift of the rest to the description and the sections of a press."""
     remedy = f"[leak] tau_s = {LEARNING_TAU_s:g} in a device file lets the drift be learned at rest and taken off"
     if "leak" in sections:
         remedy = "leave the board alone until the rest stands still, and measure again"
-    sentence = f"the rest drifts, by {percent_per_s:.2g} % of the press in a second; {says}; {remedy}"
+    sentence = f"the rest drifts, by {percent_per_s:.2g} % of the press in a second; {description}; {remedy}"
     return sentence, {"leak": {"tau_s": LEARNING_TAU_s}} | sections
 
 

@@ -1,4 +1,4 @@
-"""Listening to a port at the baud rate at which its bytes are frames, and reading these frames."""
+"""Reception of bytes from a port, at the baud rate at which the bytes are frames, and parsing of these frames."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -29,12 +29,12 @@ ECHO_SHARE = 0.7
 """Share of returned requests above which a line has an echo, dimensionless."""
 
 MIN_SPAN_S = 1e-3
-"""Smallest time in which bytes are assumed to come, s."""
+"""Smallest time span of received bytes, s. It keeps rates finite."""
 
 
 @dataclass
-class Heard:
-    """What came through a port.
+class ReceivedData:
+    """Bytes that were received from a port.
 
     Attributes:
         url: The port.
@@ -64,7 +64,7 @@ class Heard:
 
     @property
     def span_s(self) -> float:
-        """Time in which the bytes came, s.
+        """Time span in which the bytes arrived, s.
 
         The time from the first chunk to the last is extended by the mean time between two chunks.
         """
@@ -84,10 +84,10 @@ def listen(
     bauds: Sequence[int],
     seconds: float,
     request: Request | None,
-    is_clear: Callable[[Heard], bool],
+    is_clear: Callable[[ReceivedData], bool],
     wait: float = 0.0,
-) -> Heard:
-    """Listen to a port at the first baud rate at which the bytes are frames, or at which nothing comes.
+) -> ReceivedData:
+    """Listen to a port at the first baud rate at which the bytes are frames, or at which no bytes arrive.
 
     Args:
         url: The port.
@@ -101,42 +101,42 @@ def listen(
         PortError: If the port cannot be opened.
     """
     if request is not None and not request.echo:
-        heard = _listen(url, bauds[0], ECHO_S, request, wait)
-        request = replace(request, echo=heard.echo_share >= ECHO_SHARE)
+        received = _listen(url, bauds[0], ECHO_S, request, wait)
+        request = replace(request, echo=received.echo_share >= ECHO_SHARE)
     right_baud = bauds[0]
     if has_speed(url) and len(bauds) > 1:
         for baud in bauds:
-            heard = _listen(url, baud, TRY_S, request, wait)
-            if not heard.chunks or is_clear(heard):
+            received = _listen(url, baud, TRY_S, request, wait)
+            if not received.chunks or is_clear(received):
                 right_baud = baud
                 break
     return _listen(url, right_baud, seconds, request, wait)
 
 
-def _listen(url: str, baud: int, seconds: float, request: Request | None, wait: float) -> Heard:
+def _listen(url: str, baud: int, seconds: float, request: Request | None, wait: float) -> ReceivedData:
     """Listen for some time, or until the port is lost."""
-    heard = Heard(url, baud, request)
+    received = ReceivedData(url, baud, request)
     with Port(url, baud=baud, request=request, wait=wait) as port, suppress(PortLost):
         start_s = time.monotonic()
         while (remaining_s := start_s + seconds - time.monotonic()) > 0.0:
             chunk = port.read(remaining_s)
             if chunk is not None:
-                heard.chunks.append(chunk)
-    heard.seconds = time.monotonic() - start_s
-    heard.echo_share = port.echo_share
-    return heard
+                received.chunks.append(chunk)
+    received.seconds = time.monotonic() - start_s
+    received.echo_share = port.echo_share
+    return received
 
 
 @dataclass
 class Capture:
-    """Frames that came through a port.
+    """Frames that were received from a port.
 
     Attributes:
         parser: The parser, with its counters.
         frames: Good frames.
         times_s: Time of each frame, by the device's clock if it sends one, s.
         gaps: Counters of the frame numbers.
-        bytes_seen: Number of bytes that came.
+        bytes_seen: Number of bytes that were received.
     """
 
     parser: Parser
@@ -146,7 +146,7 @@ class Capture:
     bytes_seen: int = 0
 
     @property
-    def share(self) -> float:
+    def intact_share(self) -> float:
         """Share of bytes that were part of a good frame, dimensionless."""
         if not self.frames:
             return 0.0
@@ -158,7 +158,9 @@ class Capture:
         if len(self.frames) < 2:
             return 0.0
         span_s = self.times_s[-1] - self.times_s[0]
-        return (len(self.frames) - 1) / span_s if span_s > 0.0 else 0.0
+        if span_s <= 0.0:
+            return 0.0
+        return (len(self.frames) - 1) / span_s
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -181,11 +183,16 @@ class Capture:
         return np.array(rows, dtype=float), np.array(times_s) - times_s[0]
 
 
-def read_frames(heard: Heard, device: Device) -> Capture:
-    """Read the frames of the bytes that came through a port."""
-    capture = Capture(device.parser(), bytes_seen=heard.bytes_seen)
+def read_frames(received: ReceivedData, device: Device) -> Capture:
+    """Parse the frames in the bytes that were received from a port.
+
+    Args:
+        received: The bytes.
+        device: Settings of the board, which define the format.
+    """
+    capture = Capture(device.parser(), bytes_seen=received.bytes_seen)
     clock = DeviceClock()
-    for chunk in heard.chunks:
+    for chunk in received.chunks:
         for frame in capture.parser.feed(chunk.data):
             frame_time = clock.read(frame.t_us, capture.parser.t_us_modulus, chunk.timestamp)
             capture.frames.append(frame)

@@ -30,17 +30,17 @@ GAIN_REQUESTS = {
 
 @dataclass(frozen=True)
 class BoardFindings:
-    """What is known about a board when the reasons are listed.
+    """Results of the port check from which the missing things are derived.
 
     Attributes:
         capture: The frames.
         channels: Health of the channels that electrodes use.
         unused: Names of the other channels.
-        device: What is known about the board.
+        device: Settings of the board.
         electrodes: Electrodes of the model; empty for any model.
         unit: Unit of the channels: "pC", "counts" or "V".
-        held: Press that was held while listening; None without one.
-        touch: Sentence about a touch that disturbed the rest; empty without one.
+        held: Press that was held during the check; None if there was none.
+        touch: Sentence about a touch that disturbed the rest; empty if there was none.
     """
 
     capture: Capture
@@ -81,8 +81,9 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
 
 def _transmission_sentences(capture: Capture) -> Iterator[str]:
     """Yield what is wrong with the transmission."""
-    if capture.share < CLEAN_SHARE:
-        yield f"{1 - capture.share:.1%} of the bytes are no good frames: a bad cable, or a rate that is a little off"
+    if capture.intact_share < CLEAN_SHARE:
+        damaged_share = 1.0 - capture.intact_share
+        yield f"{damaged_share:.1%} of the bytes are no good frames: a bad cable, or a rate that is a little off"
     if capture.gaps.lost:
         yield f"{capture.gaps.lost} frames lost: a slower rate, or a faster link"
 

@@ -12,7 +12,7 @@ from isocharge.common.errors import IsochargeError
 from isocharge.common.printable_text import printable
 from isocharge.serve.examination.channel_health import ChannelHealth, channel_health
 from isocharge.serve.examination.held_press import HeldPress, held_press
-from isocharge.serve.examination.listening import BAUDS, Capture, Heard, listen, read_frames
+from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
 from isocharge.serve.examination.missing import BoardFindings, missing_sentences
 from isocharge.serve.examination.proposal import Proposal, propose, unit_of
 from isocharge.serve.examination.touch_search import find_touch
@@ -23,7 +23,7 @@ from isocharge.serve.port.serial_line import Request
 from isocharge.serve.recognition.recognise import recognise
 
 RIGHT_BAUD_SHARE = 0.5
-"""Share of bytes in good frames from which a baud rate is taken to be right, dimensionless."""
+"""Share of bytes in good frames from which a baud rate is assumed to be right, dimensionless."""
 
 PRESS_MARGIN_S = 0.2
 """Time before the begin of a held press that does not count as rest, s: the force is rising."""
@@ -37,17 +37,17 @@ class Examination:
         url: The port.
         baud: Bits per second at which most bytes were frames.
         format: Description of the format, for people.
-        bytes_seen: Number of bytes that came.
+        bytes_seen: Number of bytes that were received.
         seconds: Time of listening, s.
         rate_Hz: Frames per second, Hz.
-        good, bad: Number of frames, and of pieces that were no frame.
+        good, bad: Number of intact frames, and of damaged ones.
         lost, repeated: Number of frames, by the frame numbers; None if frames have no numbers.
         device_clock: Whether the device sends a clock.
         unit: Unit of the channels: "pC", or "counts" or "V" if the charge of one unit is not known.
         channels: Health of each channel that is used; empty without frames.
         unused: Channels that no electrode uses.
-        held: What a press shows that was held while listening, a sentence; empty without one.
-        touch: What shows that the film was touched while it should be at rest, a sentence; empty without a touch.
+        held: Description of a press that was held during the check, a sentence; empty if there was none.
+        touch: Description of a touch while the film should be at rest, a sentence; empty if there was none.
         missing: One sentence for each thing that is missing to get a contact.
         works: Whether a film at rest is tared with this device file. False after a touch.
         device: Content of the device file: the one that was given, or else one that fits. It is empty without frames,
@@ -86,15 +86,15 @@ def examine(
     request: Request | None = None,
     wait: float = 0.0,
 ) -> Examination:
-    """Check a port. The film must not be touched meanwhile.
+    """Check a port. The film must not be touched during the check, except for a press that is held.
 
     Args:
         url: Device path or URL, as `Port` takes it.
         bauds: Baud rates to try, bit/s.
         seconds: Time of listening, s.
-        device: What is known about the board; without it, the frames are recognised.
+        device: Settings of the board; by default the format of the frames is recognised.
         electrodes: Electrodes of the model that will be used; empty for any model.
-        gain: What is known of the amplifier if nothing is known of the board: keys of the section `[gain]`.
+        gain: Keys of the section `[gain]`, if there is no device file.
         request: Request that the board needs; by default that of the device.
         wait: Time to wait until the port can be opened, s.
 
@@ -103,26 +103,26 @@ def examine(
         InputError: If the port is a file.
         DeviceError: If the gain is wrong, or for other electrodes.
     """
-    heard = listen(url, bauds, seconds, request or device.request, lambda part: _is_clear(part, device), wait)
-    return findings(heard, device=device, electrodes=electrodes, gain=gain)
+    received = listen(url, bauds, seconds, request or device.request, lambda part: _is_clear(part, device), wait)
+    return findings(received, device=device, electrodes=electrodes, gain=gain)
 
 
-def _is_clear(heard: Heard, device: Device) -> bool:
+def _is_clear(received: ReceivedData, device: Device) -> bool:
     """Return whether most of the bytes are frames, so that the baud rate is right."""
     if device is ANY_BOARD:
-        frames = recognise(heard.data, heard.span_s, are_datagrams=heard.are_datagrams)
+        frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
         device = device_from_table({"frames": frames or {}}, "board")
-    return read_frames(heard, device).share > RIGHT_BAUD_SHARE
+    return read_frames(received, device).intact_share > RIGHT_BAUD_SHARE
 
 
 def findings(
-    heard: Heard,
+    received: ReceivedData,
     *,
     device: Device = ANY_BOARD,
     electrodes: tuple[str, ...] = (),
     gain: Mapping[str, Any] | None = None,
 ) -> Examination:
-    """Return what the bytes of a port show. The other arguments are those of `examine`.
+    """Examine the bytes that were received from a port; the other arguments are those of `examine`.
 
     Raises:
         DeviceError: If the gain is wrong, or for other electrodes.
@@ -130,11 +130,11 @@ def findings(
     proposal = Proposal(dict(device.table), electrodes)
     is_proposed = device is ANY_BOARD
     if is_proposed:
-        proposal = propose(heard, electrodes, gain or {})
+        proposal = propose(received, electrodes, gain or {})
         known_table = {key: value for key, value in proposal.table.items() if gain or key != "gain"}
         device = device_from_table(known_table, "board")
         device.check_gain(proposal.electrodes)
-    capture = read_frames(heard, device)
+    capture = read_frames(received, device)
     unit = "pC" if device.gain is not None else unit_of(capture)
     used = electrode_positions(capture, device)
     unused = tuple(name for position, name in enumerate(capture.names) if position not in used)
@@ -148,11 +148,11 @@ def findings(
     is_numbered = first_frame.seq is not None
     counts = capture.parser.counts
     return Examination(
-        url=heard.url,
-        baud=heard.baud,
+        url=received.url,
+        baud=received.baud,
         format=capture.parser.format,
-        bytes_seen=heard.bytes_seen,
-        seconds=heard.seconds,
+        bytes_seen=received.bytes_seen,
+        seconds=received.seconds,
         rate_Hz=capture.rate_Hz,
         good=len(capture.frames),
         bad=counts.crc_errors + counts.malformed,
@@ -162,16 +162,16 @@ def findings(
         unit=unit,
         channels=channels,
         unused=unused,
-        held="" if held is None else held.says,
+        held="" if held is None else held.description,
         touch=touch,
         missing=tuple(missing_sentences(board)),
-        works=bool(used) and not touch and _works(heard, table, proposal.electrodes or tuple(used.values())),
+        works=bool(used) and not touch and _works(received, table, proposal.electrodes or tuple(used.values())),
         device=table,
     )
 
 
 def _completed_table(table: Mapping[str, Any], held: HeldPress | None, *, without_offsets: bool) -> dict[str, Any]:
-    """Add the sections that a held press shows, and remove the offsets if they were measured on a touched film."""
+    """Add the sections that follow from a held press, and remove offsets that were measured on a touched film."""
     completed = dict(table)
     if held is not None:
         for name, section in held.sections.items():
@@ -202,16 +202,17 @@ def _touch_sentence(
     )
 
 
-def _works(heard: Heard, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
+def _works(received: ReceivedData, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
     """Return whether the film is tared with a device file, or there are too few frames for two tares."""
     count = 0
     try:
         device = device_from_table(table, "board")
         stream = ReadingStream(electrodes, device)
-        for timed in (timed for chunk in heard.chunks for timed in stream.feed(chunk)):
-            count += 1
-            if timed.reading.tare is not None or device.tare is None:
-                return True
+        for chunk in received.chunks:
+            for timed in stream.feed(chunk):
+                count += 1
+                if timed.reading.tare is not None or device.tare is None:
+                    return True
     except IsochargeError:
         return False
     return device.tare is not None and 0 < count < 2 * device.tare.frames

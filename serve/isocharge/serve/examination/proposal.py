@@ -11,7 +11,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.serve.examination.held_press import held_press
-from isocharge.serve.examination.listening import Capture, Heard, read_frames
+from isocharge.serve.examination.listening import Capture, ReceivedData, read_frames
 from isocharge.serve.frames.binary import FORMAT as BINARY
 from isocharge.serve.live.device import device_from_table
 from isocharge.serve.live.reading_stream import electrode_of
@@ -77,23 +77,23 @@ class Proposal(NamedTuple):
     electrodes: tuple[str, ...]
 
 
-def propose(heard: Heard, electrodes: tuple[str, ...], gain: Mapping[str, Any]) -> Proposal:
+def propose(received: ReceivedData, electrodes: tuple[str, ...], gain: Mapping[str, Any]) -> Proposal:
     """Propose the device file for a board.
 
     Args:
-        heard: What the board sent.
+        received: Bytes that the board sent.
         electrodes: Electrodes of the model; empty for any model.
-        gain: What the user knows of the amplifier: pC_per_unit, or V_per_unit and feedback_pF; empty for nothing.
+        gain: Gain as the user states it: pC_per_unit, or V_per_unit and feedback_pF; empty if it is unknown.
     """
-    frames = recognise(heard.data, heard.span_s, are_datagrams=heard.are_datagrams)
+    frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
     if frames is None:
         return Proposal({}, electrodes)
-    if heard.request is not None:
-        frames |= {"request": heard.request.data.hex(" ").upper(), "request_Hz": heard.request.rate_Hz}
-        if heard.request.echo:
+    if received.request is not None:
+        frames |= {"request": received.request.data.hex(" ").upper(), "request_Hz": received.request.rate_Hz}
+        if received.request.echo:
             frames["echo"] = True
     table: dict[str, Any] = {"name": "board", "frames": frames}
-    capture = read_frames(heard, device_from_table(table, "board"))
+    capture = read_frames(received, device_from_table(table, "board"))
     if not capture.frames:
         return Proposal({}, electrodes)
     values, times_s = capture.values()

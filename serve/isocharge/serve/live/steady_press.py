@@ -109,7 +109,7 @@ class SteadyPress(NamedTuple):
     flags: tuple[str, ...]
 
 
-class Watched(NamedTuple):
+class WatchResult(NamedTuple):
     """Result of a press watch for one reading.
 
     Attributes:
@@ -170,7 +170,7 @@ class PressWatch:
         if self._phase is Phase.settling:
             self._phase = Phase.lift
 
-    def feed(self, timed: TimedReading) -> Watched:
+    def feed(self, timed: TimedReading) -> WatchResult:
         """Process the next reading."""
         reading = timed.reading
         t_s = timed.time.clock_s
@@ -180,7 +180,7 @@ class PressWatch:
         if reading.charge_pC is None:  # There is no tare yet, or the frame is invalid.
             if TARE in reading.flags:
                 self._phase = Phase.taring
-            return Watched(self._phase)
+            return WatchResult(self._phase)
         if not reading.contact:
             return self._process_rest(reading.charge_pC, t_s)
 
@@ -189,11 +189,11 @@ class PressWatch:
         charge_pC = reading.charge_pC - self._rest_pC
         held_s = t_s - self._begin_s
         if self._phase is Phase.lift:
-            return Watched(Phase.lift, charge_pC, held_s)
+            return WatchResult(Phase.lift, charge_pC, held_s)
         result = self._process_press(reading, charge_pC, t_s)
         return result._replace(charge_pC=charge_pC, held_s=held_s)
 
-    def _process_rest(self, charge_pC: Array, t_s: float) -> Watched:
+    def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
         """Store a frame in which nothing touches, and refuse a press that has ended before it was steady."""
         rule = self._rule
         held_s = self._end_s - self._begin_s
@@ -208,7 +208,7 @@ class PressWatch:
         if is_press_unfinished and held_s >= rule.min_held_s:
             reason = self._reason or "hold it longer"
             return self._refuse(f"released after {held_s:.1f} s, before it was steady: {reason}", Phase.waiting)
-        return Watched(Phase.waiting, charge_pC)
+        return WatchResult(Phase.waiting, charge_pC)
 
     def _begin_press(self, t_s: float) -> None:
         """Begin a press at a time, s, and measure the rest just before it."""
@@ -226,7 +226,7 @@ class PressWatch:
         self._reason = ""
         self._min_scatter_pC = np.inf
 
-    def _process_press(self, reading: Reading, charge_pC: Array, t_s: float) -> Watched:
+    def _process_press(self, reading: Reading, charge_pC: Array, t_s: float) -> WatchResult:
         """Add a frame to the window of a press, and take or refuse the press if it is decided."""
         rule = self._rule
         self._end_s = t_s
@@ -245,11 +245,11 @@ class PressWatch:
             press = self._steady_press(reading)
             if press is not None:
                 self._phase = Phase.lift
-                return Watched(Phase.taken, press=press)
+                return WatchResult(Phase.taken, press=press)
         if held_s > rule.max_held_s:
             reason = self._reason or "too few frames come"
             return self._refuse(f"not steady within {rule.max_held_s:g} s: {reason}", Phase.lift)
-        return Watched(Phase.settling, reason=self._reason)
+        return WatchResult(Phase.settling, reason=self._reason)
 
     def _steady_press(self, reading: Reading) -> SteadyPress | None:
         """Return the press in the window if it is steady; otherwise None, and keep the reason."""
@@ -296,10 +296,10 @@ class PressWatch:
             flags=tuple(different_flags),
         )
 
-    def _refuse(self, reason: str, phase: Phase) -> Watched:
+    def _refuse(self, reason: str, phase: Phase) -> WatchResult:
         """Refuse a press for a reason, and continue with a phase."""
         self._phase = phase
-        return Watched(Phase.refused, reason=reason)
+        return WatchResult(Phase.refused, reason=reason)
 
 
 def unsteadiness(

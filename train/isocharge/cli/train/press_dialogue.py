@@ -11,7 +11,7 @@ from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_events import PressEvents, SessionEnd
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, PortLost, PressError
-from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, Watched
+from isocharge.serve.live.steady_press import AWAY, Phase, SteadyPress, WatchResult
 from isocharge.train.calibration.session import Answer, PressSession, describe_press, read_answer
 
 LINE_INTERVAL_s = 1.0
@@ -54,7 +54,7 @@ class Screen:
         self._last_phase = None
         say(sentence)
 
-    def show_phase(self, watched: Watched) -> None:
+    def show_phase(self, watched: WatchResult) -> None:
         """Print the instruction of the present phase, and the charges while a press settles."""
         if watched.phase not in PHASE_TEXTS:
             return
@@ -152,7 +152,7 @@ class Dialogue:
         else:
             self._screen.say(f"   row {number} is left out: {event.reason}")
 
-    def _wait_for(self, *phases: Phase) -> Watched:
+    def _wait_for(self, *phases: Phase) -> WatchResult:
         """Return the next reading in one of these phases, and show the phases of the readings before it."""
         while True:
             event = self._events.next()

@@ -7,7 +7,7 @@ from queue import Queue
 from typing import Self
 
 from isocharge.serve import Chunk, ReadingStream
-from isocharge.serve.live.steady_press import PressWatch, Watched
+from isocharge.serve.live.steady_press import PressWatch, WatchResult
 
 JOIN_TIMEOUT_s = 1.0
 """Time to wait for the thread that reads the port, s. A silent port keeps its thread busy for longer."""
@@ -39,7 +39,7 @@ class PressEvents:
         self._stream = stream
         self._watch = watch
         self._keyboard = keyboard
-        self._queue: Queue[tuple[int, Watched | str | Exception]] = Queue()
+        self._queue: Queue[tuple[int, WatchResult | str | Exception]] = Queue()
         self._stop = threading.Event()
         self._arm_count = 0
         self._port_thread = threading.Thread(target=self._read_port, name="press port", daemon=True)
@@ -60,7 +60,7 @@ class PressEvents:
         """Discard the readings so far, and detect only presses that begin from now on."""
         self._arm_count += 1
 
-    def next(self) -> Watched | str:
+    def next(self) -> WatchResult | str:
         """Wait for the next reading or typed line. Readings from before the last call of `arm` are discarded.
 
         Raises:
