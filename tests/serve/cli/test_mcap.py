@@ -140,8 +140,8 @@ def test_a_recording_is_drawn(command, recorded, models, tmp_path, figures):
     np.testing.assert_allclose(path_mm, [(record["x_mm"], record["y_mm"]) for record in contacts])
 
 
-def test_of_a_long_recording_no_peak_is_lost(command, recorded, models, tmp_path, monkeypatch, figures):
-    monkeypatch.setattr("isocharge.cli.serve.plot.MOST_GROUPS", 32)
+def test_plot_of_a_long_recording_shows_every_peak(command, recorded, models, tmp_path, monkeypatch, figures):
+    monkeypatch.setattr("isocharge.cli.serve.plot.MAX_GROUPS", 32)
     assert command("serve", "plot", recorded[0], "--models", models, "-o", tmp_path / "touch.png")[0] == 0
     records = records_in(recorded[0])
     force, charge = (bands_of(figures[0])[name][:, 1] for name in ("force", "C"))

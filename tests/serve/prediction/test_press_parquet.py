@@ -231,7 +231,7 @@ def test_more_rows_than_are_accepted(tmp_path, monkeypatch):
         PressError, match=r"long\.parquet: expected at most 1,000,000 presses, got more; split the file"
     ):
         read_presses(tmp_path / "long.parquet", NAMES)
-    monkeypatch.setattr(charge_table, "MOST_CHARGE_ROWS", 1_000_000)
+    monkeypatch.setattr(charge_table, "MAX_CHARGE_ROWS", 1_000_000)
     with pytest.raises(ChargeError, match=r"long\.parquet: expected at most 1,000,000 presses"):
         read_charge_file(tmp_path / "long.parquet", NAMES)
 

@@ -1,6 +1,6 @@
-"""`isocharge serve plot`: a recording as one picture.
+"""`isocharge serve plot`: draw a recording.
 
-The path on the film, and position, force, charges and flags over time.
+The picture shows the path on the film, and the position, force, charges and flags over time.
 """
 
 from collections.abc import Iterator
@@ -28,22 +28,28 @@ from isocharge.simulate.plots.film import draw_electrodes
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-"""Colours that eyes of every kind tell apart (Okabe and Ito 2008)."""
+"""Colours that people with colour vision deficiency can distinguish (Okabe and Ito 2008)."""
 
-MOST_GROUPS = 4000
-"""Records, or groups of neighbours, that are drawn: two for each pixel of a wide picture."""
+MAX_GROUPS = 4000
+"""Largest number of groups of neighbouring records that are drawn: two for each pixel of a wide picture."""
 
-MOST_POINTS, MOST_ELLIPSES = 20_000, 60
-"""Contacts that are drawn on the film, and those of them with an ellipse."""
+MAX_POINTS = 20_000
+"""Largest number of contacts that are drawn on the film."""
 
-LEAST_BREAK = 1.0
-"""Time without a record, s, from which nothing is drawn across it, if it is also longer than five groups."""
+MAX_ELLIPSES = 60
+"""Largest number of contacts that are drawn with an ellipse of the standard deviations."""
 
-UNITS = ((7200.0, 3600.0, "h"), (600.0, 60.0, "min"), (0.0, 1.0, "s"))
-"""From which length, s, a unit of time is used, and its seconds."""
+MIN_GAP_S = 1.0
+"""Shortest time without a record at which a line is interrupted, s."""
 
-DOUBTS = (OUTSIDE, MISFIT, SATURATED, BLIND, INVALID)
-"""Flags of a contact that is not to be taken as it stands."""
+MIN_GAP_GROUPS = 5.0
+"""Shortest time without a record at which a line is interrupted, relative to the usual length of a group."""
+
+TIME_UNITS = ((7200.0, 3600.0, "h"), (600.0, 60.0, "min"), (0.0, 1.0, "s"))
+"""Units of the time axis: shortest duration of a recording, s, length of the unit, s, and symbol."""
+
+DOUBTFUL_FLAGS = (OUTSIDE, MISFIT, SATURATED, BLIND, INVALID)
+"""Flags of contacts that may be wrong."""
 
 
 def plot_command(
@@ -63,7 +69,7 @@ def plot_command(
 ) -> None:
     """Draw a recording: the path on the film (mm), position, force (N) and charges (pC) over time, flags.
 
-    It shows the records as they were written; no model computes anything.
+    The picture shows the records as they were written. No contacts are computed again.
 
     Example: isocharge serve plot touch.rec -o touch.png
     """
@@ -95,13 +101,18 @@ PlottedRecord = defstruct(
 
 
 def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
-    """Columns of n records, each of shape (n,), NaN for null.
+    """Return the columns of records.
 
-    Numbers and flags (1 where one is set) by their names in a record, charges (pC) as `charge_pC.A`; flags that are
-    never set are left out.
+    Args:
+        records: The n records.
+        where: Name of the recording, for the error message.
+
+    Returns:
+        Columns by name, each of shape (n,), NaN for null: the numbers, the charges (pC) as `charge_pC.A`, and the flags
+        (1 if the flag is set). Flags that no record has are left out.
 
     Raises:
-        RecordingError: If there is no record.
+        RecordingError: If there are no records.
     """
     first = next(records, None)
     if first is None:
@@ -109,106 +120,151 @@ def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
     electrodes = tuple(first.charge_raw_pC or ())
 
     def row(record: Any) -> tuple[Any, ...]:
-        numbers = (getattr(record, name) for name in NUMBERS)
+        numbers = [getattr(record, name) for name in NUMBERS]
         charges = record.charge_pC or {}
-        return *numbers, *(charges.get(name) for name in electrodes), *(word in record.flags for word in MEANINGS)
+        charge_pC = [charges.get(name) for name in electrodes]
+        flags = [word in record.flags for word in MEANINGS]
+        return (*numbers, *charge_pC, *flags)
 
     names = [*NUMBERS, *(f"charge_pC.{name}" for name in electrodes), *MEANINGS]
     rows = np.fromiter(map(row, chain([first], records)), np.dtype((float, len(names))))
-    return {name: column for name, column in zip(names, rows.T, strict=True) if name not in MEANINGS or column.any()}
+    columns = dict(zip(names, rows.T, strict=True))
+    return {name: column for name, column in columns.items() if name not in MEANINGS or column.any()}
 
 
 class _Groups(NamedTuple):
-    """Neighbouring records that are drawn as one: their `start`, `first` and `last` times, and where to `break_`."""
+    """Groups of neighbouring records, each of which is drawn as one.
+
+    Attributes:
+        start: Position of the first record of each group, shape (n_group,).
+        start_time: Time of the first record of each group, in the unit of the time axis.
+        end_time: Time of the last record of each group, in the unit of the time axis.
+        after_gap: Groups that follow a gap, across which no line is drawn.
+    """
 
     start: Integers
-    first: Array
-    last: Array
-    break_: Integers
+    start_time: Array
+    end_time: Array
+    after_gap: Integers
 
     @classmethod
-    def of(cls, time: Array, seconds: float) -> "_Groups":
-        start = np.arange(0, len(time), -(-len(time) // MOST_GROUPS))
-        first, last = time[start], time[np.append(start[1:], len(time)) - 1]
-        usual = float(np.median(np.diff(first))) if len(first) > 1 else 0.0
-        break_ = np.flatnonzero(first[1:] - last[:-1] > max(LEAST_BREAK, 5.0 * usual)) + 1
-        return cls(start, first / seconds, last / seconds, break_)
+    def of(cls, time_s: Array, unit_s: float) -> "_Groups":
+        """Group records.
 
-    def draw(self, axes: Any, low: Array, high: Array, **style: Any) -> None:
-        """The band between two columns, from the smallest to the largest of each group: a line where they are one."""
-        low, high = np.fmin.reduceat(low, self.start), np.fmax.reduceat(high, self.start)
-        axes.fill_between(*(np.insert(values, self.break_, np.nan) for values in (self.first, low, high)), **style)
+        Args:
+            time_s: Times since the first record, shape (n,), s.
+            unit_s: Length of the unit of the time axis, s.
+        """
+        group_size = -(-len(time_s) // MAX_GROUPS)
+        start = np.arange(0, len(time_s), group_size)
+        last = np.append(start[1:], len(time_s)) - 1
+        start_s = time_s[start]
+        end_s = time_s[last]
+        usual_length_s = float(np.median(np.diff(start_s))) if len(start) > 1 else 0.0
+        min_gap_s = max(MIN_GAP_S, MIN_GAP_GROUPS * usual_length_s)
+        after_gap = np.flatnonzero(start_s[1:] - end_s[:-1] > min_gap_s) + 1
+        return cls(start, start_s / unit_s, end_s / unit_s, after_gap)
+
+    def draw_band(self, axes: Any, lower: Array, upper: Array, **style: Any) -> None:
+        """Draw the band between two columns, from the smallest to the largest value of each group."""
+        group_lower = np.fmin.reduceat(lower, self.start)
+        group_upper = np.fmax.reduceat(upper, self.start)
+        curves = (self.start_time, group_lower, group_upper)
+        axes.fill_between(*(np.insert(curve, self.after_gap, np.nan) for curve in curves), **style)
+
+    def draw_line(self, axes: Any, values: Array, **style: Any) -> None:
+        """Draw the line of a column, which covers all values of each group."""
+        self.draw_band(axes, values, values, lw=1.1, **style)
 
 
 def recording_picture(
     traces: dict[str, Array], sensor: Sensor | None, working_area: Array | None, title: str
 ) -> Figure:
-    """The picture of a recording.
+    """Draw the picture of a recording.
 
     Args:
-        traces: Its columns, see `traces_of`.
-        sensor: The film; None if it is not known.
-        working_area: Corners, shape (n, 2), mm.
-        title: Name of file and model.
+        traces: Columns of the records, as `traces_of` returns them.
+        sensor: The film; None if it is unknown.
+        working_area: Corners of the working area, shape (n, 2), mm; None if it is unknown.
+        title: Names of the file and the model.
     """
-    begin, time = traces["timestamp"][0], traces["timestamp"] - traces["timestamp"][0]
-    seconds, unit = next((seconds, name) for least, seconds, name in UNITS if time[-1] >= least)
-    groups, figure = _Groups.of(time, seconds), new_figure(15.0, 8.6)
-    words = [word for word in MEANINGS if word in traces]
-    film, times = cast(np.ndarray, figure.subfigures(1, 2, width_ratios=(1.0, 1.35)))
-    heights = (1.0, 0.8, 1.0, 0.09 * max(1, len(words)) + 0.05)
-    position, force, charge, flags = times.subplots(4, 1, sharex=True, height_ratios=heights)
-    for axes, name, colour in ((position, "x_mm", COLOURS[0]), (position, "y_mm", COLOURS[1]), (force, "force_N", INK)):
-        values, spread = traces[name], 2.0 * traces[name.replace("_", "_std_")]
-        groups.draw(axes, values - spread, values + spread, color=colour, alpha=0.25, lw=0.0)
-        groups.draw(axes, values, values, color=colour, lw=1.1, label=name.partition("_")[0])
-    for number, name in enumerate(name for name in traces if name.startswith("charge_pC.")):
-        colour = COLOURS[number % len(COLOURS)]
-        groups.draw(charge, traces[name], traces[name], color=colour, lw=1.1, label=name.partition(".")[2])
-    least = 2e-3 * max(float(groups.last[-1]), 1e-9)  # a single frame still is a visible mark
-    for height, word in enumerate(words):
-        inside = np.maximum.reduceat(traces[word], groups.start) > 0.0
-        lengths = np.maximum(groups.last - groups.first, least)[inside]
-        flags.broken_barh(np.column_stack([groups.first[inside], lengths]), (height - 0.35, 0.7), color=INK)
-    flags.set(yticks=range(len(words)), yticklabels=words)
-    labels = ("position, mm; bands: 2 standard deviations", "force, N", "touch charge, pC")
-    for axes, label in zip((position, force, charge), labels, strict=True):
-        axes.set_ylabel(label, fontsize=9)
-        axes.grid(alpha=0.3)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, ncols=8)
-    flags.set_xlabel(f"time since {datetime.fromtimestamp(begin, UTC):%Y-%m-%d %H:%M:%S} UTC, {unit}")
-    figure.suptitle(f"{title}: {len(time)} records in {time[-1] / seconds:.4g} {unit}")
-    axes = film.subplots()
+    start_s = traces["timestamp"][0]
+    time_s = traces["timestamp"] - start_s
+    duration_s = time_s[-1]
+    unit_s, unit = next((unit_s, unit) for min_duration_s, unit_s, unit in TIME_UNITS if duration_s >= min_duration_s)
+    groups = _Groups.of(time_s, unit_s)
+    flag_words = [word for word in MEANINGS if word in traces]
+
+    figure = new_figure(15.0, 8.6)
+    film_figure, time_figure = cast(np.ndarray, figure.subfigures(1, 2, width_ratios=(1.0, 1.35)))
+    heights = (1.0, 0.8, 1.0, 0.09 * max(1, len(flag_words)) + 0.05)
+    position_axes, force_axes, charge_axes, flag_axes = time_figure.subplots(4, 1, sharex=True, height_ratios=heights)
+    _draw_with_std(position_axes, groups, traces, "x_mm", COLOURS[0])
+    _draw_with_std(position_axes, groups, traces, "y_mm", COLOURS[1])
+    _draw_with_std(force_axes, groups, traces, "force_N", INK)
+    _draw_charges(charge_axes, groups, traces)
+    _draw_flags(flag_axes, groups, traces, flag_words)
+    _label_axes(position_axes, "position, mm; bands: 2 standard deviations")
+    _label_axes(force_axes, "force, N")
+    _label_axes(charge_axes, "touch charge, pC")
+    flag_axes.set_xlabel(f"time since {datetime.fromtimestamp(start_s, UTC):%Y-%m-%d %H:%M:%S} UTC, {unit}")
+    figure.suptitle(f"{title}: {len(time_s)} records in {duration_s / unit_s:.4g} {unit}")
+
+    film_axes = film_figure.subplots()
     if working_area is not None:
-        axes.add_patch(Polygon(working_area, fill=False, ls=":", ec=INK, lw=1.2))
+        film_axes.add_patch(Polygon(working_area, fill=False, ls=":", ec=INK, lw=1.2))
     if sensor is not None:
-        draw_electrodes(axes, sensor)
-    _draw_path(axes, traces, time / seconds, f"time, {unit}")
+        draw_electrodes(film_axes, sensor)
+    _draw_path(film_axes, traces, time_s / unit_s, f"time, {unit}")
     return figure
 
 
-def _draw_path(axes: Any, traces: dict[str, Array], time: Array, label: str) -> None:
-    """The path on the film, to scale: a line for each press, colour the time, dots that grow with the force."""
-    place = np.column_stack([traces["x_mm"], traces["y_mm"]])
-    at = np.flatnonzero(~np.isnan(place[:, 0]))
-    at = at[:: -(-len(at) // MOST_POINTS) or 1]
-    if len(at):
-        axes.plot(*place[:: -(-len(place) // MOST_POINTS)].T, color=INK, lw=0.5, alpha=0.5)  # NaN parts the presses
-        force = np.clip(traces["force_N"][at], 0.0, None)
-        size = 3.0 + 30.0 * force / max(float(force.max()), 1e-9)
-        marks = axes.scatter(*place[at].T, c=time[at], s=size, lw=0.0, alpha=0.8, zorder=4)
-        few = at[:: -(-len(at) // MOST_ELLIPSES)]
-        axes.add_collection(
-            EllipseCollection(
-                4.0 * traces["x_std_mm"][few], 4.0 * traces["y_std_mm"][few], np.zeros(len(few)), units="xy",
-                offsets=place[few], offset_transform=axes.transData, facecolors="none", edgecolors=INK, lw=0.6,
-                alpha=0.6, zorder=6,
-            )
-        )  # fmt: skip
-        doubtful = at[sum((traces[word][at] for word in DOUBTS if word in traces), np.zeros(len(at))) > 0.0]
-        axes.scatter(*place[doubtful].T, c=FELT, marker="x", s=24, lw=0.9, zorder=5)
-        axes.figure.colorbar(marks, ax=axes, shrink=0.6, label=label, location="bottom", pad=0.02)
+def _draw_with_std(axes: Any, groups: _Groups, traces: dict[str, Array], name: str, colour: str) -> None:
+    """Draw a number over time with a band of two standard deviations."""
+    values = traces[name]
+    spread = 2.0 * traces[name.replace("_", "_std_")]
+    groups.draw_band(axes, values - spread, values + spread, color=colour, alpha=0.25, lw=0.0)
+    groups.draw_line(axes, values, color=colour, label=name.partition("_")[0])
+
+
+def _draw_charges(axes: Any, groups: _Groups, traces: dict[str, Array]) -> None:
+    """Draw the charges of all electrodes over time."""
+    names = [name for name in traces if name.startswith("charge_pC.")]
+    for number, name in enumerate(names):
+        colour = COLOURS[number % len(COLOURS)]
+        groups.draw_line(axes, traces[name], color=colour, label=name.removeprefix("charge_pC."))
+
+
+def _draw_flags(axes: Any, groups: _Groups, traces: dict[str, Array], words: list[str]) -> None:
+    """Draw the times at which flags are set. A single record is drawn as a short bar, so that it is visible."""
+    min_length = 2e-3 * max(float(groups.end_time[-1]), 1e-9)
+    lengths = np.maximum(groups.end_time - groups.start_time, min_length)
+    for height, word in enumerate(words):
+        is_set = np.maximum.reduceat(traces[word], groups.start) > 0.0
+        bars = np.column_stack([groups.start_time[is_set], lengths[is_set]])
+        axes.broken_barh(bars, (height - 0.35, 0.7), color=INK)
+    axes.set(yticks=range(len(words)), yticklabels=words)
+
+
+def _label_axes(axes: Any, label: str) -> None:
+    """Add a label, a grid and, if there is anything to list, a legend to axes."""
+    axes.set_ylabel(label, fontsize=9)
+    axes.grid(alpha=0.3)
+    handles, _ = axes.get_legend_handles_labels()
+    if handles:
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, ncols=8)
+
+
+def _draw_path(axes: Any, traces: dict[str, Array], time: Array, time_label: str) -> None:
+    """Draw the path of the contacts on the film, true to scale.
+
+    Each press is a line. The colour of the dots shows the time, and their size shows the force.
+    """
+    position_mm = np.column_stack([traces["x_mm"], traces["y_mm"]])
+    contacts = _every_nth(np.flatnonzero(~np.isnan(position_mm[:, 0])), MAX_POINTS)
+    if len(contacts):
+        axes.plot(*_every_nth(position_mm, MAX_POINTS).T, color=INK, lw=0.5, alpha=0.5)  # NaN separates the presses
+        _draw_contacts(axes, traces, position_mm, contacts, time, time_label)
     else:
         axes.text(0.5, 0.5, "nothing touched the film", transform=axes.transAxes, ha="center", color=INK)
     axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
@@ -216,3 +272,44 @@ def _draw_path(axes: Any, traces: dict[str, Array], time: Array, label: str) -> 
     axes.autoscale_view()
     axes.set_title("path; ring: ± 2 standard deviations, cross: in doubt (see flags)", fontsize=9)
     axes.grid(alpha=0.2)
+
+
+def _draw_contacts(
+    axes: Any, traces: dict[str, Array], position_mm: Array, contacts: Integers, time: Array, time_label: str
+) -> None:
+    """Draw contacts as dots, some of them with an ellipse, and crosses on those that may be wrong."""
+    force_N = np.clip(traces["force_N"][contacts], 0.0, None)
+    size = 3.0 + 30.0 * force_N / max(float(force_N.max()), 1e-9)
+    dots = axes.scatter(*position_mm[contacts].T, c=time[contacts], s=size, lw=0.0, alpha=0.8, zorder=4)
+    axes.figure.colorbar(dots, ax=axes, shrink=0.6, label=time_label, location="bottom", pad=0.02)
+
+    with_ellipse = _every_nth(contacts, MAX_ELLIPSES)
+    width_mm = 4.0 * traces["x_std_mm"][with_ellipse]
+    height_mm = 4.0 * traces["y_std_mm"][with_ellipse]
+    axes.add_collection(
+        EllipseCollection(
+            width_mm,
+            height_mm,
+            np.zeros(len(with_ellipse)),
+            units="xy",
+            offsets=position_mm[with_ellipse],
+            offset_transform=axes.transData,
+            facecolors="none",
+            edgecolors=INK,
+            lw=0.6,
+            alpha=0.6,
+            zorder=6,
+        )
+    )
+
+    is_doubtful = np.zeros(len(contacts), dtype=bool)
+    for word in DOUBTFUL_FLAGS:
+        if word in traces:
+            is_doubtful |= traces[word][contacts] > 0.0
+    axes.scatter(*position_mm[contacts[is_doubtful]].T, c=FELT, marker="x", s=24, lw=0.9, zorder=5)
+
+
+def _every_nth(values: Any, max_count: int) -> Any:
+    """Return every n-th row of an array, with the smallest n for which there are at most `max_count` rows."""
+    step = max(1, -(-len(values) // max_count))
+    return values[::step]

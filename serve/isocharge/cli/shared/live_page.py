@@ -41,7 +41,7 @@ RATE_RECORDS = 400
 LOOPBACK = "127.0.0.1"
 """Host of the page if `--live` contains only a port."""
 
-LARGEST_PORT = 65535
+MAX_PORT = 65535
 """Largest number of a TCP port."""
 
 STATE_INTERVAL_S = 0.25
@@ -90,7 +90,7 @@ def page_address(live: str, token: str | None) -> Address:
     host, colon, port = live.rpartition(":")
     if not colon:
         host = LOOPBACK
-    is_port = port.isascii() and port.isdecimal() and len(port) <= len(str(LARGEST_PORT)) and int(port) <= LARGEST_PORT
+    is_port = port.isascii() and port.isdecimal() and len(port) <= len(str(MAX_PORT)) and int(port) <= MAX_PORT
     if not (host and is_port):
         raise InputError(f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}")
     address = Address(host.removeprefix("[").removesuffix("]"), int(port))

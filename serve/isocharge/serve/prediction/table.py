@@ -1,7 +1,7 @@
-"""Charges from a file, and contacts as CSV or as prediction records.
+"""Reading of charges from a file, and writing of contacts as CSV or as prediction records.
 
-The header of the charges names the electrodes, in any order, and may have further columns. The rows are touch charges
-in pC: no tare is subtracted. A row whose charges do not exceed the noise is out of contact.
+The header of the file contains the names of the electrodes in any order, and may have further columns. The rows are
+touch charges in pC, from which no tare is subtracted. In a row whose charges do not exceed the noise, nothing touches.
 """
 
 import csv
@@ -22,10 +22,10 @@ from isocharge.serve.prediction.contact import Contact, Contacts, Validity
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
 
-BLOCK = 4096
-"""Rows that are worked on at a time."""
+BLOCK_ROWS = 4096
+"""Number of rows that are converted at a time, which limits the memory."""
 
-MOST_CHARGE_ROWS = 10_000_000
+MAX_CHARGE_ROWS = 10_000_000
 """Largest number of rows of a file of charges."""
 
 
@@ -48,7 +48,7 @@ def read_charges(
 
     Raises:
         ChargeError: If a column is missing or there twice, or a cell is not a finite number, or there are more rows
-            than `MOST_CHARGE_ROWS`.
+            than `MAX_CHARGE_ROWS`.
     """
     table = CsvTable(lines, electrodes, where, ChargeError, _expected_header(electrodes))
     return _charges(table, electrodes, warn)
@@ -84,7 +84,7 @@ def _charges(table: NumberTable, electrodes: tuple[str, ...], warn: Callable[[st
     ignored = [name for name in table.header if name not in electrodes]
     if ignored:
         warn(ignored_words(table.where, ignored))
-    columns = table.read(chosen, MOST_CHARGE_ROWS)
+    columns = table.read(chosen, MAX_CHARGE_ROWS)
     return np.column_stack([columns.values[name] for name in electrodes])
 
 
@@ -109,9 +109,9 @@ def write_contacts(
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(names if validity is None else (*names, "flags"))
     rows = np.column_stack(contacts)
-    for start in range(0, len(rows), BLOCK):
-        block = rows[start : start + BLOCK]
-        is_touch = touches[start : start + BLOCK]
+    for start in range(0, len(rows), BLOCK_ROWS):
+        block = rows[start : start + BLOCK_ROWS]
+        is_touch = touches[start : start + BLOCK_ROWS]
         values = block[:, :N_WITHOUT_CORRELATION].tolist()
         flags = [()] * len(block) if validity is None else validity.batch_flags(Contacts(*block.T))
         for numbers, row_touches, words in zip(values, is_touch.tolist(), flags, strict=True):
@@ -123,9 +123,9 @@ def write_contacts(
 
 
 def blocks(rows: Array) -> Iterator[Array]:
-    """Rows a block at a time: as Python's numbers, which take five times as much memory."""
-    for start in range(0, len(rows), BLOCK):
-        yield rows[start : start + BLOCK]
+    """Yield the rows in blocks, because Python numbers need five times as much memory as an array."""
+    for start in range(0, len(rows), BLOCK_ROWS):
+        yield rows[start : start + BLOCK_ROWS]
 
 
 def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
