@@ -1,13 +1,15 @@
-"""Charges of electrodes anywhere on the film, and their derivatives by the press and by what nobody knows exactly.
+"""Table of the charges of electrodes anywhere on the film, and of their derivatives with respect to the parameters.
 
-A round film under a press at some distance from its centre is one equilibrium, whatever the electrodes. In the
-coordinates of the conformal map that carries the probe's circle onto |z| = rho (`mesh.placement`) its stress is smooth
-but for a kink on that circle. It is solved at Chebyshev nodes in the distance and sampled, with its central differences
-by the unknowns, on a grid that is even in |z| within the circle, in ln|z| from there to the rim, and in arg z.
-Polynomials interpolate in the distance and local cubics on the grid; an electrode reads the mean over its area.
+The parameters are the contact and the nuisances. The equilibrium of a round film under a press depends only on the
+distance of the press from the centre, not on the electrodes. In the coordinates of the conformal map that carries the
+circle of the probe onto |z| = rho (`mesh.placement`), its stress is smooth except for a kink on that circle.
+
+The equilibrium is solved at Chebyshev nodes in the distance. The stress and its finite differences with respect to the
+parameters are sampled on a grid that is uniform in |z| within the circle, in ln|z| from the circle to the rim, and in
+arg z. The table interpolates with polynomials in the distance and with local cubics on the grid. An electrode collects
+the mean over its area.
 """
 
-from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -35,39 +37,57 @@ from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
 
 COLUMNS = ("charge", "x", "y", "ln force", "probe radius", "pretension")
-"""Columns of a row: the charge, pC, and its derivatives, per mm, 1 and MPa."""
+"""Columns of a row: the charge, pC, and its derivatives with respect to x and y (pC/mm), ln F (pC), the probe radius
+(pC/mm) and the pretension (pC/MPa)."""
 
-INSIDE, OUTSIDE, AROUND = 10, 49, 64
-"""Nodes of the grid within the probe's circle, from there to the rim, and around."""
+INNER_ROWS = 10
+"""Number of rows of the grid within the circle of the probe."""
+
+OUTER_ROWS = 49
+"""Number of rows of the grid between the circle of the probe and the rim."""
+
+ANGLES = 64
+"""Number of columns of the grid, at equal angles."""
 
 MARGIN = 0.03
-"""The grid leaves out this share of the radius on both sides of the circle: differences are wrong there."""
+"""Share of rho that the grid omits on both sides of the circle, dimensionless. Finite differences across the kink of
+the stress would be wrong there."""
 
-SHIFT, LOG_STEP, PRETENSION_STEP = 0.02, 0.05, 0.1
-"""Steps of the differences: by place and probe radius over the probe's radius, by ln F, and by the pretension, MPa."""
+RELATIVE_STEP = 0.02
+"""Step of the finite differences with respect to position and probe radius, in units of the probe radius."""
+
+LOG_FORCE_STEP = 0.05
+"""Step of the finite differences with respect to ln F, dimensionless."""
+
+PRETENSION_STEP = 0.1
+"""Step of the finite differences with respect to the pretension, MPa."""
 
 DISTANCES = (5, 8)
-"""Number of distances that are solved: up to a quarter of the film's radius, and beyond."""
+"""Number of distances that are solved if the radius is at most, or more than, a quarter of the film radius."""
 
-RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
-"""Gauss points per side of a square by its distance from the press, in units of half its diagonal plus the probe's
-radius; nearer than the first the kink of the stress on the footprint's edge crosses it."""
+GAUSS_RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
+"""Largest distance of a square from a press, in units of half the diagonal of the square plus the probe radius, and
+number of Gauss points per side for this distance. The kink of the stress crosses squares nearer than the first
+distance."""
 
-PRESSES, POINTS = 256, 20_000
-"""Presses and points evaluated at once: keeps the working arrays within some 100 MB."""
+PRESS_CHUNK = 256
+"""Number of presses that are evaluated at once, which limits the memory to about 100 MB."""
+
+POINT_CHUNK = 20_000
+"""Number of points that are evaluated at once, which limits the memory to about 100 MB."""
 
 
 @dataclass(frozen=True)
 class ChargeTable:
-    """Charges of electrodes under one probe with one force, anywhere within a disk.
+    """Charges of electrodes under a given probe and force, for presses anywhere within a disk.
 
     Attributes:
-        film_radius: mm.
-        probe: The footprint.
-        piezo: d31 and d32, pC/N.
-        distance: Distances of the presses from the centre that were solved, shape (n_distance,), mm.
-        stress: (s11, s22, s12) and their derivatives in the frame of the press, single precision, MPa and MPa per unit:
-            shape (n_distance * 3, n_node * 6).
+        film_radius: Radius of the film, mm.
+        probe: Probe.
+        piezo: Piezoelectric coefficients d31 and d32, pC/N.
+        distance: Distances of the solved presses from the centre, shape (n_distance,), mm.
+        stress: Stress (s11, s22, s12), MPa, and its derivatives in the frame of the press, single precision, shape
+            (n_distance * 3, n_node * 6).
     """
 
     film_radius: float
@@ -80,7 +100,14 @@ class ChargeTable:
     def solve(
         cls, sensor: Sensor, probe: Circle, force: float, radius: float, executor: Executor | None = None
     ) -> "ChargeTable":
-        """Solve presses of `force` (N) up to `radius` (mm) from the centre, some sixty.
+        """Solve the presses of the table.
+
+        Args:
+            sensor: Sensor with the film, the coefficients and the surface of the readout.
+            probe: Probe.
+            force: Force of the presses, N.
+            radius: Largest distance of a press from the centre, mm.
+            executor: Executor that runs the solves; this process if absent.
 
         Raises:
             SolveError: If an equilibrium is not reached.
@@ -88,143 +115,225 @@ class ChargeTable:
         film = sensor.film
         settings = SolveSettings(theory=theory_for(sensor, probe, (force, force)), layer=layer_for(film, force))
         settings = replace(settings, resolution=needed_resolution(film, probe, (radius, 0.0), force, settings))
-        distance = chebyshev_nodes(DISTANCES[int(radius > 0.25 * film.radius)], 0.0, radius)
+        is_wide = radius > 0.25 * film.radius
+        distance = chebyshev_nodes(DISTANCES[int(is_wide)], 0.0, radius)
         solve = partial(_stress_at, film, sensor.surface, probe, force, settings)
         solved = list(track(in_order(executor, solve, distance.tolist()), "solving the film", len(distance)))
         stress = np.stack(solved).transpose(0, 3, 2, 1).reshape(3 * len(distance), -1).astype(np.float32)
         return cls(film.radius, probe, (sensor.piezo.d31, sensor.piezo.d32), distance, stress)
 
-    def rows(self, presses: Array, centres: Array, side: float, stay: tuple[Electrode, ...] = ()) -> Array:
-        """Charges and derivatives of squares, and after them of other electrodes.
+    def rows(self, presses: Array, centres: Array, side: float, others: tuple[Electrode, ...] = ()) -> Array:
+        """Compute charges and derivatives of squares and of other electrodes.
+
+        The charges are means over the areas of the electrodes, regardless of the readout of the sensor.
 
         Args:
-            presses: (x, y), shape (n, 2), mm.
-            centres: Of the squares, shape (m, 2), mm.
-            side: Of the squares, mm.
-            stay: The other electrodes, of any shape.
+            presses: Positions (x, y) of the presses, shape (n, 2), mm.
+            centres: Centres of the squares, shape (m, 2), mm.
+            side: Side of the squares, mm.
+            others: Further electrodes of any shape.
 
         Returns:
-            Shape (n, m + len(stay), 6), the columns of `COLUMNS`. The mean over the area is read, whatever the sensor's
-            readout.
+            Rows with the columns `COLUMNS`, shape (n, m + len(others), 6), with the squares first.
         """
-        chunks = [presses[start : start + PRESSES] for start in range(0, len(presses), PRESSES)]
-        return np.concatenate([np.concatenate(list(self._parts(at, centres, side, stay)), axis=1) for at in chunks])
-
-    def _parts(self, presses: Array, centres: Array, side: float, stay: tuple[Electrode, ...]) -> Iterator[Array]:
-        pressed = _Pressed.of(self, presses)
-        yield pressed.squares(centres, side)
-        for electrode in stay:
-            points, shares = electrode_rule(electrode, "area", RULES[0][1])
-            chunks = np.array_split(np.arange(len(presses)), -(-len(presses) * len(points) // POINTS))
-            every = [np.broadcast_to(points, (len(chunk), *points.shape)) for chunk in chunks]
-            means = [pressed.means(chunk, at, shares[:, 0]) for chunk, at in zip(chunks, every, strict=True)]
-            yield electrode.area * np.concatenate(means)[:, None]
+        chunks = []
+        for start in range(0, len(presses), PRESS_CHUNK):
+            pressed = _PressedFilm.of(self, presses[start : start + PRESS_CHUNK])
+            electrodes = [pressed.squares(centres, side), *(pressed.electrode(electrode) for electrode in others)]
+            chunks.append(np.concatenate(electrodes, axis=1))
+        return np.concatenate(chunks)
 
 
 @dataclass(frozen=True)
-class _Pressed:
-    """Charge per area of some presses on the grid, and where the grid lies.
+class _PressedFilm:
+    """Charge per area on the grids of several presses.
 
     Attributes:
-        table: The table.
-        presses: x + iy, shape (n,), mm.
-        turn: Direction of each press, shape (n,).
-        pole, rho: Of the conformal maps, shape (n,).
-        density: Shape (n * n_node, 6), pC/mm^2 and per unit; derivatives by place in the frame of the press.
+        table: Charge table.
+        presses: Positions x + iy of the presses, shape (n,), mm.
+        direction: Unit vector from the centre to each press as a complex number, shape (n,).
+        pole: Poles of the conformal maps, shape (n,).
+        rho: Radii of the circle of the probe in the coordinates of the conformal maps, shape (n,).
+        density: Charge per area, pC/mm^2, and its derivatives on the grids, with derivatives with respect to the
+            position in the frame of the press, shape (n * n_node, 6).
     """
 
     table: ChargeTable
     presses: Complexes
-    turn: Complexes
+    direction: Complexes
     pole: Array
     rho: Array
     density: np.ndarray
 
     @classmethod
-    def of(cls, table: ChargeTable, presses: Array) -> "_Pressed":
-        at = presses @ np.array([1.0, 1j])
-        distance, turn = np.abs(at), np.exp(1j * np.angle(at))
-        (d31, d32), double = table.piezo, turn**2
-        mean, half = 0.5 * (d31 + d32), 0.5 * (d31 - d32)
-        by_stress = np.stack([mean + half * double.real, mean - half * double.real, -2.0 * half * double.imag], axis=1)
+    def of(cls, table: ChargeTable, presses: Array) -> "_PressedFilm":
+        """Interpolate the table for presses at positions (x, y), shape (n, 2), mm."""
+        z = presses @ np.array([1.0, 1j])
+        distance = np.abs(z)
+        direction = np.exp(1j * np.angle(z))
+
+        # Charge per stress in the frame of the press, from the rotation of the stress tensor
+        d31, d32 = table.piezo
+        mean = 0.5 * (d31 + d32)
+        half_difference = 0.5 * (d31 - d32)
+        double_angle = direction**2
+        by_s11 = mean + half_difference * double_angle.real
+        by_s22 = mean - half_difference * double_angle.real
+        by_s12 = -2.0 * half_difference * double_angle.imag
+        by_stress = np.stack([by_s11, by_s22, by_s12], axis=1)
+
         by_distance = lagrange_values(table.distance, barycentric_weights(table.distance), distance)
-        weights = (by_distance[:, :, None] * by_stress[:, None, :]).reshape(len(at), -1)
+        weights = (by_distance[:, :, None] * by_stress[:, None, :]).reshape(len(z), -1)
         density = (weights.astype(np.float32) @ table.stress).reshape(-1, len(COLUMNS))
-        a = table.film_radius
-        return cls(table, at, turn, *automorphism_onto(distance / a, np.full(len(at), table.probe.radius / a)), density)
+        relative_radius = np.full(len(z), table.probe.radius / table.film_radius)
+        pole, rho = automorphism_onto(distance / table.film_radius, relative_radius)
+        return cls(table, z, direction, pole, rho, density)
 
     def squares(self, centres: Array, side: float) -> Array:
-        """Rows of all presses and squares, shape (n, m, 6), each with as many points as its distance needs."""
-        away = np.abs(centres @ np.array([1.0, 1j]) - self.presses[:, None])
-        level = np.searchsorted([reach for reach, _ in RULES], away / (np.sqrt(0.5) * side + self.table.probe.radius))
-        rows = np.empty((*away.shape, len(COLUMNS)))
-        for number, (_, count) in enumerate(RULES):
-            (unit, share), (press_index, square) = gauss_square(count), np.nonzero(level == number)
-            for start in range(0, len(square), size := POINTS // len(unit)):
-                chunk = slice(start, start + size)
-                points = centres[square[chunk], None] + side * (unit - 0.5)
-                rows[press_index[chunk], square[chunk]] = side**2 * self.means(press_index[chunk], points, share)
+        """Compute the rows of all presses and squares; the number of Gauss points depends on the distance.
+
+        Args:
+            centres: Centres of the squares, shape (m, 2), mm.
+            side: Side of the squares, mm.
+
+        Returns:
+            Rows, shape (n, m, 6).
+        """
+        distance = np.abs(centres @ np.array([1.0, 1j]) - self.presses[:, None])
+        relative_distance = distance / (np.sqrt(0.5) * side + self.table.probe.radius)
+        rule_number = np.searchsorted([largest for largest, _ in GAUSS_RULES], relative_distance)
+        rows = np.empty((*distance.shape, len(COLUMNS)))
+        for number, (_, count) in enumerate(GAUSS_RULES):
+            unit_points, weights = gauss_square(count)
+            press_index, square_index = np.nonzero(rule_number == number)
+            size = POINT_CHUNK // len(unit_points)
+            for start in range(0, len(square_index), size):
+                press_chunk = press_index[start : start + size]
+                square_chunk = square_index[start : start + size]
+                points = centres[square_chunk, None] + side * (unit_points - 0.5)
+                rows[press_chunk, square_chunk] = side**2 * self.means(press_chunk, points, weights)
         return rows
 
-    def means(self, which: Integers, points: Array, share: Array) -> Array:
-        """Means over points (k, n_point, 2), mm, with shares (n_point,) under presses `which`: (k, 6), per area."""
-        turn = self.turn[which]
-        row, column = self._coordinates(which, points @ np.array([1.0, 1j]) / turn[:, None])
-        rows, by_row = _row_weights(row)
-        columns, by_column = cubic_weights(column, AROUND, periodic=True)
-        node = (which[:, None, None, None] * (INSIDE + OUTSIDE) + rows[..., None]) * AROUND + columns[..., None, :]
-        weights = share[:, None, None] * by_row[..., None] * by_column[..., None, :]
-        flat = weights.reshape(len(which), 1, -1).astype(np.float32)
-        mean: Array = np.matmul(flat, self.density[node.reshape(len(which), -1)])[:, 0].astype(float)
-        place = (mean[:, 1] + 1j * mean[:, 2]) * turn
-        mean[:, 1], mean[:, 2] = place.real, place.imag
+    def electrode(self, electrode: Electrode) -> Array:
+        """Compute the rows of all presses for one electrode of any shape, shape (n, 1, 6)."""
+        points, weights = electrode_rule(electrode, "area", GAUSS_RULES[0][1])
+        chunk_count = -(-len(self.presses) * len(points) // POINT_CHUNK)
+        means = []
+        for chunk in np.array_split(np.arange(len(self.presses)), chunk_count):
+            chunk_points = np.broadcast_to(points, (len(chunk), *points.shape))
+            means.append(self.means(chunk, chunk_points, weights[:, 0]))
+        return electrode.area * np.concatenate(means)[:, None]
+
+    def means(self, which: Integers, points: Array, weights: Array) -> Array:
+        """Compute weighted means of the charge per area and its derivatives.
+
+        Args:
+            which: Numbers of the presses, shape (k,).
+            points: Points on the film for each press, shape (k, n_point, 2), mm.
+            weights: Weights of the points, which add up to one, shape (n_point,).
+
+        Returns:
+            Means with the columns `COLUMNS` per area, shape (k, 6).
+        """
+        direction = self.direction[which]
+        row, column = self._grid_coordinates(which, points @ np.array([1.0, 1j]) / direction[:, None])
+        rows, row_weights = _row_weights(row)
+        columns, column_weights = cubic_weights(column, ANGLES, periodic=True)
+        first_row = which[:, None, None, None] * (INNER_ROWS + OUTER_ROWS)
+        node = (first_row + rows[..., None]) * ANGLES + columns[..., None, :]
+        node_weights = weights[:, None, None] * row_weights[..., None] * column_weights[..., None, :]
+        flat_weights = node_weights.reshape(len(which), 1, -1).astype(np.float32)
+        mean: Array = np.matmul(flat_weights, self.density[node.reshape(len(which), -1)])[:, 0].astype(float)
+
+        # Rotation of the derivatives with respect to x and y from the frame of the press
+        by_position = (mean[:, 1] + 1j * mean[:, 2]) * direction
+        mean[:, 1] = by_position.real
+        mean[:, 2] = by_position.imag
         return mean
 
-    def _coordinates(self, which: Integers, points: Complexes) -> tuple[Array, Array]:
-        """Row and column on the grid of points in the frame of the press; beyond the rim they count as on it."""
+    def _grid_coordinates(self, which: Integers, points: Complexes) -> tuple[Array, Array]:
+        """Compute row and column on the grid. Points beyond the rim are moved to the rim.
+
+        Args:
+            which: Numbers of the presses, shape (k,).
+            points: Points x + iy in the frame of the press, shape (k, n_point), mm.
+
+        Returns:
+            Fractional rows and columns, each of shape (k, n_point).
+        """
         z = points / self.table.film_radius
         z = z / np.maximum(np.abs(z), 1.0)
-        c, rho = self.pole[which, None], self.rho[which, None]
-        z = (z - c) / (1.0 - c * z)
-        inside = np.abs(z) / (rho * (1.0 - MARGIN)) * (INSIDE - 1)
-        outside = 1.0 - np.log(np.maximum(np.abs(z), rho)) / np.log(rho * (1.0 + MARGIN))
-        row = np.where(np.abs(z) <= rho, inside, INSIDE + outside * (OUTSIDE - 1))
-        return row, np.angle(z) * AROUND / (2.0 * np.pi)
+        pole = self.pole[which, None]
+        rho = self.rho[which, None]
+        z = (z - pole) / (1.0 - pole * z)
+        radius = np.abs(z)
+        inner_row = radius / (rho * (1.0 - MARGIN)) * (INNER_ROWS - 1)
+        outer_share = 1.0 - np.log(np.maximum(radius, rho)) / np.log(rho * (1.0 + MARGIN))
+        outer_row = INNER_ROWS + outer_share * (OUTER_ROWS - 1)
+        row = np.where(radius <= rho, inner_row, outer_row)
+        return row, np.angle(z) * ANGLES / (2.0 * np.pi)
 
 
 def _row_weights(row: Array) -> tuple[Integers, Array]:
-    """Neighbours and weights across the rows; the two sides of the probe's circle do not share neighbours."""
-    within = (row < INSIDE - 0.5)[..., None]
-    (near, by_near), (far, by_far) = cubic_weights(row, INSIDE), cubic_weights(row - INSIDE, OUTSIDE)
-    return np.where(within, near, far + INSIDE), np.where(within, by_near, by_far)
+    """Compute the nodes and weights of cubic interpolation across the rows, separately on both sides of the circle.
+
+    Args:
+        row: Fractional rows, any shape.
+
+    Returns:
+        Numbers of the four rows and their weights, each of shape (..., 4).
+    """
+    is_inner = (row < INNER_ROWS - 0.5)[..., None]
+    inner_rows, inner_weights = cubic_weights(row, INNER_ROWS)
+    outer_rows, outer_weights = cubic_weights(row - INNER_ROWS, OUTER_ROWS)
+    return np.where(is_inner, inner_rows, outer_rows + INNER_ROWS), np.where(is_inner, inner_weights, outer_weights)
 
 
 def _stress_at(
     film: Film, surface: Surface, probe: Circle, force: float, settings: SolveSettings, distance: float
 ) -> Array:
-    """Stress on the grid in the frame of the press, and its derivatives by all unknowns, shape (6, n_node, 3)."""
-    points, step = _grid_points(film.radius, probe.radius, distance), SHIFT * probe.radius
+    """Solve a press on the positive x axis, and compute the stress on the grid and its derivatives.
+
+    Args:
+        film: Film.
+        surface: Surface at which the stress is read.
+        probe: Probe.
+        force: Force, N.
+        settings: Settings of the solver.
+        distance: Distance of the press from the centre, mm.
+
+    Returns:
+        Stress (s11, s22, s12), MPa, and its derivatives in the order of `COLUMNS`, shape (6, n_node, 3).
+    """
+    points = _grid_points(film.radius, probe.radius, distance)
+    step = RELATIVE_STEP * probe.radius
     first = press(film, probe, (distance, 0.0), force, settings)
 
-    def stress(x: float = 0.0, y: float = 0.0, log: float = 0.0, radius: float = 0.0, pretension: float = 0.0) -> Array:
-        other, at = replace(film, pretension=film.pretension + pretension), (distance + x, y)
-        pressed = press(other, Circle(probe.radius + radius), at, force * float(np.exp(log)), settings, start=first)
+    def stress(
+        x: float = 0.0, y: float = 0.0, log_force: float = 0.0, radius: float = 0.0, pretension: float = 0.0
+    ) -> Array:
+        """Stress on the grid for changed parameters."""
+        changed_film = replace(film, pretension=film.pretension + pretension)
+        changed_probe = Circle(probe.radius + radius)
+        changed_force = force * float(np.exp(log_force))
+        pressed = press(changed_film, changed_probe, (distance + x, y), changed_force, settings, start=first)
         return touch_stress(pressed, points, surface)
 
-    derivatives = [
-        (stress(**{name: size}) - stress(**{name: -size})) / (2.0 * size)
-        for name, size in (("x", step), ("y", step), ("log", LOG_STEP), ("radius", step))
-    ]
     base = touch_stress(first, points, surface)
-    return np.stack([base, *derivatives, (stress(pretension=PRETENSION_STEP) - base) / PRETENSION_STEP])
+    by_x = (stress(x=step) - stress(x=-step)) / (2.0 * step)
+    by_y = (stress(y=step) - stress(y=-step)) / (2.0 * step)
+    by_log_force = (stress(log_force=LOG_FORCE_STEP) - stress(log_force=-LOG_FORCE_STEP)) / (2.0 * LOG_FORCE_STEP)
+    by_radius = (stress(radius=step) - stress(radius=-step)) / (2.0 * step)
+    by_pretension = (stress(pretension=PRETENSION_STEP) - base) / PRETENSION_STEP
+    return np.stack([base, by_x, by_y, by_log_force, by_radius, by_pretension])
 
 
 def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Array:
-    """Film points (x, y) of the grid under a press on the positive x axis, shape (n_node, 2), mm."""
-    a = film_radius
-    c, rho = automorphism_onto(np.array(distance / a), np.array(probe_radius / a))
-    inside = rho * (1.0 - MARGIN) * np.linspace(0.0, 1.0, INSIDE)
-    outside = (rho * (1.0 + MARGIN)) ** np.linspace(1.0, 0.0, OUTSIDE)
-    z = np.concatenate([inside, outside])[:, None] * np.exp(2j * np.pi * np.arange(AROUND) / AROUND)
-    points = a * ((z + c) / (1.0 + c * z)).ravel() * (1.0 - 1e-12)
+    """Compute the points (x, y) of the grid of a press on the positive x axis, shape (n_node, 2), mm."""
+    pole, rho = automorphism_onto(np.array(distance / film_radius), np.array(probe_radius / film_radius))
+    inner_radii = rho * (1.0 - MARGIN) * np.linspace(0.0, 1.0, INNER_ROWS)
+    outer_radii = (rho * (1.0 + MARGIN)) ** np.linspace(1.0, 0.0, OUTER_ROWS)
+    directions = np.exp(2j * np.pi * np.arange(ANGLES) / ANGLES)
+    z = np.concatenate([inner_radii, outer_radii])[:, None] * directions
+    points = film_radius * ((z + pole) / (1.0 + pole * z)).ravel() * (1.0 - 1e-12)
     return np.stack([points.real, points.imag], axis=1)
