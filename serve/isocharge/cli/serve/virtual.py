@@ -175,7 +175,7 @@ def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) 
 
 
 def _amplifier(noise: str, settings: VirtualScript) -> Amplifier:
-    """Return the amplifier of a noise level, with the changes that a script makes to it."""
+    """Return the amplifier that `--noise` names, changed as the settings of the script request."""
     changes: dict[str, Any] = {
         "step": settings.temperature_step_K,
         "bias": settings.drift_pC_per_s,

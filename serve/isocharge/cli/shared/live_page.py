@@ -1,4 +1,4 @@
-"""The live page in commands: its options, and the messages between a stream and its page."""
+"""Options of the live page for commands, and the messages between a stream and its page."""
 
 import logging
 import math

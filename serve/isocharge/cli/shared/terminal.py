@@ -80,7 +80,7 @@ def show_json(value: Any) -> None:
 
 
 def announce(line: str) -> None:
-    """Print a line on stdout for programs that wait for it. A command that serves others continues if stdout fails."""
+    """Print a line on stdout for programs that wait for it. A server continues if stdout is closed."""
     try:
         print(printable(line), flush=True)
     except OSError:

@@ -161,7 +161,11 @@ def _numbered_rows(
 
 
 def _other_format(data: bytes) -> str | None:
-    """Return what a file is that begins with some bytes, and what to do; None if it may be text in one byte each."""
+    """Return the name of another file format and the advice for it; None if the bytes may be text.
+
+    Args:
+        data: First bytes of the file.
+    """
     for mark, advice in _OTHER_FORMATS.items():
         if data.startswith(mark):
             return advice

@@ -1,6 +1,7 @@
 """Conversion of prediction records to ROS 2 messages in CDR: the wrench of the press, its pose, and the record as text.
 
-The frame is `frame_id`, the name of the sensor. Origin, x and y are those of README.md, Coordinates. ROS requires
+The coordinate frame of the messages is named `frame_id`, after the sensor. README.md, Coordinates, defines its origin
+and its axes x and y. ROS requires
 right-handed frames, so z points towards the probe, against the push. The wrench is the load of the probe on the film: a
 press of F at (x, y) has the force (0, 0, -F) and the torque (-y F, x F, 0) about the origin. The pose is the point of
 contact in the plane of the unloaded film, without rotation, with the model's standard deviations.

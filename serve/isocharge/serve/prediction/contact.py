@@ -298,7 +298,7 @@ class Validity:
         """Return the flags of one contact.
 
         Contacts inside the largest circle around the origin, or outside the radius of the working area, take about a
-        microsecond. The test of the polygon, which the others need, takes about 30 us.
+        microsecond. Other contacts have to be compared with the polygon, which takes about 30 us.
         """
         return _flag_words(
             is_outside=self._is_outside(contact),

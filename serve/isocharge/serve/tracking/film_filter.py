@@ -320,7 +320,7 @@ class FilmFilter:
         return self._residuals(misfit, jacobian, noise)
 
     def _linearise(self, charge_pC: Array) -> tuple[Array, Array]:
-        """Return the misfit vector of a touch at each pretension, and its derivatives by the linear unknowns.
+        """Return the misfit vector of a touch at each pretension, and its Jacobian for the linear unknowns.
 
         The derivative with respect to the offset is the difference quotient between the charges and the charges
         without the estimated mean offset of the level. The misfit without that offset is therefore exact.

@@ -180,7 +180,8 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
 def thermal_charge(sensor: Sensor, step: float) -> Array:
     """Compute the pyroelectric charge of a uniform change of the temperature.
 
-    The clamp is assumed to expand as the film does. The stress from different expansions is part of the pretension.
+    The clamp is assumed to expand like the film. A clamp that expands differently changes the pretension of the film,
+    which is described by another parameter.
 
     Args:
         sensor: The sensor.

@@ -122,19 +122,21 @@ class Coating:
 
     def _laminate(self, points: Complexes) -> "_Laminate":
         """Compute the laminate at each point; see the module for the formulas."""
+        # `_shares` counts the area under at least so many layers; the differences are the areas under exactly so many.
         shares = -np.diff(self._shares(points), prepend=1.0, append=0.0)
-        x, y = self._normal(points)
-        jump = np.zeros((*points.shape, 1, 3, 2))  # N
-        jump[..., 0, 0, 0] = x
-        jump[..., 0, 2, 1] = x
-        jump[..., 0, 1, 1] = y
-        jump[..., 0, 2, 0] = y
-        stiffness = self.bare + np.arange(len(self.layers) + 1)[:, None, None] * self.added
-        traction = jump.swapaxes(-1, -2) @ stiffness  # N^T C_i
-        compliance = np.linalg.inv(traction @ jump)  # M_i^-1
+        normal_x, normal_y = self._normal(points)
+        normal = np.zeros((*points.shape, 1, 3, 2))  # N: maps a displacement jump across the edge to a strain
+        normal[..., 0, 0, 0] = normal_x
+        normal[..., 0, 2, 1] = normal_x
+        normal[..., 0, 1, 1] = normal_y
+        normal[..., 0, 2, 0] = normal_y
+        n_layers = np.arange(len(self.layers) + 1)
+        stiffness = self.bare + n_layers[:, None, None] * self.added
+        traction = normal.swapaxes(-1, -2) @ stiffness  # N^T C_i
+        compliance = np.linalg.inv(traction @ normal)  # M_i^-1
         weighted = shares[..., None, None] * compliance
         common_traction = np.linalg.solve(weighted.sum(axis=-3), (weighted @ traction).sum(axis=-3))  # T
-        strain = np.eye(3) + jump @ compliance @ (common_traction[..., None, :, :] - traction)
+        strain = np.eye(3) + normal @ compliance @ (common_traction[..., None, :, :] - traction)
         return _Laminate(shares, stiffness, strain)
 
 

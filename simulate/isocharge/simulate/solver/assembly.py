@@ -48,32 +48,35 @@ class Assembly:
         self.skeleton = np.flatnonzero(in_skeleton & self.free.ravel())
         number = np.full(self.free.size, -1, dtype=np.intp)
         number[self.skeleton] = np.arange(self.skeleton.size)
-        self._pattern(number[self.outer_global])
+        self._set_pattern(number[self.outer_global])
         self.follow = None
         if mesh.constraint is not None:
             each = kron(mesh.constraint, eye_array(components)).tocsr()[self.skeleton][:, self.skeleton]
             self.follow = each[:, each.diagonal() > 0.0].tocsc()
         self._reorder()
 
-    def _pattern(self, number: Integers) -> None:
+    def _set_pattern(self, skeleton_numbers: Integers) -> None:
         """Compute the sparsity pattern of the skeleton matrix, and the position of each entry of the element matrices.
 
         Entries of fixed unknowns get a position after the last entry.
 
         Args:
-            number: Number of each outer unknown in the skeleton, -1 if it is fixed, shape (n_element, n_outer).
+            skeleton_numbers: Number of each outer unknown in the skeleton, -1 if it is fixed, shape (n_element,
+                n_outer).
         """
-        shape = (*number.shape, number.shape[1])
+        shape = (*skeleton_numbers.shape, skeleton_numbers.shape[1])
         size = self.skeleton.size
-        row = np.broadcast_to(number[:, :, None], shape)
-        column = np.broadcast_to(number[:, None, :], shape)
-        free = (row >= 0) & (column >= 0)
-        key, place = np.unique(column[free] * size + row[free], return_inverse=True)
-        self._place = np.full(shape, key.size, dtype=np.intp)
-        self._place[free] = place
-        self._place = self._place.ravel()
-        self._indices = (key % size).astype(np.int32)
-        self._indptr = np.concatenate([[0], np.cumsum(np.bincount(key // size, minlength=size))]).astype(np.int32)
+        row = np.broadcast_to(skeleton_numbers[:, :, None], shape)
+        column = np.broadcast_to(skeleton_numbers[:, None, :], shape)
+        is_free = (row >= 0) & (column >= 0)
+        # Entries are ordered by columns, as the compressed sparse column format stores them.
+        entry, position = np.unique(column[is_free] * size + row[is_free], return_inverse=True)
+        positions = np.full(shape, entry.size, dtype=np.intp)
+        positions[is_free] = position
+        self._place = positions.ravel()
+        self._indices = (entry % size).astype(np.int32)
+        entries_per_column = np.bincount(entry // size, minlength=size)
+        self._indptr = np.concatenate([[0], np.cumsum(entries_per_column)]).astype(np.int32)
 
     def _reorder(self) -> None:
         """Renumber the skeleton unknowns so that the factorisation has little fill-in (minimum degree)."""

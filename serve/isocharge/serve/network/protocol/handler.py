@@ -89,9 +89,9 @@ class Handler:
             store: The models.
             limits: Bounds of body and batch, and of the connections, which the transport observes.
             traffic: Counters and log of the requests.
-            token: Token that requests must carry; None answers everybody.
-            browser_check: Refuses requests by pages of other sites; None accepts the host names that always lead to
-                this machine.
+            token: Token that requests must carry; None if no token is needed.
+            browser_check: Check that refuses requests by web pages of other sites. Without one, requests for the host
+                names of this machine are accepted, or requests for any host name if there is a token.
         """
         self.store = store
         self.token = token

@@ -226,7 +226,7 @@ def _charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[
 
 
 def _from_values(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
-    """Return the charges from a list of numbers, which is flat or nested like the shape."""
+    """Return the charges from a flat list of numbers, or from a list of rows."""
     rows, columns = shape
     # For a few numbers, struct is several times faster than creating and testing arrays. It converts True to 1.0, so
     # that a list with a number that equals True or False is converted by `_from_array`.
