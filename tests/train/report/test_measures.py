@@ -110,11 +110,11 @@ def method_record(name, kind, error_mm, latency_us, *, given_force=False, answer
         (
             ("fast", "learnt", 0.21, 5.0),
             [],
-            "none of 1 .* is both .* .2 times as fast, 5 % more error",
+            "none of 1 .* is both .* 2 times as fast .* with 5 % more error",
         ),
         (("slow", "learnt", 0.3, 20.0), [], "none of 1 other methods is faster"),
-        (("better", "paper", 0.19, 4.0), ["better (NumPy)"], "1 of 1 other .* .2.5 times as fast, 5 % less error"),
-        (("small", "network", 0.19, 5.0), ["small (NumPy)"], "1 of 1 networks that estimate only the contact"),
+        (("better", "paper", 0.19, 4.0), ["better (NumPy)"], "1 of 1 .* 2.5 times as fast .* with 5 % less error"),
+        (("small", "network", 0.19, 5.0), ["small (NumPy)"], "1 of 1 other networks is both faster"),
     ],
 )
 def test_comparison_names_faster_and_more_accurate_methods(other, faster_and_more_accurate, sentence):

@@ -74,8 +74,8 @@ def write_report(
         sections = []
         for file_stem, evaluation in zip(file_stems, evaluations, strict=True):
             section = evaluation.measure(run.keeping(file_stem))
-            evaluation.draw_pictures(section, run.data, file_stem)
-            sections.append(section.content)
+            picture_files = section.save_pictures(run.data, file_stem)
+            sections.append({**section.content, "pictures": picture_files})
         page = report_page({**header, "datasets": sections})
         record = {**header, "datasets": [_json_section(section) for section in sections]}
         write_whole(run.data / "report.md", page.encode())

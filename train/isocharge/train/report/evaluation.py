@@ -55,12 +55,32 @@ class Section:
     """Results of one dataset.
 
     Attributes:
-        content: Section of the report: the entries of `report.json`, with the methods as `MethodRecord` objects.
+        content: Entries of the dataset in `report.json`, except the names of the pictures. The methods are
+            `MethodRecord` objects.
         drawings: Functions that draw the pictures of the section, by the name of the picture.
     """
 
     content: dict[str, Any]
     drawings: dict[str, DrawPicture]
+
+    def save_pictures(self, folder: Path, file_stem: str) -> dict[str, list[str]]:
+        """Draw and save all pictures.
+
+        Args:
+            folder: Folder of the pictures.
+            file_stem: First part of the file names.
+
+        Returns:
+            The names of the files of each picture, by the name of the picture.
+        """
+        files_by_picture = {}
+        for name, draw in track(self.drawings.items(), "drawing"):
+            files = [f"{file_stem}-{name}.{extension}" for extension in PICTURE_FORMATS]
+            figure = draw()
+            for file in files:
+                save_picture(figure, folder / file)
+            files_by_picture[name] = files
+        return files_by_picture
 
 
 @dataclass(frozen=True)
@@ -103,25 +123,24 @@ class DatasetEvaluation:
             PressError: If there are too few measured presses.
         """
         model = Predictor(model_folder).metadata
+        select_for_model = measured_presses_for if is_measured(dataset) else simulated_presses_for
+        usable = select_for_model(model, dataset)
+        case = EvaluationCase.of(usable, settings.presses, settings.seed)
         held_out_presses = None
         if is_measured(dataset):
-            dataset = measured_presses_for(model, dataset)
-            case = EvaluationCase.of(dataset, settings.presses, settings.seed)
-            all_presses = LabelledPresses.of(dataset)
+            all_presses = LabelledPresses.of(usable)
             is_held_out = held_out(all_presses.contact)
             held_out_presses = all_presses[is_held_out]
-            dataset = _first_presses(select_presses(dataset, ~is_held_out), settings.learn_from)
-            fitting_presses = presses_of(dataset, MIN_TRAINING_PRESSES)
+            fitting_dataset = _first_presses(select_presses(usable, ~is_held_out), settings.learn_from)
+            fitting_presses = presses_of(fitting_dataset, MIN_TRAINING_PRESSES)
         else:
-            dataset = simulated_presses_for(model, dataset)
-            case = EvaluationCase.of(dataset, settings.presses, settings.seed)
-            dataset = _first_presses(dataset, settings.learn_from)
-            fitting_presses = presses_of(dataset)
+            fitting_dataset = _first_presses(usable, settings.learn_from)
+            fitting_presses = presses_of(fitting_dataset)
         train, validation = split_by_position(fitting_presses, settings.hold_out, settings.seed)
         task = FittingTask(train, validation, case.domain, case.noise, settings.seed, settings.quick)
         unique_students = dict.fromkeys(students)
         own_students = tuple(path for path in unique_students if Predictor(path).metadata.sensor == model.sensor)
-        return cls(dataset, ReleasedModel(model_folder), own_students, task, case, settings, held_out_presses)
+        return cls(fitting_dataset, ReleasedModel(model_folder), own_students, task, case, settings, held_out_presses)
 
     def identity(self) -> dict[str, Any]:
         """Return what identifies the inputs: the checksum of the dataset and the folders of the models."""
@@ -135,8 +154,7 @@ class DatasetEvaluation:
             executor: Executor of the solves and of the integrals of the Bayes limit.
 
         Returns:
-            The section of the report, whose entry "pictures" is still missing, and the functions that draw its
-            pictures.
+            The results with the functions that draw their pictures.
         """
         if self.held_out_presses is None:
             section = self._measure_on_simulated_presses(executor)
@@ -147,23 +165,6 @@ class DatasetEvaluation:
         for cost in pictures.COST_LABELS:
             drawings[cost] = partial(pictures.cost_plot, section.content["methods"], cost, limits)
         return Section(section.content, drawings)
-
-    def draw_pictures(self, section: Section, folder: Path, file_stem: str) -> None:
-        """Draw and save the pictures of a section, and add the names of their files to it as the entry "pictures".
-
-        Args:
-            section: The section.
-            folder: Folder of the pictures.
-            file_stem: First part of the file names.
-        """
-        files_by_picture = {}
-        for name, draw in track(section.drawings.items(), "drawing"):
-            files = [f"{file_stem}-{name}.{extension}" for extension in PICTURE_FORMATS]
-            figure = draw()
-            for file in files:
-                save_picture(figure, folder / file)
-            files_by_picture[name] = files
-        section.content["pictures"] = files_by_picture
 
     def _measure_on_simulated_presses(self, executor: Executor) -> Section:
         """Return the section of a simulated dataset, whose test presses are simulated."""

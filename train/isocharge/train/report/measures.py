@@ -250,7 +250,7 @@ def compare_with_released(records: Sequence[MethodRecord]) -> dict[str, Any]:
     sentences = []
     for group_name, group in (
         ("other methods", other_methods),
-        ("networks that estimate only the contact", networks),
+        ("other networks", networks),
     ):
         if group:
             sentences += [_comparison_sentence(cost, released, group, group_name) for cost in SPEED_NAMES]
@@ -289,6 +289,7 @@ def _comparison_sentence(cost: Cost, released: MethodRecord, group: Sequence[Met
     comparative = "less" if error_change_percent < 0.0 else "more"
     return (
         f"In {SPEED_NAMES[cost]}, {more_accurate_count or 'none'} of {len(group)} {group_name} {verb} both faster and "
-        f"more accurate than the released model. The most accurate of the faster methods is {best.label} "
-        f"({speed_ratio:.3g} times as fast, {abs(error_change_percent):.2g} % {comparative} error)."
+        f"more accurate than the released model. The most accurate of the faster ones is {best.label}: it is "
+        f"{speed_ratio:.3g} times as fast as the released model, with {abs(error_change_percent):.2g} % {comparative} "
+        "error."
     )

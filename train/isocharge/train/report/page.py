@@ -127,7 +127,7 @@ def _method_comparison(section: Section) -> Iterator[str]:
     yield (
         "A method is printed in bold if no other method is both faster for one press and more accurate. Methods with "
         "*force given* use the true force, which no sensor measures. If a method answered less than 100 % of the "
-        "presses, its errors are those of the answered presses."
+        "presses, the table states its errors on the answered presses."
     )
     for picture_name in ("latency", "throughput", "memory"):
         yield _picture(section, picture_name)
@@ -190,7 +190,7 @@ def _mismatch_effects(section: Section) -> Iterator[str]:
     yield _picture(section, "effects")
     yield (
         "The table shows the root-mean-square position errors in mm, and the alarms of the released model (misfit "
-        f"above {_number_text(section['alarm_threshold'])})."
+        f"above {_number_text(section['alarm_threshold'])} standard deviations of the noise)."
     )
     method_names = list(section["cases"][0]["errors"])
     header = ["difference", *method_names, "force rms, %", "coverage of the 68 % intervals, %", "alarms, %"]
