@@ -18,7 +18,7 @@ from isocharge.common.tables.csv_table import csv_text
 from isocharge.common.tables.header_advice import ColumnMeaning
 from isocharge.common.tables.number_table import (
     CHARGE_RULE,
-    MOST_COLUMNS,
+    MAX_COLUMNS,
     ColumnRule,
     NumberColumns,
 )
@@ -37,7 +37,8 @@ CONTACT = ("x_mm", "y_mm", "force_N")
 UNCERTAINTY = ("position_std_mm", "force_std")
 
 TEMPERATURE = "temperature_C"
-COLDEST_C, WARMEST_C = -100.0, 200.0
+MIN_TEMPERATURE_C = -100.0
+MAX_TEMPERATURE_C = 200.0
 """Range of temperatures that a film of PVDF may have."""
 
 _POSITION = "a position in mm, or an empty cell if it is unknown"
@@ -54,17 +55,18 @@ PRESS_RULES = {
     "position_std_mm": ColumnRule("a positive standard deviation in mm", is_positive=True),
     "force_std": ColumnRule("a positive share of the force up to 1 (0.01 is 1 %)", maximum=1.0, is_positive=True),
     TEMPERATURE: ColumnRule(
-        f"a temperature of {COLDEST_C:g} to {WARMEST_C:g} degrees Celsius, or an empty cell if it is unknown",
-        COLDEST_C,
-        WARMEST_C,
+        f"a temperature of {MIN_TEMPERATURE_C:g} to {MAX_TEMPERATURE_C:g} degrees Celsius, or an empty cell if it is "
+        "unknown",
+        MIN_TEMPERATURE_C,
+        MAX_TEMPERATURE_C,
     ),
 }
 """The columns of a file of presses that are not electrodes."""
 
-MOST_ELECTRODES = MOST_COLUMNS - len(PRESS_RULES)
+MAX_ELECTRODES = MAX_COLUMNS - len(PRESS_RULES)
 """Largest number of electrodes in a file of presses."""
 
-LONGEST_NAME = 1_000
+MAX_NAME_CHARACTERS = 1_000
 """Largest number of characters of the name of an electrode in a file of presses."""
 
 
@@ -343,16 +345,17 @@ def _check_electrodes(electrodes: Collection[str]) -> None:
     """Raise PressError if names of electrodes cannot be names of columns that are read back."""
     if not electrodes or len(set(electrodes)) < len(electrodes) or not all(electrodes):
         raise PressError(f"electrodes: expected one name or more, all different, none empty, got {shown(electrodes)}")
-    if len(electrodes) > MOST_ELECTRODES:
-        raise PressError(f"electrodes: expected at most {MOST_ELECTRODES} names, got {len(electrodes):,}")
+    if len(electrodes) > MAX_ELECTRODES:
+        raise PressError(f"electrodes: expected at most {MAX_ELECTRODES} names, got {len(electrodes):,}")
     for name in electrodes:
         if name in PRESS_RULES:
             raise PressError(
                 f"electrode {shown(name)}: expected a name that is none of {', '.join(PRESS_RULES)}, which are columns "
                 "of a file of presses; rename the electrode"
             )
-        if not name.isprintable() or name != name.strip() or len(name) > LONGEST_NAME:
+        if not name.isprintable() or name != name.strip() or len(name) > MAX_NAME_CHARACTERS:
             raise PressError(
-                f"electrode {shown(name)}: expected a name of at most {LONGEST_NAME:,} printable characters without "
-                "blanks at its ends, because the name is the header of a column of charges; rename the electrode"
+                f"electrode {shown(name)}: expected a name of at most {MAX_NAME_CHARACTERS:,} printable characters "
+                "without blanks at its ends, because the name is the header of a column of charges; rename the "
+                "electrode"
             )

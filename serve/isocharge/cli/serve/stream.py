@@ -50,8 +50,8 @@ from isocharge.serve import (
 from isocharge.serve.live.device import with_settings
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 
-LONGEST_NAME = 100
-"""Characters of a film's name."""
+MAX_NAME_CHARACTERS = 100
+"""Largest number of characters of a film's name."""
 
 
 def stream_command(
@@ -139,8 +139,8 @@ def stream_command(
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
-    if name is not None and not (0 < len(name) <= LONGEST_NAME and is_printable(name)):
-        raise InputError(f"--name: expected 1 to {LONGEST_NAME} printable characters, got {shown(name)}")
+    if name is not None and not (0 < len(name) <= MAX_NAME_CHARACTERS and is_printable(name)):
+        raise InputError(f"--name: expected 1 to {MAX_NAME_CHARACTERS} printable characters, got {shown(name)}")
     address = None if live is None else page_address(live, token)
     predictor, board = Predictor(model, models=models), load_device(device)
     if offset_limit_pC is not None:
@@ -192,7 +192,7 @@ def stream_command(
 
 
 def _load(model: str, models: Path | None) -> Predictor:
-    """The latest version of a model; it must answer on this machine as where it was trained."""
+    """Load the latest version of a model, and check its golden vectors on this machine."""
     folder = find_model(model, models)
     loaded = load_model(folder)
     check_golden(loaded)

@@ -20,7 +20,7 @@ GENERAL_WORDS = frozenset(
 )
 """Words of a header that do not change which column is meant."""
 
-LONGEST_COLUMN = 100
+MAX_COLUMN_CHARACTERS = 100
 """Largest number of characters of a column for which advice is given; a longer one is no name of a quantity."""
 
 _LABEL_AND_UNIT = re.compile(r"(.*?)(?:\s*[\[(]\s*([^\[\]()]+?)\s*[\])]|[\s_/]+([^\s_/\[\]()]+))")
@@ -52,7 +52,7 @@ def header_advice(columns: Iterable[str], absent: Mapping[str, ColumnMeaning]) -
     """
     remaining = dict(absent)
     for column in columns:
-        if len(column) > LONGEST_COLUMN:
+        if len(column) > MAX_COLUMN_CHARACTERS:
             continue
         for name, meaning in remaining.items():
             advice = _advice(column, name, meaning)

@@ -17,13 +17,13 @@ from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import InputError, shown
 from isocharge.common.tables.header_advice import ColumnMeaning, header_advice
 
-MOST_COLUMNS = 1_000
+MAX_COLUMNS = 1_000
 """Largest number of columns of a file."""
 
 LARGEST = float(np.finfo(np.float32).max)
 """Largest magnitude of a number in a file; it is the largest number of the models' tensors."""
 
-MOST_LISTED_NAMES = 10
+MAX_LISTED_NAMES = 10
 """Largest number of column names that an error message lists."""
 
 
@@ -137,8 +137,8 @@ class NumberTable(ABC):
         Raises:
             error: If the file has too many columns.
         """
-        if len(header) > MOST_COLUMNS:
-            raise error(f"{where}: expected at most {MOST_COLUMNS:,} columns, got {len(header):,}")
+        if len(header) > MAX_COLUMNS:
+            raise error(f"{where}: expected at most {MAX_COLUMNS:,} columns, got {len(header):,}")
         self.header = tuple(name if name in names else name.strip() for name in header)
         self.where = where
         self.error = error
@@ -160,7 +160,7 @@ class NumberTable(ABC):
         if missing:
             absent = {name: rule.meaning for name, rule in allowed.items() if name not in self.header}
             advice = header_advice(other_columns, absent)
-            self._refuse_header("; ".join([f"missing: {_listed(missing)}", *islice(advice, MOST_LISTED_NAMES)]))
+            self._refuse_header("; ".join([f"missing: {_listed(missing)}", *islice(advice, MAX_LISTED_NAMES)]))
         repeated = [name for name in chosen if self.header.count(name) > 1]
         if repeated:
             self._refuse_header(f"repeated: {_listed(repeated)}")
@@ -170,7 +170,7 @@ class NumberTable(ABC):
     def refuse_similar_names(self, columns: Iterable[str], optional: Mapping[str, ColumnRule]) -> None:
         """Raise `error` if columns are named almost as optional columns that the file does not have."""
         absent = {name: rule.meaning for name, rule in optional.items() if name not in self.header}
-        advice = list(islice(header_advice(columns, absent), MOST_LISTED_NAMES))
+        advice = list(islice(header_advice(columns, absent), MAX_LISTED_NAMES))
         if advice:
             self._refuse_header(f"{'; '.join(advice)}; or remove the column")
 
@@ -201,10 +201,10 @@ class NumberTable(ABC):
 
 def _listed(names: Sequence[str]) -> str:
     """Return names for a message, with the number of those that are not listed."""
-    listed = ", ".join(map(shown, names[:MOST_LISTED_NAMES]))
-    if len(names) <= MOST_LISTED_NAMES:
+    listed = ", ".join(map(shown, names[:MAX_LISTED_NAMES]))
+    if len(names) <= MAX_LISTED_NAMES:
         return listed
-    return f"{listed} and {len(names) - MOST_LISTED_NAMES} more"
+    return f"{listed} and {len(names) - MAX_LISTED_NAMES} more"
 
 
 def ignored_words(where: str, names: Sequence[str]) -> str:

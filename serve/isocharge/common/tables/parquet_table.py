@@ -27,7 +27,7 @@ SUFFIX = ".parquet"
 MARK = b"PAR1"
 """First and last four bytes of a Parquet file."""
 
-MOST_FOOTER_BYTES = 16 << 20
+MAX_FOOTER_BYTES = 16 << 20
 """Largest size of the metadata at the end of a file."""
 
 ROWS_PER_BATCH = 1 << 16
@@ -165,9 +165,9 @@ def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
     file.seek(0)
     if head != MARK or tail != MARK:
         raise error(f"{where}: not a Parquet file, or one that was cut off; write it again, or as CSV")
-    if footer_bytes > MOST_FOOTER_BYTES:
+    if footer_bytes > MAX_FOOTER_BYTES:
         raise error(
-            f"{where}: expected metadata of at most {MOST_FOOTER_BYTES:,} bytes, got {footer_bytes:,}; write the file "
+            f"{where}: expected metadata of at most {MAX_FOOTER_BYTES:,} bytes, got {footer_bytes:,}; write the file "
             "with fewer columns or row groups"
         )
 

@@ -13,7 +13,7 @@ from isocharge.cli.shared.options import JsonOption, ModelsOption, StressLimitOp
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json, this_command
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
-from isocharge.common.measured_presses import COLDEST_C, WARMEST_C
+from isocharge.common.measured_presses import MAX_TEMPERATURE_C, MIN_TEMPERATURE_C
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
@@ -181,12 +181,11 @@ def _check_usage(
         is_moved: Whether an earlier calibration is moved to this temperature, without presses.
     """
     is_nothing_calibrated = file is None and not is_moved
-    is_out_of_range = temperature_C is not None and not COLDEST_C <= temperature_C <= WARMEST_C
+    is_out_of_range = temperature_C is not None and not MIN_TEMPERATURE_C <= temperature_C <= MAX_TEMPERATURE_C
+    temperature_range = f"{MIN_TEMPERATURE_C:g} to {MAX_TEMPERATURE_C:g}"
     refuse(
         {
-            f"--temperature: expected {COLDEST_C:g} to {WARMEST_C:g} degrees Celsius, got {temperature_C}": (
-                is_out_of_range
-            ),
+            f"--temperature: expected {temperature_range} degrees Celsius, got {temperature_C}": is_out_of_range,
             "--temperature: expected PRESSES.csv that were made at it, or --from FOLDER for it, got neither": (
                 is_nothing_calibrated and temperature_C is not None
             ),
