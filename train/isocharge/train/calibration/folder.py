@@ -1,4 +1,4 @@
-"""The folder of a calibrated film: its one writer, and the reader of what the next calibration starts from.
+"""Folder of a calibrated film: its writer, and the reader of an earlier calibration.
 
     FOLDER/config.pbtxt            for Triton
     FOLDER/<version>/model.onnx    the model of this film, with golden.json and card.md as every model
@@ -9,9 +9,9 @@
     FOLDER/<version>/calibration.png
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the last version's
 
-A further calibration in the same folder is its next version: a server that watches it takes it with a reload, and
-nothing is lost. Only the version folders count: what lies above them is written anew from the last one, whatever was
-killed when.
+A further calibration in the same folder is its next version, which a server loads when it reloads its models. Only the
+version folders are read. The copies above them are written again from the last version, so that they are correct even
+after a process was killed.
 """
 
 import json
@@ -50,7 +50,7 @@ RESULT, SENSOR, PRESSES, PICTURE, CARD = "calibration.json", "sensor.toml", "pre
 
 
 def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
-    """Raise ModelError if a calibration cannot go into this folder: for its name, or for what it holds."""
+    """Raise ModelError if the name or the content of a folder does not allow a calibration in it."""
     versions = version_folders(folder)
     check_target(folder, max(versions, default=0) + 1, electrodes)
     if not folder.exists() or any((version / RESULT).is_file() for version in versions.values()):
@@ -65,8 +65,8 @@ def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[No
 
     Raises:
         ModelError: As `check_calibration_folder`.
-        OutputExists: If another process calibrates into it.
-        OutputError: If the file system refuses.
+        OutputExists: If another process writes a calibration to the folder.
+        OutputError: If the folder cannot be written.
     """
     check_calibration_folder(folder, problem.electrodes)
     missing = [folder, *(parent for parent in folder.parents if not parent.exists())]
@@ -84,7 +84,7 @@ def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[No
 
 
 def _publish(folder: Path) -> None:
-    """Copy the files for people of the last calibration to the top, where they differ."""
+    """Copy the readable files of the last version to the folder above it, if they differ."""
     calibrated = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
     for version, name in product(calibrated[-1:], (SENSOR, PICTURE, CARD, RESULT)):
         data = (version / name).read_bytes()
@@ -93,19 +93,19 @@ def _publish(folder: Path) -> None:
 
 
 def write_calibration(result: CalibrationResult, folder: Path, command: str = "") -> Path:
-    """Write a calibrated film as a version of a model folder, and copy its files for people to the top.
+    """Write a calibrated film as a version of a model folder, and copy its readable files to the folder itself.
 
     Args:
-        result: What the presses say.
-        folder: The folder; new, or one of an earlier calibration.
-        command: How to make this again, for the card.
+        result: The calibration.
+        folder: A new folder, or that of an earlier calibration.
+        command: Command that makes this calibration again, for the card.
 
     Returns:
         The version folder.
 
     Raises:
-        ModelError: If the folder holds something else.
-        OutputError: If the file system refuses.
+        ModelError: If the folder has other content.
+        OutputError: If the folder cannot be written.
     """
     check_calibration_folder(folder, result.problem.electrodes)
     with threadpool_limits(1):  # many small matrices: a second thread only waits
@@ -162,7 +162,7 @@ def held_out_table(result: CalibrationResult) -> dict[str, float] | None:
 
 
 def error_table(error: ContactError) -> dict[str, float]:
-    """An error of contacts for JSON."""
+    """Return an error of contacts for JSON."""
     return {"position_mm": error.position_mm, "force_percent": error.force_percent}
 
 
@@ -170,8 +170,8 @@ def read_earlier(folder: Path, problem: CalibrationProblem, *, knows_temperature
     """Return the film of an earlier calibration, with the uncertainty of its drift since.
 
     Args:
-        folder: As `write_calibration` made it, or one of its version folders.
-        problem: The new calibration.
+        folder: Folder that `write_calibration` wrote, or one of its version folders.
+        problem: Films of the new calibration.
         knows_temperature: Whether the temperatures of the new presses are known.
 
     Raises:
@@ -189,11 +189,11 @@ def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> Calibr
     path, film = _read(folder, problem)
     if film.warming is None or not film.warming.identified:
         raise PressError(
-            f"{path}: this calibration does not know what temperature does to the film: it takes presses with a column "
-            "temperature_C, over a few degrees"
+            f"{path}: expected a calibration that contains the change of the film with temperature, got one without; "
+            "calibrate with presses that have a column temperature_C and cover a few degrees"
         )
     version = "/".join(path.parts[-3:-1])
-    moved = f"moved from {film.warming.at_C:.1f} C, {version}, to {to_C:.1f} C by the change that it knows"
+    moved = f"moved from {film.warming.at_C:.1f} C, {version}, to {to_C:.1f} C by the change in its calibration"
     return film_without_presses(replace(problem, earlier=film), film.at_temperature(to_C, problem.prior), moved)
 
 
@@ -205,7 +205,7 @@ def _read(folder: Path, problem: CalibrationProblem) -> tuple[Path, FilmEstimate
 
 
 def _card(result: CalibrationResult, about: ModelMetadata) -> str:
-    """The text of the card."""
+    """Return the text of the card."""
     sensor, probe = result.film
     low, high = about.force_range_N
     made = f"{result.moved}," if result.moved else f"calibrated on {len(result.presses)} presses"

@@ -20,29 +20,34 @@ from isocharge.train.model_release.onnx_graph import write_graph
 from isocharge.train.training.folded_network import MISFIT_UNIT, FoldedNetwork
 
 NODES = 6
-"""Pretensions at which weights are given."""
+"""Number of pretensions at which weights are given."""
 
 REACH = 1.4
-"""Farthest pretension from that of the calibration, MPa: three or four degrees."""
+"""Largest distance of a pretension from that of the calibration, MPa; three or four degrees of temperature."""
 
-TOUCHES, SEED = 300, 21
-"""Simulated touches by which misfits are judged, and their seed."""
+TOUCHES = 300
+"""Number of simulated touches from which the typical misfit is computed."""
+
+SEED = 21
+"""Seed of the simulated touches."""
 
 ROUGH = 1.5
-"""Root mean square of the misfits of good touches above which misfits tell nothing of a film, in units of the noise."""
+"""Root mean square of the misfits of good touches, in units of the noise, above which a film cannot be followed."""
 
 
 def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretensions | None:
-    """The network of a calibrated film at other pretensions.
+    """Compute the weights of the network of a calibrated film at other pretensions.
 
     Args:
         result: The calibration.
-        network: The model's own network.
+        network: The network of the model.
 
     Returns:
-        None if charges have no number to spare (three electrodes), or the network's misfits are too rough on this film.
+        The weights; None if three electrodes leave no charge for the pretension, or if the misfits of the network are
+        too inaccurate on this film.
     """
-    problem, posterior = result.problem, result.posterior
+    problem = result.problem
+    posterior = result.posterior
     if len(problem.electrodes) <= 3:
         return None
     prior = problem.prior
@@ -82,17 +87,26 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
     return replace(pretensions, misfit_rms=max(typical_misfit, 1.0))
 
 
-def _nodes(own: float, low: float, high: float) -> Array:
-    """Chebyshev's nodes about the calibrated pretension within a range, the nearest of them moved onto it."""
-    low, high = max(low, own - REACH), min(high, own + REACH)
+def _nodes(calibrated: float, lower: float, upper: float) -> Array:
+    """Return Chebyshev nodes around the calibrated pretension, MPa, shape (NODES,).
+
+    The node closest to the calibrated pretension is moved onto it.
+
+    Args:
+        calibrated: The calibrated pretension, MPa.
+        lower: Smallest pretension that a film may have, MPa.
+        upper: Largest pretension that a film may have, MPa.
+    """
+    low = max(lower, calibrated - REACH)
+    high = min(upper, calibrated + REACH)
     angle = np.pi * (np.arange(NODES) + 0.5) / NODES
     nodes = 0.5 * (low + high) - 0.5 * (high - low) * np.cos(angle) / np.cos(angle[0])
-    nodes[np.abs(nodes - own).argmin()] = own
+    nodes[np.abs(nodes - calibrated).argmin()] = calibrated
     return np.asarray(nodes)
 
 
 def _like(network: FoldedNetwork, other: FoldedNetwork) -> FoldedNetwork:
-    """Another network with the correlations of this one: they hardly change with the pretension."""
+    """Return `other` with the correlations of `network`, which hardly change with the pretension."""
     if not network.n_angle:
         return other
     columns = network.angle_columns
@@ -101,7 +115,7 @@ def _like(network: FoldedNetwork, other: FoldedNetwork) -> FoldedNetwork:
 
 
 def _arrays(network: FoldedNetwork) -> list[np.ndarray]:
-    """Weights in the order of `Pretensions`."""
+    """Return the weights of a network in the order of `Pretensions`."""
     layers = network.layers
     arrays: list[Array] = []
     for layer in layers.hidden:
@@ -111,7 +125,7 @@ def _arrays(network: FoldedNetwork) -> list[np.ndarray]:
 
 
 def _constants(network: FoldedNetwork) -> list[str]:
-    """Names of the graph's constants that hold them."""
+    """Return the names of the constants of the ONNX graph that hold these weights."""
     graph = onnx.load_from_string(write_graph(network, {})).graph
     constants = [(constant.name, numpy_helper.to_array(constant)) for constant in graph.initializer]
     return [next(name for name, held in constants if np.array_equal(held, array)) for array in _arrays(network)]

@@ -1,4 +1,4 @@
-"""The picture of a calibration: error left over the film before and after, quantities with intervals, residuals."""
+"""Picture of a calibration: maps of the remaining error before and after, quantities with intervals, and residuals."""
 
 from typing import Any
 
@@ -18,14 +18,14 @@ LEVELS_MM = (0.02, 5.0)
 """Errors at the ends of the colours, mm."""
 
 ASSUMED, FITTED = "#b9c4cf", "#3a7ca5"
-"""Colours of what was assumed before the presses and of what they say."""
+"""Colours of the estimates before and after the presses."""
 
 NEIGHBOURS = 12
-"""Contacts that the map of the error is smoothed over: neighbours have different forces."""
+"""Number of contacts over which the map of the error is smoothed, since neighbours have different forces."""
 
 
 def calibration_picture(result: CalibrationResult) -> Figure:
-    """Maps of the error that the film leaves, quantities in units of what was assumed, residuals of the presses."""
+    """Draw the remaining error over the film, the quantities in units of their prior, and the residuals of the presses."""
     figure = new_figure(15.0, 9.4)
     (before, after), (identified, residuals) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
     then, now = (

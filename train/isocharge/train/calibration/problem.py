@@ -1,4 +1,4 @@
-"""What a calibration is about: the film as it is described, and the network for all films that fits its layout."""
+"""Problem of a calibration: the film as it is described, and the network for all films that fits its layout."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -22,31 +22,34 @@ from isocharge.train.films.films_model import AddedVariance, FilmsModel
 from isocharge.train.training.fitted import Fitted
 
 DRIFT = {"pretension": 0.4, "d31": 0.05, "d32": 0.05, "gain": 0.1}
-"""Standard deviations of what may have changed since an earlier calibration, over those of the prior: creep of the
-pretension and a degree of temperature 0.35 MPa, coefficients 1 %, gains 0.5 %; everything else by `REMOUNTED`. What
-presses of known force show beyond that, they show in spite of it; touches of unknown force can only follow the
-pretension."""
+"""Standard deviations of the changes since an earlier calibration, over those of the prior.
+
+The pretension changes by 0.35 MPa, by creep and a degree of temperature, coefficients by 1 % and gains by 0.5 %. All
+other parameters change by `REMOUNTED`. Presses of known force also show larger changes. Touches of unknown force can
+only follow the pretension."""
 
 REMOUNTED = 0.03
-"""See `DRIFT`."""
+"""Standard deviation of the change of every other parameter, over that of the prior."""
 
 UNSTEADY = 0.002
-"""Standard deviation by which coefficients of a discrepancy may have changed."""
+"""Standard deviation of the change of the coefficients of a discrepancy since an earlier calibration."""
 
 THERMOMETER = 0.1
-"""Standard deviation of the same for the pretension where the temperatures of both days are known: creep."""
+"""Standard deviation of the change of the pretension, over that of the prior, if the temperatures of both calibrations
+are known. The remaining change is creep."""
 
 LIKELY = Hypothesis(modes=0.5, size=0.01)
-"""What presses are planned for besides a film of the prior: half of what imperfect films have. Plans for less leave
-half as much again of such films, and this one leaves as much of a film of the prior after eight presses, 7 % more after
-five."""
+"""Imperfections for which presses are planned: half of those that imperfect films have.
+
+Plans for smaller imperfections leave errors on imperfect films that are half as large again. On a film without
+imperfections, this plan leaves the same error after eight presses, and 7 % more after five."""
 
 IDENTIFIED = 0.5
 """Standard deviation after the presses over that before, below which a quantity counts as identified, dimensionless."""
 
 
 class Warming(NamedTuple):
-    """What temperature does to the pretension of a film.
+    """Change of the pretension of a film with temperature.
 
     Attributes:
         MPa_per_K: Change of the pretension.
@@ -156,14 +159,15 @@ class FilmEstimate:
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """Which films a sensor may be, and where contacts shall be right.
+    """Films that a sensor may have, and the contacts for which the calibration is needed.
 
     Attributes:
-        sensor: As described.
-        probe: As described.
+        sensor: The sensor as described.
+        probe: The probe as described.
         films: The network for all films of the layout.
-        earlier: An earlier calibration of this film, as `read_earlier` gives it; what the sensor's file says if absent.
-        stress_limit: Largest stress of the film in a press that is proposed, MPa.
+        earlier: Estimate of the film from an earlier calibration, as `read_earlier` returns it; None for the sensor as
+            described.
+        stress_limit: Largest stress of the film in a proposed press, MPa.
 
     Example:
         >>> problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))  # doctest: +SKIP
@@ -179,7 +183,12 @@ class CalibrationProblem:
 
     @classmethod
     def of(cls, sensor: Sensor, probe: Probe, models: Path | None = None) -> "CalibrationProblem":
-        """A sensor and a probe, with the installed network that fits them; arguments as `films_for`.
+        """Return the problem of a sensor and a probe, with the installed network that fits them.
+
+        Args:
+            sensor: The sensor; see `films_for`.
+            probe: The probe.
+            models: Folder of models that is searched first.
 
         Raises:
             SceneError: If the probe is not round.
@@ -187,24 +196,24 @@ class CalibrationProblem:
         """
         if not isinstance(probe, Circle):
             raise SceneError(
-                f"probe {probe.notation}: expected a round one, such as circle:1.0, for its radius is calibrated as "
-                "well"
+                f"probe {probe.notation}: expected a round one, such as circle:1.0, because its radius is calibrated "
+                "as well"
             )
         return cls(sensor, probe, films_for(sensor, probe, models))
 
     @property
     def electrodes(self) -> tuple[str, ...]:
-        """Names of the electrodes."""
+        """Names of the electrodes of the sensor."""
         return self.sensor.electrode_names
 
     @cached_property
     def prior(self) -> FilmPrior:
-        """How films spread; their electrodes are as described, traces included."""
+        """Distribution of the films. Their electrodes are those of the sensor, with its traces."""
         return _with_electrodes(self.films.prior, self.sensor)
 
     @cached_property
     def charges(self) -> FilmCharges:
-        """The films' charges."""
+        """Charges of the films."""
         return FilmCharges(self.prior, self.films.family)
 
     def fitted(
@@ -215,10 +224,18 @@ class CalibrationProblem:
         *,
         release: bool = True,
     ) -> Fitted:
-        """The network of a film, arguments as `FilmsModel.film` takes them.
+        """Return the network of a film.
 
-        The network is changed for its factor and for what only the described electrodes have. Only one for `release`
-        learns correlations and is judged.
+        The network is adapted to the factor, and to the difference between the electrodes of the sensor and those of
+        the network for all films.
+
+        Args:
+            parameters: Parameters of the film, shape (n_parameter,).
+            added_variance: Variances that are added to those of the network.
+            factor: Function that returns the factors on the charges, shape (n, n_electrode), at contacts (x, y, F),
+                shape (n, 3), mm and N.
+            release: Whether the network will be released. Only such a network learns correlations and gets presses
+                for measuring its errors.
         """
         about: dict[str, Any] = {} if release else {"correlation": False, "n_test": 0}
         described, own = self.charges.forward_map(parameters), self.films.forward_map(parameters)
@@ -233,12 +250,12 @@ class CalibrationProblem:
 
     @property
     def domain(self) -> Domain:
-        """Where contacts shall be right."""
+        """Contacts for which the calibration is needed."""
         return self.films.domain
 
     @cached_property
     def proposed_forces(self) -> tuple[float, float]:
-        """Smallest and largest force of a press that is proposed, N: those of the domain within the stress limit.
+        """Smallest and largest force of a proposed press, N: the forces of the domain within the stress limit.
 
         Raises:
             SceneError: If the smallest force already exceeds the limit.
@@ -248,23 +265,26 @@ class CalibrationProblem:
 
     @property
     def noise(self) -> NoiseModel:
-        """Of the charges."""
+        """Noise of the charges."""
         return self.films.noise
 
     @cached_property
     def before(self) -> FilmEstimate:
-        """What is known of the film before the presses."""
+        """Estimate of the film before the presses."""
         if self.earlier:
             return self.earlier
         parameters = self.prior.parameters_of(self.sensor, self.probe)
         pretension = self.prior.index("pretension")
-        if parameters[pretension] <= 0.0:  # a sensor file that gives no pretension does not say that there is none
+        if parameters[pretension] <= 0.0:  # the sensor file gives no pretension, which does not mean a slack film
             parameters[pretension] = self.prior.mean[pretension]
         return FilmEstimate(parameters, np.eye(parameters.size))
 
     @cached_property
     def expected(self) -> FilmEstimate:
-        """The same for a plan of presses: a film of which no press has told anything may have `LIKELY` besides."""
+        """Estimate of the film for a plan of presses.
+
+        Without an earlier calibration, it includes the imperfections of `LIKELY`.
+        """
         if self.earlier:
             return self.before
         layout = self.charges.layout
@@ -274,12 +294,12 @@ class CalibrationProblem:
 
 
 def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> FilmsModel:
-    """The network for all films of a sensor's layout, looked up by the electrodes, not by the name.
+    """Find the network for all films of a sensor's layout by its electrodes. The name of the sensor does not matter.
 
     Args:
-        sensor: Its pads, radius and readout must be those of a network's; everything else may differ within the spread
-            of its films, and electrodes may have traces and patterned backs besides.
-        probe: What presses; its radius must be within the spread as well.
+        sensor: The sensor. Its pads, radius and readout must be those of a network. Everything else may differ within
+            the spread of the films, and the electrodes may have traces and patterned backs.
+        probe: The probe. Its radius must be within the spread of the films.
         models: Folder of models that is searched first.
 
     Raises:
@@ -306,15 +326,22 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
 
 
 def _with_electrodes(prior: FilmPrior, sensor: Sensor) -> FilmPrior:
-    """The prior with a sensor's electrodes if their pads are its own: they may have traces and patterned backs."""
-    own, pads = ({e.name: np.round(e.corners, 6).tolist() for e in each.electrodes} for each in (prior.sensor, sensor))
-    if own != pads or prior.sensor.electrodes == sensor.electrodes:
+    """Return the prior with the electrodes of a sensor, if their pads are equal to those of the prior.
+
+    The electrodes of the sensor may have traces and patterned backs.
+    """
+    if _pads(prior.sensor) != _pads(sensor) or prior.sensor.electrodes == sensor.electrodes:
         return prior
     return replace(prior, sensor=replace(prior.sensor, electrodes=sensor.electrodes))
 
 
+def _pads(sensor: Sensor) -> dict[str, list[list[float]]]:
+    """Return the corners of the pads by the names of the electrodes, rounded to 1e-6 mm."""
+    return {electrode.name: np.round(electrode.corners, 6).tolist() for electrode in sensor.electrodes}
+
+
 def _folders(models: Path | None, name: str) -> list[Path]:
-    """Version folders with a films file, those named after the sensor first."""
+    """Return the version folders with a films file, those named after the sensor first."""
     folders = [find_model((root / model).resolve()) for root in repositories(models) for model in model_names(root)]
     with_films = [folder for folder in folders if (folder / FILE).is_file()]
     return sorted(with_films, key=lambda folder: not folder.parent.name.startswith(name))
