@@ -25,7 +25,7 @@ NEIGHBOURS = 12
 
 
 def calibration_picture(result: CalibrationResult) -> Figure:
-    """Draw the remaining error over the film, the quantities in units of their prior, and the residuals of the presses."""
+    """Draw maps of the remaining error, the quantities in units of their prior, and the residuals of the presses."""
     figure = new_figure(15.0, 9.4)
     (before, after), (identified, residuals) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
     then, now = (
