@@ -33,7 +33,7 @@ LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
 
 
 class Policy(StrEnum):
-    """Which frames get a record; the chain sees all of them either way."""
+    """Which frames have a record. The signal chain processes all frames with either policy."""
 
     every = "every"
     latest = "latest"
@@ -41,12 +41,12 @@ class Policy(StrEnum):
 
 @dataclass(slots=True)
 class StreamCounts:
-    """Counts of a stream that neither its parser nor its gaps hold.
+    """Counts of a stream, in addition to those of its parser and of its frame numbers.
 
     Attributes:
         records: Number of records.
         skipped: Number of frames without a record, because a newer frame had arrived with them (`Policy.latest`).
-        outages: Number of times that the port came back.
+        outages: Number of times that the port was connected again after an outage.
     """
 
     records: int = 0
@@ -55,7 +55,7 @@ class StreamCounts:
 
 
 class StreamTotals(NamedTuple):
-    """All counts of a stream since it began, including restarts; see `FrameCounts` and `SequenceGaps`."""
+    """All counts of a stream since its begin, across restarts; see `FrameCounts` and `SequenceGaps`."""
 
     frames: int = 0
     lost: int = 0
@@ -82,9 +82,9 @@ def stream(
         chunks: Bytes with the time of their arrival: an open `Port`, or another iterable of chunks.
         predictor: The model of this sensor.
         device: Settings of the board, from `load_device`.
-        chain: Rules of the signal chain; by default those of the device.
-        parser: Parser of the frames; pass one to read its counters. By default that of the device.
-        gaps: Counter of missing frame numbers; pass one to read it.
+        chain: Settings of the signal chain; by default those of the device.
+        parser: Parser of the frames, for example to read its counters; by default that of the device.
+        gaps: Counter of missing frame numbers, for example to read it; by default a new one.
 
     Raises:
         ChargeError: If a frame has another number of charges than the model.
@@ -103,11 +103,13 @@ class TouchStream:
     """The path from chunks to records, with its state; belongs to one thread.
 
     Attributes:
-        parser, gaps, clock: The parts that read the frames, with their counters.
+        parser: Parser of the frames, with its counters.
+        gaps: Counter of missing frame numbers.
+        clock: Clock of the device.
         counts: Records, skipped frames and outages.
         predictor: The model as it was loaded. If the film is followed, `answering_predictor` is the model of the film
             as it is now.
-        frame_id: The film's name in the records.
+        frame_id: Name of the film in the records.
     """
 
     def __init__(
@@ -127,16 +129,16 @@ class TouchStream:
         Args:
             predictor: The model of this sensor.
             device: Settings of the board.
-            chain: Rules of the signal chain; by default those of the device.
-            parser: By default that of the device.
-            gaps: Counter of missing frame numbers.
-            policy: Which frames get a record.
+            chain: Settings of the signal chain; by default those of the device.
+            parser: Parser of the frames; by default that of the device.
+            gaps: Counter of missing frame numbers; by default a new one.
+            policy: Which frames have a record.
             now_ns: The clock of `Chunk.clock_ns`, for latencies.
             frame_id: Name of this film in its records; by default that of the model's sensor.
 
         Raises:
             DeviceError: If the device file has other electrodes than the model.
-            ModelError: If the film is to be followed, and the model cannot.
+            ModelError: If the film is to be followed, but the model does not allow it.
         """
         self._readings = ReadingStream(
             predictor.metadata.electrodes,
@@ -186,11 +188,11 @@ class TouchStream:
         self.frame_id = self._given_name or predictor.metadata.frame_id
 
     def use(self, predictor: Predictor) -> None:
-        """Continue with another model of the same electrodes; tare and signal chain keep their state.
+        """Continue with another model of the same electrodes. The tare and the signal chain keep their state.
 
         Raises:
-            ModelError: If its electrodes are others, or in another order, or its film cannot be followed as the
-                present film is. The stream then keeps its model.
+            ModelError: If the model has other electrodes, or the electrodes in another order, or a stage cannot use
+                the model. The stream then keeps its present model.
         """
         before = self.predictor.metadata
         after = predictor.metadata
