@@ -81,11 +81,12 @@ def report_command(
     model_names = model or [dataset.sensor.name for dataset in loaded_datasets]
     model_folders = [find_model(name) for name in model_names]
     student_folders = _find_students(student, model_names)
+    settings = QUICK if quick else Settings()
     with shown_progress():
         record = write_report(
             output,
             list(zip(loaded_datasets, model_folders, strict=True)),
-            QUICK if quick else Settings(),
+            settings,
             students=student_folders,
             command=this_command(),
             fresh=fresh,

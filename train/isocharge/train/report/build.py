@@ -91,7 +91,8 @@ def _file_stems(sensor_names: Sequence[str]) -> list[str]:
     stems = []
     for number, name in enumerate(sensor_names, start=1):
         is_unique = sensor_names.count(name) == 1
-        stems.append(name if is_unique else f"{name}-{number}")
+        stem = name if is_unique else f"{name}-{number}"
+        stems.append(stem)
     return stems
 
 

@@ -102,7 +102,8 @@ def _rms_in_bins(errors: Array, bin_index: Integers) -> list[float | None]:
     values: list[float | None] = []
     for index in range(FORCE_BINS):
         errors_in_bin = errors[(bin_index == index) & np.isfinite(errors)]
-        values.append(round_significant(rms(errors_in_bin)) if errors_in_bin.size else None)
+        value = round_significant(rms(errors_in_bin)) if errors_in_bin.size else None
+        values.append(value)
     return values
 
 
