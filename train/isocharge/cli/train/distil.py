@@ -49,9 +49,12 @@ def distil_command(
             "file instead"
         )
     model_folder = find_model(model, models)
-    fit_config = student_config("int8" if int8 else "float32")
     if config is not None:
         fit_config = load_config(config)
+    elif int8:
+        fit_config = student_config("int8")
+    else:
+        fit_config = student_config("float32")
     case = StudentCase.of(load_model(model_folder).metadata)
     options = ReleaseOptions(output, version, fresh=fresh, json=json)
     version_folder = options.check_version_folder(case.sensor.electrode_names)
