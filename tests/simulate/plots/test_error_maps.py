@@ -19,7 +19,7 @@ PRESSES = 4.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [0.5, 1.0], [0
 
 @pytest.mark.parametrize(
     ("nuisances", "before", "known"),
-    [(NO_NUISANCES, False, "everything else known"), (Nuisances(), True, "nobody knows")],
+    [(NO_NUISANCES, False, "without nuisances"), (Nuisances(), True, "with nuisances")],
 )
 def test_error_maps_picture_marks_the_position_of_the_largest_error(nuisances, before, known):
     errors = ErrorMap(PRESSES, np.ones(5), np.array([0.1, 0.2, 0.1, 3.0, 0.3]))

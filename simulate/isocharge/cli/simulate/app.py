@@ -1,9 +1,9 @@
-"""`isocharge simulate ...`: its commands, one module each."""
+"""Commands of `isocharge simulate`, each in its own module."""
 
 from isocharge.cli.shared.lazy import LazyCommand, lazy_group
 
 simulate_app = lazy_group(
-    "Compute the charges of presses, and what charges determine about a press.",
+    "Compute the charges of presses, and the accuracy with which charges determine a press.",
     {
         "point": LazyCommand(
             "isocharge.cli.simulate.point:point_command",
@@ -12,17 +12,17 @@ simulate_app = lazy_group(
         ),
         "sweep": LazyCommand(
             "isocharge.cli.simulate.sweep:sweep_command",
-            "Compute the charges of many presses: a dataset to train on.",
+            "Compute the charges of many presses and write them as a dataset for training.",
             extra="simulate",
         ),
         "identify": LazyCommand(
             "isocharge.cli.simulate.identify:identify_command",
-            "Say what the charges of a sensor determine: limits, folds, working area.",
+            "Compute error limits, folds and the working area of a sensor.",
             extra="simulate",
         ),
         "design": LazyCommand(
             "isocharge.cli.simulate.design:design_command",
-            "Place the electrodes where their charges determine contacts best.",
+            "Search the electrode positions with the smallest position errors.",
             extra="design",
         ),
     },

@@ -1,4 +1,4 @@
-"""`isocharge simulate design`: where the electrodes should lie."""
+"""Command `isocharge simulate design`: search of the electrode positions."""
 
 from typing import Annotated
 
@@ -32,7 +32,7 @@ def design_command(
     sensor: SensorArgument,
     output: NewFolderOption,
     electrodes: Annotated[
-        int, typer.Option("--electrodes", metavar="N", help="Number of electrodes, 3 to 8, with those that stay.")
+        int, typer.Option("--electrodes", metavar="N", help="Number of electrodes, 3 to 8, including kept ones.")
     ],
     radius: Annotated[
         float, typer.Option("--radius", metavar="MM", help="Largest distance of a press from the film's centre, mm.")
@@ -42,21 +42,23 @@ def design_command(
         typer.Option(
             "--goal",
             metavar="worst|rms|MAP",
-            help="What is made small: the worst error, its root mean square, or that weighted with a map of what "
-            "matters, a CSV file with the columns x_mm, y_mm, weight.",
+            help="Quantity to minimise: the largest error, the root mean square of the errors, or the root mean square "
+            "weighted with a map, a CSV file with the columns x_mm, y_mm, weight.",
         ),
     ] = "worst",
     known: Annotated[
         bool,
         typer.Option(
             "--known",
-            help="Take probe radius, pretension and gains as exactly known. (default: unknown by 0.3 mm, 0.1 MPa and "
-            "0.2 %)",
+            help="Assume that probe radius, pretension and gains are known exactly. (default: standard deviations of "
+            "0.3 mm, 0.1 MPa and 0.2 %)",
         ),
     ] = False,
     keep: Annotated[
         str | None,
-        typer.Option("--keep", metavar="NAMES", help="Electrodes of SENSOR that stay, like A,B. (default: none)"),
+        typer.Option(
+            "--keep", metavar="NAMES", help="Electrodes of SENSOR that are kept, such as A,B. (default: none)"
+        ),
     ] = None,
     side: Annotated[
         float | None,
@@ -65,15 +67,15 @@ def design_command(
     probe: ProbeOption = "circle:1.0",
     force: ForceOption = 1.0,
     noise: NoiseOption = "reference",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the search; the same seed, the same design.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the search. Equal seeds give equal designs.")] = 0,
     stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
     fresh: FreshOption = False,
 ) -> None:
-    """Search the places of electrodes that determine presses best, and write sensor file, drawings and numbers.
+    """Search the electrode positions with the smallest position errors, and write sensor file, drawings and numbers.
 
-    Errors are Cramer-Rao limits, mm, with what nobody knows exactly as nuisances. A search that was stopped goes on
-    with the same command.
+    The errors are Cramer-Rao limits in mm, with probe radius, pretension and gains as nuisance parameters. If the
+    search is interrupted, the same command resumes it.
 
     Example: isocharge simulate design four-25um-biaxial --electrodes 4 --radius 15 -o over-15mm
     """
@@ -114,13 +116,23 @@ def design_command(
 
 
 def _table(found: Design) -> str:
-    """Places, and errors before and after; an error beyond the disk itself says that charges do not tell the place."""
-    rows = ["{:<10} {:9.3f} {:9.3f} mm".format(e.name, *e.centre) for e in found.sensor.electrodes]
-    rows.append("least position error, mm     worst      rms")
+    """Format the electrode positions and the errors before and after."""
+    rows = []
+    for electrode in found.sensor.electrodes:
+        x, y = electrode.centre
+        rows.append(f"{electrode.name:<10} {x:9.3f} {y:9.3f} mm")
+    rows.append("position error limit, mm     worst      rms")
     for name, errors in (("before", found.before), ("after", found.after)):
-        for level, values in errors.to_dict().items() if errors else ():
+        if errors is None:
+            continue
+        for level, values in errors.to_dict().items():
             title = f"{name}, {level.replace('_', ' ')}"
-            sizes = values["worst_mm"], values["rms_mm"]
-            worst, rms = (f"{mm:.3f}" if mm < found.case.radius else "folds" for mm in sizes)
+            worst = _error_text(values["worst_mm"], found.case.radius)
+            rms = _error_text(values["rms_mm"], found.case.radius)
             rows.append(f"{title:<26} {worst:>7} {rms:>8}")
     return "\n".join(rows)
+
+
+def _error_text(error: float, radius: float) -> str:
+    """Format an error (mm). An error of the size of the disk means that the charges do not determine the position."""
+    return f"{error:.3f}" if error < radius else "folds"

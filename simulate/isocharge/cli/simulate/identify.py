@@ -1,4 +1,4 @@
-"""`isocharge simulate identify`: what the charges of a sensor determine about a press."""
+"""Command `isocharge simulate identify`: error limits, folds and working area of a sensor."""
 
 import json as json_module
 from math import inf
@@ -17,8 +17,11 @@ from isocharge.simulate import identify, load_sensor, noise_model, parse_probe
 from isocharge.simulate.plots.error_maps import identification_picture
 from isocharge.simulate.plots.figure import picture_bytes
 
-PICTURE, NUMBERS = "identify.png", "identify.json"
-"""Files in an output folder."""
+PICTURE = "identify.png"
+"""File name of the picture in the output folder."""
+
+NUMBERS = "identify.json"
+"""File name of the numbers in the output folder."""
 
 
 def identify_command(
@@ -34,20 +37,20 @@ def identify_command(
         typer.Option(
             "--radius",
             metavar="MM",
-            help="Distance from the centre up to which presses are searched, mm. (default: to the electrodes' far "
-            "corners)",
+            help="Distance from the centre up to which presses are searched, mm. (default: distance of the outermost "
+            "corner of an electrode)",
         ),
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR", help="New folder for map and numbers. (default: none)"),
+        typer.Option("--output", "-o", metavar="DIR", help="New folder for picture and numbers. (default: none)"),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Say how well the charges determine a press: smallest errors over the film, ambiguities, working area.
+    """Compute how well the charges determine a press: error limits over the film, ambiguities and working area.
 
-    The errors are Cramer-Rao limits, mm for the position and percent for the force: no unbiased method has smaller
-    ones.
+    The errors are Cramer-Rao limits, in mm for the position and in percent for the force. No unbiased method has
+    smaller errors.
 
     Example: isocharge simulate identify three-25um-biaxial --probe circle:1.0 --error 0.5 -o limits
     """
@@ -72,6 +75,7 @@ def identify_command(
 
 
 def _table(numbers: dict[str, Any]) -> str:
+    """Format the error statistics within the working area as a table."""
     area = numbers["working_area"]
     head = f"within {area['radius_mm']:g} mm    position, mm: median    rms  worst    force, %: median    rms  worst"
     rows = [

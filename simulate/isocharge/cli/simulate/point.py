@@ -1,4 +1,4 @@
-"""`isocharge simulate point`: the charges of one press."""
+"""Command `isocharge simulate point`: charges and deflection of one press."""
 
 from math import isfinite
 from typing import Annotated, Any
@@ -25,33 +25,36 @@ def point_command(
     accuracy: Annotated[
         float,
         typer.Option(
-            "--accuracy", help="Relative error that the charges may have, 1e-8 to 1; it decides on theory and mesh."
+            "--accuracy", help="Allowed relative error of the charges, 1e-8 to 1. It determines theory and mesh."
         ),
     ] = 1e-3,
     theory: Annotated[
         str,
         typer.Option(
             "--theory",
-            help="'nonlinear membrane + bending', 'linear plate', ...; auto takes the cheapest that suffices.",
+            help="'nonlinear membrane + bending', 'linear plate', ...; auto selects the cheapest sufficient one.",
         ),
     ] = "auto",
     temperature: Annotated[
         float,
-        typer.Option("--temperature", metavar="K", help="Temperature step of the whole film, K; its charge is added."),
+        typer.Option("--temperature", metavar="K", help="Temperature step of the film, K, whose charge is added."),
     ] = 0.0,
     json: JsonOption = False,
 ) -> None:
-    """Compute the charge of every electrode (pC) and the film's deflection (mm) under one press.
+    """Compute the charge of every electrode (pC) and the deflection of the film (mm) under one press.
 
     Example: isocharge simulate point three-25um-biaxial --probe triangle:4.0@30 --at 3,-2 --force 1.0
     """
     if not 1e-8 <= accuracy <= 1.0:
         raise InputError(f"--accuracy: expected a relative error from 1e-8 to 1, got {accuracy}")
-    film_sensor, pressing = load_sensor(sensor), parse_probe(probe)
-    terms = theory_by_name(theory, film_sensor.film) if theory != "auto" else None
-    terms = terms or theory_for(film_sensor, pressing, (force, force), accuracy)
-    settings = SolveSettings(accuracy=accuracy, theory=terms)
-    equilibrium = press(film_sensor.coated_film, pressing, parse_position(at), force, settings)
+    film_sensor = load_sensor(sensor)
+    footprint = parse_probe(probe)
+    if theory == "auto":
+        selected_theory = theory_for(film_sensor, footprint, (force, force), accuracy)
+    else:
+        selected_theory = theory_by_name(theory, film_sensor.film)
+    settings = SolveSettings(accuracy=accuracy, theory=selected_theory)
+    equilibrium = press(film_sensor.coated_film, footprint, parse_position(at), force, settings)
     charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
     charge_pC = dict(zip(film_sensor.electrode_names, charge.tolist(), strict=True))
     report = {"charge_pC": charge_pC, **summary(equilibrium)}
@@ -64,16 +67,17 @@ def point_command(
 
 
 def _cautions(equilibrium: Equilibrium, accuracy: float) -> list[str]:
-    """Sentences for an accuracy that was not reached."""
+    """Return warnings if the required accuracy was not reached."""
     error = estimated_error(equilibrium)
     if not isfinite(error):
-        return [f"a {equilibrium.theory.name} does not describe this film at all; leave --theory away"]
+        return [f"a {equilibrium.theory.name} does not describe this film at all; omit --theory"]
     if error > accuracy:
         return [f"expected an error of the charges of at most {accuracy:.2g}, as --accuracy says, got {error:.2g}"]
     return []
 
 
 def _table(report: dict[str, Any]) -> str:
+    """Format the charges, the deflection and the state of the solver."""
     charges = [f"charge {name:<10} {charge:10.2f} pC" for name, charge in report["charge_pC"].items()]
     return "\n".join(
         [
@@ -87,4 +91,5 @@ def _table(report: dict[str, Any]) -> str:
 
 
 def _percent(error: float | None) -> str:
+    """Format a relative error in percent; None stands for an unknown error."""
     return "unknown" if error is None else f"{error:.2%}"

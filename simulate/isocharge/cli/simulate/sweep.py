@@ -1,4 +1,4 @@
-"""`isocharge simulate sweep`: a dataset of many presses."""
+"""Command `isocharge simulate sweep`: dataset of many presses."""
 
 import json as json_module
 from enum import StrEnum
@@ -30,21 +30,26 @@ from isocharge.simulate import Dataset, Sweep, load_sensor, parse_probe, read_da
 from isocharge.simulate.sensor.probe import PROBE_HELP
 
 TABLES = (".csv", ".parquet")
-"""Ends of the names of tables of presses."""
+"""Suffixes of tables of presses."""
 
-SOLVER_MM, SOLVER_FORCE = 0.01, 1e-3
-"""What a solver's error of 0.05 % of a charge is at most, as an error of place, mm, and as a share of force."""
+SOLVER_POSITION_STD_mm = 0.01
+"""Standard deviation of the position in tables of simulated presses, mm. It corresponds to a solver error of 0.05 % of
+the charge."""
+
+SOLVER_FORCE_STD = 1e-3
+"""Relative standard deviation of the force in tables of simulated presses, dimensionless. It corresponds to a solver
+error of 0.05 % of the charge."""
 
 
 class Orientation(StrEnum):
-    """Angle of the probe in each press."""
+    """Orientation of the probe in the presses of a sweep."""
 
     fixed = "fixed"
     random = "random"
 
 
 class Sampling(StrEnum):
-    """How the presses of a sweep spread over positions and forces."""
+    """Sampling of the positions and forces of a sweep."""
 
     sobol = "sobol"
     random = "random"
@@ -59,8 +64,8 @@ def sweep_command(
             "--output",
             "-o",
             metavar="DIR",
-            help="Folder to make for the dataset; it must not exist yet. NAME.csv or NAME.parquet: the folder NAME and "
-            "beside it this table of its presses, for other programs.",
+            help="New folder for the dataset, which must not exist yet. For NAME.csv or NAME.parquet, the dataset is "
+            "written to the folder NAME, and a table of its presses for other programs is written beside it.",
         ),
     ],
     probe: Annotated[
@@ -69,29 +74,29 @@ def sweep_command(
     ] = None,
     radius: RadiusOption = f"{DEFAULT_RADIUS}",
     force: ForceRangeOption = DEFAULT_FORCE_RANGE,
-    samples: Annotated[int, typer.Option("--samples", help="Number of presses, of all probes together.")] = 20_000,
+    samples: Annotated[int, typer.Option("--samples", help="Number of presses of all probes together.")] = 20_000,
     orientation: Annotated[
-        Orientation, typer.Option("--orientation", help="Angle of the probe: as given, or a random one in each press.")
+        Orientation, typer.Option("--orientation", help="Angle of the probe: as given, or random for each press.")
     ] = Orientation.fixed,
     sampling: Annotated[
         Sampling,
-        typer.Option(
-            "--sampling", help="How presses spread over positions and forces; a grid has at most --samples of them."
-        ),
+        typer.Option("--sampling", help="Sampling of positions and forces. A grid has at most --samples presses."),
     ] = Sampling.sobol,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the presses; the same seed, the same data.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the presses. Equal seeds give equal data.")] = 0,
     stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
     fresh: FreshOption = False,
 ) -> None:
-    """Simulate many presses, spread over positions and forces, and write their charges as a dataset for training.
+    """Simulate many presses at different positions and forces, and write their charges as a dataset for training.
 
-    A run that was stopped or killed leaves DIR.part; the same command goes on from there and writes the same bytes.
+    If the run is interrupted, its finished parts remain in DIR.part. The same command then resumes the run and writes
+    the same bytes as an uninterrupted run.
 
     Example: isocharge simulate sweep three-25um-biaxial --probe circle:1.0 --radius 8 --force 0.05 2 -o presses
     """
-    film_sensor, probes = load_sensor(sensor), [parse_probe(text) for text in probe or ["circle:1.0"]]
+    film_sensor = load_sensor(sensor)
+    probes = [parse_probe(text) for text in probe or ["circle:1.0"]]
     table = output if output.suffix.lower() in TABLES else None
     if table:
         refuse_existing(table)
@@ -111,28 +116,30 @@ def sweep_command(
                 f"{output}"
             )
         if table.suffix.lower() == ".parquet":
-            with require("parquet"):  # missed now, not after the sweep
+            with require("parquet"):  # raises before the sweep if the package is missing
                 import pyarrow  # noqa: F401
     refuse_finished(output)
     warn_of_stress(film_sensor.film, probes, force[1], stress_limit)
     with shown_run(output), executor_for(workers, cluster) as executor:
-        reach = sweep_radius(radius, film_sensor, probes, force)
-        sweep = Sweep(reach, force, samples, seed, orientation.value, sampling.value)
+        largest_distance = sweep_radius(radius, film_sensor, probes, force)
+        sweep = Sweep(largest_distance, force, samples, seed, orientation.value, sampling.value)
         run_sweep(output, film_sensor, probes, sweep, executor=executor, fresh=fresh)
     if table:
         write_presses(table, _presses(read_dataset(output)))
     count = json_module.loads((output / "manifest.json").read_text())["samples"]
-    say(f"{count} presses in {output}{f' and {table}' if table else ''}")
+    written = f"{output} and {table}" if table else f"{output}"
+    say(f"{count} presses in {written}")
 
 
 def _presses(dataset: Dataset) -> MeasuredPresses:
-    """The presses of a dataset as measured ones are written."""
-    samples, count = dataset.samples, len(dataset.samples)
+    """Convert the presses of a dataset into the form of measured presses."""
+    samples = dataset.samples
+    count = len(samples)
     return MeasuredPresses(
         np.column_stack([samples.x_mm, samples.y_mm, samples.force_N]),
         samples.charge_pC,
-        np.full(count, SOLVER_MM),
-        np.full(count, SOLVER_FORCE),
+        np.full(count, SOLVER_POSITION_STD_mm),
+        np.full(count, SOLVER_FORCE_STD),
         dataset.sensor.electrode_names,
         tuple(range(1, count + 1)),
     )

@@ -1,1 +1,1 @@
-"""Pictures of a film, to scale, in mm and pC. The only package that imports matplotlib."""
+"""Pictures of films, charges and errors. No other package of isocharge.simulate imports matplotlib."""

@@ -1,4 +1,4 @@
-"""Maps of the least possible error over the film: what a layout allows, and what a design has gained."""
+"""Maps of the lower limit of the position error over the film, for an identification and for a design."""
 
 from typing import Any
 
@@ -14,27 +14,38 @@ from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_circle, draw_electrodes, draw_working_area
 from isocharge.simulate.sensor.sensor import Sensor
 
-SMALLEST_MM, LARGEST_MM = 0.02, 5.0
-"""Position errors at the ends of the colours, mm; smaller and larger ones have the colours of the ends."""
+MIN_ERROR_mm = 0.02
+"""Position error at the lower end of the colours, mm. Smaller errors have the same colour."""
+
+MAX_ERROR_mm = 5.0
+"""Position error at the upper end of the colours, mm. Larger errors have the same colour."""
 
 TICKS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
-"""Position errors that the colour bar names, mm."""
+"""Position errors that are labelled on the colour bar, mm."""
 
-MOST_TIMES = 10.0
-"""Errors above this multiple of the smallest have the colour of the end."""
+MAX_ERROR_RATIO = 10.0
+"""Ratio of the errors at both ends of the colours in the maps of a design, dimensionless."""
 
 MARGIN = 1.0
-"""Space around the electrodes, mm."""
+"""Margin around the electrodes, mm."""
+
+FORCE_COLOURS = ("#8fb8de", "#3a7ca5", INK)
+"""Colours of the curves, of which the last is that of the largest force."""
 
 
 def identification_picture(identification: Identification) -> Figure:
-    """Maps under the least and the greatest force, and the error against distance."""
+    """Draw the maps for the smallest and the largest force, and the error as a function of the distance."""
     figure = new_figure(16.0, 5.2)
     weak, strong, curves = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
     for axes, limit_map in ((weak, identification.maps[0]), (strong, identification.maps[-1])):
         shades = draw_limit_map(axes, identification, limit_map)
     figure.colorbar(
-        shades, ax=[weak, strong], label="least position error (rms), mm", ticks=TICKS, format="%g", pad=0.01
+        shades,
+        ax=[weak, strong],
+        label="lower limit of the position error (rms), mm",
+        ticks=TICKS,
+        format="%g",
+        pad=0.01,
     )
     _draw_distance(curves, identification)
     title = f"{identification.sensor.name}, {identification.probe.notation}, noise {identification.noise.name}"
@@ -43,27 +54,28 @@ def identification_picture(identification: Identification) -> Figure:
 
 
 def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMap) -> Any:
-    """Position errors under one force as colours, with folds, working area and electrodes to scale."""
+    """Draw the position errors for one force as colours, with folds, working area and electrodes to scale."""
     x, y = limit_map.rings.position.reshape(-1, 2).T
-    levels = np.geomspace(SMALLEST_MM, LARGEST_MM, 25)
-    shown = np.clip(limit_map.position.ravel(), SMALLEST_MM, LARGEST_MM)
-    shades = axes.tricontourf(x, y, shown, levels, norm=LogNorm(), cmap="viridis")
+    levels = np.geomspace(MIN_ERROR_mm, MAX_ERROR_mm, 25)
+    errors = np.clip(limit_map.position.ravel(), MIN_ERROR_mm, MAX_ERROR_mm)
+    shades = axes.tricontourf(x, y, errors, levels, norm=LogNorm(), cmap="viridis")
     folds = identification.area.folds
     axes.plot(*folds.T, ".", color=FELT, ms=3)
     draw_circle(axes, identification.area.radius, ls="--", lw=1.8, color="white")
     draw_electrodes(axes, identification.sensor)
-    reach = identification.area.searched
+    limits = (-identification.area.searched, identification.area.searched)
     title = f"{limit_map.force:g} N; dashed: working area, {identification.area.radius:g} mm"
-    title += "; red: folds" if len(folds) else ""
-    axes.set(title=title, xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=(-reach, reach), ylim=(-reach, reach))
+    if len(folds):
+        title += "; red: folds"
+    axes.set(title=title, xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=limits, ylim=limits)
     return shades
 
 
 def _draw_distance(axes: Any, identification: Identification) -> None:
-    """Median and worst error of every ring against its distance from the centre."""
+    """Draw the median and the largest error of every ring against its distance from the centre."""
     area = identification.area
-    for number, limit_map in enumerate(identification.maps):
-        colour = ("#8fb8de", "#3a7ca5", INK)[number - len(identification.maps)]
+    colours = FORCE_COLOURS[len(FORCE_COLOURS) - len(identification.maps) :]
+    for limit_map, colour in zip(identification.maps, colours, strict=True):
         distance = limit_map.rings.distance
         axes.semilogy(distance, np.median(limit_map.position, axis=1), color=colour, label=f"{limit_map.force:g} N")
         axes.semilogy(distance, limit_map.position.max(axis=1), ":", color=colour)
@@ -74,7 +86,7 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
         axes.axvline(area.fold_radius, color=FELT, label=f"first fold, {area.fold_radius:.1f} mm")
     axes.set(
         xlabel="distance from the centre, mm",
-        ylabel="least position error (rms), mm",
+        ylabel="lower limit of the position error (rms), mm",
         xlim=(0.0, area.searched),
         ylim=(0.005, 20.0),
     )
@@ -86,33 +98,37 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
 
 
 def error_maps_picture(design: Design) -> Figure:
-    """Errors with the nuisances of the case as colours, before and after."""
-    case, layouts = design.case, [(design.sensor, design.after)]
+    """Draw the errors with the nuisances of the case as colours, for the initial and the new layout."""
+    case = design.case
+    layouts = [(design.sensor, design.after)]
     if design.before:
         layouts.insert(0, (case.sensor, design.before))
     figure = new_figure(6.4 * len(layouts) + 1.0, 6.0)
     smallest = min(float(errors.with_nuisances.min()) for _, errors in layouts)
-    norm = LogNorm(smallest, MOST_TIMES * smallest)
+    norm = LogNorm(smallest, MAX_ERROR_RATIO * smallest)
     electrodes = [electrode for sensor, _ in layouts for electrode in sensor.electrodes]
     corners = np.concatenate([polygon for electrode in electrodes for polygon in electrode.front])
-    reach = float(max(case.radius, np.abs(corners).max())) + MARGIN
-    every = figure.subplots(1, len(layouts), squeeze=False)[0]
-    for axes, (sensor, errors) in zip(every, layouts, strict=True):
-        shown = _draw_errors(axes, sensor, errors, norm)
+    half_width = float(max(case.radius, np.abs(corners).max())) + MARGIN
+    limits = (-half_width, half_width)
+    all_axes = figure.subplots(1, len(layouts), squeeze=False)[0]
+    for axes, (sensor, errors) in zip(all_axes, layouts, strict=True):
+        shades = _draw_errors(axes, sensor, errors, norm)
         draw_working_area(axes, case.radius)
-        axes.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x, mm", ylabel="y, mm", aspect="equal")
-    bar = figure.colorbar(shown, ax=list(every), label="least position error (rms), mm", shrink=0.85, extend="max")
+        axes.set(xlim=limits, ylim=limits, xlabel="x, mm", ylabel="y, mm", aspect="equal")
+    label = "lower limit of the position error (rms), mm"
+    bar = figure.colorbar(shades, ax=list(all_axes), label=label, shrink=0.85, extend="max")
     bar.ax.yaxis.set_major_formatter(ScalarFormatter())
     bar.ax.yaxis.set_minor_formatter(ScalarFormatter())
-    known = "everything else known" if case.nuisances == NO_NUISANCES else "with what nobody knows exactly"
-    figure.suptitle(f"{case.force:g} N, {case.probe.notation}, noise {case.noise.name}, {known}")
+    nuisances = "without nuisances" if case.nuisances == NO_NUISANCES else "with nuisances"
+    figure.suptitle(f"{case.force:g} N, {case.probe.notation}, noise {case.noise.name}, {nuisances}")
     return figure
 
 
 def _draw_errors(axes: Any, sensor: Sensor, errors: ErrorMap, norm: LogNorm) -> Any:
-    """Errors as colours, the worst place, and the electrodes."""
+    """Draw the errors of one layout as colours, the position of the largest error, and the electrodes."""
     draw_electrodes(axes, sensor)
     axes.plot(*errors.presses[np.argmax(errors.with_nuisances)], "x", color=FELT, ms=9, mew=2)
-    worst, rms = errors.with_nuisances.max(), np.sqrt(np.mean(errors.with_nuisances**2))
+    worst = errors.with_nuisances.max()
+    rms = np.sqrt(np.mean(errors.with_nuisances**2))
     axes.set_title(f"{sensor.name}\nworst {worst:.3g} mm (cross), rms {rms:.3g} mm")
     return axes.tripcolor(*errors.presses.T, errors.with_nuisances, norm=norm, cmap="viridis", shading="gouraud")

@@ -1,6 +1,6 @@
-"""Figures without a window: colours, sizes, and how they become files. Every picture of isocharge uses it.
+"""Matplotlib figures without a window: creation, colours, and output files. All pictures of isocharge use this module.
 
-It needs matplotlib, so it is imported only where a picture is drawn.
+The module needs matplotlib, so it is imported only where a picture is drawn.
 """
 
 from io import BytesIO
@@ -17,67 +17,68 @@ from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing, write_whole
 
 INK, PRESSED, FELT = "#1b2a41", "#9aa5b1", "#d1495b"
-"""Colours of outlines, of true presses and of estimated ones."""
+"""Colours of outlines, of true presses and of estimated presses."""
 
 COLOURS = ("#d1495b", "#2e6f9e", "#3a8f5c", "#c98a1b")
-"""Colours of the electrodes, in their order."""
+"""Colours of the electrodes in the order of the charges."""
 
 FORMATS = ("png", "svg", "pdf")
-"""Formats of a picture; a file's suffix names its own."""
+"""Formats of a picture, which are also the allowed suffixes of its file name."""
 
 DPI = 130
 """Resolution of PNG files, dots per inch."""
 
-PALEST = 0.92
-"""End of the viridis scale that `shades` uses, from 0 to 1: its last yellow cannot be seen on white."""
+LAST_SHADE = 0.92
+"""End of the part of the viridis colour map that `shades` uses, from 0 to 1. The remaining part is hardly visible on
+white."""
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """A figure that no window belongs to; width and height in inches."""
+    """Create a figure without a window; width and height are in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def new_axes(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
-    """A figure and its axes, as matplotlib's `subplots` gives them; width and height in inches."""
+    """Create a figure and its axes as `subplots` of matplotlib does; width and height are in inches."""
     figure = new_figure(width, height)
     return figure, figure.subplots(rows, columns)
 
 
 def finish_axes(axes: Any, x: str, y: str, title: str = "", **legend: Any) -> None:
-    """Labels, grid and legend of a plot with lines."""
+    """Add labels, title, grid and legend to axes; `legend` contains arguments of the legend."""
     axes.set(xlabel=x, ylabel=y, title=title)
     axes.grid(alpha=0.3, which="both")
     axes.legend(**{"fontsize": 8} | legend)
 
 
 def shades(count: int) -> Array:
-    """Colours of lines that have an order, from dark to pale: RGBA, shape (count, 4)."""
-    return np.asarray(colormaps["viridis"](np.linspace(0.0, PALEST, count)))
+    """Return RGBA colours from dark to light for an ordered set of lines, shape (count, 4)."""
+    return np.asarray(colormaps["viridis"](np.linspace(0.0, LAST_SHADE, count)))
 
 
 def check_picture(path: Path) -> None:
-    """Check the name of a picture before anything is computed.
+    """Check the file name of a picture, which is done before the computation.
 
     Raises:
-        InputError: If its suffix is not one of FORMATS.
+        InputError: If the suffix is not one of `FORMATS`.
         OutputExists: If the file exists.
     """
     if path.suffix.lstrip(".").lower() not in FORMATS:
-        raise InputError(f"{path}: expected a picture's name ending in {', '.join(FORMATS)}, got {path.suffix!r}")
+        raise InputError(f"{path}: expected a picture with the suffix {', '.join(FORMATS)}, got {path.suffix!r}")
     refuse_existing(path)
 
 
 def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
-    """A figure as PNG, SVG or PDF; the same figure gives the same bytes."""
-    dates: dict[str, None] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
+    """Convert a figure into the bytes of a PNG, SVG or PDF file. Equal figures give equal bytes."""
+    without_date: dict[str, None] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
     buffer = BytesIO()
     with rc_context({"svg.hashsalt": "isocharge", "svg.fonttype": "none"}):
-        figure.savefig(buffer, format=kind, dpi=DPI, metadata=dates)
+        figure.savefig(buffer, format=kind, dpi=DPI, metadata=without_date)
     return buffer.getvalue()
 
 
 def save_picture(figure: Figure, path: Path) -> None:
-    """Write a figure in the format of the path's suffix, whole or not at all."""
+    """Write a figure in the format of the suffix of the path. A failed write leaves no partial file."""
     write_whole(path, picture_bytes(figure, path.suffix.lstrip(".").lower()))

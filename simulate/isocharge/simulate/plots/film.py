@@ -1,4 +1,4 @@
-"""The film to scale: electrodes, probe, working area, charge map, deflection."""
+"""Drawings of a film to scale: electrodes, probe, working area, charge map and deflection."""
 
 from math import atan2, cos, hypot, sin
 from typing import Any
@@ -16,12 +16,21 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
 
-INNER = 0.999999
-"""Share of the film's radius up to which its deflection is drawn: the rim itself may be outside by rounding."""
+DRAWN_RADIUS = 0.999999
+"""Radius up to which the deflection is drawn, in units of the film radius. Because of rounding errors, points on the
+rim may lie outside the film."""
 
 
 def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool = True, ink: str = INK) -> None:
-    """Outlines of the electrodes at their calibrated positions, with their names, legible on any shade."""
+    """Draw the outlines of the electrodes at their calibrated positions, with solid lines for the front.
+
+    Args:
+        axes: Matplotlib axes.
+        sensor: Sensor.
+        highlight: Name of an electrode that is drawn in another colour.
+        names: Whether to write the names of the electrodes.
+        ink: Colour of the outlines.
+    """
     halo = [withStroke(linewidth=3.0, foreground="white", alpha=0.8)]
     for electrode in sensor.electrodes:
         colour = FELT if electrode.name == highlight else ink
@@ -35,37 +44,47 @@ def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool 
 
 
 def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "") -> None:
-    """The footprint of a press at (x, y), mm."""
+    """Draw the footprint of a press at (x, y), mm."""
     style: dict[str, Any] = {"fill": True, "fc": FELT, "ec": FELT, "alpha": 0.35, "zorder": 2, "label": label}
     axes.add_patch(Patch(to_corners(complex(*at) + probe.outline), **style))
 
 
 def draw_circle(axes: Any, radius: float, **style: Any) -> None:
-    """A circle of `radius` (mm) about the centre."""
+    """Draw a circle of `radius` (mm) about the centre."""
     axes.add_patch(Disk((0, 0), radius, fill=False, **style))
 
 
 def draw_working_area(axes: Any, radius: float, label: str = "") -> None:
-    """A dotted circle of `radius` (mm) about the centre."""
+    """Draw a working area as a dotted circle of `radius` (mm) about the centre."""
     draw_circle(axes, radius, ls=":", color=INK, label=label)
 
 
 def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> None:
-    """Axes in mm, to scale, that show all electrodes and a circle of `radius` (mm) about the centre."""
+    """Scale and label axes in mm so that they show all electrodes and a circle of `radius` (mm) about the centre."""
     corners = np.concatenate([polygon for electrode in sensor.electrodes for polygon in electrode.front])
-    reach = max(radius, float(np.hypot(*sensor.calibration.place(corners).T).max())) + 0.7
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x, mm", ylabel="y, mm", aspect="equal", title=title)
+    outermost = float(np.hypot(*sensor.calibration.place(corners).T).max())
+    half_width = max(radius, outermost) + 0.7
+    limits = (-half_width, half_width)
+    axes.set(xlim=limits, ylim=limits, xlabel="x, mm", ylabel="y, mm", aspect="equal", title=title)
 
 
 def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "", highlight: str = "") -> None:
-    """Electrodes and the working area of `radius` (mm), on axes that show both."""
+    """Draw the electrodes and the working area of `radius` (mm), and scale the axes; see `draw_electrodes`."""
     draw_electrodes(axes, sensor, highlight)
     draw_working_area(axes, radius)
     frame_film(axes, sensor, radius, title)
 
 
 def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float = 1.0, count: int = 81) -> None:
-    """Shades and labelled contours of one electrode's charge over the position of a press."""
+    """Draw the charge of one electrode over the position of a press as shades and labelled contours.
+
+    Args:
+        axes: Matplotlib axes.
+        charge_map: Charges as a function of the contact.
+        number: Number of the electrode in the order of the charges.
+        force: Force of the presses, N.
+        count: Number of angles of the grid.
+    """
     x, y = _polar_grid(charge_map.domain.radius, count // 2, count)
     contact = np.stack([x.ravel(), y.ravel(), np.full(x.size, force)], axis=1)
     values = charge_map.charges(contact)[:, number].reshape(x.shape)
@@ -75,9 +94,9 @@ def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float 
 
 
 def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
-    """Deflection of the whole film as shades, seen from above."""
+    """Draw the deflection of the complete film as shades."""
     radius = equilibrium.film.radius
-    x, y = _polar_grid(INNER * radius, 240, 361)
+    x, y = _polar_grid(DRAWN_RADIUS * radius, 240, 361)
     depth = deflection(equilibrium, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
     shades = axes.contourf(x, y, depth, levels=24, cmap="viridis_r")
     axes.figure.colorbar(shades, ax=axes, shrink=0.8, label="deflection, mm")
@@ -86,8 +105,8 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
 
 
 def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
-    """Deflection on a cut through the probe and the centre of the film, not to scale."""
-    along = np.linspace(-INNER, INNER, 801) * equilibrium.film.radius
+    """Draw the deflection on a section through the probe and the centre of the film, with a stretched vertical axis."""
+    along = np.linspace(-DRAWN_RADIUS, DRAWN_RADIUS, 801) * equilibrium.film.radius
     x, y = equilibrium.at
     distance, angle = hypot(x, y), atan2(y, x)
     depth = deflection(equilibrium, np.outer(along, [cos(angle), sin(angle)]))
@@ -103,7 +122,7 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
 
 
 def _polar_grid(radius: float, rings: int, angles: int) -> tuple[Array, Array]:
-    """Points x and y on a disk, mm, shape (rings, angles) each, with rings of equal area."""
+    """Return coordinates x and y (mm) on a disk, each of shape (rings, angles), on rings of equal area."""
     distance = radius * np.sqrt(np.linspace(0.0, 1.0, rings))
     angle = np.linspace(0.0, 2.0 * np.pi, angles)
     return np.outer(distance, np.cos(angle)), np.outer(distance, np.sin(angle))
