@@ -185,7 +185,7 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
 @pytest.mark.slow
 def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
     """Three uniaxial electrodes fold within 8 mm, and the user is told."""
-    monkeypatch.setattr("isocharge.cli.shared.forward_maps.SAMPLES", 4000)
+    monkeypatch.setattr("isocharge.cli.shared.forward_maps.N_SIMULATED_PRESSES", 4000)
     (tmp_path / "quick.toml").write_text(
         "[network]\nhidden = [24, 24]\nmisfit_hidden = [24, 24]\n"
         "[training]\nsteps = 300\nmisfit_steps = 50\nmisfit_charges = 1000\n"
