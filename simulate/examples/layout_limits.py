@@ -29,7 +29,7 @@ print(area.summary)
 
 figure, axes = plt.subplots(figsize=(6.6, 5.6), layout="constrained")
 shades = axes.tricontourf(x, y, limits.position, levels=20)
-figure.colorbar(shades, label="least position error at 1 N (rms), mm")
+figure.colorbar(shades, label="lower limit of the position error at 1 N (rms), mm")
 draw_electrodes(axes, sensor)
 draw_working_area(axes, area.radius)
 frame_film(axes, sensor, 8.0, "four squares, 9 mm from the centre")
