@@ -211,8 +211,7 @@ class ChargeScaleStage(ContactStage):
     def _shift(self, frame: ContactFrame, contact: Contact) -> tuple[float, float, float] | None:
         """Return how far one standard deviation of the scale moves x and y, mm, and the force, N; None if not at all.
 
-        The scale of the charges does not change the position of a contact of the mixture, because only its force
-        depends on the scale.
+        For a contact of the mixture, only the force is assumed to depend on the scale, with the largest exponent.
         """
         charge_scale_std = frame.reading.charge_scale_std
         charge_pC = frame.reading.charge_pC

@@ -234,7 +234,7 @@ class TouchStream:
             stage.reset()
 
     def restart(self) -> None:
-        """Begin as a new stream does, so that its records can be repeated from its bytes alone; `totals` continue."""
+        """Return to the state of a new stream, so that records depend only on the bytes from now on; keep `totals`."""
         self._before_restart = self.totals()
         self._readings.restart()
         self._discard_contact()
@@ -338,6 +338,6 @@ def _contact_fields(frame: ContactFrame) -> Mapping[str, Any]:
 
 
 def _with_lasting_flags(reading: Reading, skipped_flags: set[str]) -> Reading:
-    """Return a reading with those flags of the skipped frames before it that describe what happened meanwhile."""
+    """Return a reading with those flags of skipped frames that describe events before it, such as lost frames."""
     earlier = tuple(flag for flag in LASTING_FLAGS if flag in skipped_flags and flag not in reading.flags)
     return reading._replace(flags=earlier + reading.flags)
