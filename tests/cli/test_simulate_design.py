@@ -56,8 +56,8 @@ def test_a_design_is_a_folder_that_other_commands_read(command, tmp_path, monkey
     assert command(*words)[0] == 1  # nothing is overwritten
 
 
-def test_an_error_beyond_the_disk_is_a_fold():
-    """33 mm on a disk of 12 mm is no error: two places have the same charges."""
+def test_table_reports_errors_larger_than_the_radius_as_folds():
+    """An error of 33 mm on a disk of 12 mm means that two positions have the same charges."""
     errors = design_module.ErrorMap(np.zeros((2, 2)), np.array([1.0, 33.0]), np.array([1.0, 2.0]))
     found = SimpleNamespace(case=SimpleNamespace(radius=12.0), sensor=load_sensor("three-25um-biaxial"))
     *_, before, after = design_command._table(SimpleNamespace(before=None, after=errors, **vars(found))).splitlines()

@@ -1,4 +1,4 @@
-"""A run that was stopped goes on, and writes what it would have written; nothing else is touched or trusted."""
+"""Resumed sweeps: equal bytes after interruptions, damaged parts, and folders that must not be changed."""
 
 import re
 import signal
@@ -198,7 +198,7 @@ if __name__ == "__main__":
 
 
 def test_killed_run_is_resumed_with_the_same_bytes(tmp_path, whole):
-    """SIGKILL between two shards; no worker outlives it."""
+    """The run is killed by SIGKILL between two shards, and its workers end as well."""
     script = tmp_path / "driver.py"
     script.write_text(DRIVER.format(path=sys.path))
     run = subprocess.run([sys.executable, script, tmp_path / "presses"], capture_output=True, text=True, timeout=100)

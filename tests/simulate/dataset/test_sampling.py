@@ -1,4 +1,4 @@
-"""Where the presses of a sweep lie: inside what was asked for, evenly, and the same for a seed."""
+"""Sampling of the presses of a sweep: ranges, uniform distribution, seeds and grids."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_presses_are_uniform_over_the_disk_and_in_the_logarithm_of_the_force(sam
 
 
 def test_sobol_presses_have_a_smaller_discrepancy_than_random_presses():
-    """What the Sobol points are for: a tenth of the discrepancy of independent draws, for every probe by itself."""
+    """For every probe, the discrepancy is a tenth of that of independent draws."""
     probes = 3
     presses = Sweep(samples=1024 * probes, seed=4).over(PROBES[:probes])
     chance = np.random.default_rng(4).random((1024, 2))

@@ -1,4 +1,4 @@
-"""The dataset format: whole or not at all, and every kind of damage is told."""
+"""Dataset format: round trip, manifest, and errors for incomplete or damaged datasets."""
 
 import errno
 import hashlib
@@ -83,7 +83,7 @@ def test_manifest_and_card_describe_the_dataset(dataset):
 
 
 def test_dataset_of_measured_presses_needs_no_solver_entry(tmp_path):
-    """A rig knows no seed and no mesh; integers are numbers too."""
+    """A measured dataset has no seed and no mesh, and its columns may be integers."""
     measured = replace(samples(2), force_N=np.array([1, 2]))
     assert len(read_dataset(write_dataset(tmp_path / "rig", SENSOR, [measured], {})).samples) == 2
 
@@ -238,7 +238,7 @@ def test_invalid_samples_are_not_written(tmp_path, changes, message):
 
 
 def test_full_disk_leaves_no_partial_dataset(tmp_path, monkeypatch):
-    """At every file of it."""
+    """The disk becomes full at each of the files in turn."""
     for failing in range(1, 5):
         calls = []
 

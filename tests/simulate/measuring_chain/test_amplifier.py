@@ -1,4 +1,4 @@
-"""The amplifier against closed forms of a leaky integrator and the statistics of what it adds."""
+"""Amplifier, compared with closed forms of a leaky integrator and with statistics of noise, hum and drift."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ CLEAN, RATE = noise_model("clean"), 200.0
 
 
 def measure(amplifier, charge, seed=0, rate=RATE, blocks=1):
-    """Readings of charges (n, electrodes), pC, taken in so many blocks."""
+    """Readings of charges, shape (n, electrodes), pC, that are simulated in a number of blocks."""
     process = amplifier.start(charge.shape[1], rate, np.random.default_rng(seed))
     return np.concatenate([process(block) for block in np.array_split(charge, blocks)]), process
 
