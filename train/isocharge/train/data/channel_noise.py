@@ -1,7 +1,8 @@
-"""Noise of measured presses, learned from them: what neighbours in place and force do not share.
+"""Estimation of the noise of measured presses from the presses themselves.
 
-A plane through the nearest presses predicts the charges of the press in their midst. What is left over is noise of the
-channels, and of the rig that does not know place and force exactly: s^2 = white^2 + (gain * Q)^2, for each channel.
+A plane that is fitted to the nearest presses, in position and force, predicts the charges of the press between them.
+The residuals are the noise of the channels and of the rig, which does not know position and force exactly. The variance
+of each channel is modelled as s^2 = white^2 + (gain * Q)^2.
 """
 
 from dataclasses import dataclass
@@ -14,42 +15,47 @@ from isocharge.common.arrays import Array
 from isocharge.simulate import NoiseModel
 
 NEIGHBOURS = 16
-"""Presses that a plane is put through, four for each of its coefficients."""
+"""Number of presses to which a plane is fitted: four for each of its coefficients."""
 
 ROUNDS = 10
-"""Weighted least squares in turn: each has the variances that the one before found."""
+"""Number of weighted least-squares fits. Each uses the variances that the fit before has found."""
 
 OUTLIER = 3.0
-"""Standard deviations beyond which a residual counts as this many: a knock against the rig is no noise."""
+"""Number of standard deviations to which residuals are clipped, because a knock against the rig is not noise."""
 
 LEAST_SHARE = 0.01
-"""Least white noise over gain, relative to the usual size of a channel's charges: where no charge is small, the presses
-do not tell the white noise."""
+"""Smallest ratio of white noise to gain, relative to the usual size of the charges of a channel.
+
+If no charge is small, the presses do not determine the white noise.
+"""
 
 BOTH_SIGNS = 0.01
-"""Share of presses from which on the rarer sign of a channel's charges counts, dimensionless."""
+"""Share of presses above which the rarer sign of the charges of a channel is taken into account."""
 
 LEAST_BEND = 0.5
-"""Least charge of such a channel from which features are logarithmic, relative to the usual size: without noise they
-would have a kink where the charge changes its sign."""
+"""Smallest charge from which features are logarithmic for channels of both signs, relative to the usual size.
+
+With less, features of charges without noise would have a kink where the charge changes its sign.
+"""
 
 LARGEST_EXPONENT = 50.0
-"""Of charges from levels: 1e21 times the white noise over gain is no charge."""
+"""Largest exponent in the conversion of levels to charges. It limits charges to 1e21 times white noise over gain."""
 
 LEAST_GAIN = 1e-4
-"""Least gain, dimensionless: that of a good amplifier. It keeps asinh(gain Q / white) / gain apart from Q / white."""
+"""Smallest gain noise, that of a good amplifier. With less, asinh(gain Q / white) / gain would equal Q / white."""
 
 CANDIDATES = 8
-"""Planes among which the nearest is looked for."""
+"""Number of planes among which the nearest one is searched."""
 
 
 @dataclass(frozen=True)
 class ChannelNoise:
-    """As `NoiseModel`, with numbers of its own for each channel, shape (n_electrode,).
+    """A noise model with parameters for each channel.
 
     Attributes:
-        white: Standard deviation that every reading has, pC.
-        gain: Standard deviation in proportion to the charge, dimensionless.
+        white: Constant part of the standard deviation, shape (n_electrode,), pC.
+        gain: Part of the standard deviation that is proportional to the charge, shape (n_electrode,), dimensionless.
+        name: Name of the noise model.
     """
 
     white: Array
@@ -58,7 +64,12 @@ class ChannelNoise:
 
     @classmethod
     def of(cls, charge: Array, unit: Array) -> "ChannelNoise":
-        """Learn it from measured charges, shape (n, n_electrode), pC, and contacts of one scale, shape (n, 3)."""
+        """Estimate the noise from measured presses.
+
+        Args:
+            charge: Measured charges, shape (n, n_electrode), pC.
+            unit: Contacts in unit coordinates, shape (n, 3).
+        """
         planes = LocalPlanes.through(unit, charge)
         fits = [_variance(*columns) for columns in zip(planes.value.T, planes.residual.T, strict=True)]
         white, gain = np.sqrt(np.array(fits)).T
@@ -67,51 +78,55 @@ class ChannelNoise:
 
     @classmethod
     def alike(cls, noise: NoiseModel, electrodes: int) -> "ChannelNoise":
-        """The same noise on every one of so many channels."""
+        """Return the noise model with the same noise on every electrode; `electrodes` is their number."""
         return cls(np.full(electrodes, noise.white), np.full(electrodes, max(noise.gain, LEAST_GAIN)), noise.name)
 
     def sigma(self, charge: Array) -> Array:
-        """Standard deviation for charges of shape (n, n_electrode), pC; the same shape."""
+        """Return the standard deviations of charges of shape (n, n_electrode), pC, as an array of the same shape."""
         return np.asarray(np.hypot(self.white, self.gain * charge))
 
     def add(self, charge: Array, rng: np.random.Generator) -> Array:
-        """Noisy readings of charges of shape (n, n_electrode), pC."""
+        """Return noisy readings of charges of shape (n, n_electrode), pC."""
         return np.asarray(charge + self.sigma(charge) * rng.standard_normal(charge.shape))
 
     def level(self, charge: Array) -> Array:
-        """Charges of shape (n, n_electrode), pC, in units in which their noise is 1: asinh(gain Q / white) / gain."""
+        """Return charges of shape (n, n_electrode), pC, in units of their noise: asinh(gain Q / white) / gain."""
         return np.asarray(np.arcsinh(charge * self.gain / self.white) / self.gain)
 
     def charge(self, level: Array) -> Array:
-        """The inverse of `level`, pC."""
+        """Return the charges that correspond to levels, pC; the inverse of `level`."""
         exponent = np.clip(level * self.gain, -LARGEST_EXPONENT, LARGEST_EXPONENT)
         return np.asarray(np.sinh(exponent) * self.white / self.gain)
 
     def bend(self, charge: Array) -> Array:
-        """Sizes from which features of charges (n, n_electrode) are logarithmic, shape (n_electrode,), pC."""
-        rarer = np.minimum(np.mean(charge > 0.0, axis=0), np.mean(charge < 0.0, axis=0))
-        least = np.where(rarer > BOTH_SIGNS, LEAST_BEND * usual_size(charge), 0.0)
-        return np.asarray(np.maximum(self.white / self.gain, least))
+        """Return the charges from which features are logarithmic, shape (n_electrode,), pC.
+
+        Args:
+            charge: Charges of presses, shape (n, n_electrode), pC.
+        """
+        share_of_rarer_sign = np.minimum(np.mean(charge > 0.0, axis=0), np.mean(charge < 0.0, axis=0))
+        smallest = np.where(share_of_rarer_sign > BOTH_SIGNS, LEAST_BEND * usual_size(charge), 0.0)
+        return np.asarray(np.maximum(self.white / self.gain, smallest))
 
     def scaled(self, factor: float) -> "ChannelNoise":
-        """The same noise, larger by a factor."""
+        """Return the noise model with standard deviations that are larger by a factor."""
         return ChannelNoise(factor * self.white, factor * self.gain, self.name)
 
     def to_dict(self) -> dict[str, object]:
-        """For metadata."""
+        """Return the noise model as it is stored in the metadata of a model."""
         white, gain = ([float(f"{number:.4g}") for number in row] for row in (self.white, self.gain))
         return {"name": self.name, "white_pC": white, "gain": gain}
 
 
 @dataclass(frozen=True)
 class LocalPlanes:
-    """Planes through the neighbours of each press, the press itself left out.
+    """Planes that are fitted to the neighbours of each press, without the press itself.
 
     Attributes:
-        value: At the press, shape (n, k).
-        slope: Derivatives by the unit coordinates, shape (n, k, 3).
-        residual: Of the press, over the root of 1 + the plane's own variance, shape (n, k).
-        reach: Distance of the farthest neighbour, shape (n,).
+        value: Value of the plane at the press, shape (n, k).
+        slope: Derivatives with respect to the unit coordinates, shape (n, k, 3).
+        residual: Residual of the press, divided by the square root of 1 + the variance of the plane, shape (n, k).
+        reach: Distance of the farthest neighbour in unit coordinates, shape (n,).
     """
 
     value: Array
@@ -121,38 +136,62 @@ class LocalPlanes:
 
     @classmethod
     def through(cls, unit: Array, values: Array) -> "LocalPlanes":
-        """Planes of values (n, k) over places (n, 3)."""
-        distance, near = cKDTree(unit).query(unit, NEIGHBOURS + 1)
-        near = near[:, 1:]
-        columns = np.concatenate([np.ones((*near.shape, 1)), unit[near] - unit[:, None]], axis=2)
+        """Fit a plane to the neighbours of each press.
+
+        Args:
+            unit: Contacts in unit coordinates, shape (n, 3).
+            values: Values at the contacts, such as charges, shape (n, k).
+        """
+        distance, neighbours = cKDTree(unit).query(unit, NEIGHBOURS + 1)
+        neighbours = neighbours[:, 1:]  # the nearest point is the press itself
+        offsets = unit[neighbours] - unit[:, None]
+        columns = np.concatenate([np.ones((*neighbours.shape, 1)), offsets], axis=2)
         solver = np.linalg.pinv(columns)
-        plane = solver @ values[near]
-        spread = np.sqrt(1.0 + (solver[:, :1] ** 2).sum(axis=2))
-        return cls(plane[:, 0], plane[:, 1:].swapaxes(1, 2), (values - plane[:, 0]) / spread, distance[:, -1])
+        coefficients = solver @ values[neighbours]
+        value = coefficients[:, 0]
+        slope = coefficients[:, 1:].swapaxes(1, 2)
+        # The plane is itself uncertain, by the sum of the squared weights of its neighbours.
+        residual_std = np.sqrt(1.0 + (solver[:, :1] ** 2).sum(axis=2))
+        return cls(value, slope, (values - value) / residual_std, distance[:, -1])
 
     def residuals(self, values: Array) -> Array:
-        """Values (m, k) less the nearest that any plane has within its reach, shape (m, k)."""
-        near = cKDTree(self.value).query(values, CANDIDATES)[1]
-        inverse = np.linalg.pinv(self.slope)
+        """Return the differences of values from the nearest point of any plane, shape (m, k).
+
+        A plane ends at the distance of its farthest neighbour.
+
+        Args:
+            values: The values, shape (m, k).
+        """
+        _, candidates = cKDTree(self.value).query(values, CANDIDATES)
+        inverse_slope = np.linalg.pinv(self.slope)
         best = np.full(values.shape, np.inf)
-        for rows in near.T:
-            off = values - self.value[rows]
-            step = (inverse[rows] @ off[..., None])[..., 0]
+        for rows in candidates.T:
+            difference = values - self.value[rows]
+            step = (inverse_slope[rows] @ difference[..., None])[..., 0]
             length = np.linalg.norm(step, axis=1)
             step *= np.minimum(1.0, self.reach[rows] / np.maximum(length, 1e-30))[:, None]
-            left = off - (self.slope[rows] @ step[..., None])[..., 0]
-            nearer = (left**2).sum(axis=1) < (best**2).sum(axis=1)
-            best[nearer] = left[nearer]
+            residual = difference - (self.slope[rows] @ step[..., None])[..., 0]
+            is_nearer = (residual**2).sum(axis=1) < (best**2).sum(axis=1)
+            best[is_nearer] = residual[is_nearer]
         return best
 
 
 def usual_size(charge: Array) -> Array:
-    """Median size of the charges that are not 0, shape (n_electrode,), of (n, n_electrode), pC; none may be 0 alone."""
+    """Return the median magnitude of the charges of each channel that are not 0, shape (n_electrode,), pC.
+
+    Args:
+        charge: Charges, shape (n, n_electrode), pC. Every channel has at least one charge that is not 0.
+    """
     return np.array([np.median(np.abs(column[column != 0.0])) for column in charge.T])
 
 
 def _variance(value: Array, residual: Array) -> tuple[float, float]:
-    """white^2 and gain^2 of one channel, from its charges and residuals, shape (n,): weighted least squares."""
+    """Estimate white^2 and gain^2 of one channel by weighted least squares.
+
+    Args:
+        value: Charges, shape (n,), pC.
+        residual: Residuals, shape (n,), pC.
+    """
     columns = np.stack([np.ones_like(value), value**2], axis=1)
     fit = np.array([np.mean(residual**2), 0.0])
     for _ in range(ROUNDS):
@@ -164,4 +203,4 @@ def _variance(value: Array, residual: Array) -> tuple[float, float]:
 
 
 Noise = NoiseModel | ChannelNoise
-"""Noise of readings: one for all channels, or one for each."""
+"""Noise model for all channels alike, or for each channel."""

@@ -1,14 +1,14 @@
-"""The map from contacts to charges as a short series fitted to a dataset, and how far from the centre it is invertible.
+"""A series for the map from contacts to charges that is fitted to a dataset, and the disk in which it is invertible.
 
 Without pretension Q = F^(2/3) g(x, y) nearly, with g smooth, so ln Q is expanded in Chebyshev polynomials
 
     ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
 
-with r the radius of the working area and l the logarithm of the force scaled to [-1, 1]. Charges of both signs, as taut
-uniaxial films give, have Q_e / S(l) in the logarithm's place, with S their usual size under that force. The
-coefficients follow from linear least squares. Training needs the series to find the contact nearest to any charges, and
-to see folds, by the simulator's search for folds and for contacts far apart with the same charges; the model itself
-does without. A dataset of several probes gives their mean.
+with r the radius of the working area and l the logarithm of the force scaled to [-1, 1]. For charges of both signs,
+which taut uniaxial films give, Q_e / S(l) is expanded instead of the logarithm, where S is the usual size of the
+charges under this force. The coefficients follow from linear least squares. The training uses the series to find the
+contact that is nearest to given charges, and to find folds and distant contacts with the same charges with the searches
+of the simulator. The model itself does not use the series. For a dataset of several probes, the series is their mean.
 """
 
 from dataclasses import dataclass, replace
@@ -29,30 +29,34 @@ from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 
 CANDIDATES = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
-"""Degrees tried in turn, in position and in force."""
+"""Degrees in position and in force that are tried one after the other."""
 
 SIGNED_CANDIDATES = ((6, 1), (6, 4), (8, 8), (12, 8), (16, 8), (20, 8), (24, 6), (24, 8))
-"""The same for charges of both signs: taut films, on which the force's power changes with the force."""
+"""The same for charges of both signs: on taut films, the exponent of the force changes with the force."""
 
 SIZE_DEGREE = 4
 """Degree of ln S in l."""
 
 NOISY = 500.0
-"""Charge below which errors of charges of both signs are relative to this, pC: it has as much of either noise of
-`reference`, 1 pC and 0.2 %."""
+"""Charge at which both parts of the `reference` noise are equal, 1 pC and 0.2 %, pC.
+
+Errors of charges of both signs are relative to at least about this charge.
+"""
 
 ROWS_PER_TERM = 40
-"""Presses used for each coefficient at most. Near the edge of the disk, where the series is worst, more help most."""
+"""Largest number of presses for each coefficient. More presses help most near the edge of the disk."""
 
 FEWEST_PER_TERM = 8
-"""Fewer presses for a coefficient than this leave the slopes at the rim to chance."""
+"""Smallest number of presses for each coefficient. With fewer, the slopes at the rim are not determined."""
 
 RIDGE = 1e-9
-"""Weight of the coefficients' own size in the fit, relative: the square's corners lie outside the disk, where nothing
-holds the polynomials."""
+"""Relative weight of the squared coefficients in the fit (ridge regression).
+
+The polynomials are defined on a square, whose corners lie outside of the disk and contain no presses.
+"""
 
 GOOD_ENOUGH = 1.5e-4
-"""Root-mean-square relative error of the charges at which no higher degree is tried: a tenth of the reference noise."""
+"""Relative rms error of the charges below which no higher degree is tried: about a tenth of the reference noise."""
 
 
 @dataclass(frozen=True)
@@ -60,12 +64,12 @@ class ChargeField:
     """A `ChargeMap` fitted to presses.
 
     Attributes:
-        domain: Where it holds.
-        electrodes: Names, in the order of the charges.
+        domain: Contacts for which the field holds.
+        electrodes: Names of the electrodes, in the order of the charges.
         series: Coefficients of ln Q (Q in pC), shape (degree + 1, degree + 1, force_degree + 1, n_electrode).
-        error: Root-mean-square relative error on presses that the fit did not see.
-        log_size: For charges of both signs the coefficients of ln S, shape (SIZE_DEGREE + 1,); `series` is then of
-            Q / S.
+        error: Relative rms error of the charges of presses that were not used in the fit.
+        log_size: Coefficients of ln S for charges of both signs, shape (SIZE_DEGREE + 1,); the series then has the
+            coefficients of Q / S. None for positive charges.
     """
 
     domain: Domain
@@ -78,13 +82,13 @@ class ChargeField:
     def fit(
         cls, domain: Domain, electrodes: tuple[str, ...], presses: LabelledPresses, held: LabelledPresses
     ) -> "ChargeField":
-        """Least squares on presses, the degree chosen on others.
+        """Fit the series to presses by least squares, and choose its degree by the error on other presses.
 
         Args:
-            domain: Where the contacts lie.
-            electrodes: Names.
-            presses: Clean.
-            held: Presses to measure the error on.
+            domain: Domain of the contacts.
+            electrodes: Names of the electrodes.
+            presses: Presses without noise.
+            held: Presses on which the error is measured.
 
         Raises:
             TrainingError: If there are too few presses for the smallest degree.
@@ -112,15 +116,15 @@ class ChargeField:
         return best
 
     def charges(self, contact: Array) -> Array:
-        """See `ChargeMap`."""
+        """Return the charges of contacts; see `ChargeMap`."""
         return self.linearised(contact)[0]
 
     def derivatives(self, contact: Array) -> Array:
-        """See `ChargeMap`."""
+        """Return the derivatives of the charges; see `ChargeMap`."""
         return self.linearised(contact)[1]
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Charges and derivatives at once, in half the time; see `ChargeMap`."""
+        """Return charges and derivatives together, which takes half the time; see `ChargeMap`."""
         unit = self.domain.to_unit(contact)
         values = self._series.values(unit)
         if self.log_size is None:
@@ -137,27 +141,27 @@ class ChargeField:
 
     @property
     def of_positive(self) -> ChargeSeries | None:
-        """The series that follows contacts across folds; None for charges of both signs."""
+        """The series with which contacts are tracked across folds; None for charges of both signs."""
         if self.log_size is not None:
             return None
         return ChargeSeries(self._series, self.domain.radius, self.domain.force_range)
 
 
 def _log_size(logs: Array, charge: Array) -> Array:
-    """Coefficients of ln S, from logarithms of forces in [-1, 1], shape (n,), and charges (n, n_electrode)."""
+    """Fit the coefficients of ln S to scaled logarithms of forces, shape (n,), and charges, shape (n, n_electrode)."""
     total = np.maximum(np.linalg.norm(charge, axis=1), LOWEST_CHARGE)
     return np.asarray(chebyshev.chebfit(logs, np.log(total), SIZE_DEGREE))
 
 
 def _size(coefficients: Array, logs: Array) -> tuple[Array, Array]:
-    """S and the derivative of ln S by l, each of shape (n, 1)."""
+    """Return S and the derivative of ln S with respect to l, each of shape (n, 1)."""
     inside = np.clip(logs, -1.0, 1.0)[:, None]
     slope = chebyshev.chebval(inside, chebyshev.chebder(coefficients))
     return np.exp(chebyshev.chebval(inside, coefficients)), np.asarray(slope)
 
 
 def _least_squares(unit: Array, target: Array, degree: int, force_degree: int) -> Array:
-    """Series for targets of shape (n, k), by the normal equations: double precision is plenty for these polynomials."""
+    """Fit the series to targets of shape (n, k) by the normal equations, which are well conditioned here."""
     count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
     normal, moment = RIDGE * len(unit) * np.eye(count), np.zeros((count, target.shape[1]))
     for some in np.array_split(np.arange(len(unit)), len(unit) // CHUNK_SIZE + 1):
@@ -172,37 +176,40 @@ def _least_squares(unit: Array, target: Array, degree: int, force_degree: int) -
 
 
 SURE = 3e-4
-"""Largest error of the fitted charges, relative, for which a fold is certain: a poor fit has folds of its own."""
+"""Largest relative error of the fitted charges for which a fold is certain. A poor fit has spurious folds."""
 
 SMOOTH = 2e-3
-"""Largest error of a poor fit to charges without noise, relative."""
+"""Largest relative error of a poor fit to charges without noise."""
 
 CREDIBLE_SMOOTH, CREDIBLE_NOISY = 0.95, 0.8
-"""Share of the radius within which a fold of a poor fit is believed: its spurious folds lie at the rim, where presses
-hold it from one side only, and noise moves them inwards."""
+"""Share of the radius within which a fold of a poor fit is taken to be real, without and with noise.
+
+Spurious folds lie at the rim, where presses determine the fit from one side only. Noise moves them inwards.
+"""
 
 RIM = 0.98
-"""Searched radius over the domain's, dimensionless: at the very rim no press holds the slopes from outside."""
+"""Ratio of the searched radius to that of the domain. At the rim, presses do not determine the slopes."""
 
 PAIR_PLACES = 400
-"""Places from which contacts with the same charges are looked for; 400 take half a second."""
+"""Number of contacts for which another contact with the same charges is searched. 400 contacts take half a second."""
 
 SMALLEST_SHARE = 0.2
-"""Smallest fold-free radius over the dataset's, dimensionless, for which a training makes sense."""
+"""Smallest ratio of the fold-free radius to the radius of the dataset for which a training makes sense."""
 
 
 def invertible_domain(
     field: ChargeField, presses: LabelledPresses, noise: NoiseModel
 ) -> tuple[Domain, tuple[str, ...]]:
-    """The largest disk in which the map certainly does not fold, and sentences on folds and ambiguous pairs.
+    """Return the largest disk without a certain fold, and sentences about folds and ambiguous pairs.
 
-    A fit to measured charges, which have more noise than `SURE`, or to few presses is too poor for a certain fold: the
-    domain then stays, and the sentence says where the map seems to fold. Pairs are searched for where it is smooth.
+    A fit to a few presses, or to measured charges with more noise than `SURE`, is too poor for a certain fold. The
+    domain is then not reduced, and a sentence says where the map seems to fold. Ambiguous pairs are searched only if
+    the fit is smooth.
 
     Args:
-        field: Fitted to the presses.
-        presses: For the sentence: how many of them are left.
-        noise: Of good presses: what it hides is the same charge.
+        field: Charge field that was fitted to the presses.
+        presses: The presses, whose remaining number a sentence states.
+        noise: Noise of good presses. Charges that differ by less count as the same.
 
     Raises:
         DatasetError: If hardly anything is left of the domain.
@@ -240,6 +247,6 @@ def invertible_domain(
 
 
 def _fold_radius(field: ChargeField, noise: NoiseModel) -> float:
-    """Distance of the nearest fold from the centre, mm; infinite if there is none."""
+    """Return the distance of the nearest fold from the centre, mm; infinity if there is no fold."""
     area = working_area(within(field, RIM * field.domain.radius), noise, search_pairs=False)
     return float(f"{area.unambiguous_radius:.6g}") if np.isfinite(area.fold_radius) else np.inf

@@ -1,9 +1,10 @@
-"""Charges that the misfit is learned from: of good presses, of bad ones, and of no press at all.
+"""Training charges of the misfit network: charges of good presses, of faulty presses, and of no press at all.
 
-The misfit network answers whatever charges come in, so it has to have seen all kinds: presses with their noise, charges
-off the image of the forward map by any distance, wrong gains, dying electrodes, forces far outside, two presses at once
-(their charges added: the film is not linear, so this is only like two presses), and charges drawn from a box that holds
-everything. Few electrodes make a space small enough to be covered.
+The misfit network has to answer any charges, so it is trained on all kinds of charges: presses with noise; charges at
+any distance from the charges that contacts can have; wrong gains; failing electrodes; forces far outside of the range;
+two presses at the same time; and charges from a box that contains all of these. The charges of two presses are added.
+This is an approximation, because the film is not linear. With few electrodes, the space of all charges is small enough
+to be covered.
 """
 
 from typing import Any
@@ -18,20 +19,20 @@ from isocharge.train.data.channel_noise import ChannelNoise, Noise
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, LabelledPresses
 
 KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0.06, "two": 0.1, "any": 0.07}
-"""Kinds of charges, and the share of the examples that each makes up, dimensionless."""
+"""Share of each kind of charges in the training examples, dimensionless."""
 
 FARTHEST = 2.5
-"""Decades by which charges of any sign are moved, in standard deviations of the noise."""
+"""Decimal logarithm of the largest shift of charges of any sign, in standard deviations of the noise."""
 
 LARGEST_FACTOR = 2.0
-"""Factor by which a map may be off at a press to be scaled there: a quotient of charges near zero says nothing."""
+"""Largest factor by which the charge map is scaled at a press. A quotient of charges near zero is meaningless."""
 
 FAR = 6.0
-"""Distance above which a press's own place may not be the nearest: searched as the others are."""
+"""Misfit above which the contact of a press may not be the nearest one, so that the nearest one is searched."""
 
 
 def misfit_noise(noise: NoiseModel) -> NoiseModel:
-    """The unit of the misfit: the training's noise, or `reference` where that is none."""
+    """Return the noise that is the unit of the misfit: the noise of the training, or `reference` if that is zero."""
     return noise if noise.white > 0.0 else noise_model("reference")
 
 
@@ -45,19 +46,19 @@ def draw_misfit_examples(
     candidates: int = CANDIDATES,
     limits: tuple[Array | float, Array | float] = (LOWEST_CHARGE, HIGHEST_CHARGE),
 ) -> Array:
-    """Draw charges of every kind, and find how far from any known contact they are.
+    """Draw charges of every kind, and compute their distance from the charges of the nearest contact.
 
     Args:
-        presses: To start from.
-        charge_map: What is known.
-        noise: Noise of good presses, and the unit of distance; `ChannelNoise` for charges of any sign.
-        count: How many.
-        seed: Of all that is drawn.
-        candidates: Contacts among which searches start.
-        limits: What charges are brought between, pC, as the network brings them.
+        presses: Presses from whose charges the examples are made.
+        charge_map: Map from contacts to charges.
+        noise: Noise of good presses, which is also the unit of the distance; a `ChannelNoise` for charges of any sign.
+        count: Number of examples.
+        seed: Seed of the random numbers.
+        candidates: Number of contacts from which a search starts.
+        limits: Smallest and largest charge, pC. Charges are clipped to these limits, as in the network.
 
     Returns:
-        The charges Q, pC, and their residuals (Q - Q(c)) / sigma at the nearest known contact c, shape (2, count,
+        The charges Q, pC, and their residuals (Q - Q(c)) / sigma at the nearest contact c, shape (2, count,
         n_electrode).
     """
     rng = np.random.default_rng(seed)
@@ -71,20 +72,36 @@ def draw_misfit_examples(
 def _residuals(
     charge_map: ChargeMap, charge: Array, sigma: Array, chosen: LabelledPresses, near: Booleans, candidates: int
 ) -> Array:
-    """Those `near` their own press start there, with the map scaled to be right there; the others search."""
-    residual, at = np.zeros_like(charge), np.flatnonzero(near)
-    start = chosen.contact[at]
-    scale = np.clip(chosen.charge[at] / charge_map.charges(start), 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
-    residual[at] = explain(charge_map, charge[at] / scale, sigma[at] / scale, start)[1]
-    far = np.flatnonzero(~near | (np.linalg.norm(residual, axis=1) > FAR))
-    searched = search(charge_map, charge[far], sigma[far], candidates=candidates)[1]
-    keep = near[far] & ((residual[far] ** 2).sum(axis=1) < (searched**2).sum(axis=1))
-    residual[far] = np.where(keep[:, None], residual[far], searched)
+    """Return the residuals of charges at the nearest contact, in units of their noise, shape (n, n_electrode).
+
+    Charges that are `near` to those of their own press are compared with contacts around it. The charge map is scaled
+    so that it is exact at this press. For all other charges the nearest contact is searched.
+    """
+    residual = np.zeros_like(charge)
+    near_rows = np.flatnonzero(near)
+    start = chosen.contact[near_rows]
+    scale = np.clip(chosen.charge[near_rows] / charge_map.charges(start), 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
+    _, residual[near_rows] = explain(charge_map, charge[near_rows] / scale, sigma[near_rows] / scale, start)
+    far_rows = np.flatnonzero(~near | (np.linalg.norm(residual, axis=1) > FAR))
+    _, searched = search(charge_map, charge[far_rows], sigma[far_rows], candidates=candidates)
+    is_smaller = (residual[far_rows] ** 2).sum(axis=1) < (searched**2).sum(axis=1)
+    keep = near[far_rows] & is_smaller
+    residual[far_rows] = np.where(keep[:, None], residual[far_rows], searched)
     return residual
 
 
 def draw_charges(rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> tuple[NDArray[Any], Array]:
-    """Kinds, shape (n,), and charges of them made from those of presses, shape (n, n_electrode), pC."""
+    """Draw a kind for each press and make charges of this kind.
+
+    Args:
+        rng: Random number generator.
+        charge: Charges of presses, shape (n, n_electrode), pC.
+        others: Charges of further presses, for two presses at the same time and for the box, shape (m, n_electrode).
+        noise: Noise of good presses.
+
+    Returns:
+        The kinds, shape (n,), and the charges, shape (n, n_electrode), pC.
+    """
     kinds = np.array(list(KINDS))[rng.choice(len(KINDS), size=len(charge), p=list(KINDS.values()))]
     drawn = np.empty_like(charge)
     for kind in KINDS:
@@ -94,8 +111,11 @@ def draw_charges(rng: np.random.Generator, charge: Array, others: Array, noise: 
 
 
 def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> Array:
-    """Charges of one kind; those of any sign are moved, and fill a box, in units of their noise."""
-    each = len(charge), 1
+    """Draw charges of one kind, shape (n, n_electrode), pC.
+
+    Charges of any sign are moved and fill the box in units of their noise, positive charges in logarithms.
+    """
+    each = (len(charge), 1)
     match kind:
         case "moved" if isinstance(noise, ChannelNoise):
             far = 10.0 ** rng.uniform(-1.0, FARTHEST, each)
