@@ -94,7 +94,8 @@ def say_missing_records(outputs: Outputs) -> None:
 
 def summary(touch: TouchStream, latencies: deque[float]) -> str:
     """Return the counts of frames and faults, and percentiles of the latency, as a text."""
-    totals, stream = touch.totals(), touch.counts
+    totals = touch.totals()
+    stream = touch.counts
     text = (
         f"{totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated, {totals.restarts} restarts; "
         f"{totals.crc_errors} CRC errors, {totals.malformed} malformed, {totals.bytes_dropped} bytes dropped, "

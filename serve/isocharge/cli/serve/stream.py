@@ -142,7 +142,8 @@ def stream_command(
     if name is not None and not (0 < len(name) <= MAX_NAME_CHARACTERS and is_printable(name)):
         raise InputError(f"--name: expected 1 to {MAX_NAME_CHARACTERS} printable characters, got {shown(name)}")
     address = None if live is None else page_address(live, token)
-    predictor, board = Predictor(model, models=models), load_device(device)
+    predictor = Predictor(model, models=models)
+    board = load_device(device)
     if offset_limit_pC is not None:
         board = with_settings(board, "tare", offset_limit_pC=offset_limit_pC)
     board = with_settings(board, "track", on=True) if track else board
@@ -228,7 +229,8 @@ def replay_command(
     Example: isocharge serve replay touch.rec --real-time
     """
     address = None if live is None else page_address(live, token)
-    recording, clock = Recording(file), RecordedClock()
+    recording = Recording(file)
+    clock = RecordedClock()
     folder = find_model(model, models) if model else find_labelled_model(recording.model, models)
     predictor = Predictor(folder)
     board = load_device(device) if device else device_from_table(recording.device, str(file))

@@ -129,7 +129,8 @@ def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
     """
     contact = contact_of(record)
     x_mm, y_mm = contact["x_mm"], contact["y_mm"]
-    x_std_mm, y_std_mm = contact["x_std_mm"], contact["y_std_mm"]
+    x_std_mm = contact["x_std_mm"]
+    y_std_mm = contact["y_std_mm"]
     if None in (x_mm, y_mm, x_std_mm, y_std_mm):
         return None
     xy_correlation = contact.get("xy_correlation") or 0.0  # a record of an earlier version has none

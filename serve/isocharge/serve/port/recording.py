@@ -81,7 +81,8 @@ class Recorder:
             device: Content of the device file.
             name: The film's own name in the records; None for that of the model's sensor.
         """
-        self.path, self.model_label = path, model
+        self.path = path
+        self.model_label = model
         self.failed = False
         self._header = {KIND: VERSION, "model": model, "policy": policy, "device": dict(device)}
         if name:

@@ -37,7 +37,9 @@ from isocharge.serve.signal_chain.rule import Rule, Share, TimeConstant
 DECADES_S = 10.0 ** np.arange(-3, 5)
 """Time constants of the creep terms, s. They represent creep from 1 ms to some minutes."""
 
-WARMTH_ROW, SLOPE_ROW, CHARGE_ROW = -3, -2, -1
+WARMTH_ROW = -3
+SLOPE_ROW = -2
+CHARGE_ROW = -1
 """Rows of the warmth d, of its slope and of the touch charge q in the state.
 
 They follow the rows of the creep terms and of the thermoelastic term.

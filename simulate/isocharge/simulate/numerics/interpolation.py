@@ -182,7 +182,10 @@ def cubic_weights(at: Array, count: int, periodic: bool = False) -> tuple[Intege
     if not periodic:
         first = np.clip(first, 0, count - 4)
     t = (at - first)[..., None]
-    a, b, c, d = t, t - 1.0, t - 2.0, t - 3.0
+    a = t
+    b = t - 1.0
+    c = t - 2.0
+    d = t - 3.0
     weights = np.concatenate([-b * c * d / 6.0, a * c * d / 2.0, -a * b * d / 2.0, a * b * c / 6.0], axis=-1)
     number = first[..., None] + np.arange(4)
     if periodic:

@@ -16,7 +16,9 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing, write_whole
 
-INK, PRESSED, FELT = "#1b2a41", "#9aa5b1", "#d1495b"
+INK = "#1b2a41"
+PRESSED = "#9aa5b1"
+FELT = "#d1495b"
 """Colours of outlines, of true presses and of estimated presses."""
 
 COLOURS = ("#d1495b", "#2e6f9e", "#3a8f5c", "#c98a1b")

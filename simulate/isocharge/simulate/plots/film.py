@@ -108,7 +108,8 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     """Draw the deflection on a section through the probe and the centre of the film, with a stretched vertical axis."""
     along = np.linspace(-DRAWN_RADIUS, DRAWN_RADIUS, 801) * equilibrium.film.radius
     x, y = equilibrium.at
-    distance, angle = hypot(x, y), atan2(y, x)
+    distance = hypot(x, y)
+    angle = atan2(y, x)
     depth = deflection(equilibrium, np.outer(along, [cos(angle), sin(angle)]))
     axes.plot(along, -depth, color=INK, lw=1.5)
     half = equilibrium.probe.reach

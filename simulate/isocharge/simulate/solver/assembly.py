@@ -103,7 +103,8 @@ class Assembly:
         Returns:
             Factorisation that solves K x = b for any b.
         """
-        inner, outer = self._inner, self._outer
+        inner = self._inner
+        outer = self._outer
         size = matrix.shape[1] * self.components
         matrix = matrix.transpose(0, 2, 1, 4, 3).reshape(-1, size, size)
         coupling = matrix[:, inner[:, None], outer]

@@ -112,7 +112,8 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     Raises:
         SceneError: If a point lies outside the film.
     """
-    mesh, groups = equilibrium.mesh, equilibrium.groups
+    mesh = equilibrium.mesh
+    groups = equilibrium.groups
     element, xi, eta, mirrored = _locate(equilibrium, points)
     gradient = mesh.gradient(element, xi, eta)
     strained = strain(gradient @ equilibrium.field[mesh.template.nodes[element]], groups.amplitude2)

@@ -106,7 +106,9 @@ def estimated_error(equilibrium: Equilibrium) -> float:
     Returns:
         The error, which is infinite if the theory cannot describe the film.
     """
-    film, probe, force = equilibrium.film, equilibrium.probe, equilibrium.force
+    film = equilibrium.film
+    probe = equilibrium.probe
+    force = equilibrium.force
     return mesh_error(equilibrium) + modelling_error(film, probe, force, equilibrium.theory)
 
 

@@ -187,7 +187,8 @@ class CalibrationResult:
     @cached_property
     def summary(self) -> tuple[str, ...]:
         """The result in sentences; they are computed once, since they contain a plan of further presses."""
-        left, before = self.error_left, self.error_left_before
+        left = self.error_left
+        before = self.error_left_before
         noise = self.sensitivity.noise_error
         when = "it was moved" if self.moved else "these presses"
         errors = (

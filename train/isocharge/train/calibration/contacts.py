@@ -66,7 +66,8 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
         data: The presses.
         start: Contacts (x, y, ln F), shape (n, 3).
     """
-    layout, domain = charges.layout, charges.domain
+    layout = charges.layout
+    domain = charges.domain
     films, shares = neighbouring_films(charges, unknowns, data)
     maps = [charges.forward_map(film[layout.parameters]) for film in films]
     factor = np.ones_like(data.charge)

@@ -45,7 +45,8 @@ OTHER_UNITS = (
 PRETENSIONS = (0.03, 0.25, 0.5, 1.0)
 """Pretensions that are tried, over the largest of the prior."""
 
-SCATTER, OFFSET = 0.1, 0.6
+SCATTER = 0.1
+OFFSET = 0.6
 """Standard deviations of the logarithm of a charge over the expected one: among electrodes and presses, and in common.
 Gains, shift and coefficients explain this much."""
 
@@ -94,7 +95,8 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
     Raises:
         PressError: If there are any.
     """
-    charge, placed = presses.charge_pC, presses.contact[presses.placed]
+    charge = presses.charge_pC
+    placed = presses.contact[presses.placed]
     for name, column in zip(presses.electrodes, charge.T, strict=True):
         if np.isnan(column).all():
             raise PressError(f"electrode {name!r}: no press has a charge of it; a calibration needs all electrodes")

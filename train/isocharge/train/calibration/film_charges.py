@@ -105,7 +105,8 @@ class FilmCharges:
     def domain(self) -> Domain:
         """Contacts for which every film of the prior has charges, including those a step of the differences away."""
         film = self.prior.sensor.film
-        young, thickness = self.prior.index("young"), self.prior.index("thickness")
+        young = self.prior.index("young")
+        thickness = self.prior.index("thickness")
         load = film.young * film.thickness * film.radius
         softest, stiffest = (load * np.exp(bound[young] + bound[thickness]) for bound in self.prior.bounds)
         smallest_load, largest_load = self.family.limits["load"]

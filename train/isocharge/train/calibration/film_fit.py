@@ -204,7 +204,8 @@ def _posterior(
     problem: "_FitProblem", data: PressData, freedom: Array, settled: "_SettledFit", at_C: float | None
 ) -> FilmPosterior:
     """Return the posterior of a fit that has settled."""
-    layout, prior = problem.layout, problem.charges.prior
+    layout = problem.layout
+    prior = problem.charges.prior
     mixture = settled.mixture
     unit = np.clip(problem.mean + mixture.mean, *problem.bounds)
     scatter = float(np.sqrt(sum(weight * each.scatter**2 for each, weight in mixture.weights.items())))

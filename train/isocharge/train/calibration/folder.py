@@ -45,7 +45,11 @@ from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.model_release.release import release
 from isocharge.train.training.fitted import Provenance
 
-RESULT, SENSOR, PRESSES, PICTURE, CARD = "calibration.json", "sensor.toml", "presses.csv", "calibration.png", "card.md"
+RESULT = "calibration.json"
+SENSOR = "sensor.toml"
+PRESSES = "presses.csv"
+PICTURE = "calibration.png"
+CARD = "card.md"
 """Names of the files."""
 
 

@@ -17,7 +17,8 @@ from isocharge.train.calibration.quantities import NORMAL_95
 LEVELS_MM = (0.02, 5.0)
 """Errors at the ends of the colours, mm."""
 
-ASSUMED, FITTED = "#b9c4cf", "#3a7ca5"
+ASSUMED = "#b9c4cf"
+FITTED = "#3a7ca5"
 """Colours of the estimates before and after the presses."""
 
 NEIGHBOURS = 12
@@ -35,7 +36,8 @@ def calibration_picture(result: CalibrationResult) -> Figure:
     )
     _draw_error(before, result, result.error_left_before, then)
     shades = _draw_error(after, result, result.error_left, now)
-    contact, bad = result.posterior.contact, result.posterior.bad
+    contact = result.posterior.contact
+    bad = result.posterior.bad
     after.plot(*contact[~bad, :2].T, "o", color="white", mec=INK, ms=6, label="presses")
     if bad.any():
         after.plot(*contact[bad, :2].T, "X", color=FELT, mec=INK, ms=9, label="left out")
@@ -66,7 +68,8 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
     change = (result.posterior.parameters - result.problem.before.parameters) / result.problem.prior.std
     centre = np.array([quantity.weights @ change / quantity.before_std for quantity in quantities])
     half = np.array([NORMAL_95 * quantity.std / quantity.before_std for quantity in quantities])
-    row, identified = np.arange(len(quantities)), np.array([quantity.identified for quantity in quantities])
+    row = np.arange(len(quantities))
+    identified = np.array([quantity.identified for quantity in quantities])
     axes.barh(row, 4.0, left=-2.0, color=ASSUMED, height=0.72, label="assumed before, 95 %")
     for some, colour, label in (
         (identified, FITTED, "identified by the presses, 95 %"),
@@ -88,7 +91,8 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
 
 
 def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
-    posterior, lines = result.posterior, result.presses.lines
+    posterior = result.posterior
+    lines = result.presses.lines
     residual = np.sqrt(posterior.chi2 / np.maximum(posterior.freedom, 1.0))
     colours = [FELT if bad else FITTED for bad in posterior.bad]
     axes.bar(np.arange(len(lines)), np.minimum(residual, 10.0), color=colours)

@@ -238,7 +238,8 @@ class CalibrationProblem:
                 for measuring its errors.
         """
         about: dict[str, Any] = {} if release else {"correlation": False, "n_test": 0}
-        described, own = self.charges.forward_map(parameters), self.films.forward_map(parameters)
+        described = self.charges.forward_map(parameters)
+        own = self.films.forward_map(parameters)
 
         def over_own(contact: Array) -> Array:
             if self.prior is self.films.prior:

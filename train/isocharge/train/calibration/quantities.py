@@ -92,7 +92,8 @@ def _rows(prior: FilmPrior) -> dict[str, tuple[str, float, Array]]:
     mean_gain = sum(gains.values(), np.zeros(len(unit))) / len(gains)
     response = 0.5 * (unit["d31"] + unit["d32"]) + mean_gain
     of_slack_film = (unit["young"] - 2.0 * unit["thickness"]) / 3.0 + response
-    placed, degrees = prior.sensor.calibration, float(np.rad2deg(1.0))
+    placed = prior.sensor.calibration
+    degrees = float(np.rad2deg(1.0))
 
     def relative(meaning: str, weights: Array) -> tuple[str, float, Array]:
         return f"{meaning}{PERCENT}, %", 0.0, 100.0 * weights

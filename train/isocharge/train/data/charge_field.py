@@ -94,7 +94,8 @@ class ChargeField:
             TrainingError: If there are too few presses for the smallest degree.
         """
         best: ChargeField | None = None
-        unit, signed = domain.to_unit(presses.contact), presses.signed
+        unit = domain.to_unit(presses.contact)
+        signed = presses.signed
         log_size = _log_size(unit[:, 2], presses.charge) if signed else None
         target = np.log(presses.charge) if log_size is None else presses.charge / _size(log_size, unit[:, 2])[0]
         for degree, force_degree in SIGNED_CANDIDATES if signed else CANDIDATES:
@@ -163,7 +164,8 @@ def _size(coefficients: Array, logs: Array) -> tuple[Array, Array]:
 def _least_squares(unit: Array, target: Array, degree: int, force_degree: int) -> Array:
     """Fit the series to targets of shape (n, k) by the normal equations, which are well conditioned here."""
     count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
-    normal, moment = RIDGE * len(unit) * np.eye(count), np.zeros((count, target.shape[1]))
+    normal = RIDGE * len(unit) * np.eye(count)
+    moment = np.zeros((count, target.shape[1]))
     for some in np.array_split(np.arange(len(unit)), len(unit) // CHUNK_SIZE + 1):
         plane, in_force = chebyshev_terms(unit[some], degree, force_degree)
         columns = (plane[:, :, None] * in_force[:, None, :]).reshape(len(some), -1)
@@ -181,7 +183,8 @@ SURE = 3e-4
 SMOOTH = 2e-3
 """Largest relative error of a poor fit to charges without noise."""
 
-CREDIBLE_SMOOTH, CREDIBLE_NOISY = 0.95, 0.8
+CREDIBLE_SMOOTH = 0.95
+CREDIBLE_NOISY = 0.8
 """Share of the radius within which a fold of a poor fit is taken to be real, without and with noise.
 
 Spurious folds lie at the rim, where presses determine the fit from one side only. Noise moves them inwards.
@@ -214,7 +217,8 @@ def invertible_domain(
     Raises:
         DatasetError: If hardly anything is left of the domain.
     """
-    asked, fold = field.domain, _fold_radius(field, noise)
+    asked = field.domain
+    fold = _fold_radius(field, noise)
     if field.error > SURE:
         if fold < (CREDIBLE_SMOOTH if field.error < SMOOTH else CREDIBLE_NOISY) * asked.radius:
             return asked, (
@@ -229,7 +233,8 @@ def invertible_domain(
             f"the map from contacts to charges folds {fold:g} mm from the centre, of {asked.radius:g} mm asked for: "
             "beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
         )
-    domain, cautions = asked, []
+    domain = asked
+    cautions = []
     if fold < asked.radius:
         domain = asked.within(fold)
         cautions.append(

@@ -87,7 +87,8 @@ class PressedArea(Domain):
     @property
     def places(self) -> str:
         """Words that say where contacts may lie."""
-        (left, bottom), (right, top) = np.min(self.corners, axis=0), np.max(self.corners, axis=0)
+        left, bottom = np.min(self.corners, axis=0)
+        right, top = np.max(self.corners, axis=0)
         return f"a place in the pressed area, x from {left:g} to {right:g} mm and y from {bottom:g} to {top:g} mm,"
 
     def is_outside(self, contact: Array) -> Booleans:
@@ -138,7 +139,8 @@ def outline(places: Array) -> Array:
 
 def _circumradii(corners: Array) -> Array:
     """Radii of the circles through triangles, shape (n, 3, 2)."""
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    a = corners[:, 1] - corners[:, 0]
+    b = corners[:, 2] - corners[:, 0]
     sides = [np.hypot(*side.T) for side in (a, b, b - a)]
     doubled = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     return np.asarray(np.prod(sides, axis=0) / np.maximum(2.0 * doubled, 1e-30))
@@ -157,7 +159,8 @@ def _ring(triangles: Integers, count: int) -> list[int] | None:
     if any(len(others) != 2 for others in beside.values()):
         return None
     first = min(beside)
-    ring, at = [first], beside[first][0]
+    ring = [first]
+    at = beside[first][0]
     while at != first:
         one, other = beside[at]
         ring.append(at)

@@ -17,7 +17,8 @@ from isocharge.common.measured_presses import MeasuredPresses
 from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
 from isocharge.train.data.channel_noise import Noise
 
-LOWEST_CHARGE, HIGHEST_CHARGE = 1.0, 1e6
+LOWEST_CHARGE = 1.0
+HIGHEST_CHARGE = 1e6
 """Limits to which charges are clipped before the logarithm, pC, so that every charge gives a finite answer."""
 
 SOLVER = "solver"
