@@ -41,7 +41,7 @@ RESEARCH_TUTORIAL = "simulate/docs/tutorial.md"
 """Tutorial that goes from a press to records of a virtual sensor."""
 
 
-SLOW = ("simulate identify", "train report", "make paper", "fit presses --config quick.toml")
+SLOW = ("simulate identify", "train report", "examples/paper", "make paper", "fit presses --config quick.toml")
 """What takes an example of a README more than a few seconds, or stands in that of another."""
 
 

@@ -87,7 +87,7 @@ def test_the_rate_is_that_of_the_board_however_fast_a_recording_is_read(predicto
     """Unknown until time has passed between two frames."""
     monkeypatch.setattr(live_page_module, "STATE_INTERVAL_S", -1.0)
     told = []
-    link = SimpleNamespace(put=id, tell=lambda **state: told.append(state), is_open=True, dropped=0)
+    link = SimpleNamespace(send_sample=id, send_message=lambda **state: told.append(state), is_open=True, dropped=0)
     feed = live_page_module.PageFeed(link, TouchStream(predictor))
     for k in (0, 0, *range(2, 51)):
         feed.write(record(timestamp=1e9 + 0.005 * k))
@@ -131,4 +131,4 @@ def test_a_replay_is_sought_and_played_fast(film, models, start, command, tmp_pa
     ],
 )
 def test_addresses_that_no_page_may_have(models, refused, live, message):
-    refused("serve", "stream", "linear", "--models", models, "--port", "x", "--live", live, message=message)
+    refused("serve", "stream", "linear", "--models", models, "--port", "x", "--live", live, said=message)

@@ -139,3 +139,9 @@ def test_load_is_uniform_over_a_polygon(probe, distance):
     mixed = 0.5 * np.sum(cross * (x * v + 2 * x * y + 2 * u * v + u * y))
     assert load @ (about.real * about.imag) == pytest.approx(mixed, abs=1e-12 * (probe.reach / RADIUS) ** 2)
     assert not load[~np.isin(np.arange(mesh.n_node), mesh.nodes[mesh.footprint])].any()
+
+
+def test_ellipse_too_near_the_rim_is_refused():
+    ellipse = Ellipse(16.0, 16.0 * 0.999, 0.0)
+    with pytest.raises(SceneError, match=r"comes within 0\.1\d* mm of the rim: expected at least 1\.6 mm"):
+        LoadCase.of(FILM, ellipse, (36.85, 0.0), 1e-3, SolveSettings(theory=FULL, layer=0.1), None)

@@ -94,7 +94,8 @@ def test_a_pretension_drifts_less_where_both_temperatures_are_known(day, problem
 
 
 @pytest.mark.parametrize(
-    ("std", "to_C", "why"), [(0.3, 20.5, "does not know what temp"), (0.03, 60.0, "nearer to that of the presses")]
+    ("std", "to_C", "why"),
+    [(0.3, 20.5, "contains the change of the film with temperature"), (0.03, 60.0, "nearer to that of the presses")],
 )
 def test_a_film_is_not_moved_farther_than_is_known(day, problem, tmp_path, std, to_C, why):
     vague = replace(day.posterior, warming=day.posterior.warming._replace(std=std))

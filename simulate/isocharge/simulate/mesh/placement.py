@@ -38,6 +38,9 @@ NEWTON_STEPS = 20
 OVERSHOOT = 0.1
 """Largest distance outside its element at which Newton's method evaluates a point, in local coordinates from 0 to 1."""
 
+SECTOR_TOLERANCE = 1e-9
+"""Distance outside its element, in local coordinates from 0 to 1, from which a neighbouring sector is tried."""
+
 PARAMETER_STEP = 1e-5
 """Step of the boundary parameter for the derivative of a curved boundary by central differences."""
 
@@ -49,6 +52,10 @@ class QuadCorners(NamedTuple):
     b: Complexes
     c: Complexes
     d: Complexes
+
+    def of_elements(self, element: Integers) -> "QuadCorners":
+        """Return the corners of one element for each of n points, if these are the corners of all elements."""
+        return QuadCorners(*(corner[np.arange(element.size), element] for corner in self))
 
 
 @dataclass(frozen=True)
@@ -267,9 +274,43 @@ class Placement:
             distance_from_outer_side,
         ]
         element = np.argmax(np.min(distances, axis=0), axis=1)
-        corners_of_element = QuadCorners(*(corner[np.arange(points.size), element] for corner in corners))
-        v, t = self._invert_blend(blocks, points, element, corners_of_element)
+        v, t = self._invert_blend(blocks, points, element, corners.of_elements(element))
+        if blocks.n_layer == 2:
+            self._correct_sectors(blocks, points, corners, element, v, t)
         return element, v, t
+
+    def _correct_sectors(
+        self, blocks: Blocks, points: Complexes, corners: QuadCorners, element: Integers, v: Array, t: Array
+    ) -> None:
+        """Move points whose coordinates lie outside of their element to a neighbouring sector that contains them.
+
+        The straight sides of two sectors may cross outside of the elements, so that a point lies between the sides of
+        a sector that does not contain it. This occurs for elongated probes near the rim.
+
+        Args:
+            blocks: The elements.
+            points: Film points, shape (n,), in film radii.
+            corners: Corners of all elements inside the innermost circle, each of shape (n, n_inner).
+            element: Index of the element that was found for each point, shape (n,); changed in place.
+            v: Coordinates from the inner to the outer side, shape (n,); changed in place.
+            t: Coordinates along the sector, shape (n,); changed in place.
+        """
+        original = element.copy()
+        for shift in range(1, blocks.n_sector // 2 + 1):
+            rows = np.flatnonzero((_overshoot(v, t) > SECTOR_TOLERANCE) & (original >= blocks.n_quad))
+            if rows.size == 0:
+                return
+            for signed_shift in (shift, -shift):
+                in_last_layer = original[rows] >= blocks.last_layer.start
+                first = np.where(in_last_layer, blocks.last_layer.start, blocks.n_quad)
+                candidate = first + (original[rows] - first + signed_shift) % blocks.n_sector
+                row_corners = QuadCorners(*(corner[rows] for corner in corners)).of_elements(candidate)
+                new_v, new_t = self[rows]._invert_blend(blocks, points[rows], candidate, row_corners)
+                is_better = _overshoot(new_v, new_t) < _overshoot(v[rows], t[rows])
+                better_rows = rows[is_better]
+                element[better_rows] = candidate[is_better]
+                v[better_rows] = new_v[is_better]
+                t[better_rows] = new_t[is_better]
 
     def _inner_corners(self, blocks: Blocks) -> QuadCorners:
         """Return the corners of all elements inside the innermost circle, each of shape (n_placement, n_inner)."""
@@ -349,6 +390,11 @@ class Placement:
         before = self.boundary(parameter - PARAMETER_STEP)
         by_parameter = (after - before)[:, 0] / (2.0 * PARAMETER_STEP)
         return self.boundary(parameter)[:, 0], by_parameter * width
+
+
+def _overshoot(v: Array, t: Array) -> Array:
+    """Return how far local coordinates lie outside of the range from 0 to 1; negative inside, shape (n,)."""
+    return np.asarray(np.maximum(np.abs(v - 0.5), np.abs(t - 0.5)) - 0.5)
 
 
 def _distance_to_left(start: Complexes, end: Complexes, points: Complexes) -> Array:

@@ -58,6 +58,12 @@ MAX_SHAPE_ERROR = 0.05
 RELIABLE_RADIUS = 0.6
 """Distance from the centre within which the shapes of the elements predict the error reliably, in film radii."""
 
+MIN_RIM_DISTANCE = 0.2
+"""Smallest distance from the rim of a curved footprint that is not circular, relative to its reach.
+
+Nearer to the rim, the mesh between the footprint and the innermost circle is so thin that points cannot be located.
+"""
+
 RELIABLE_REACH = 0.08
 """Largest reach of a footprint that is not circular for which the shapes of the elements predict the error reliably, in
 film radii."""
@@ -108,6 +114,15 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
         raise SceneError(
             f"probe off the film: centre ({at[0]:.4g}, {at[1]:.4g}) mm, farthest point of {probe.notation} "
             f"{probe.farthest_distance(at):.4g} mm from the film's centre, film radius {film.radius:.4g} mm"
+        )
+    rim_distance = film.radius - probe.farthest_distance(at)
+    needs_second_layer = probe.topology.is_curved and not probe.topology.fills_circle
+    min_rim_distance = MIN_RIM_DISTANCE * probe.reach
+    if needs_second_layer and rim_distance < min_rim_distance:
+        raise SceneError(
+            f"{probe.notation} at ({at[0]:.4g}, {at[1]:.4g}) mm comes within {rim_distance:.3g} mm of the rim: "
+            f"expected at least {min_rim_distance:.3g} mm, because the mesh around the footprint would be too thin; "
+            "press farther inside"
         )
     amplitude2 = amplitude_squared(film, force)
     if amplitude2 > MAX_AMPLITUDE2:
