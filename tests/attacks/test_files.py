@@ -30,6 +30,7 @@ from isocharge.serve import (
 from isocharge.serve.model.charge_series import read_charges as read_charge_series
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.pretensions import read_pretensions
+from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.virtual_sensor.script import load_script
 from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
 from isocharge.simulate.execution.workers import in_order
@@ -279,6 +280,35 @@ def test_calibrations_with_faults(calibration, tmp_path, attack):
         attack(
             f"calibration {kind} numbers", read, lambda rng, text=text: number_bomb(rng, text.decode()).encode(), 500
         )
+
+
+def test_loads_of_half_copied_versions(tmp_path, attack):
+    """Whatever lies in the folder of a newer version, the old version of a model goes on serving after a load."""
+    folder = tmp_path / "models" / "three-25um-biaxial"
+    shutil.copytree(find_model("three-25um-biaxial").parent, folder)
+    store = open_model_store(folder.parent)
+    charge_pC = np.full((1, 3), 500.0, np.float32)
+    names = ("model.onnx", "golden.json", "card.md")
+    contents = {name: (folder / "1" / name).read_bytes() for name in names}
+
+    def half_copied(rng):
+        """Some files of a version, cut or with faults."""
+        chosen = rng.sample(names, rng.randrange(len(names) + 1))
+        return {name: contents[name][: rng.randrange(len(contents[name]))] for name in chosen}
+
+    def load(files):
+        newer = folder / "2"
+        newer.mkdir()
+        for name, data in files.items():
+            (newer / name).write_bytes(data)
+        try:
+            store.load("three-25um-biaxial")
+        finally:
+            shutil.rmtree(newer)
+            outputs = store.get("three-25um-biaxial").model.session.run(None, {"charge_pC": charge_pC})
+            assert np.isfinite(outputs[0]).all()
+
+    attack("half-copied versions", load, half_copied, 1_000)
 
 
 def series_with_faults(rng, arrays):
