@@ -82,6 +82,7 @@ def test_few_presses_have_no_held_out_errors(problem, session):
     assert "measured_presses" not in evaluate(few.fitted)
 
 
+@pytest.mark.slow
 def test_fit_with_a_sensor_is_the_same_as_calibrate(problem, session, command, refused, tmp_path):
     _, presses = session
     path = tmp_path / "presses.csv"
