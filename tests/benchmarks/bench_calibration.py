@@ -23,15 +23,16 @@ import torch
 from matplotlib.ticker import FormatStrFormatter, NullFormatter, ScalarFormatter
 from shared import arguments
 
+from isocharge.common.contact_errors import position_error
+from isocharge.common.statistics import rms
 from isocharge.serve import MeasuredPresses
 from isocharge.serve.benchmark import machine
 from isocharge.simulate import Circle, ForwardMap, load_sensor
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.plots.figure import new_figure
 from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.baselines.gauss_newton import GaussNewton
 from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
-from isocharge.train.data.presses import draw_contacts, position_error
+from isocharge.train.data.presses import draw_contacts
 
 SENSORS = "four-25um-biaxial,three-25um-biaxial,four-25um-uniaxial"
 COUNTS = (1, 3, 5, 8, 15, 30)

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 from shared import in_turns, options, print_results
 
+from isocharge.common.contact_errors import position_error
+from isocharge.common.statistics import rms
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.benchmark import Contender
 from isocharge.simulate import Sweep, read_dataset, run_sweep
 from isocharge.simulate.execution.workers import cores, local_workers
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train import FilmsConfig, FilmsModel, fit, fit_films, read_films, release, release_films
-from isocharge.train.data.presses import position_error
 
 SAMPLES = 24_000
 

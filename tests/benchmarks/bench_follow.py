@@ -24,12 +24,13 @@ from typing import NamedTuple
 import numpy as np
 from shared import arguments, print_results
 
+from isocharge.common.contact_errors import position_error
+from isocharge.common.statistics import rms
 from isocharge.serve import Contact, MeasuredPresses, Predictor
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.simulate import Circle, ForwardMap, load_sensor
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
-from isocharge.train.data.presses import draw_contacts, position_error
+from isocharge.train.data.presses import draw_contacts
 
 PRETENSION_MPa = 1.0
 CHANGES_MPa = (0.0, 0.35, -0.35, 0.8)

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from shared import arguments, print_results
 
+from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
-from isocharge.train.bayes.limit import BayesLimit, BayesProblem, bayes_estimate
+from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
 from isocharge.train.model_release.evaluate import alarm_threshold
 from isocharge.train.report.measures import interval_coverage
 
@@ -55,8 +56,8 @@ def against_limit(bench: Bench, count: int) -> dict[str, Any]:
     truth = bench.presses[:count]
     charge = NOISE.add(bench.film.charges(truth), bench.rng)
     problem = BayesProblem(bench.film.sensor, bench.film.probe, bench.radius, bench.film.domain.force_range, NOISE)
-    least = BayesLimit.of(bayes_estimate(problem, charge, charge_map=bench.film)[0], truth)
-    mine = BayesLimit.of(bench.answers(charge)[0], truth)
+    least = ContactErrorStatistics.of(bayes_estimate(problem, charge, charge_map=bench.film)[0], truth)
+    mine = ContactErrorStatistics.of(bench.answers(charge)[0], truth)
     return {
         "presses": count,
         "position_rms_mm": mine.position_rms_mm,

@@ -12,10 +12,11 @@ from dataclasses import replace
 import matplotlib.pyplot as plt
 import numpy as np
 
+from isocharge.common.contact_errors import position_error
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle, load_sensor, noise_model
 from isocharge.train import CalibrationProblem, calibrate
-from isocharge.train.data.presses import draw_contacts, position_error
+from isocharge.train.data.presses import draw_contacts
 
 problem, noise = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0)), noise_model("reference")
 rng, pretension = np.random.default_rng(5), problem.prior.names.index("pretension")

@@ -8,16 +8,17 @@ import torch
 from scipy.optimize import least_squares
 from tests.train.baselines.conftest import DOMAIN, KnownMap
 
+from isocharge.common.contact_errors import position_error
 from isocharge.common.errors import DatasetError
+from isocharge.common.statistics import rms
 from isocharge.serve import find_model
 from isocharge.simulate import Domain, FunctionMap, noise_model
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines.compared_methods import compared_methods, polynomial_ridge
 from isocharge.train.baselines.gauss_newton import GaussNewton
 from isocharge.train.baselines.learned import Logarithms
 from isocharge.train.baselines.networks import OnnxContact, ReleasedModel
 from isocharge.train.baselines.paper import Triangulate
-from isocharge.train.data.presses import LabelledPresses, position_error
+from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.model_release.onnx_graph import write_contact_graph
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.features import WhitenedFeatures

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.common.errors import ChargeError, InputError
 from isocharge.simulate import Circle, Domain, ForwardMap, NoiseModel, noise_model
-from isocharge.train import BayesLimit, BayesProblem, bayes_estimate, bayes_limit
+from isocharge.train import BayesProblem, bayes_estimate, bayes_limit
 from isocharge.train.bayes.posterior import Cells, Posterior
 from isocharge.train.data.presses import draw_contacts
 
@@ -180,7 +181,7 @@ def test_the_limit_is_computed_without_a_new_map(problem, spline, monkeypatch):
 
 def test_errors_of_two_contacts():
     truth = np.array([[0.0, 0.0, 1.0], [1.0, 1.0, 2.0]])
-    limit = BayesLimit.of(truth + np.array([[0.3, 0.4, 0.01], [0.0, 0.0, 0.0]]), truth)
+    limit = ContactErrorStatistics.of(truth + np.array([[0.3, 0.4, 0.01], [0.0, 0.0, 0.0]]), truth)
     position = limit.position_rms_mm, limit.position_median_mm, limit.position_p95_mm
     assert position == pytest.approx((0.5 / np.sqrt(2.0), 0.25, 0.475))
     assert (limit.force_rms_percent, limit.force_median_percent) == pytest.approx((1.0 / np.sqrt(2.0), 0.5))

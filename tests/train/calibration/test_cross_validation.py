@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from tests.train.calibration.conftest import rig
 
+from isocharge.common.contact_errors import position_error
 from isocharge.serve import Predictor, load_model, write_presses
 from isocharge.train import calibrate, write_calibration
 from isocharge.train.calibration.cross_validation import FOLD_COUNT
-from isocharge.train.data.presses import folds_by_place, position_error
+from isocharge.train.data.presses import folds_by_place
 from isocharge.train.model_release.evaluate import evaluate
 
 COUNT = 60

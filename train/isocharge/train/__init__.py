@@ -20,7 +20,8 @@ from isocharge.common.extras import require
 from isocharge.common.versions import version_attribute
 
 with require("train"):
-    from isocharge.train.bayes.limit import BayesLimit, BayesProblem, bayes_estimate, bayes_limit
+    from isocharge.common.contact_errors import ContactErrorStatistics
+    from isocharge.train.bayes.limit import BayesProblem, bayes_estimate, bayes_limit
     from isocharge.train.calibration.calibrate import CalibrationResult, calibrate
     from isocharge.train.calibration.contact_error import ProposedPress, next_presses
     from isocharge.train.calibration.folder import read_earlier, write_calibration
@@ -35,10 +36,10 @@ with require("train"):
     from isocharge.train.training.fitted import Fitted, Provenance
 
 __all__ = [
-    "BayesLimit",
     "BayesProblem",
     "CalibrationProblem",
     "CalibrationResult",
+    "ContactErrorStatistics",
     "FilmEstimate",
     "FilmsConfig",
     "FilmsModel",

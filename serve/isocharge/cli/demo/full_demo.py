@@ -14,6 +14,7 @@ from scipy.stats import binned_statistic
 from isocharge.cli.shared.terminal import say, show, shown_progress, this_command
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.arrays import Array
+from isocharge.common.contact_errors import ContactErrorStatistics, position_error
 from isocharge.common.files import new_folder
 from isocharge.common.progress import track
 from isocharge.serve import Port, PredictionRecord, Predictor, TouchStream, find_model, load_model
@@ -194,10 +195,7 @@ def _test_presses(forward_map: ForwardMap, predictor: Predictor, sweep: Sweep) -
 
 def _position_error(presses: Array) -> Array:
     """Compute the distance between true and estimated position, mm, from rows that end with both (x, y, F)."""
-    estimated_xy = presses[:, -3:-1]
-    true_xy = presses[:, -6:-4]
-    error: Array = np.linalg.norm(estimated_xy - true_xy, axis=1)
-    return error
+    return position_error(presses[:, -3:], presses[:, -6:-3])
 
 
 def _position_words(presses: Array) -> str:
@@ -215,9 +213,7 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], fold
         durations_s: Duration of each step, s.
         folder: Folder of the results.
     """
-    force_error_percent = 100.0 * (tested[:, 5] / tested[:, 2] - 1.0)
-    force_median = np.median(np.abs(force_error_percent))
-    force_rms = np.sqrt(np.mean(force_error_percent**2))
+    errors = ContactErrorStatistics.of(tested[:, 3:], tested[:, :3])
     model = load_model(find_model(str(folder / "models" / SENSOR)))
     predictor = Predictor(model.folder)
     charges = press_charges(predictor, model.golden.charge_pC)
@@ -226,7 +222,7 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], fold
     rows = [
         ("position error, with noise", _position_words(tested)),
         ("position error, live", _position_words(followed)),
-        ("force error", f"median {force_median:.2f} %, rms {force_rms:.2f} %"),
+        ("force error", f"median {errors.force_median_percent:.2f} %, rms {errors.force_rms_percent:.2f} %"),
         ("model", f"{size_KiB:.0f} KiB, {model.metadata.label}"),
         ("one prediction", f"p50 {latency.p50_us:.1f} us, p99 {latency.p99_us:.1f} us"),
         ("seconds", ", ".join(f"{name} {duration:.1f}" for name, duration in durations_s.items())),

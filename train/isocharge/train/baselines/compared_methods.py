@@ -16,12 +16,13 @@ from sklearn.neighbors import KNeighborsRegressor
 from sklearn.preprocessing import FunctionTransformer, MinMaxScaler, PolynomialFeatures
 
 from isocharge.common.arrays import Array
+from isocharge.common.contact_errors import position_error
+from isocharge.common.statistics import rms
 from isocharge.simulate import ChargeMap, Domain, NoiseModel
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines.gauss_newton import GaussNewton
 from isocharge.train.baselines.learned import AXIS_SCALES, ResidualRegressor, SubsetProcess, on_logarithms, scale_axes
 from isocharge.train.baselines.paper import AffineTable, LinearBand, Triangulate
-from isocharge.train.data.presses import LabelledPresses, position_error
+from isocharge.train.data.presses import LabelledPresses
 
 Kind = Literal["paper", "learnt", "fitted map", "network"]
 """Kind of a method, which decides about its colour in pictures."""

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.simulate import ChargeSpline, ForwardMap, NoiseModel, Probe, Sensor, Sweep, noise_model
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.bayes.posterior import Posterior
 
 N_PRESSES = 4000
@@ -44,42 +44,6 @@ class BayesProblem:
     def forward_map(self, executor: Executor | None = None) -> ForwardMap:
         """Simulate the map from contacts to charges, which takes about 5 s."""
         return ForwardMap.build(self.sensor, self.probe, self.radius, self.force_range, executor=executor)
-
-
-@dataclass(frozen=True)
-class BayesLimit:
-    """Errors of the posterior mean.
-
-    Attributes:
-        presses: Number of presses.
-        position_median_mm: Median of the distance from the true position, mm.
-        position_rms_mm: Root mean square of this distance, mm.
-        position_p95_mm: 95th percentile of this distance, mm.
-        force_median_percent: Median of the absolute relative error of the force, %.
-        force_rms_percent: Root mean square of the relative error of the force, %.
-    """
-
-    presses: int
-    position_median_mm: float
-    position_rms_mm: float
-    position_p95_mm: float
-    force_median_percent: float
-    force_rms_percent: float
-
-    @classmethod
-    def of(cls, contact: Array, truth: Array) -> "BayesLimit":
-        """Compute the errors of contacts (x, y, F), shape (n, 3), mm and N, from the true contacts of this shape."""
-        error = contact - truth
-        position = np.hypot(error[:, 0], error[:, 1])
-        force = 100.0 * (contact[:, 2] / truth[:, 2] - 1.0)
-        return cls(
-            presses=len(truth),
-            position_median_mm=float(np.median(position)),
-            position_rms_mm=rms(position),
-            position_p95_mm=float(np.percentile(position, 95)),
-            force_median_percent=float(np.median(np.abs(force))),
-            force_rms_percent=rms(force),
-        )
 
 
 def bayes_estimate(
@@ -123,7 +87,7 @@ def bayes_limit(
     *,
     charge_map: ForwardMap | ChargeSpline | None = None,
     executor: Executor | None = None,
-) -> BayesLimit:
+) -> ContactErrorStatistics:
     """Compute the limit of a problem on presses drawn from its prior, which takes about a minute.
 
     Args:
@@ -132,9 +96,12 @@ def bayes_limit(
         seed: Seed of presses and noise.
         charge_map: Map from contacts to charges; None to simulate it. See `bayes_estimate`.
         executor: Executor for the solves and integrals; None for this process.
+
+    Returns:
+        Statistics of the errors of the posterior means.
     """
     charges = charge_map or problem.forward_map(executor)
     contact = Sweep(problem.radius, problem.force_range, presses, seed, sampling="random").contacts()
     charge = problem.noise.add(charges.charges(contact), np.random.default_rng([seed, 1]))
     estimate, _ = bayes_estimate(problem, charge, charge_map=charges, executor=executor)
-    return BayesLimit.of(estimate, contact)
+    return ContactErrorStatistics.of(estimate, contact)

@@ -11,8 +11,8 @@ from threadpoolctl import threadpool_limits
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import MeasuredPresses, row_words
+from isocharge.common.statistics import rms
 from isocharge.simulate import Circle, Sensor
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
 from isocharge.train.calibration.cross_validation import HeldOutAnswers, cross_validate
 from isocharge.train.calibration.diagnosis import check_channels, check_places, explain, find_mistakes, misfit

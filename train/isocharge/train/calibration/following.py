@@ -12,8 +12,8 @@ from onnx import numpy_helper
 
 from isocharge.common.arrays import Array
 from isocharge.common.perceptron import Layer
+from isocharge.common.statistics import rms
 from isocharge.serve.model.pretensions import Pretensions
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.calibration.calibrate import CalibrationResult
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, draw_contacts
 from isocharge.train.model_release.onnx_graph import write_graph

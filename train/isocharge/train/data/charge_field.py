@@ -21,11 +21,11 @@ from scipy.linalg import cho_factor, cho_solve
 from isocharge.common.arrays import Array
 from isocharge.common.chebyshev_series import CHUNK_SIZE, Series, chebyshev_terms, position_degrees
 from isocharge.common.errors import DatasetError, TrainingError
+from isocharge.common.statistics import rms
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate import NoiseModel, working_area
 from isocharge.simulate.forward.charge_map import Domain, within
 from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 
 CANDIDATES = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))

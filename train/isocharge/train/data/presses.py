@@ -168,11 +168,6 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
     return presses
 
 
-def position_error(contact: Array, truth: Array) -> Array:
-    """Return the distances between estimated and true positions, shape (n,), mm, from contacts of shape (n, 3)."""
-    return np.asarray(np.hypot(contact[:, 0] - truth[:, 0], contact[:, 1] - truth[:, 1]))
-
-
 HELD_SHARE = 0.2
 """Share of measured presses that is held out, dimensionless."""
 

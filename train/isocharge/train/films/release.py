@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.contact_errors import position_error
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.train.data.presses import draw_contacts, position_error
+from isocharge.train.data.presses import draw_contacts
 from isocharge.train.films.films_file import FILE, films_bytes, films_from_bytes
 from isocharge.train.films.films_model import FilmsModel
 from isocharge.train.model_release.evaluate import ONLY_SIMULATED, contact_errors, rounded

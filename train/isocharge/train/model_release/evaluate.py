@@ -1,14 +1,15 @@
 """Measured errors of a network on presses on which it was not trained: the figures of cards, reports and the demo."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
+from isocharge.common.contact_errors import ContactErrorStatistics, position_error
 from isocharge.simulate import Dataset, NoiseModel
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.misfit_charges import misfit_noise
-from isocharge.train.data.presses import LabelledPresses, position_error
+from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.fitted import Fitted
 
 Predict = Callable[[Array], tuple[Array, Array, Array]]
@@ -109,17 +110,11 @@ def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]
     Returns:
         Errors by name, as `evaluate` returns them.
     """
-    position = position_error(contact, truth)
-    relative_force = contact[:, 2] / truth[:, 2] - 1.0
+    statistics = asdict(ContactErrorStatistics.of(contact, truth))
+    del statistics["presses"]
     deviation = np.abs(contact - truth) / std
     errors = {
-        "position_median_mm": np.median(position),
-        "position_rms_mm": rms(position),
-        "position_p95_mm": np.percentile(position, 95),
-        "position_p99_mm": np.percentile(position, 99),
-        "force_median_percent": 100.0 * np.median(np.abs(relative_force)),
-        "force_rms_percent": 100.0 * rms(relative_force),
-        "force_p99_percent": 100.0 * np.percentile(np.abs(relative_force), 99),
+        **statistics,
         "coverage_68": np.mean(deviation < 1.0),
         "coverage_95": np.mean(deviation < WITHIN_95_PERCENT),
     }

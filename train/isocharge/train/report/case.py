@@ -13,6 +13,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError
+from isocharge.common.statistics import rms
 from isocharge.simulate import (
     ChargeSpline,
     Dataset,
@@ -31,7 +32,6 @@ from isocharge.simulate import (
 from isocharge.simulate.dataset.sweep import solve_maps
 from isocharge.simulate.identifiability.cramer_rao import CramerRao
 from isocharge.simulate.mechanics.theory import ACCURACY
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
 from isocharge.train.data.presses import LabelledPresses, domain_of
 from isocharge.train.report.measures import ContactErrors, round_significant

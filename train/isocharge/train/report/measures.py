@@ -13,10 +13,9 @@ import numpy as np
 import scipy  # scipy imports its submodules at their first use
 
 from isocharge.common.arrays import Array, Booleans
+from isocharge.common.contact_errors import ContactErrorStatistics
 from isocharge.serve.benchmark import Timing
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines.compared_methods import ComparedMethod
-from isocharge.train.data.presses import position_error
 
 
 def round_significant(value: float | None, digits: int = 4) -> float | None:
@@ -70,16 +69,13 @@ class ContactErrors:
         is_answered = np.isfinite(estimate[:, :2]).all(axis=1)
         if not is_answered.any():
             return cls(None, None, None, None, None, 0.0)
-        answered_estimate = estimate[is_answered]
-        answered_truth = truth[is_answered]
-        position_mm = position_error(answered_estimate, answered_truth)
-        force_percent = 100.0 * np.abs(answered_estimate[:, 2] / answered_truth[:, 2] - 1.0)
+        statistics = ContactErrorStatistics.of(estimate[is_answered], truth[is_answered])
         return cls(
-            position_rms_mm=round_significant(rms(position_mm)),
-            position_median_mm=round_significant(float(np.median(position_mm))),
-            position_p95_mm=round_significant(float(np.percentile(position_mm, 95))),
-            force_rms_percent=round_significant(rms(force_percent)),
-            force_median_percent=round_significant(float(np.median(force_percent))),
+            position_rms_mm=round_significant(statistics.position_rms_mm),
+            position_median_mm=round_significant(statistics.position_median_mm),
+            position_p95_mm=round_significant(statistics.position_p95_mm),
+            force_rms_percent=round_significant(statistics.force_rms_percent),
+            force_median_percent=round_significant(statistics.force_median_percent),
             answered=round_significant(float(np.mean(is_answered))) or 0.0,
         )
 

@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from isocharge.common.contact_errors import position_error
+from isocharge.common.statistics import rms
 from isocharge.simulate import Domain, Sensor
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.simulate.plots.figure import FELT, INK, new_axes, new_figure
 from isocharge.simulate.plots.film import draw_layout
 from isocharge.train.baselines.networks import RELEASED
-from isocharge.train.data.presses import position_error
 from isocharge.train.model_release.evaluate import FALSE_ALARM_RATE
 from isocharge.train.report.case import BAYES, CRAMER_RAO
 from isocharge.train.report.measures import Cost, MethodRecord

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array, Integers
+from isocharge.common.contact_errors import position_error
+from isocharge.common.statistics import rms
 from isocharge.simulate import Domain, NoiseModel, parse_probe
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.baselines.compared_methods import ComparedMethod
 from isocharge.train.baselines.networks import ReleasedModel
-from isocharge.train.data.presses import LabelledPresses, position_error
+from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.report.case import CRAMER_RAO, EvaluationCase, Settings, simulate_presses
 from isocharge.train.report.measures import ContactErrors, interval_coverage, round_significant
 

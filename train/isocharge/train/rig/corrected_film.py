@@ -8,8 +8,8 @@ import scipy  # loads a part when it is used
 
 from isocharge.common.arrays import Array
 from isocharge.common.measured_presses import MeasuredPresses, row_words
+from isocharge.common.statistics import rms
 from isocharge.simulate import Domain, ForwardMap, NoiseModel
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.rig.correction import Correction, Residuals, fit_correction
 
 _log = logging.getLogger(__name__)

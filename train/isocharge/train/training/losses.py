@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from isocharge.common.statistics import rms
 from isocharge.simulate import Domain
-from isocharge.simulate.numerics.statistics import rms
 from isocharge.train.data.channel_noise import Noise
 
 WARM_UP_MEAN_WEIGHT = 30.0

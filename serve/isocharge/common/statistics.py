@@ -1,4 +1,4 @@
-"""Root mean square."""
+"""Root mean square of an array."""
 
 import numpy as np
 

@@ -1,0 +1,59 @@
+"""Statistics of the errors of estimated contacts: the same figures for cards, reports, the Bayes limit and the demo."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.statistics import rms
+
+
+def position_error(contact: Array, truth: Array) -> Array:
+    """Return the distances between estimated and true positions, shape (n,), mm, from contacts of shape (n, 3)."""
+    return np.asarray(np.hypot(contact[:, 0] - truth[:, 0], contact[:, 1] - truth[:, 1]))
+
+
+def force_error_percent(contact: Array, truth: Array) -> Array:
+    """Return the relative errors of estimated forces, shape (n,), %, from contacts of shape (n, 3)."""
+    return np.asarray(100.0 * (contact[:, 2] / truth[:, 2] - 1.0))
+
+
+@dataclass(frozen=True)
+class ContactErrorStatistics:
+    """Medians, root mean squares and percentiles of the errors of contacts.
+
+    Attributes:
+        presses: Number of presses.
+        position_median_mm: Median of the distance from the true position, mm.
+        position_rms_mm: Root mean square of this distance, mm.
+        position_p95_mm: 95th percentile of this distance, mm.
+        position_p99_mm: 99th percentile of this distance, mm.
+        force_median_percent: Median of the absolute relative error of the force, %.
+        force_rms_percent: Root mean square of the relative error of the force, %.
+        force_p99_percent: 99th percentile of the absolute relative error of the force, %.
+    """
+
+    presses: int
+    position_median_mm: float
+    position_rms_mm: float
+    position_p95_mm: float
+    position_p99_mm: float
+    force_median_percent: float
+    force_rms_percent: float
+    force_p99_percent: float
+
+    @classmethod
+    def of(cls, contact: Array, truth: Array) -> "ContactErrorStatistics":
+        """Compute the statistics of contacts (x, y, F), mm and N, from the true contacts, shape (n, 3) each."""
+        position_mm = position_error(contact, truth)
+        force_percent = np.abs(force_error_percent(contact, truth))
+        return cls(
+            presses=len(truth),
+            position_median_mm=float(np.median(position_mm)),
+            position_rms_mm=rms(position_mm),
+            position_p95_mm=float(np.percentile(position_mm, 95)),
+            position_p99_mm=float(np.percentile(position_mm, 99)),
+            force_median_percent=float(np.median(force_percent)),
+            force_rms_percent=rms(force_percent),
+            force_p99_percent=float(np.percentile(force_percent, 99)),
+        )
