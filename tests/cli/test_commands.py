@@ -238,8 +238,8 @@ BAD = [
             ("", "expected either a DATASET folder or --sensor"),
             ("presses", "--films: expected --sensor SENSOR alone, got presses"),
             ("--sensor four-25um-biaxial --radius auto", "--films: expected --radius in mm, got auto"),
-            ("--sensor four-25um-biaxial --probe rectangle:4x2", "--films: expected one round probe"),
-            ("--sensor four-25um-biaxial --probe circle:1 --probe circle:2", "--films: expected one round probe"),
+            ("--sensor four-25um-biaxial --probe rectangle:4x2", "--films: expected one probe"),
+            ("--sensor four-25um-biaxial --probe circle:1 --probe circle:2", "--films: expected one probe"),
             ("--sensor four-25um-biaxial --config quick.toml", "--films: expected no --config"),
         ]
     ),
@@ -268,7 +268,7 @@ BAD = [
             ("8 --side 30", "do not fit"),
             ("3 --goal best", "expected 'worst', 'rms' or a CSV file"),
             ("3 --keep Q", "no electrode 'Q'"),
-            ("3 --probe triangle:3", "round probes"),
+            ("3 --probe triangle:3", "expected circle:RADIUS"),
         ]
     ),
     (("serve", "bench", "nowhere"), 2, "ModelError: "),

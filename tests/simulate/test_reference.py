@@ -1,7 +1,8 @@
 """Charges and deflections compared with independent solvers.
 
 `film_cases.json`: axisymmetric collocation (1e-8) and dolfinx P3 (about 1e-4), errors below 3e-4.
-`film_cases_skfem.json`: scikit-fem P3 (3e-5), with off-centre polygons, ellipses, presses near the rim and thick films.
+`film_cases_skfem.json`: scikit-fem P3 (3e-5), with off-centre polygons, ellipses, fingers, presses near the rim and
+thick films.
 """
 
 import json
@@ -18,6 +19,7 @@ from isocharge.simulate import (
     Ellipse,
     Equilibrium,
     Film,
+    Finger,
     Polygon,
     Probe,
     Sensor,
@@ -79,6 +81,8 @@ def probe_of(about: dict) -> Probe:
     angle = np.deg2rad(about.get("turn_deg", 0.0))
     if about["shape"] == "circle":
         return Circle(about["radius_mm"])
+    if about["shape"] == "finger":
+        return Finger(about["radius_mm"])
     if about["shape"] == "ellipse":
         return Ellipse(about["width_mm"], about["height_mm"], angle)
     if about["shape"] == "rectangle":

@@ -36,7 +36,7 @@ with require("simulate"):
     from isocharge.simulate.mesh.blocks import Resolution
     from isocharge.simulate.sensor.film import Film, Piezo
     from isocharge.simulate.sensor.film_prior import FilmPrior, virtual_film
-    from isocharge.simulate.sensor.probe import Circle, Ellipse, Polygon, Probe, parse_probe
+    from isocharge.simulate.sensor.probe import Circle, Ellipse, Finger, Polygon, Probe, parse_probe
     from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor
     from isocharge.simulate.sensor.sensor_file import built_in_sensors, load_sensor, write_sensor
     from isocharge.simulate.solver.equilibrium import Equilibrium, deflection, touch_stress
@@ -57,6 +57,7 @@ __all__ = [
     "Equilibrium",
     "Film",
     "FilmPrior",
+    "Finger",
     "ForwardMap",
     "FunctionMap",
     "NoiseModel",

@@ -180,7 +180,7 @@ def test_a_seed_is_one_draw(run, asked):
         (f"{SENSOR} --seconds 0 --link TMP/film", OutputExists, "film is already there"),
         (f"{SENSOR} --seconds 0 --link TMP/no/film", InputError, "the link cannot be made"),
         ("five-25um-biaxial", SensorError, "no sensor 'five-25um-biaxial'"),
-        (f"{SENSOR} --film 1 --probe triangle:4", InputError, r"--film: expected a round --probe .*got 'triangle:4'"),
+        (f"{SENSOR} --film 1 --probe triangle:4", InputError, r"--film: expected a --probe like circle.*'triangle:4'"),
         (f"{SENSOR} --device TMP/plain.toml", InputError, "expected a file with described frames"),
     ],
 )

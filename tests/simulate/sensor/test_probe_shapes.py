@@ -10,11 +10,14 @@ from matplotlib.figure import Figure
 from isocharge.simulate import (
     Circle,
     Ellipse,
+    Finger,
+    ForwardMap,
     Polygon,
     Probe,
     Resolution,
     SolveSettings,
     Theory,
+    deflection,
     load_sensor,
     parse_probe,
     press,
@@ -53,6 +56,7 @@ SHAPES = {
     "triangle": ShapeCase(Polygon.triangle(2.0), np.sqrt(3.0), 2.0 / np.sqrt(3.0), 2 * np.pi / 3),
     "polygon": ShapeCase(Polygon.of(HOUSE), 3.0, np.sqrt(130.0) / 9.0, 2 * np.pi),
     "ellipse": ShapeCase(Ellipse(4.0, 2.0, 0.5), 2.0 * np.pi, 2.0, np.pi),
+    "finger": ShapeCase(Finger(2.0), 4.0 * np.pi, 2.0, 0.0),
 }
 
 
@@ -140,10 +144,31 @@ def test_mesh_elements_of_the_footprint_have_its_area_and_centroid(shape, distan
     assert centroid.real * SENSOR.film.radius == pytest.approx(distance, abs=1e-4)
 
 
-CURVED = {name: shape for name, shape in SHAPES.items() if shape.probe.topology.is_curved}
+def test_mean_of_the_relative_pressure_is_one_and_its_centre_is_the_centroid(shape):
+    grid = grid_of(shape.probe)
+    inside = grid[shape.probe.contains(grid)]
+    pressure = shape.probe.pressure(inside)
+    assert pressure.mean() == pytest.approx(1.0, rel=5e-3)
+    assert abs((pressure * inside).mean()) < 5e-3 * shape.reach
 
 
-@pytest.mark.parametrize("shape", CURVED.values(), ids=CURVED)
+def test_force_share_of_a_triangle_is_that_of_a_grid(shape):
+    at = 0.3 - 0.2j
+    size = 10.0 * shape.reach
+    corners = np.array([(at.real - size, at.imag - size), (at.real + size, at.imag - size), (at.real, at.imag + 0.2)])
+    grid = grid_of(shape.probe)
+    pressure = np.where(shape.probe.contains(grid), shape.probe.pressure(grid), 0.0)
+    below = grid.imag < np.interp(grid.real, [-size, 0.0, size], [-size, 0.2, -size])
+    expected = pressure[below].sum() / pressure.sum()
+    assert shape.probe.force_share(corners, at) == pytest.approx(expected, abs=3e-3)
+
+
+UNIFORM_CURVED = {
+    name: shape for name, shape in SHAPES.items() if shape.probe.topology.is_curved and shape.probe.has_uniform_pressure
+}
+
+
+@pytest.mark.parametrize("shape", UNIFORM_CURVED.values(), ids=UNIFORM_CURVED)
 def test_curved_probe_has_the_charges_of_a_polygon_with_many_corners(shape):
     """The corners lie on the boundary, and the polygon is enlarged to the area of the footprint."""
     corners = to_corners(boundary_points(shape.probe, 24))
@@ -173,3 +198,30 @@ def test_pressure_charge_of_an_ellipse_on_an_electrode():
     sensor = replace(SENSOR, piezo=replace(SENSOR.piezo, d33=-20.0))
     charge = contact_charge(sensor, Ellipse(2.0, 1.0, 0.7), sensor.electrodes[0].centre, 0.5)
     np.testing.assert_allclose(charge, [5.0, 0.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("share_of_radius", [-0.9, -0.3, 0.0, 0.5, 0.99])
+def test_force_share_of_a_finger_on_a_half_plane_is_the_closed_form(share_of_radius):
+    """Integrated across the footprint, Hertzian pressure is 3/4 (1 - c^2), so (2 - 3 c + c^3) / 4 lies beyond c."""
+    finger = Finger(5.0)
+    edge = 5.0 * share_of_radius
+    beyond = np.array([(edge, -50.0), (50.0, -50.0), (50.0, 50.0), (edge, 50.0)])
+    expected = (2.0 - 3.0 * share_of_radius + share_of_radius**3) / 4.0
+    assert finger.force_share(beyond, 0.0) == pytest.approx(expected, abs=1e-5)
+
+
+def test_taut_membrane_under_a_finger_deflects_as_the_closed_form():
+    """The deflection at the centre is F / (2 pi T h) (ln(R / a) + H / 2) with the harmonic number H of 3/2."""
+    film = replace(SENSOR.film, pretension=2.0)
+    linear = Theory(stretching=False, bending=False, pretensioned=True)
+    solved = press(film, Finger(6.0), (0.0, 0.0), 0.1, SolveSettings(theory=linear))
+    half_harmonic_number = 4.0 / 3.0 - np.log(2.0)
+    tension = film.pretension * film.thickness
+    expected = 0.1 / (2.0 * np.pi * tension) * (np.log(film.radius / 6.0) + half_harmonic_number)
+    assert deflection(solved, np.zeros((1, 2)))[0] == pytest.approx(expected, rel=1e-5)
+
+
+def test_forward_map_of_a_finger_interpolates_its_solved_charges():
+    forward_map = ForwardMap.build(SENSOR, Finger(6.0), 8.0, (0.5, 1.0))
+    solved = touch_charge(SENSOR, press(SENSOR.film, Finger(6.0), (3.0, -4.0), 0.7))
+    np.testing.assert_allclose(forward_map.charges(np.array([[3.0, -4.0, 0.7]]))[0], solved, rtol=1e-3)

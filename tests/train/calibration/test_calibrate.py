@@ -454,7 +454,7 @@ def test_a_network_is_chosen_by_layout_and_not_by_name():
     table["electrodes"]["A"] = [12.0, 0.0]
     with pytest.raises(ModelError, match=r"expected the electrodes of .*train fit --films"):
         CalibrationProblem.of(sensor_from_dict(table), Circle(1.0))
-    with pytest.raises(SceneError, match="expected a round one"):
+    with pytest.raises(SceneError, match="expected a circle"):
         CalibrationProblem.of(load_sensor("four-25um-biaxial"), Polygon.triangle(4.0))
 
 

@@ -161,16 +161,14 @@ def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) 
     """Return sensor and probe as described, or a random variation of them if there is a seed.
 
     Raises:
-        InputError: If there is a seed and the probe is not round, because the radius of the probe is varied, too.
+        InputError: If there is a seed and the probe is not a circle, because the radius of the probe is varied, too.
     """
     sensor = load_sensor(sensor_name)
     probe = parse_probe(probe_text)
     if film_seed is None:
         return sensor, probe
     if not isinstance(probe, Circle):
-        raise InputError(
-            f"--film: expected a round --probe like circle:1.0, whose radius is drawn too, got {probe_text!r}"
-        )
+        raise InputError(f"--film: expected a --probe like circle:1.0, whose radius is drawn, too, got {probe_text!r}")
     return virtual_film(sensor, probe, film_seed)
 
 

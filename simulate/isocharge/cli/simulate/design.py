@@ -82,7 +82,7 @@ def design_command(
     refuse_finished(output)
     footprint = parse_probe(probe)
     if not isinstance(footprint, Circle):
-        raise InputError(f"--probe: a layout is designed for round probes, got {probe}; use circle:RADIUS")
+        raise InputError(f"--probe: expected circle:RADIUS, for which layouts are designed, got {probe}")
     case = DesignCase(
         load_sensor(sensor),
         electrodes,

@@ -168,13 +168,13 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     """
     if sensor.piezo.d33 == 0.0:
         return np.zeros(len(sensor.electrodes))
-    covered = []
+    force_share = []
     for electrode, (centre, radius) in zip(sensor.electrodes, sensor.part_circles, strict=True):
         near = np.flatnonzero(np.abs(complex(*at) - centre) < radius + probe.reach)
-        covered.append(
-            sum(probe.covered_area(sensor.calibration.place(electrode.parts[i]), complex(*at)) for i in near)
+        force_share.append(
+            sum(probe.force_share(sensor.calibration.place(electrode.parts[i]), complex(*at)) for i in near)
         )
-    return np.asarray(-0.5 * sensor.piezo.d33 * force / probe.area * sensor.gains * np.array(covered))
+    return np.asarray(-0.5 * sensor.piezo.d33 * force * sensor.gains * np.array(force_share))
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:

@@ -1,6 +1,6 @@
 """Potential energy of the film under a load, with its first and second derivatives.
 
-    Pi = stretching energy + bending energy - load * mean of W over the footprint
+    Pi = stretching energy + bending energy - load * mean of W over the footprint, weighted with the pressure
 
 The energy is a function of the scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3). Lengths are in units
 of the film radius a. With the amplitude A of `isocharge.simulate.mechanics.scaling`, the displacements and the

@@ -1,5 +1,6 @@
 """The mesh of one press: a template, its position on the film, and the integration rules of its elements."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -24,6 +25,12 @@ from isocharge.simulate.sensor.probe import Probe
 
 UNDEFORMED_RADIUS = 0.5
 """Radius within which the mesh of an oval film equals that of a circular film, in film radii."""
+
+PRESSURE_POINTS = 32
+"""Number of integration points in each direction of an element for a pressure that is not uniform."""
+
+Pressure = Callable[[Complexes], Array]
+"""Function that returns the pressure at film points."""
 
 INVERSE_STEPS = 8
 """Number of Newton steps of `from_oval`, which suffice for round-off up to e = 0.05. The slope is that at the rim."""
@@ -55,21 +62,28 @@ class Geometry:
     coat: tuple[Integers, Array] | None = None
 
     @classmethod
-    def build(cls, template: Template, points: Complexes) -> "Geometry":
-        """Compute the integration rules of a mesh. The load is uniform over the footprint.
+    def build(cls, template: Template, points: Complexes, pressure: Pressure | None = None) -> "Geometry":
+        """Compute the integration rules of a mesh.
 
         Args:
             template: Template of the mesh.
             points: Film points of the nodes of every element, shape (n_element, n_local), in film radii.
+            pressure: Function that returns the pressure at film points (in film radii), in any unit. None if the
+                pressure is uniform over the footprint.
         """
         rule = _quadrature(template.resolution.order)
         gradient, determinant = _film_gradient(rule.derivatives[:, None], points)
         area = determinant * rule.weights
         mass = _jacobian(rule.node_derivatives[:, None], points).determinant * rule.node_weights
         footprint = template.footprint
-        node_area = area[footprint] @ rule.values
-        load = np.bincount(template.nodes[footprint].ravel(), node_area.ravel(), template.n_node)
-        load = load / (template.copies * area[footprint].sum())
+        if pressure is None:
+            node_load = area[footprint] @ rule.values
+            total_load = area[footprint].sum()
+        else:
+            node_load = _integrated_pressure(template.resolution.order, points[footprint], pressure)
+            total_load = node_load.sum()
+        load = np.bincount(template.nodes[footprint].ravel(), node_load.ravel(), template.n_node)
+        load = load / (template.copies * total_load)
         if template.constraint is not None:
             load = template.constraint.T @ load
         return cls(template.nodes, gradient, area, load, mass, template.constraint)
@@ -132,13 +146,24 @@ class PlacedMesh:
     @cached_property
     def geometry(self) -> Geometry:
         """Integration rules of the elements."""
-        geometry = Geometry.build(self.template, self.points)
+        is_uniform = self.placement.probe.has_uniform_pressure
+        geometry = Geometry.build(self.template, self.points, None if is_uniform else self._pressure)
         if self.coat is None:
             return geometry
         xi, eta, _ = gauss_reference_square(self.resolution.order + 1)
         points = self.points @ tensor_values(self.resolution.order, xi, eta).T
         coated = np.flatnonzero(self.coat.near(points).any(axis=1))
         return replace(geometry, coat=(coated, self.coat.moduli(points[coated])))
+
+    def _pressure(self, points: Complexes) -> Array:
+        """Return the pressure of the probe at film points, shape (..., n), relative to the mean pressure.
+
+        Args:
+            points: Film points rotated with the press, in film radii.
+        """
+        centroid = self.placement.corners[-1]
+        from_centroid = (from_oval(points, self.oval) - centroid) / self.placement.rotation_and_scale
+        return self.placement.probe.pressure(from_centroid)
 
     def locate(self, points: Complexes) -> tuple[Integers, Array, Array, Booleans]:
         """Find the elements that contain film points.
@@ -254,6 +279,23 @@ class _Quadrature(NamedTuple):
     weights: Array
     node_derivatives: Array
     node_weights: Array
+
+
+def _integrated_pressure(order: int, points: Complexes, pressure: Pressure) -> Array:
+    """Integrate the pressure times each basis function over elements.
+
+    Args:
+        order: Order of the elements.
+        points: Film points of the nodes of every element, shape (n_element, n_local), in film radii.
+        pressure: Function that returns the pressure at film points.
+
+    Returns:
+        Integrals, shape (n_element, n_local).
+    """
+    xi, eta, weights = gauss_reference_square(PRESSURE_POINTS)
+    values, derivatives = tensor_basis(order, xi, eta)
+    area = _jacobian(derivatives[:, None], points).determinant * weights
+    return np.asarray((area * pressure(points @ values.T)) @ values)
 
 
 class _Jacobian(NamedTuple):

@@ -1,23 +1,26 @@
 """The probe shapes, and the notation for them on the command line and in files.
 
 Examples of the notation are `circle:1.0` (radius), `ellipse:4.0x2.0` (axes along x and y), `rectangle:4.0x2.0` (sides
-along x and y), `triangle:4.0` (side of an equilateral triangle with one corner towards +y) and `polygon:x,y;x,y;x,y`
-(corners of a convex polygon, anticlockwise). Lengths are in mm. `@30` at the end rotates the footprint by 30 degrees
-anticlockwise. The position of a probe is the centroid of its footprint.
+along x and y), `triangle:4.0` (side of an equilateral triangle with one corner towards +y), `polygon:x,y;x,y;x,y`
+(corners of a convex polygon, anticlockwise) and `finger:6.0` (radius of the contact area of a fingertip). Lengths are
+in mm. `@30` at the end rotates the footprint by 30 degrees anticlockwise. The position of a probe is the centroid of
+its footprint.
 """
 
 from isocharge.common.errors import SceneError, cut
 from isocharge.simulate.sensor.probe_shapes.base import Probe, ProbeNotation
 from isocharge.simulate.sensor.probe_shapes.circle import Circle
 from isocharge.simulate.sensor.probe_shapes.ellipse import Ellipse
+from isocharge.simulate.sensor.probe_shapes.finger import Finger
 from isocharge.simulate.sensor.probe_shapes.polygon import Polygon
 
-__all__ = ["PROBE_HELP", "Circle", "Ellipse", "Polygon", "Probe", "parse_probe"]
+__all__ = ["PROBE_HELP", "Circle", "Ellipse", "Finger", "Polygon", "Probe", "parse_probe"]
 
 PROBE_SHAPES: tuple[type[Probe], ...] = (
     Circle,
     Polygon,
     Ellipse,
+    Finger,
 )
 """All probe shapes. The parser, the help text and the error messages list these."""
 

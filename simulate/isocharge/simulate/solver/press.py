@@ -55,7 +55,7 @@ def press(
 
     Args:
         film: The clamped film.
-        probe: The probe. Its pressure is uniform over the footprint, and keeps its direction.
+        probe: The probe. The direction of its pressure does not change as the film deflects.
         at: Centroid (x, y) of the footprint, mm.
         force: Force, N, positive in the direction of the push.
         settings: Accuracy, theory and mesh.

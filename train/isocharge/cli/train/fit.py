@@ -353,5 +353,5 @@ def _film_prior(
         )
     probe = parse_probe(notations[0])
     if len(notations) != 1 or not isinstance(probe, Circle):
-        raise InputError(f"--films: expected one round probe (circle:RADIUS), got {', '.join(notations)}")
+        raise InputError(f"--films: expected one probe circle:RADIUS, got {', '.join(notations)}")
     return FilmPrior(load_sensor(sensor), probe)

@@ -191,13 +191,13 @@ class CalibrationProblem:
             models: Folder of models that is searched first.
 
         Raises:
-            SceneError: If the probe is not round.
+            SceneError: If the probe is not a circle.
             ModelError: If no network was trained for this layout; the message says how to train one.
         """
         if not isinstance(probe, Circle):
             raise SceneError(
-                f"probe {probe.notation}: expected a round one, such as circle:1.0, because its radius is calibrated "
-                "as well"
+                f"probe {probe.notation}: expected a circle, such as circle:1.0, because its radius is calibrated as "
+                "well"
             )
         return cls(sensor, probe, films_for(sensor, probe, models))
 

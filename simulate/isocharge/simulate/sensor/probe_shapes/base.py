@@ -94,9 +94,10 @@ class FootprintTopology:
 
 
 class Probe(ABC):
-    """A rigid object that presses on the film with uniform pressure over its footprint.
+    """An object that presses on the film over its footprint, with a pressure that does not depend on the film.
 
-    Subclasses are frozen dataclasses. `Circle`, `Ellipse` and `Polygon` are examples.
+    Subclasses are frozen dataclasses. `Circle`, `Ellipse`, `Finger` and `Polygon` are examples. The pressure is uniform
+    unless a subclass overrides `has_uniform_pressure`, `pressure` and `force_share`.
     """
 
     notations: ClassVar[tuple[ProbeNotation, ...]]
@@ -185,6 +186,32 @@ class Probe(ABC):
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
             at: Position of the centroid as x + iy, mm.
         """
+
+    @property
+    def has_uniform_pressure(self) -> bool:
+        """Whether the pressure is the same at all points of the footprint."""
+        return True
+
+    def pressure(self, points: Complexes) -> Array:
+        """Return the pressure at points of the footprint relative to the mean pressure, dimensionless.
+
+        Args:
+            points: Points x + iy relative to the centroid, any shape, mm.
+
+        Returns:
+            Relative pressure, of the shape of `points`. Its mean over the footprint is 1, and its centre of pressure is
+            the centroid.
+        """
+        return np.ones(points.shape)
+
+    def force_share(self, corners: Array, at: complex) -> float:
+        """Return the share of the force that acts on a convex polygon, from 0 to 1.
+
+        Args:
+            corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
+            at: Position of the centroid as x + iy, mm.
+        """
+        return self.covered_area(corners, at) / self.area
 
     @property
     def is_axisymmetric(self) -> bool:

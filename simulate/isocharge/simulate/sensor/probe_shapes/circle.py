@@ -1,6 +1,7 @@
-"""Circular probe."""
+"""Circular probe, and the base class of all probes with a circular footprint."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -11,8 +12,8 @@ from isocharge.simulate.sensor.size_check import tidy
 
 
 @dataclass(frozen=True)
-class Circle(CurvedProbe):
-    """A circular footprint.
+class RoundProbe(CurvedProbe):
+    """A circular footprint. Subclasses implement `notation`, and `pressure` if the pressure is not uniform.
 
     Attributes:
         radius: Radius, mm.
@@ -20,15 +21,8 @@ class Circle(CurvedProbe):
 
     radius: float
 
-    notations = (ProbeNotation("circle", "RADIUS", lambda numbers, _angle: Circle(numbers[0])),)
-
     def __post_init__(self) -> None:
         check_reach(self.radius, "probe radius")
-
-    @property
-    def notation(self) -> str:
-        """Text that `parse_probe` converts back into this probe."""
-        return f"circle:{tidy(self.radius)}"
 
     @property
     def area(self) -> float:
@@ -55,7 +49,7 @@ class Circle(CurvedProbe):
         """A square core polygon, and a layer of blocks up to the innermost circle of the mesh."""
         return FootprintTopology(n_corner=4, is_curved=True, fills_circle=True)
 
-    def rotated(self, angle: float) -> "Circle":
+    def rotated(self, angle: float) -> Self:
         """Return the same circle."""
         del angle
         return self
@@ -75,3 +69,19 @@ class Circle(CurvedProbe):
     def covered_area(self, corners: Array, at: complex) -> float:
         """Return the area of a polygon that lies in the circle, mm^2."""
         return float(area_in_disk(to_complex(corners), at, self.radius))
+
+
+@dataclass(frozen=True)
+class Circle(RoundProbe):
+    """A circular footprint with uniform pressure.
+
+    Attributes:
+        radius: Radius, mm.
+    """
+
+    notations = (ProbeNotation("circle", "RADIUS", lambda numbers, _angle: Circle(numbers[0])),)
+
+    @property
+    def notation(self) -> str:
+        """Text that `parse_probe` converts back into this probe."""
+        return f"circle:{tidy(self.radius)}"

@@ -1,0 +1,62 @@
+"""Fingertip: a circular footprint with Hertzian pressure.
+
+A soft sphere that is pressed against a flat surface touches it in a circle of radius a, with the pressure (Johnson
+1985, Contact Mechanics, eq. 3.39)
+
+    p(r) = p0 sqrt(1 - (r / a)^2),   p0 = 1.5 F / (pi a^2).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Complexes
+from isocharge.simulate.numerics.polygon import area_in_disk, to_complex
+from isocharge.simulate.sensor.probe_shapes.base import ProbeNotation
+from isocharge.simulate.sensor.probe_shapes.circle import RoundProbe
+from isocharge.simulate.sensor.size_check import tidy
+
+PEAK_PRESSURE = 1.5
+"""Largest pressure relative to the mean pressure, dimensionless."""
+
+PRESSURE_LEVELS = 48
+"""Number of pressure levels from which the share of the force on an area is computed."""
+
+
+@dataclass(frozen=True)
+class Finger(RoundProbe):
+    """A circular contact area whose pressure falls from its centre to zero at its edge.
+
+    Attributes:
+        radius: Radius of the contact area, mm; 4 to 8 mm for a fingertip. It does not depend on the force.
+    """
+
+    notations = (ProbeNotation("finger", "RADIUS", lambda numbers, _angle: Finger(numbers[0])),)
+
+    @property
+    def notation(self) -> str:
+        """Text that `parse_probe` converts back into this probe."""
+        return f"finger:{tidy(self.radius)}"
+
+    @property
+    def has_uniform_pressure(self) -> bool:
+        """False."""
+        return False
+
+    def pressure(self, points: Complexes) -> Array:
+        """Return the Hertzian pressure relative to its mean, zero outside of the contact area."""
+        depth = np.clip(1.0 - np.abs(points) ** 2 / self.radius**2, 0.0, None)
+        return np.asarray(PEAK_PRESSURE * np.sqrt(depth))
+
+    def force_share(self, corners: Array, at: complex) -> float:
+        """Return the share of the force that acts on a convex polygon.
+
+        The pressure exceeds the share t of its peak within a disk of radius a sqrt(1 - t^2). The force on the polygon
+        is the integral over t of the area that the polygon has in common with this disk.
+        """
+        nodes, weights = np.polynomial.legendre.leggauss(PRESSURE_LEVELS)
+        level = 0.5 * (nodes + 1.0)
+        level_radius = self.radius * np.sqrt(1.0 - level**2)
+        points = to_complex(corners)
+        areas = [float(area_in_disk(points, at, radius)) for radius in level_radius]
+        return float(PEAK_PRESSURE / self.area * 0.5 * (weights @ areas))
