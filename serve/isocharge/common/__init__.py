@@ -1,4 +1,4 @@
-"""What simulate, train, serve and the commands share: errors, files, tables, progress, runs that go on after a kill.
+"""Modules that simulate, train, serve and the commands share: errors, files, tables, progress and resumable runs.
 
 May import: nothing else of isocharge.
 """

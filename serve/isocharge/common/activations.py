@@ -1,7 +1,7 @@
-"""Activation functions of hidden layers: what each is called in NumPy, PyTorch, ONNX and C.
+"""Activation functions of hidden layers, with the name of each in NumPy, PyTorch, ONNX and C.
 
-`ACTIVATIONS` is the only list of them. The configuration of a training, the evaluations of a network, the ONNX export
-and the C export all read it.
+`ACTIVATIONS` is the only list of these functions. The configuration of a training, the evaluations of a network, the
+ONNX export and the C export all read it.
 """
 
 from collections.abc import Callable

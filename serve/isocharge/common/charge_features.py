@@ -9,9 +9,9 @@ from isocharge.common.arrays import Array
 
 @dataclass(frozen=True)
 class ChargeFeatures:
-    """The function from charges Q to the inputs of the first layer.
+    """Function that computes the inputs of the first layer of a network from charges Q.
 
-    For positive charges it is ln(clip(Q) / typical). If charges can have both signs, it is
+    For positive charges the function is ln(clip(Q) / typical). If charges can have both signs, the function is
     asinh(clip(Q) / typical) - mean, which is linear for small charges and logarithmic for large ones.
 
     Attributes:

@@ -23,34 +23,43 @@ class Series:
 
     coefficients: Array
 
-    def values(self, unit: Array) -> Array:
+    def values(self, coordinates: Array) -> Array:
         """Evaluate the series and its derivatives with respect to the three coordinates.
 
+        The series is evaluated in chunks of `CHUNK_SIZE` points. Each chunk is first summed over the polynomials in x
+        and y, and then over the polynomials in the logarithm of the force.
+
         Args:
-            unit: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.
+            coordinates: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.
 
         Returns:
             Shape (n, 4, n_electrode): the value, then the three derivatives.
         """
         _, n_y, n_force, n_electrode = self.coefficients.shape
-        chunks = []
-        for points in np.array_split(unit, len(unit) // CHUNK_SIZE + 1):
-            position_terms, force_terms = chebyshev_terms(points, degree=n_y - 1, force_degree=n_force - 1)
-            force_coefficients = (position_terms @ self._rows).reshape(len(points), n_force, -1)
-            chunks.append((force_terms[:, None, :] @ force_coefficients)[:, 0])
-        return np.concatenate(chunks).reshape(len(unit), 4, n_electrode)
+        n_chunk = len(coordinates) // CHUNK_SIZE + 1
+        evaluated_chunks = []
+        for chunk in np.array_split(coordinates, n_chunk):
+            position_terms, force_terms = chebyshev_terms(chunk, degree=n_y - 1, force_degree=n_force - 1)
+            # (points, n_term) @ (n_term, n_force * 4 * n_electrode)
+            force_coefficients = (position_terms @ self._term_coefficients).reshape(len(chunk), n_force, -1)
+            # (points, 1, n_force) @ (points, n_force, 4 * n_electrode)
+            evaluated = force_terms[:, None, :] @ force_coefficients
+            evaluated_chunks.append(evaluated[:, 0, :])
+        return np.concatenate(evaluated_chunks).reshape(len(coordinates), 4, n_electrode)
 
     @cached_property
-    def _rows(self) -> Array:
-        """The coefficients of the series and of its derivatives, one row for each product of polynomials in x and y.
+    def _term_coefficients(self) -> Array:
+        """Coefficients of the series and of its derivatives, with one row for each product of polynomials in x and y.
 
         The shape is (n_term, (force_degree + 1) * 4 * n_electrode).
         """
         derivatives = [_derivative(self.coefficients, axis) for axis in range(3)]
-        stacked = np.stack([self.coefficients, *derivatives])
+        series_and_derivatives = np.stack([self.coefficients, *derivatives])
         x_degree, y_degree = position_degrees(self.coefficients.shape[0] - 1)
-        rows = stacked[:, x_degree, y_degree].transpose(1, 2, 0, 3)
-        return np.asarray(rows.reshape(len(x_degree), -1))
+
+        terms = series_and_derivatives[:, x_degree, y_degree]  # shape (4, n_term, force_degree + 1, n_electrode)
+        terms_first = terms.transpose(1, 2, 0, 3)
+        return np.asarray(terms_first.reshape(len(x_degree), -1))
 
 
 def position_degrees(degree: int) -> tuple[Integers, Integers]:
@@ -61,11 +70,11 @@ def position_degrees(degree: int) -> tuple[Integers, Integers]:
     return x_degree, y_degree
 
 
-def chebyshev_terms(unit: Array, degree: int, force_degree: int) -> tuple[Array, Array]:
+def chebyshev_terms(coordinates: Array, degree: int, force_degree: int) -> tuple[Array, Array]:
     """Evaluate the polynomials of which a series consists.
 
     Args:
-        unit: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.
+        coordinates: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.
         degree: Largest total degree in x and y.
         force_degree: Largest degree in the logarithm of the force.
 
@@ -73,12 +82,14 @@ def chebyshev_terms(unit: Array, degree: int, force_degree: int) -> tuple[Array,
         The products of the polynomials in x and y, shape (n, n_term), in the order of `position_degrees`, and the
         polynomials in the logarithm of the force, shape (n, force_degree + 1).
     """
-    inside = np.clip(unit, -1.0, 1.0)
-    x_polynomials = chebyshev.chebvander(inside[:, 0], degree).astype(float)
-    y_polynomials = chebyshev.chebvander(inside[:, 1], degree).astype(float)
-    force_polynomials = chebyshev.chebvander(inside[:, 2], force_degree).astype(float)
+    x, y, log_force = np.clip(coordinates, -1.0, 1.0).T
+    x_polynomials = chebyshev.chebvander(x, degree).astype(float)  # shape (n, degree + 1)
+    y_polynomials = chebyshev.chebvander(y, degree).astype(float)
+    force_polynomials = chebyshev.chebvander(log_force, force_degree).astype(float)
+
     x_degree, y_degree = position_degrees(degree)
-    return x_polynomials[:, x_degree] * y_polynomials[:, y_degree], force_polynomials
+    position_terms = x_polynomials[:, x_degree] * y_polynomials[:, y_degree]
+    return position_terms, force_polynomials
 
 
 def _derivative(coefficients: Array, axis: int) -> Array:

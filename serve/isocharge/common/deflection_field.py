@@ -5,7 +5,8 @@ maps rings around the origin to rings around the probe,
 
     z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
 
-where p is the distance of the probe from the centre and r is its radius, both in film radii. The deflection is smooth
+where z = x + i y is a point, p is the distance of the probe from the centre and r is the radius of the probe, all in
+film radii. The deflection is smooth
 on these rings, so that a few hundred numbers describe it. Between two forces, the deflection divided by the cube root
 of the force, which is constant for a membrane, is interpolated over the logarithm of the force. The package `simulate`
 writes the file, and the live page of `serve` shows the deflection.
@@ -88,7 +89,7 @@ def _is_close(given: object, value: float) -> bool:
 
 
 def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, rings: Array, angles: int) -> Complexes:
-    """Compute the points of a field under a probe on the x axis.
+    """Compute the points of a field under a probe on the x axis, by the automorphism in the docstring of this module.
 
     Args:
         radius_mm: Radius of the film, mm.
@@ -100,11 +101,14 @@ def points_mm(radius_mm: float, probe_radius_mm: float, distance_mm: float, ring
     Returns:
         Points x + i y, shape (rings, angles), mm.
     """
-    p = distance_mm / radius_mm
-    r = probe_radius_mm / radius_mm
-    c = math.tanh(0.5 * (math.atanh(p + r) + math.atanh(p - r)))
-    z = rings[:, None] * np.exp(1j * np.linspace(0.0, math.pi, angles))
-    return np.asarray(radius_mm * (z + c) / (1.0 + c * z))
+    probe_far_edge = (distance_mm + probe_radius_mm) / radius_mm
+    probe_near_edge = (distance_mm - probe_radius_mm) / radius_mm
+    shift = math.tanh(0.5 * (math.atanh(probe_far_edge) + math.atanh(probe_near_edge)))
+
+    directions = np.exp(1j * np.linspace(0.0, math.pi, angles))
+    points_around_origin = rings[:, None] * directions  # shape (rings, angles), in film radii
+    points_around_probe = (points_around_origin + shift) / (1.0 + shift * points_around_origin)
+    return np.asarray(radius_mm * points_around_probe)
 
 
 def read_deflection_field(path: Path) -> DeflectionField:
@@ -146,11 +150,14 @@ class _File(Struct):
         if set(self.film) != set(FILM_KEYS):
             raise WrongKey("film", f"the keys {', '.join(FILM_KEYS)}", list(self.film))
         for key in ("force_N", "distance_mm", "rings"):
-            if any(a >= b for a, b in pairwise(getattr(self, key))):
-                raise WrongKey(key, "increasing numbers", list(getattr(self, key)))
-        count = math.prod(self.shape)
-        if count > MAX_NUMBERS or len(self.deflection) != 2 * count:
-            expected = f"{count} numbers of 16 bits in base64, {MAX_NUMBERS} at most"
+            numbers = getattr(self, key)
+            if any(number >= next_number for number, next_number in pairwise(numbers)):
+                raise WrongKey(key, "increasing numbers", list(numbers))
+
+        expected_count = math.prod(self.shape)
+        expected_bytes = 2 * expected_count
+        if expected_count > MAX_NUMBERS or len(self.deflection) != expected_bytes:
+            expected = f"{expected_count} numbers of 16 bits in base64, {MAX_NUMBERS} at most"
             raise WrongKey("deflection", expected, len(self.deflection))
 
     @property

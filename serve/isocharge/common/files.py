@@ -54,12 +54,14 @@ def read_whole(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
     Raises:
         OSError: If the file cannot be read, is not a regular file, or is larger; `strerror` states the reason.
     """
+    too_large = OSError(errno.EFBIG, f"larger than {max_bytes} bytes", str(path))
     with open_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        data = file.read(max_bytes + 1) if size <= max_bytes else b""
-        if max(len(data), size) > max_bytes:
-            raise OSError(errno.EFBIG, f"larger than {max_bytes} bytes", str(path))
-        return data
+        if os.fstat(file.fileno()).st_size > max_bytes:
+            raise too_large
+        data = file.read(max_bytes + 1)  # the file may have grown in the meantime
+    if len(data) > max_bytes:
+        raise too_large
+    return data
 
 
 def bounded_lines(file: TextIO, max_characters: int = MAX_LINE_CHARACTERS) -> Iterator[str]:
@@ -101,15 +103,15 @@ def refuse_existing(path: Path) -> None:
 
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file under a temporary name, flush it to disk, and then rename it. An existing file is replaced."""
-    draft = _draft_of(path)
+    temporary = _temporary_path(path)
     try:
-        with draft.open("wb") as file:
+        with temporary.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        draft.replace(path)
+        temporary.replace(path)
     finally:
-        draft.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 class AtomicWriter:
@@ -168,18 +170,18 @@ def new_file(path: Path) -> Iterator[Path]:
         OutputError: If the file cannot be written.
     """
     refuse_existing(path)
-    draft = _draft_of(path)
+    temporary = _temporary_path(path)
     try:
         with as_output_errors(path):
-            yield draft
-            sync_folder(draft)
+            yield temporary
+            sync_folder(temporary)
             refuse_existing(path)  # another process may have created it in the meantime
-            draft.rename(path)
+            temporary.rename(path)
             sync_folder(path.parent)
     finally:
-        shutil.rmtree(draft, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
         with suppress(OSError):
-            draft.unlink()
+            temporary.unlink()
 
 
 @contextmanager
@@ -198,14 +200,14 @@ def new_folder(path: Path) -> Iterator[Path]:
     """
     missing = [parent for parent in path.parents if not parent.exists()]
     try:
-        with new_file(path) as draft:
-            draft.mkdir(parents=True)
-            yield draft
+        with new_file(path) as temporary:
+            temporary.mkdir(parents=True)
+            yield temporary
     finally:
         remove_empty(missing)
 
 
-def _draft_of(path: Path) -> Path:
+def _temporary_path(path: Path) -> Path:
     return path.with_name(f".{secrets.token_hex(4)}.draft")
 
 

@@ -21,6 +21,7 @@ from isocharge.common.tables.number_table import (
     MAX_COLUMNS,
     ColumnRule,
     NumberColumns,
+    NumberTable,
 )
 from isocharge.common.tables.table_file import open_table, write_columns
 
@@ -146,7 +147,7 @@ class MeasuredPresses:
 
         Args:
             electrodes: Names of the electrodes.
-            whose: Owner of the electrodes, for the message.
+            whose: Possessor of the electrodes, for the message, such as "the model".
 
         Raises:
             PressError: If one of the electrodes is missing.
@@ -163,7 +164,10 @@ class MeasuredPresses:
 
     @property
     def columns(self) -> dict[str, Array]:
-        """All numbers as columns of a file, each of shape (n,); without the temperature if it is nowhere known."""
+        """Numbers of the presses by the names of their columns in a file, each of shape (n,).
+
+        There is no column of the temperature if the temperature of no press is known.
+        """
         columns = dict(zip(CONTACT, self.contact.T, strict=True))
         columns |= dict(zip(self.electrodes, self.charge_pC.T, strict=True))
         columns |= dict(zip(UNCERTAINTY, (self.position_std_mm, self.force_std), strict=True))
@@ -172,6 +176,7 @@ class MeasuredPresses:
         return columns
 
     def _check_shapes(self) -> None:
+        """Raise PressError if an array does not have one row for each press, or one charge for each electrode."""
         count = len(self.lines)
         expected_shapes: dict[str, tuple[int, ...]] = {
             "contact": (count, len(CONTACT)),
@@ -187,6 +192,7 @@ class MeasuredPresses:
                 raise PressError(f"{name}: expected an array of shape {shape}, got {given}")
 
     def _check_values(self) -> None:
+        """Raise PressError if a number is not allowed in its column, if only x or only y is given, or no charge is."""
         rules = PRESS_RULES | dict.fromkeys(self.electrodes, CHARGE_RULE)
         for name in UNCERTAINTY:
             rules[name] = replace(rules[name], may_be_empty=False)
@@ -233,19 +239,17 @@ def read_presses(
             given and what to do.
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
+    path = Path(path)
     default_stds = {"position_std_mm": position_std_mm, "force_std": force_std}
     for name, std in default_stds.items():
         if not 0.0 < std <= PRESS_RULES[name].maximum:
             raise PressError(f"{name}: expected {PRESS_RULES[name].description}, got {std:g}")
 
-    path = Path(path)
-    named = "the electrodes' names" if electrodes is None else f"the electrodes {tuple(electrodes)}"
-    expected = f"a header with {', '.join(CONTACT)} and {named} (charges in pC)"
-    with open_table(path, (*(electrodes or ()), *PRESS_RULES), PressError, expected) as table:
-        if electrodes is None:
-            electrodes = [name for name in table.header if name and name not in PRESS_RULES]
-            table.refuse_similar_names([name for name in electrodes if len(name) > 1], PRESS_RULES)
-        names = tuple(electrodes)
+    expected_electrodes = "the electrodes' names" if electrodes is None else f"the electrodes {tuple(electrodes)}"
+    expected_header = f"a header with {', '.join(CONTACT)} and {expected_electrodes} (charges in pC)"
+    names_with_meaning = (*(electrodes or ()), *PRESS_RULES)
+    with open_table(path, names_with_meaning, PressError, expected_header) as table:
+        names = _electrode_columns(table) if electrodes is None else tuple(electrodes)
         with error_prefix(f"{path}: ", PressError):
             _check_electrodes(names)
         chosen = table.choose_columns(dict.fromkeys(names, CHARGE_RULE), PRESS_RULES)
@@ -255,7 +259,8 @@ def read_presses(
     if not count:
         raise PressError(f"{path}: expected one press or more below the header, got none")
 
-    values = {name: columns.values.get(name, np.full(count, np.nan)) for name in (*names, *PRESS_RULES)}
+    absent_column = np.full(count, np.nan)
+    values = {name: columns.values.get(name, absent_column) for name in (*names, *PRESS_RULES)}
     for name, std in default_stds.items():
         values[name] = np.where(np.isnan(values[name]), std, values[name])
     temperature_C = values[TEMPERATURE]
@@ -273,11 +278,26 @@ def read_presses(
         )
 
 
+def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
+    """Return the columns without another meaning, which are taken for electrodes.
+
+    Raises:
+        PressError: If a column of more than one character is named almost as a column of `PRESS_RULES`.
+    """
+    electrodes = tuple(name for name in table.header if name and name not in PRESS_RULES)
+    long_names = [name for name in electrodes if len(name) > 1]
+    table.refuse_similar_names(long_names, PRESS_RULES)
+    return electrodes
+
+
 def read_press_list(path: Path) -> Array:
-    """Read the presses that a machine makes, in their order: (x_mm, y_mm, force_N), NaN if unknown, shape (n, 3).
+    """Read the presses that a machine is to make, in their order.
 
     Args:
         path: CSV or Parquet with x_mm, y_mm and force_N, as `read_presses` reads them; further columns are ignored.
+
+    Returns:
+        (x_mm, y_mm, force_N) of each press, shape (n, 3), mm and N; NaN where the file has an empty cell.
 
     Raises:
         PressError: If the file cannot be read, or a row is not a press; line and column are named.
@@ -290,9 +310,11 @@ def read_press_list(path: Path) -> Array:
     count = len(columns.row_numbers)
     if not count:
         raise PressError(f"{path}: expected one press or more below the header, got none")
+    contact = np.column_stack([columns.values[name] for name in CONTACT])
     with error_prefix(f"{path}, ", PressError):
-        presses = MeasuredPresses(
-            contact=np.column_stack([columns.values[name] for name in CONTACT]),
+        # `MeasuredPresses` checks the contacts; the other numbers are arbitrary valid ones.
+        MeasuredPresses(
+            contact=contact,
             charge_pC=np.zeros((count, 1)),
             position_std_mm=np.ones(count),
             force_std=np.ones(count),
@@ -300,7 +322,7 @@ def read_press_list(path: Path) -> Array:
             lines=tuple(columns.row_numbers.tolist()),
             row_noun=columns.row_noun,
         )
-    return presses.contact
+    return contact
 
 
 def write_presses(path: Path, presses: MeasuredPresses) -> None:
@@ -333,8 +355,8 @@ def row_words(rows: Sequence[int], row_noun: str, most: int = 10) -> str:
         row_noun: What the numbers count, such as "line", "row" or "press".
         most: Largest number of presses that are listed.
     """
-    ending = "es" if row_noun.endswith("s") else "s"
-    noun = row_noun if len(rows) == 1 else f"{row_noun}{ending}"
+    plural = f"{row_noun}es" if row_noun.endswith("s") else f"{row_noun}s"
+    noun = row_noun if len(rows) == 1 else plural
     listed = ", ".join(map(str, rows[:most]))
     if len(rows) <= most:
         return f"{noun} {listed}"
@@ -343,7 +365,9 @@ def row_words(rows: Sequence[int], row_noun: str, most: int = 10) -> str:
 
 def _check_electrodes(electrodes: Collection[str]) -> None:
     """Raise PressError if names of electrodes cannot be names of columns that are read back."""
-    if not electrodes or len(set(electrodes)) < len(electrodes) or not all(electrodes):
+    are_different = len(set(electrodes)) == len(electrodes)
+    are_named = all(name != "" for name in electrodes)
+    if not (electrodes and are_different and are_named):
         raise PressError(f"electrodes: expected one name or more, all different, none empty, got {shown(electrodes)}")
     if len(electrodes) > MAX_ELECTRODES:
         raise PressError(f"electrodes: expected at most {MAX_ELECTRODES} names, got {len(electrodes):,}")

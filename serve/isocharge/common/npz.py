@@ -100,10 +100,10 @@ def finite_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int |
     array = arrays[name]
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name}: expected real numbers, got an array of {array.dtype}")
-    fits = array.ndim == len(shape) and all(
+    has_expected_shape = array.ndim == len(shape) and all(
         length > 0 and expected in (None, length) for length, expected in zip(array.shape, shape, strict=True)
     )
-    if not fits:
+    if not has_expected_shape:
         lengths = ", ".join("n" if length is None else str(length) for length in shape)
         raise ValueError(f"{name}: expected an array of shape ({lengths}), got {array.shape}")
     values = array.astype(np.float64)
@@ -181,9 +181,13 @@ def _array_of(content: bytearray, name: str) -> np.ndarray:
         raise ValueError(f"{name}: version {version} of the npy format is not supported")
     if dtype.hasobject:
         raise ValueError(f"{name}: expected numbers or text, got Python objects")
+    header_bytes = header.tell()
+    number_bytes = len(content) - header_bytes
     size = math.prod(shape)
-    declared_bytes = size * dtype.itemsize
-    if min(shape, default=0) < 0 or declared_bytes != len(content) - header.tell():
-        raise ValueError(f"{name}: the shape {shape} of {dtype} does not fit {len(content) - header.tell()} bytes")
-    array = np.frombuffer(content, dtype=dtype, count=size, offset=header.tell()) if size else np.empty(0, dtype)
+    if min(shape, default=0) < 0 or size * dtype.itemsize != number_bytes:
+        raise ValueError(f"{name}: the shape {shape} of {dtype} does not fit {number_bytes} bytes")
+
+    if size == 0:  # `frombuffer` refuses an empty buffer
+        return np.empty(shape, dtype)
+    array = np.frombuffer(content, dtype=dtype, count=size, offset=header_bytes)
     return array.reshape(shape, order="F" if is_fortran else "C")

@@ -53,9 +53,9 @@ def printable_lines(text: str) -> str:
 
 
 def _escape(character: str) -> str:
-    """Return the escape sequence of a character in JSON; two sequences beyond U+FFFF."""
+    """Return the escape sequence of a character in JSON, which consists of two sequences for one beyond U+FFFF."""
     if character in SHORT_ESCAPES:
         return SHORT_ESCAPES[character]
     utf16 = character.encode("utf-16-be", "surrogatepass")
-    units = (utf16[position : position + 2] for position in range(0, len(utf16), 2))
-    return "".join(f"\\u{unit.hex()}" for unit in units)
+    code_units = (utf16[position : position + 2] for position in range(0, len(utf16), 2))
+    return "".join(f"\\u{code_unit.hex()}" for code_unit in code_units)

@@ -153,6 +153,10 @@ class _StoringExecutor(Executor):
         self._submitted = 0
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Return the future of a task, whose result is loaded if it is stored, and otherwise computed and stored.
+
+        If there is no other executor, the task is computed before this method returns.
+        """
         part = f"{self._name}-{self._submitted:04d}.npy"
         self._submitted += 1
         stored: Future[Any] = Future()
@@ -170,7 +174,13 @@ class _StoringExecutor(Executor):
         return stored
 
     def _store(self, part: str, computed: Future[Any], stored: Future[Any]) -> None:
-        """Store the result of a computed future, and set the result of the returned future."""
+        """Store the result of a task, and pass it on to the future that `submit` has returned.
+
+        Args:
+            part: Name of the part in which the result is stored.
+            computed: Future of the task, which is done or cancelled.
+            stored: Future that `submit` has returned. It gets the result, or the error of the task or of the storing.
+        """
         if computed.cancelled():
             stored.cancel()
         if not stored.set_running_or_notify_cancel():
@@ -255,7 +265,8 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
                 yield draft
                 draft.remove()
             except BaseException as error:
-                if draft.is_empty() or isinstance(error, InputError | SolveError | TrainingError):
+                would_fail_again = isinstance(error, InputError | SolveError | TrainingError)
+                if draft.is_empty() or would_fail_again:
                     draft.remove()
                 raise
     finally:
@@ -264,7 +275,13 @@ def resume_parts(target: Path, identity: Mapping[str, Any], *, fresh: bool = Fal
 
 @contextmanager
 def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterator[None]:
-    """Lock the draft of a run during the block, and create the draft if necessary."""
+    """Lock the draft of a run during the block, and create the draft if necessary.
+
+    Args:
+        draft: The run.
+        identity: Settings of the run. A draft with other settings is refused.
+        fresh: Whether an existing draft is removed first.
+    """
     folder = draft.folder
     if fresh and (folder / "run.json").is_file():
         with locked(folder / "lock"):

@@ -175,20 +175,20 @@ def _first_mistake(value: object, kind: Any, cause: Exception) -> str:
         return "nested too deeply"
 
 
-def _mistakes(value: object, kind: Any, path: str) -> Iterator[str]:
-    """Yield descriptions of the mistakes in a value, the innermost first.
+def _mistakes(value: object, expected_type: Any, path: str) -> Iterator[str]:
+    """Yield descriptions of the mistakes in a value. Mistakes in the parts of a value precede those of the value.
 
     Args:
         value: Value from TOML or JSON.
-        kind: Expected type.
+        expected_type: Expected type.
         path: Names of the keys that lead to the value, such as "film.radius_mm".
     """
-    members = list(_union_members(kind))
+    members = list(_union_members(expected_type))
     yield from _mistakes_in_tag(value, members, path)
     for member in members:
-        yield from _mistakes_inside(value, member, path)
+        yield from _mistakes_in_parts(value, member, path)
     try:
-        msgspec.convert(value, kind)
+        msgspec.convert(value, expected_type)
     except msgspec.ValidationError as error:
         cause = error.__cause__
         if isinstance(cause, WrongKey):
@@ -197,51 +197,71 @@ def _mistakes(value: object, kind: Any, path: str) -> Iterator[str]:
         elif cause is not None:
             yield f"{_prefix(path)}{cause}"
         else:
-            yield f"{_prefix(path)}expected {_expected_value(kind, members[0])}, got {shown(value)}"
+            yield f"{_prefix(path)}expected {_expected_value(expected_type, members[0])}, got {shown(value)}"
 
 
-def _expected_value(kind: Any, first_member: Any) -> str:
+def _expected_value(expected_type: Any, first_member: Any) -> str:
     """Return a description of the values of a type."""
     if get_origin(first_member) is Literal:
         return _one_of(get_args(first_member))  # in the declared order, which msgspec does not keep
-    return _describe_type(inspect.type_info(kind))
+    return _describe_type(inspect.type_info(expected_type))
 
 
 def _mistakes_in_tag(value: object, members: list[Any], path: str) -> Iterator[str]:
-    """Yield mistakes in the key that selects one of several structs."""
+    """Yield a mistake in the tag, the key whose value selects one of several structs.
+
+    Args:
+        value: Value from TOML or JSON.
+        members: Members of the expected union. There is no tag if none of them is a struct with a tag.
+        path: Names of the keys that lead to the value.
+    """
     structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
-    configs = [struct.__struct_config__ for struct in structs]
-    tags = {config.tag: config.tag_field for config in configs if config.tag is not None}
-    if isinstance(value, Mapping) and tags:
-        field = str(next(iter(tags.values())))
-        if field not in value and len(tags) > 1:
-            yield f"key {_join(path, field)!r} is missing"
-        elif value.get(field) not in (*tags, None):
-            yield f"{_join(path, field)}: expected {_one_of(tags)}, got {shown(value[field])}"
+    tagged = [struct.__struct_config__ for struct in structs if struct.__struct_config__.tag is not None]
+    if not tagged or not isinstance(value, Mapping):
+        return
+    tags = [config.tag for config in tagged]
+    tag_key = str(tagged[0].tag_field)
+    if tag_key not in value:
+        if len(tags) > 1:
+            yield f"key {_join(path, tag_key)!r} is missing"
+    elif value[tag_key] is not None and value[tag_key] not in tags:
+        yield f"{_join(path, tag_key)}: expected {_one_of(tags)}, got {shown(value[tag_key])}"
 
 
-def _mistakes_inside(value: object, kind: Any, path: str) -> Iterator[str]:
-    """Yield mistakes in the parts of a table or list."""
-    if isinstance(value, Mapping) and isinstance(kind, type) and issubclass(kind, Struct):
-        yield from _mistakes_in_keys(value, kind, path)
-    elif isinstance(value, Mapping) and get_origin(kind) is dict:
-        _, item_kind = get_args(kind)
+def _mistakes_in_parts(value: object, expected_type: Any, path: str) -> Iterator[str]:
+    """Yield mistakes in the values of a table or in the items of a list.
+
+    Args:
+        value: Value from TOML or JSON.
+        expected_type: Expected type, which is no union.
+        path: Names of the keys that lead to the value.
+    """
+    if isinstance(value, Mapping) and isinstance(expected_type, type) and issubclass(expected_type, Struct):
+        yield from _mistakes_in_keys(value, expected_type, path)
+    elif isinstance(value, Mapping) and get_origin(expected_type) is dict:
+        _, item_type = get_args(expected_type)
         for key, item in value.items():
-            yield from _mistakes(item, item_kind, _join(path, key))
-    elif isinstance(value, list | tuple) and get_origin(kind) in (list, tuple):
-        item_kinds = [item_kind for item_kind in get_args(kind) if item_kind is not Ellipsis]
-        if len(item_kinds) in (1, len(value)):
+            yield from _mistakes(item, item_type, _join(path, key))
+    elif isinstance(value, list | tuple) and get_origin(expected_type) in (list, tuple):
+        item_types = [item_type for item_type in get_args(expected_type) if item_type is not Ellipsis]
+        if len(item_types) == 1:
+            item_types = item_types * len(value)
+        if len(item_types) == len(value):
             for number, item in enumerate(value[:MAX_EXAMINED_ITEMS]):
-                yield from _mistakes(item, item_kinds[number % len(item_kinds)], f"{path}[{number}]")
+                yield from _mistakes(item, item_types[number], f"{path}[{number}]")
 
 
-def _mistakes_in_keys(table: Mapping[str, Any], kind: type[Struct], path: str) -> Iterator[str]:
-    """Yield unknown keys, missing keys, and mistakes in the values of the keys."""
-    config = kind.__struct_config__
+def _mistakes_in_keys(table: Mapping[str, Any], struct: type[Struct], path: str) -> Iterator[str]:
+    """Yield unknown keys, missing keys, and mistakes in the values of the keys.
+
+    Nothing is yielded if the tag of the table selects another struct.
+    """
+    config = struct.__struct_config__
     if config.tag is not None and table.get(str(config.tag_field)) != config.tag:
         return
-    hints = get_type_hints(kind, include_extras=True)
-    fields = msgspec.structs.fields(kind)
+
+    types_of_fields = get_type_hints(struct, include_extras=True)
+    fields = msgspec.structs.fields(struct)
     known_keys = [field.encode_name for field in fields]
     if config.tag_field:
         known_keys.insert(0, config.tag_field)
@@ -249,16 +269,17 @@ def _mistakes_in_keys(table: Mapping[str, Any], kind: type[Struct], path: str) -
         for key in table:
             if key not in known_keys:
                 yield unknown_key(_join(path, key), key, known_keys)
+
     for field in fields:
         key = field.encode_name
         if key in table:
-            yield from _mistakes(table[key], hints[field.name], _join(path, key))
+            yield from _mistakes(table[key], types_of_fields[field.name], _join(path, key))
         elif field.required:
             yield f"key {_join(path, key)!r} is missing"
 
 
 def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
-    """Return an error message about an unknown key, which suggests the most similar known key.
+    """Return an error message about an unknown key, with the most similar known key as a suggestion.
 
     Args:
         name: The key with the names of the tables that contain it.
@@ -274,7 +295,7 @@ def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
 
 
 def _union_members(kind: Any) -> Iterator[Any]:
-    """Yield the members of a union without their annotations; for any other type, the type itself."""
+    """Yield the members of a union without their annotations. Any other type is its own only member."""
     if get_origin(kind) is Annotated:
         yield from _union_members(get_args(kind)[0])
     elif get_origin(kind) in (Union, UnionType):
@@ -285,6 +306,7 @@ def _union_members(kind: Any) -> Iterator[Any]:
 
 
 def _join(path: str, key: str) -> str:
+    """Return the path to a key of the table at `path`, such as "film.radius_mm"."""
     return cut(f"{path}.{key}" if path else str(key))
 
 
@@ -364,5 +386,5 @@ def _describe_number(noun: str, above: float | None, minimum: float | None, maxi
 
 
 def _bound_text(bound: float) -> str:
-    """Return a bound as a text; whole numbers have all their digits."""
+    """Return a bound as a text, with six digits if it is a float, and with all digits if it is a whole number."""
     return f"{bound:g}" if isinstance(bound, float) else str(bound)

@@ -26,13 +26,19 @@ def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
     Raises:
         TypeError: If a value is of another type.
     """
-    lines = [f"# {printable(line)}".rstrip() for text in comment for line in text.splitlines() or [""]]
+    lines = []
+    for text in comment:
+        lines += [f"# {printable(line)}".rstrip() for line in text.splitlines() or [""]]
     if lines:
         lines.append("")
+
     lines += [_pair(key, value) for key, value in tables.items() if not isinstance(value, Mapping)]
+
     for name, table in tables.items():
         if isinstance(table, Mapping):
-            lines += ["", f"[{_key(name)}]", *(_pair(key, value) for key, value in table.items())]
+            lines.append("")
+            lines.append(f"[{_key(name)}]")
+            lines += [_pair(key, value) for key, value in table.items()]
     return "\n".join(lines).lstrip("\n") + "\n"
 
 
@@ -45,6 +51,7 @@ def _key(key: str) -> str:
 
 
 def _value(value: object) -> str:
+    """Return a value in the notation of TOML; raise TypeError if TOML has no notation for its type."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(_pair(key, item) for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):

@@ -76,11 +76,12 @@ class WriterQueue(Generic[T]):
         """Write the waiting items for as long as the consumer accepts them, and count the rest as lost.
 
         Raises:
-            Exception: As `put`, once.
+            Exception: What `write` has raised in the thread, unless `put` has raised it already.
         """
         with self._change:
             while self._waiting and self._thread.is_alive():
-                if not self._change.wait_for(partial(self._makes_progress, self._taken), CLOSE_TIMEOUT_s):
+                has_changed = partial(self._has_changed, self._taken)
+                if not self._change.wait_for(has_changed, CLOSE_TIMEOUT_s):
                     break
             self.lost += len(self._waiting)
             self._waiting.clear()
@@ -91,17 +92,19 @@ class WriterQueue(Generic[T]):
             self.lost += 1
         self._raise_error()
 
-    def _makes_progress(self, taken: int) -> bool:
-        """Return whether an item was taken since `taken` were counted, or none will be taken any more."""
+    def _has_changed(self, taken: int) -> bool:
+        """Return whether the thread has taken more than `taken` items, or has ended with an error."""
         return self._taken > taken or self._error is not None
 
     def _raise_error(self) -> None:
+        """Raise the error of the thread, if there is one that was not raised yet."""
         error = self._error
         self._error = None
         if error is not None:
             raise error
 
     def _run(self) -> None:
+        """Write items until the queue is closed and empty, or until `write` raises an error."""
         try:
             while (item := self._next()) is not None:
                 self._write(item)
@@ -111,14 +114,15 @@ class WriterQueue(Generic[T]):
                 self._change.notify_all()
 
     def _next(self) -> T | None:
-        """Return the next item when the consumer would accept it; None at the end."""
+        """Wait until the consumer would accept an item, and return the oldest; None if the queue is at its end."""
         while True:
             with self._change:
                 self._change.wait_for(lambda: self._waiting or self._is_closed)
-            if self._is_ready() or self._is_closed:
-                with self._change:
-                    if not self._waiting:
-                        return None
-                    self._taken += 1
-                    self._change.notify_all()
-                    return self._waiting.popleft()
+            if not (self._is_ready() or self._is_closed):
+                continue
+            with self._change:
+                if not self._waiting:
+                    return None
+                self._taken += 1
+                self._change.notify_all()
+                return self._waiting.popleft()

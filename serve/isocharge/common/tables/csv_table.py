@@ -69,24 +69,25 @@ class CsvTable(NumberTable):
         super().__init__(header, names, where, error, expected)
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
-        places = {name: self.header.index(name) for name in rules}
+        positions = {name: self.header.index(name) for name in rules}
         line_numbers = array("q")
-        numbers = array("d")
+        numbers = array("d")  # the chosen columns of one row after another
         for line_number, cells in self._rows:
             if len(line_numbers) == most_rows:
                 self._refuse_row_count(most_rows)
             self._check_cell_count(line_number, cells)
             line_numbers.append(line_number)
-            for name, place in places.items():
-                number = _number(cells[place])
+            for name, position in positions.items():
+                number = _number(cells[position])
                 if number is None:
-                    self._refuse_cell(line_number, name, rules[name], cells[place])
+                    self._refuse_cell(line_number, name, rules[name], cells[position])
                 numbers.append(number)
-        matrix = np.array(numbers, dtype=np.float64).reshape(len(line_numbers), len(places))
-        values = dict(zip(places, matrix.T, strict=True))
+        matrix = np.array(numbers, dtype=np.float64).reshape(len(line_numbers), len(positions))
+        values = dict(zip(positions, matrix.T, strict=True))
         return NumberColumns(values, np.array(line_numbers, dtype=np.intp), self.row_noun)
 
     def _check_cell_count(self, line_number: int, cells: list[str]) -> None:
+        """Raise `error` if a row has fewer cells than the header, or more cells that are not blank."""
         surplus = cells[len(self.header) :]
         if len(cells) < len(self.header) or any(cell.strip() for cell in surplus):
             raise self.error(
@@ -95,6 +96,7 @@ class CsvTable(NumberTable):
             )
 
     def _refuse_cell(self, line_number: int, name: str, rule: ColumnRule, cell: str) -> NoReturn:
+        """Raise `error` for a cell that is not a finite number."""
         has_decimal_comma = "," in cell and _number(cell.replace(",", ".", 1)) is not None
         advice = "; write a decimal point" if has_decimal_comma else ""
         raise self.error(
@@ -113,7 +115,7 @@ class CsvTable(NumberTable):
 
 
 def csv_text(columns: Mapping[str, Array]) -> str:
-    """Return columns of shape (n,) as CSV text that reads back to the same numbers; NaN becomes an empty cell."""
+    """Return columns of shape (n,) as CSV text with all digits. NaN becomes an empty cell."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -122,24 +124,49 @@ def csv_text(columns: Mapping[str, Array]) -> str:
     return text.getvalue()
 
 
+class _LinesWithoutComments:
+    """Iterator of the lines of a CSV text, in which each comment line is replaced by a blank line.
+
+    Attributes:
+        at_row_start: Whether the next line begins a row; otherwise it continues a quoted cell and is no comment. The
+            reader of the rows sets it after each row.
+    """
+
+    def __init__(self, lines: Iterable[str], names: Collection[str]) -> None:
+        """Store the lines, and the names that have a meaning as in `CsvTable`."""
+        self.at_row_start = True
+        self._lines = iter(lines)
+        self._names = names
+        self._at_first_line = True
+
+    def __iter__(self) -> Iterator[str]:
+        """Return the iterator itself."""
+        return self
+
+    def __next__(self) -> str:
+        """Return the next line; a blank line for a comment."""
+        line = next(self._lines)
+        if self._at_first_line:
+            line = line.removeprefix(BYTE_ORDER_MARK)
+            self._at_first_line = False
+        is_comment = self.at_row_start and _is_comment(line, self._names)
+        self.at_row_start = False
+        return "\n" if is_comment else line
+
+
 def _numbered_rows(
     lines: Iterable[str], names: Collection[str], where: str, error: type[InputError]
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number, from 1, and cells of each row that is neither blank nor a comment."""
-    begins_row = True
+    """Yield the line number, from 1, and the cells of each row that is neither blank nor a comment.
 
-    def lines_without_comments() -> Iterator[str]:
-        nonlocal begins_row
-        for index, text in enumerate(lines):
-            line = text.removeprefix(BYTE_ORDER_MARK) if index == 0 else text
-            is_comment = begins_row and _is_comment(line, names)
-            begins_row = False
-            yield "\n" if is_comment else line
-
-    reader = csv.reader(lines_without_comments(), strict=True)
+    Raises:
+        error: If the lines are not CSV text in UTF-8.
+    """
+    source = _LinesWithoutComments(lines, names)
+    reader = csv.reader(source, strict=True)
     try:
         for cells in reader:
-            begins_row = True
+            source.at_row_start = True
             if any(cell.strip() for cell in cells):
                 yield reader.line_num, cells
     except InputError:  # from the iterator that supplies the lines
@@ -147,21 +174,32 @@ def _numbered_rows(
     except csv.Error as cause:
         raise error(f"{where}, line {reader.line_num}: not CSV text ({cause})") from cause
     except UnicodeDecodeError as cause:
-        is_first_piece = reader.line_num == 0
-        other_format = _other_format(cause.object) if is_first_piece else None
-        if other_format:
-            raise error(f"{where}: {other_format}") from cause
-        line_number = reader.line_num + 1 + cause.object[: cause.start].count(b"\n")
-        raise error(
-            f"{where}, line {line_number}: the byte 0x{cause.object[cause.start]:02x} is not text in UTF-8: save the "
-            "file as UTF-8; if it is Windows or Latin-1 text, as with: iconv -f WINDOWS-1252 -t UTF-8 FILE > NEW.csv"
-        ) from cause
+        raise error(where + _decoding_advice(cause, reader.line_num)) from cause
     except ValueError as cause:  # a line that is too long to be held
         raise error(f"{where}, line {reader.line_num + 1}: not CSV text ({cause})") from cause
 
 
+def _decoding_advice(cause: UnicodeDecodeError, lines_before: int) -> str:
+    """Return the end of an error message about bytes that are not UTF-8: the place, the reason and what to do.
+
+    Args:
+        cause: The error, which contains the piece of the file that was being decoded.
+        lines_before: Number of lines before this piece.
+    """
+    is_first_piece = lines_before == 0
+    other_format = _other_format(cause.object) if is_first_piece else None
+    if other_format:
+        return f": {other_format}"
+    lines_in_piece = cause.object[: cause.start].count(b"\n")
+    return (
+        f", line {lines_before + lines_in_piece + 1}: the byte 0x{cause.object[cause.start]:02x} is not text in UTF-8: "
+        "save the file as UTF-8; if it is Windows or Latin-1 text, as with: iconv -f WINDOWS-1252 -t UTF-8 FILE > "
+        "NEW.csv"
+    )
+
+
 def _other_format(data: bytes) -> str | None:
-    """Return the name of another file format and the advice for it; None if the bytes may be text.
+    """Return a sentence that names another file format and what to do; None if the bytes may be text.
 
     Args:
         data: First bytes of the file.
@@ -173,6 +211,7 @@ def _other_format(data: bytes) -> str | None:
 
 
 def _is_comment(line: str, names: Collection[str]) -> bool:
+    """Return whether a line begins with # and its first cell is none of the names."""
     first_cell = line.partition(",")[0].strip()
     return first_cell.startswith("#") and first_cell not in names
 

@@ -44,11 +44,11 @@ class ColumnMeaning:
 
 
 def header_advice(columns: Iterable[str], absent: Mapping[str, ColumnMeaning]) -> Iterator[str]:
-    """Yield what to do with each column that probably stands for an absent one.
+    """Yield advice for each column that probably is one of the missing columns under another name.
 
     Args:
         columns: Columns of the file that have no other meaning.
-        absent: Meanings of the columns that the file does not have, by name.
+        absent: Meanings of the missing columns, by name.
     """
     remaining = dict(absent)
     for column in columns:
@@ -63,26 +63,35 @@ def header_advice(columns: Iterable[str], absent: Mapping[str, ColumnMeaning]) -
 
 
 def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
-    """Return what to do with a column that stands for the column `name`; an empty text if it probably does not."""
+    """Return advice for a column that probably is the missing column `name`; an empty text if it probably is not.
+
+    Args:
+        column: Name of the column in the file.
+        name: Name of the missing column.
+        meaning: Meaning of the missing column.
+    """
     if column.casefold() == name.casefold():
         return (
             f"column {shown(column)} differs from {meaning.noun} {shown(name)} only by case: rename it to {shown(name)}"
         )
-    rename = f"rename {shown(column)} to {shown(name)}"
+    advice_to_rename = f"rename {shown(column)} to {shown(name)}"
     if meaning.noun == "electrode":
         meaning = replace(meaning, words=_words(name))
 
     words = _words(column)
-    if _is_named(words, meaning) and words <= meaning.words | GENERAL_WORDS:
-        return rename
+    has_only_known_words = words <= meaning.words | GENERAL_WORDS
+    if _is_named(words, meaning) and has_only_known_words:
+        return advice_to_rename
+
     match = _LABEL_AND_UNIT.fullmatch(column)
     if match is None:
         return ""
     label, bracketed_unit, last_word = match.groups()
     unit = bracketed_unit or last_word
     is_named = _is_named(_words(label), meaning)
-    if unit == meaning.unit and (is_named or (meaning.is_known_by_unit and bracketed_unit)):
-        return rename
+    is_recognised_by_unit = meaning.is_known_by_unit and bracketed_unit
+    if unit == meaning.unit and (is_named or is_recognised_by_unit):
+        return advice_to_rename
     if unit in OTHER_UNITS.get(meaning.unit, ()) and is_named:
         return f"column {shown(column)} is in {unit}: convert it to {meaning.unit} and rename it to {shown(name)}"
     return ""
@@ -96,4 +105,5 @@ def _is_named(words: frozenset[str], meaning: ColumnMeaning) -> bool:
 
 
 def _words(text: str) -> frozenset[str]:
+    """Return the words of a text in lower case, separated by anything but letters and digits."""
     return frozenset(word for word in re.split(r"[\W_]+", text.casefold()) if word)

@@ -48,7 +48,7 @@ class ColumnRule:
     meaning: ColumnMeaning = field(default_factory=ColumnMeaning)
 
     def violations(self, values: Array) -> Booleans:
-        """Return which values break the rule, shape (n,), from values of shape (n,) with NaN for an empty cell."""
+        """Return which of the values break the rule, shape (n,). NaN stands for an empty cell."""
         is_empty = np.isnan(values)
         is_outside = (values < self.minimum) | (values > self.maximum)
         if self.is_positive:
@@ -190,7 +190,7 @@ class NumberTable(ABC):
 
     @abstractmethod
     def _read_columns(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
-        """Turn the columns of the format into arrays, as `read` describes, without checking the values."""
+        """Convert the columns of the format to arrays, as `read` describes, without checking the values."""
 
     def _refuse_header(self, reason: str) -> NoReturn:
         raise self.error(f"{self.where}: expected {self.expected}, got the header {shown(list(self.header))}; {reason}")

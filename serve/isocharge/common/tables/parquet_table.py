@@ -157,24 +157,27 @@ def require_pyarrow() -> None:
 
 def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
     """Check the marks at both ends of a file and the size of its metadata, before pyarrow reads all of the metadata."""
-    head = file.read(len(MARK))
-    size = file.seek(0, io.SEEK_END)
-    file.seek(max(0, size - 4 - len(MARK)))
-    footer_bytes = int.from_bytes(file.read(4), "little")
-    tail = file.read(len(MARK))
+    first_mark = file.read(len(MARK))
+
+    # A Parquet file ends with the size of its metadata (u32, little-endian) and the mark.
+    file_bytes = file.seek(0, io.SEEK_END)
+    file.seek(max(0, file_bytes - 4 - len(MARK)))
+    metadata_bytes = int.from_bytes(file.read(4), "little")
+    last_mark = file.read(len(MARK))
     file.seek(0)
-    if head != MARK or tail != MARK:
+
+    if first_mark != MARK or last_mark != MARK:
         raise error(f"{where}: not a Parquet file, or one that was cut off; write it again, or as CSV")
-    if footer_bytes > MAX_FOOTER_BYTES:
+    if metadata_bytes > MAX_FOOTER_BYTES:
         raise error(
-            f"{where}: expected metadata of at most {MAX_FOOTER_BYTES:,} bytes, got {footer_bytes:,}; write the file "
+            f"{where}: expected metadata of at most {MAX_FOOTER_BYTES:,} bytes, got {metadata_bytes:,}; write the file "
             "with fewer columns or row groups"
         )
 
 
 @contextmanager
 def _damage_explained(where: str, error: type[InputError]) -> Iterator[None]:
-    """Turn the errors of pyarrow, which has one class for each kind of damage, into `error`."""
+    """Convert the errors of pyarrow in the block, which has one class for each kind of damage, to `error`."""
     from pyarrow import ArrowException
 
     try:

@@ -54,7 +54,13 @@ def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
 
 @contextmanager
 def _read_errors_explained(path: Path, error: type[InputError], expected: str) -> Iterator[None]:
-    """Turn the errors of the file system into `error`."""
+    """Convert the errors of the file system in the block to `error`.
+
+    Args:
+        path: The file, for the error message.
+        error: Class of the error that is raised.
+        expected: Description of the expected file, for the error message.
+    """
     try:
         yield
     except OSError as cause:
