@@ -26,6 +26,7 @@ from isocharge.serve.model.model_folder import (
     check_golden,
     find_labelled_model,
     find_model,
+    load_checked_model,
     load_model,
     write_model,
 )
@@ -76,6 +77,7 @@ __all__ = [
     "examine",
     "find_labelled_model",
     "find_model",
+    "load_checked_model",
     "load_device",
     "load_model",
     "open_source",

@@ -7,7 +7,7 @@ import typer
 
 from isocharge.cli.shared.options import JsonOption
 from isocharge.cli.shared.terminal import show, show_json, shown_progress
-from isocharge.serve import Model, Predictor, check_golden, find_model, load_model
+from isocharge.serve import Model, Predictor, find_model, load_checked_model
 from isocharge.serve.benchmark import Timing, in_process_contenders, machine, press_charges, take_turns
 
 ERROR_NAMES = {
@@ -32,8 +32,7 @@ def bench_command(
 
     Example: isocharge serve bench three-25um-biaxial --seconds 10
     """
-    loaded = load_model(find_model(model))
-    check_golden(loaded)
+    loaded = load_checked_model(find_model(model))
     predictor = Predictor(loaded.folder)
     contenders = in_process_contenders(predictor, press_charges(predictor, loaded.golden.charge_pC))
     with shown_progress():

@@ -30,7 +30,7 @@ from isocharge.cli.shared.terminal import (
     unless_hung_up,
     until_stopped,
 )
-from isocharge.common.errors import InputError, ModelError, shown
+from isocharge.common.errors import InputError, shown
 from isocharge.common.printable_text import is_printable
 from isocharge.serve import (
     Policy,
@@ -39,12 +39,11 @@ from isocharge.serve import (
     Recorder,
     Recording,
     TouchStream,
-    check_golden,
     device_from_table,
     find_labelled_model,
     find_model,
+    load_checked_model,
     load_device,
-    load_model,
     open_source,
 )
 from isocharge.serve.live.device import with_settings
@@ -195,10 +194,7 @@ def stream_command(
 def _load(model: str, models: Path | None) -> Predictor:
     """Load the latest version of a model, and check its golden vectors on this machine."""
     folder = find_model(model, models)
-    loaded = load_model(folder)
-    check_golden(loaded)
-    if folder.name.isdecimal() and folder.name != str(loaded.metadata.version):
-        raise ModelError(f"{folder}: expected version {folder.name}, got {loaded.metadata.label}; export it again")
+    load_checked_model(folder)
     return Predictor(folder)
 
 

@@ -244,6 +244,23 @@ def check_golden(model: Model) -> None:
     check_outputs(model.golden, outputs, where)
 
 
+def load_checked_model(folder: Path) -> Model:
+    """Read a model, and check that this machine computes its golden vectors.
+
+    Raises:
+        ModelError: If `load_model` or `check_golden` raises it, or the folder is named after another version than the
+            metadata.
+    """
+    model = load_model(folder)
+    if folder.name.isdecimal() and folder.name != str(model.metadata.version):
+        raise ModelError(
+            f"{folder}: expected version {folder.name}, got {model.metadata.label}; "
+            "move it into a folder of that version, or export it again"
+        )
+    check_golden(model)
+    return model
+
+
 def write_model(
     folder: Path,
     onnx_model: bytes,

@@ -20,8 +20,7 @@ from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import (
     Model,
-    check_golden,
-    load_model,
+    load_checked_model,
     model_names,
     repositories,
     version_folders,
@@ -301,11 +300,10 @@ def _refusal_reason(folder: Path, error: Exception) -> str:
 
 def _load_version(name: str, version: int, folder: Path, statistics: Statistics) -> LoadedVersion:
     """Load and check one version; raise ModelError if its metadata name another model or version than its folders."""
-    model = load_model(folder)
-    if (model.metadata.name, model.metadata.version) != (name, version):
+    model = load_checked_model(folder)
+    if model.metadata.name != name:
         raise ModelError(
             f"{folder}: expected the model {name}/{version}, as the folders say, got {model.metadata.label}; "
             "move it into folders of that name and version"
         )
-    check_golden(model)
     return LoadedVersion(model, model.metadata, str(version), statistics)
