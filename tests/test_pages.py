@@ -18,7 +18,7 @@ SMALLER = {
     "--samples 100000": "--samples 500",
     "--radius 8 --force 0.05 2 --samples 6000": "--radius 3 --force 0.5 1 --samples 800",
     "--link film &": "--link film --force-max 0.05 &",
-    "--count 5000": "--count 1000",
+    "--count 2000": "--count 1000",
     "train/configs/quick.toml": "quick.toml",
 }
 """Parts of examples that would take a test too long, and the shorter parts that the tests run in their place."""
@@ -93,7 +93,7 @@ def test_an_example_does_what_it_says(page_example, desk, installed, run_example
     printed = run_commands(text, desk, environment, timeout=3600)
     if page_example.page == RESEARCH_TUTORIAL and "simulate point" in text:
         assert '"charge_pC"' in printed
-        assert printed.count('"frame_id": "three-25um-biaxial"') == 2000
+        assert printed.count('"frame_id": "three-25um-biaxial"') == 1000
 
 
 def anchors(text):
