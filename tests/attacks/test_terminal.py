@@ -24,7 +24,7 @@ from isocharge.serve import (
 )
 from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
-from isocharge.serve.examination.port_check import findings
+from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import find_model
 from isocharge.serve.record.csv_rows import csv_header
@@ -127,7 +127,7 @@ def test_names_of_a_board_through_the_doctor(notation, attack):
     def read(names):
         chunks = [Chunk(data, 1.7e9 + 0.005 * number, 0) for number, data in enumerate(NOTATIONS[notation](names))]
         with checked_terminal():
-            examination = findings(ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=1.0))
+            examination = examine_received(ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=1.0))
             show("\n".join(report_lines(examination)))
             show_json(asdict(examination))
             comments = [line for line in device_text(examination).splitlines() if line.startswith("#")]

@@ -23,7 +23,7 @@ from cobs import cobs
 from isocharge.serve import Chunk, Predictor, TouchStream, load_device
 from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
-from isocharge.serve.examination.port_check import findings
+from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
 
@@ -182,7 +182,7 @@ class Board:
 def examined(board, kind, gain):
     """What doctor finds in a second of a board."""
     received = ReceivedData(kind.url, 115200, kind.request, list(board.chunks(330)), 0.825)
-    return findings(received, electrodes=predictor(kind.model).metadata.electrodes, gain=gain)
+    return examine_received(received, electrodes=predictor(kind.model).metadata.electrodes, gain=gain)
 
 
 @pytest.fixture

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame
-from isocharge.serve.examination.held_press import LEARNING_TAU_s, held_press
+from isocharge.serve.examination.held_press import LEARNING_TAU_s, find_held_press
 from isocharge.serve.examination.listening import ReceivedData
-from isocharge.serve.examination.port_check import findings
+from isocharge.serve.examination.port_check import examine_received
 
 T_S = np.arange(0.0, 20.0, 0.005)
 HELD_S = T_S - 5.0
@@ -60,7 +60,7 @@ def still(t):
     ],
 )
 def test_held_press_finds_leak_creep_or_drift(law, drift, sections, said, scale):
-    held = held_press(board(law, drift, scale=scale), T_S)
+    held = find_held_press(board(law, drift, scale=scale), T_S)
     assert held.begin_s == pytest.approx(5.0, abs=0.2)
     assert held.sections == {name: pytest.approx(keys, rel=0.15) for name, keys in sections.items()}
     assert re.search(said, held.description)
@@ -68,8 +68,8 @@ def test_held_press_finds_leak_creep_or_drift(law, drift, sections, said, scale)
 
 @pytest.mark.parametrize("until_s", [0.0, 7.0])
 def test_no_press_or_a_short_press_has_no_result(until_s):
-    assert held_press(board(still, until_s=until_s), T_S) is None
-    assert held_press(board(still)[:300], T_S[:300]) is None
+    assert find_held_press(board(still, until_s=until_s), T_S) is None
+    assert find_held_press(board(still)[:300], T_S[:300]) is None
 
 
 def test_proposed_file_has_the_leak_and_the_offset_before_the_press():
@@ -78,7 +78,7 @@ def test_proposed_file_has_the_leak_and_the_offset_before_the_press():
         Chunk(encode_frame(Frame(k % 65536, 5000 * k, tuple(row.tolist()))), 1e9 + t, 0)
         for k, (t, row) in enumerate(zip(T_S, values, strict=True))
     ]
-    report = findings(ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=20.0))
+    report = examine_received(ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=20.0))
     assert device_from_table(report.device, "board").leak.tau_s == pytest.approx(10.0, rel=0.05)
     assert max(abs(channel.offset_pC) for channel in report.channels) < 1.0
     assert report.works

@@ -14,10 +14,10 @@ import pytest
 from isocharge.cli.serve.doctor import report_lines
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text
-from isocharge.serve.examination.channel_health import channel_health
+from isocharge.serve.examination.channel_health import measure_channel_health
 from isocharge.serve.examination.device_text import device_text
 from isocharge.serve.examination.listening import ReceivedData
-from isocharge.serve.examination.port_check import findings
+from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.port.serial_line import Request
 
 RATE_HZ = 200.0
@@ -54,7 +54,7 @@ def missing(report):
 
 
 def test_check_of_a_healthy_board():
-    report = findings(received(charges()), device=AT_REST, electrodes=("A", "B", "C"))
+    report = examine_received(received(charges()), device=AT_REST, electrodes=("A", "B", "C"))
     assert (report.baud, report.format, report.missing) == (115200, "binary frames of isocharge", ())
     assert (report.good, report.bad, report.lost, report.repeated, report.device_clock) == (400, 0, 0, 0, True)
     assert report.rate_Hz == pytest.approx(200.0)
@@ -64,14 +64,14 @@ def test_check_of_a_healthy_board():
 def test_check_uses_no_stage_that_is_switched_off():
     """A gain that is off multiplies nothing, and a leak that is off is missing."""
     off = {"gain": {"on": False, "pC_per_unit": 2.0}, "leak": {"on": False, "tau_s": 10.0}}
-    report = findings(received(charges()), device=device_from_table(off, "test"))
+    report = examine_received(received(charges()), device=device_from_table(off, "test"))
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]
     assert "time constants ([leak] tau_s" in missing(report)
 
 
 def test_check_of_a_channel_without_a_number():
     """A board prints `nan` where an amplifier is missing; the others are reported as ever, in valid JSON too."""
-    report = findings(received(lambda _: b"A:nan,B:1.5,C:2.5\n"))
+    report = examine_received(received(lambda _: b"A:nan,B:1.5,C:2.5\n"))
     assert [(c.name, c.offset_pC) for c in report.channels] == [("A", None), ("B", 1.5), ("C", 2.5)]
     assert report.channels[0].unusable == report.good == 400
     assert "charges on channel A" in missing(report)
@@ -96,17 +96,21 @@ def test_check_of_a_channel_without_a_number():
     ],
 )
 def test_check_reports_missing_settings(board, said):
-    assert said in missing(findings(received(board), electrodes=FOUR))
+    assert said in missing(examine_received(received(board), electrodes=FOUR))
 
 
 def test_missing_clock_is_reported_only_with_leak():
     lines = received(charges(encode=partial(encode_text, notation="csv")))
-    reports = findings(lines, device=AT_REST), findings(lines), findings(received(charges()), device=AT_REST)
+    reports = (
+        examine_received(lines, device=AT_REST),
+        examine_received(lines),
+        examine_received(received(charges()), device=AT_REST),
+    )
     assert ["a device clock" in missing(report) for report in reports] == [True, False, False]
 
 
 def test_unused_inputs_are_ignored():
-    report = findings(received(row), electrodes=FOUR)
+    report = examine_received(received(row), electrodes=FOUR)
     assert report.device["channels"] == {"A": "1", "B": "3", "C": "4", "D": "6"}
     assert (report.unused, report.unit) == (("2", "5"), "counts")
     assert "life" not in missing(report)
@@ -117,7 +121,7 @@ def test_unused_inputs_are_ignored():
 
 
 def test_too_few_used_channels_for_the_model():
-    report = findings(received(row), electrodes=("A", "B", "C", "D", "E"))
+    report = examine_received(received(row), electrodes=("A", "B", "C", "D", "E"))
     assert "6 channels, but the model has the electrodes" in missing(report)
     assert "channels" not in report.device
 
@@ -126,12 +130,16 @@ def test_channels_of_most_similar_noise_are_proposed():
     """Side by side; the first input is a temperature, far quieter in pC than the film."""
     rng = np.random.default_rng(0)
     board = lambda _: ",".join(f"{x:.3f}" for x in rng.normal(0.0, [0.05, 3.0, 3.0, 3.0])).encode() + b"\n"  # noqa: E731
-    assert findings(received(board), electrodes=("A", "B", "C")).device["channels"] == {"A": "2", "B": "3", "C": "4"}
+    assert examine_received(received(board), electrodes=("A", "B", "C")).device["channels"] == {
+        "A": "2",
+        "B": "3",
+        "C": "4",
+    }
 
 
 def test_channels_that_the_device_file_omits_are_ignored():
     board = {"channels": {"A": "ch1", "B": "3", "C": "4"}, "gain": {"pC_per_unit": 0.5, "offset": 300}}
-    report = findings(received(row), device=device_from_table(board, "test"))
+    report = examine_received(received(row), device=device_from_table(board, "test"))
     assert ([channel.name for channel in report.channels], report.unused) == (["1", "3", "4"], ("2", "5", "6"))
     assert all(abs(channel.offset_pC) < 10 for channel in report.channels)
 
@@ -139,14 +147,14 @@ def test_channels_that_the_device_file_omits_are_ignored():
 def test_proposed_device_file_reads_the_same_charges():
     """What doctor says of the board, its file says again."""
     gain = {"pC_per_unit": {"A": 0.5, "B": -0.5, "C": 0.5, "D": 0.5}}
-    first = findings(received(row), electrodes=FOUR, gain=gain)
+    first = examine_received(received(row), electrodes=FOUR, gain=gain)
     assert first.device["gain"]["offset"] == pytest.approx(305, abs=10)
-    again = findings(received(row), device=device_from_table(first.device, "test"))
+    again = examine_received(received(row), device=device_from_table(first.device, "test"))
     assert [channel.name for channel in again.channels] == [channel.name for channel in first.channels]
     assert all(abs(channel.offset_pC) < 5 for channel in again.channels)
     assert (again.unit, again.unused) == ("pC", ("2", "5"))
     with pytest.raises(DeviceError, match=r"gain\.pC_per_unit: expected a number, or one for each"):
-        findings(received(row), electrodes=FOUR, gain={"pC_per_unit": {"A": 0.5}})
+        examine_received(received(row), electrodes=FOUR, gain={"pC_per_unit": {"A": 0.5}})
 
 
 @pytest.mark.parametrize(
@@ -164,22 +172,22 @@ def test_proposed_device_file_reads_the_same_charges():
 )
 def test_offset_is_proposed_if_the_rest_is_too_large_for_a_tare(gain, rests, offset):
     board = lambda k: b"%d,%d\n" % tuple(rest + (k * 7) % 5 - 2 for rest in rests)  # noqa: E731
-    proposed = findings(received(board), electrodes=("A", "B"), gain=gain).device["gain"]
+    proposed = examine_received(received(board), electrodes=("A", "B"), gain=gain).device["gain"]
     assert proposed == gain | ({} if offset is None else {"offset": offset})
 
 
 def test_proposed_file_of_a_board_far_from_zero_works():
     rng = np.random.default_rng(0)
     board = lambda _: b"%.2f;%.2f;%.2f\n" % tuple(rng.normal((312.0, -128.0, 3.0), 1.0))  # noqa: E731
-    report = findings(received(board))
+    report = examine_received(received(board))
     assert report.device["gain"]["offset"] == pytest.approx({"A": 312.0, "B": -128.0, "C": 3.0}, abs=0.3)
     assert "rest near zero on channel 1: 311.9 pC" in missing(report)
     assert report.works
-    assert not findings(received(row)).works  # counts of which nobody has said what they are
+    assert not examine_received(received(row)).works  # counts of which nobody has said what they are
 
 
 def test_proposed_file_has_the_request():
-    frames = findings(received(row, request=Request(b"?\n", 50.0, echo=True))).device["frames"]
+    frames = examine_received(received(row, request=Request(b"?\n", 50.0, echo=True))).device["frames"]
     assert (frames["request"], frames["request_Hz"], frames["echo"]) == ("3F 0A", 50.0, True)
 
 
@@ -192,7 +200,7 @@ def test_proposed_file_has_the_request():
 )
 def test_device_text_has_lines_to_fill_in(gain, lines):
     board = lambda k: b"%d,%d,0\n" % (303 + k % 5, 307 - k % 5)  # noqa: E731
-    text = device_text(findings(received(board), electrodes=("A", "B"), gain=gain))
+    text = device_text(examine_received(received(board), electrodes=("A", "B"), gain=gain))
     assert all(f"\n{line}" in text for line in lines)
     assert ("= ?" in text) == (not gain)
     assert re.search(r"\n# text, CSV: 3 columns without names; 20[01] frames per second\n", text)
@@ -202,7 +210,7 @@ def test_device_text_has_lines_to_fill_in(gain, lines):
 def test_check_with_a_wrong_device_file_still_reports():
     fields = [{"name": "A", "type": "f32"}]
     table = {"frames": {"format": "described", "sync": "AA", "length": 5, "fields": fields}}
-    report = findings(received(row), device=device_from_table(table, "test"))
+    report = examine_received(received(row), device=device_from_table(table, "test"))
     assert report.good == 0
     assert "bytes come, but no frames" in missing(report)
 
@@ -210,7 +218,7 @@ def test_check_with_a_wrong_device_file_still_reports():
 def test_offset_drift_hum_and_noise_of_a_channel():
     t, rng = np.arange(0.0, 4.0, 0.002), np.random.default_rng(0)
     charge = 12.0 + 3.0 * t + 2.0 * np.sin(2 * np.pi * 50 * t + 1) + 0.5 * np.sin(2 * np.pi * 60 * t)
-    health = channel_health("A", charge + rng.normal(0, 0.3, t.size), t, 500.0)
+    health = measure_channel_health("A", charge + rng.normal(0, 0.3, t.size), t, 500.0)
     assert health.offset_pC == pytest.approx(12.0 + 6.0, abs=0.1)
     assert health.drift_pC_per_s == pytest.approx(3.0, abs=0.05)
     assert health.hum_pC == pytest.approx((2.0, 0.5), abs=0.05)
@@ -219,13 +227,13 @@ def test_offset_drift_hum_and_noise_of_a_channel():
 
 def test_hum_above_half_the_rate_is_not_estimated():
     t = np.arange(0.0, 4.0, 0.01)
-    assert channel_health("A", np.sin(t), t, 100.0).hum_pC == (None, None)
+    assert measure_channel_health("A", np.sin(t), t, 100.0).hum_pC == (None, None)
 
 
 def test_values_that_are_no_charges_are_counted_and_left_out():
     t = np.arange(0.0, 4.0, 0.01)
     charge = 7.0 + np.random.default_rng(0).normal(0.0, 0.3, t.size)
     charge[[3, 90, 200]] = np.nan, 1e300, -np.inf
-    health = channel_health("A", charge, t, 100.0)
+    health = measure_channel_health("A", charge, t, 100.0)
     assert health.offset_pC == pytest.approx(7.0, abs=0.05)
     assert (health.unusable, health.noise_pC) == (3, pytest.approx(0.3, rel=0.1))

@@ -1,5 +1,6 @@
 """Health of one channel of a board while the film is at rest: offset, noise, drift and hum."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,8 +41,10 @@ class ChannelHealth:
     unusable: int = 0
 
 
-def channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz: float) -> ChannelHealth:
-    """Fit a constant, a slope and the hum to the values of a channel.
+def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz: float) -> ChannelHealth:
+    """Measure the health of a channel, by a fit of a constant, a slope and the hum to its values.
+
+    Values whose magnitude is larger than `LARGEST_PC`, and NaN, are left out.
 
     Args:
         name: Name of the channel.
@@ -53,26 +56,30 @@ def channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz: float) 
     unusable = int(np.count_nonzero(~is_usable))
     if unusable == is_usable.size:
         return ChannelHealth(name, unusable=unusable)
-    charge_pC = charge_pC[is_usable]
-    times_s = times_s[is_usable]
+    usable_pC = charge_pC[is_usable]
+    usable_times_s = times_s[is_usable]
 
-    is_long_enough = times_s[-1] > SHORTEST_S
-    fitted_Hz = [hum_Hz for hum_Hz in MAINS_HZ if is_long_enough and rate_Hz > SAMPLES_PER_PERIOD * hum_Hz]
-    columns = [np.ones_like(times_s), times_s]
+    fitted_Hz: list[float] = []
+    if usable_times_s[-1] > SHORTEST_S:
+        fitted_Hz = [hum_Hz for hum_Hz in MAINS_HZ if rate_Hz > SAMPLES_PER_PERIOD * hum_Hz]
+    columns = [np.ones_like(usable_times_s), usable_times_s]
     for hum_Hz in fitted_Hz:
-        phase = 2.0 * np.pi * hum_Hz * times_s
+        phase = 2.0 * np.pi * hum_Hz * usable_times_s
         columns += [np.cos(phase), np.sin(phase)]
     design_matrix = np.column_stack(columns)
-    coefficients = np.linalg.lstsq(design_matrix, charge_pC, rcond=None)[0]
-    slope = coefficients[1]
-    waves = coefficients[2:].reshape(-1, 2)
-    amplitudes = {hum_Hz: float(np.hypot(*wave)) for hum_Hz, wave in zip(fitted_Hz, waves, strict=True)}
+    coefficients = np.linalg.lstsq(design_matrix, usable_pC, rcond=None)[0]
+    residual_pC = usable_pC - design_matrix @ coefficients
+
+    _, slope_pC_per_s, *hum_coefficients = coefficients.tolist()
+    cosines_pC = hum_coefficients[0::2]
+    sines_pC = hum_coefficients[1::2]
+    amplitudes_pC = dict(zip(fitted_Hz, map(math.hypot, cosines_pC, sines_pC), strict=True))
     return ChannelHealth(
         name,
-        offset_pC=float(charge_pC.mean()),
-        noise_pC=float((charge_pC - design_matrix @ coefficients).std()),
-        drift_pC_per_s=float(slope),
-        hum_pC=(amplitudes.get(50.0), amplitudes.get(60.0)),
-        span_pC=float(np.ptp(charge_pC)),
+        offset_pC=float(usable_pC.mean()),
+        noise_pC=float(residual_pC.std()),
+        drift_pC_per_s=slope_pC_per_s,
+        hum_pC=(amplitudes_pC.get(50.0), amplitudes_pC.get(60.0)),
+        span_pC=float(np.ptp(usable_pC)),
         unusable=unusable,
     )

@@ -22,16 +22,22 @@ LINES_TO_FILL_IN = {
 
 
 def device_text(examination: Examination) -> str:
-    """Return the device file of a board, TOML. Keys of the gain that are not known are comments to fill in."""
-    table = {key: value for key, value in examination.device.items() if key != "gain"}
-    text = to_toml(table, (*HEAD, *_description(examination)))
+    """Return the device file of a board as TOML text.
+
+    The section `[gain]` comes last. Keys of the section that are not known are comments for the user to complete.
+    """
+    other_sections = {key: value for key, value in examination.device.items() if key != "gain"}
+    text = to_toml(other_sections, (*HEAD, *_description(examination)))
+
     gain = examination.device.get("gain")
-    lines = LINES_TO_FILL_IN.get(examination.unit, ())
+    lines_to_fill_in = LINES_TO_FILL_IN.get(examination.unit, ())
     if gain is not None:
         text += "\n" + to_toml({"gain": gain})
-    elif lines:
+    elif lines_to_fill_in:
         text += "\n[gain]\n"
-    return text + "".join(f"{line}\n" for line in lines)
+    for line in lines_to_fill_in:
+        text += f"{line}\n"
+    return text
 
 
 def _description(examination: Examination) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Check which channel belongs to which electrode, by a press near each electrode in turn.
 
-The electrode next to a press collects the largest charge. The gains of the channels need not be known or equal: each
-channel is compared with its own answers to the other presses.
+The electrode next to a press collects the largest charge. The gains of the channels need not be known or equal, because
+the change of each channel is compared with the changes of the same channel under the other presses.
 """
 
 import math
@@ -33,10 +33,10 @@ REST_UPDATE = 0.2
 """Weight of a new block in the rest while nothing presses, dimensionless. The rest follows a slow drift."""
 
 NORMALISATION_STEPS = 20
-"""Number of times that the answers are divided by the means of their rows and columns."""
+"""Number of times that the changes are divided by the means of their rows and columns."""
 
 MIN_ADVANTAGE = 1.1
-"""Smallest ratio of the answer of the nearest electrode to that of any other, dimensionless."""
+"""Smallest ratio of the largest normalised change under a press to the change of any other channel, dimensionless."""
 
 PRESS_TIMEOUT_S = 60.0
 """Time to wait for each press, s."""
@@ -44,18 +44,18 @@ PRESS_TIMEOUT_S = 60.0
 
 @dataclass(frozen=True)
 class ElectrodeCheck:
-    """Which channel answered to the press near each electrode.
+    """Result of the presses: the channel that changed most under the press near each electrode.
 
     Attributes:
         expected: Channel of each electrode as it was assumed, by the names of the electrodes.
-        found: Channel of each electrode by the presses.
-        answers: Change of each channel under each press, shape (electrodes, channels), in the unit of the board.
+        found: Channel of each electrode as the presses show it, by the names of the electrodes.
+        changes: Change of each channel under each press, shape (electrodes, channels), in the unit of the board.
         inverted: Channels whose charge falls under a press.
     """
 
     expected: Mapping[str, str]
     found: Mapping[str, str]
-    answers: Array
+    changes: Array
     inverted: tuple[str, ...]
 
     @property
@@ -65,7 +65,7 @@ class ElectrodeCheck:
 
     @property
     def sentences(self) -> Iterator[str]:
-        """What the presses show, for people."""
+        """Sentences that describe the result to the user."""
         for electrode, channel in self.found.items():
             yield f"press near {electrode}: channel {printable(channel)} answers most strongly"
         yield _order_sentence(self.expected, self.found)
@@ -75,19 +75,28 @@ class ElectrodeCheck:
 
 
 def _order_sentence(expected: Mapping[str, str], found: Mapping[str, str]) -> str:
-    """Return whether channels are swapped or turned."""
-    names = list(expected)
-    electrode_of_channel = {channel: electrode for electrode, channel in expected.items()}
-    assumed = [electrode_of_channel[found[name]] for name in names]
-    moved = [name for name, other in zip(names, assumed, strict=True) if name != other]
-    if not moved:
+    """Return a sentence that states whether the channels are swapped, turned, or in another order.
+
+    Args:
+        expected: Channel of each electrode as it was assumed, by the names of the electrodes.
+        found: Channel of each electrode as the presses show it, by the names of the electrodes.
+    """
+    electrodes = list(expected)
+    assumed_electrode = {channel: electrode for electrode, channel in expected.items()}
+    assumed_electrodes = [assumed_electrode[found[electrode]] for electrode in electrodes]
+    pairs = zip(electrodes, assumed_electrodes, strict=True)
+    wrong_electrodes = [electrode for electrode, assumed in pairs if electrode != assumed]
+    if not wrong_electrodes:
         return "every channel belongs to its electrode"
-    for places in range(1, len(names)):
-        if len(names) > 2 and assumed == names[places:] + names[:places]:
-            return f"the channels are turned by {places} of {len(names)} places"
-    if len(moved) == 2:
-        return f"the channels of {moved[0]} and {moved[1]} are swapped"
-    return f"the channels of {', '.join(moved)} are in another order"
+
+    if len(electrodes) > 2:
+        for places in range(1, len(electrodes)):
+            turned_electrodes = electrodes[places:] + electrodes[:places]
+            if assumed_electrodes == turned_electrodes:
+                return f"the channels are turned by {places} of {len(electrodes)} places"
+    if len(wrong_electrodes) == 2:
+        return f"the channels of {wrong_electrodes[0]} and {wrong_electrodes[1]} are swapped"
+    return f"the channels of {', '.join(wrong_electrodes)} are in another order"
 
 
 def check_electrodes(
@@ -103,62 +112,68 @@ def check_electrodes(
         port: The open port.
         device: Format of the frames.
         channels: Name of the channel of each electrode, as it is assumed.
-        ask: Called with a sentence that asks for a press.
+        ask: Function that is called with a sentence that asks the user for a press.
         timeout_s: Time to wait for each press, s.
 
     Raises:
         PressCheckError: If a press does not come in time, or the presses do not tell the channels apart.
         PortLost: If the port goes away.
     """
-    blocks = _Blocks(port, device, list(channels.values()))
-    answers = []
-    for electrode in channels:
+    electrodes = list(channels)
+    channel_names = list(channels.values())
+    blocks = _Blocks(port, device, channel_names)
+    measured_changes = []
+    for electrode in electrodes:
         ask(f"press near electrode {electrode}, as close to it as you can, and let go")
-        answers.append(_answer_to_press(blocks, electrode, timeout_s))
-    order = assign_channels(np.array(answers), list(channels))
-    names = list(channels.values())
-    found = {electrode: names[column] for electrode, column in zip(channels, order, strict=True)}
-    changes = np.array(answers)
-    own_changes = changes[np.arange(len(order)), order]
-    inverted = tuple(found[electrode] for electrode, change in zip(found, own_changes, strict=True) if change < 0.0)
-    return ElectrodeCheck(dict(channels), found, changes, inverted)
+        measured_changes.append(_wait_for_press(blocks, electrode, timeout_s))
+    changes = np.array(measured_changes)  # shape (electrodes, channels)
+
+    found = {}
+    inverted = []
+    for row, column in enumerate(assign_channels(changes, electrodes)):
+        channel = channel_names[column]
+        found[electrodes[row]] = channel
+        if changes[row, column] < 0.0:
+            inverted.append(channel)
+    return ElectrodeCheck(dict(channels), found, changes, tuple(inverted))
 
 
-def assign_channels(answers: Array, electrodes: Sequence[str]) -> list[int]:
-    """Find the channel that answers most strongly to the press near each electrode.
+def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
+    """Find the channel that changes most under the press near each electrode.
 
     The forces of the presses and the gains of the channels differ. They are removed by dividing rows and columns
     alternately by their means (Sinkhorn and Knopp 1967).
 
     Args:
-        answers: Change of each channel under the press near each electrode, shape (electrodes, channels), any unit.
+        changes: Change of each channel under the press near each electrode, shape (electrodes, channels), any unit.
         electrodes: Names of the electrodes.
 
     Returns:
         Column of the channel for each electrode.
 
     Raises:
-        PressCheckError: If two presses move the same channel most, or a press moves two channels alike.
+        PressCheckError: If two presses change the same channel most, or a press changes two channels almost equally.
     """
-    strength = np.abs(answers) + 1e-30
+    normalised = np.abs(changes) + 1e-30  # a channel that never changes must not cause a division by zero
     for _ in range(NORMALISATION_STEPS):
-        strength = strength / strength.mean(axis=0)
-        strength = strength / strength.mean(axis=1, keepdims=True)
-    order = [int(column) for column in np.argmax(strength, axis=1)]
-    for row, column in enumerate(order):
-        others = np.delete(strength[row], column)
-        if others.size and strength[row, column] < MIN_ADVANTAGE * others.max():
+        normalised = normalised / normalised.mean(axis=0)
+        normalised = normalised / normalised.mean(axis=1, keepdims=True)
+
+    columns = [int(column) for column in np.argmax(normalised, axis=1)]
+    for row, column in enumerate(columns):
+        other_channels = np.delete(normalised[row], column)
+        if other_channels.size and normalised[row, column] < MIN_ADVANTAGE * other_channels.max():
             raise PressCheckError(
                 f"the press near electrode {electrodes[row]} moves two channels alike; press closer to the electrode, "
                 "with a thinner probe, and try again"
             )
-        if column in order[:row]:
-            first = electrodes[order.index(column)]
+        if column in columns[:row]:
+            earlier_electrode = electrodes[columns.index(column)]
             raise PressCheckError(
-                f"the presses near electrodes {first} and {electrodes[row]} move the same channel most; press closer "
-                "to each electrode, and try again"
+                f"the presses near electrodes {earlier_electrode} and {electrodes[row]} move the same channel most; "
+                "press closer to each electrode, and try again"
             )
-    return order
+    return columns
 
 
 def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str, Any]:
@@ -170,27 +185,35 @@ def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str
         table: Content of the device file with the assumed channels.
         check: Result of the presses.
     """
-    electrode_of_channel = {channel: electrode for electrode, channel in check.expected.items()}
-    source = {electrode: electrode_of_channel[channel] for electrode, channel in check.found.items()}
-    corrected = {name: _moved_settings(section, source) for name, section in table.items()}
+    assumed_electrode = {channel: electrode for electrode, channel in check.expected.items()}
+    source_electrode = {electrode: assumed_electrode[channel] for electrode, channel in check.found.items()}
+    corrected = {name: _reassigned_settings(section, source_electrode) for name, section in table.items()}
     corrected["channels"] = dict(check.found)
     return corrected
 
 
-def _moved_settings(section: Any, source: Mapping[str, str]) -> Any:
-    """Return a section in which the settings of each electrode are those of its source."""
+def _reassigned_settings(section: Any, source_electrode: Mapping[str, str]) -> Any:
+    """Return a section of a device file in which the settings of the electrodes are exchanged.
+
+    Args:
+        section: The section. A section that is no table, and settings that are not given for each electrode, are
+            returned unchanged.
+        source_electrode: Electrode whose settings each electrode gets, by the name of the electrode.
+    """
     if not isinstance(section, Mapping):
         return section
-    moved = {}
+    reassigned = {}
     for key, setting in section.items():
-        if isinstance(setting, Mapping) and set(setting) == set(source):
-            setting = {electrode: setting[source[electrode]] for electrode in source}
-        moved[key] = setting
-    return moved
+        is_for_each_electrode = isinstance(setting, Mapping) and set(setting) == set(source_electrode)
+        if is_for_each_electrode:
+            reassigned[key] = {electrode: setting[source] for electrode, source in source_electrode.items()}
+        else:
+            reassigned[key] = setting
+    return reassigned
 
 
 class _Blocks:
-    """Medians of some channels over blocks of `BLOCK_S`, as they come from a port."""
+    """Reader of a port that averages the values of some channels over blocks of `BLOCK_S`."""
 
     def __init__(self, port: Port, device: Device, channels: list[str]) -> None:
         self._port = port
@@ -204,7 +227,8 @@ class _Blocks:
             deadline_s: Time on the monotonic clock until which frames are waited for, s.
 
         Returns:
-            Medians and noise of one frame, each of shape (channels,); None if no frames come before the deadline.
+            Medians of the block and noise of one frame, each of shape (channels,), in the unit of the board; None if
+            no frames come before the deadline.
         """
         rows: list[list[float]] = []
         end_s = time.monotonic() + BLOCK_S
@@ -220,48 +244,73 @@ class _Blocks:
         return np.median(values, axis=0), noise
 
     def _rows(self, data: bytes) -> Iterator[list[float]]:
-        """Yield the values of the channels in each frame that has all of them as finite numbers."""
+        """Yield the values of the channels in each frame that has a finite number for every channel."""
         for frame in self._parser.feed(data):
             positions = [position_of(channel, frame) for channel in self._channels]
-            row = [frame.values[position] for position in positions if position is not None]
-            if len(row) == len(positions) and all(map(math.isfinite, row)):
-                yield row
+            values = [frame.values[position] for position in positions if position is not None]
+            has_all_channels = len(values) == len(positions)
+            if has_all_channels and all(map(math.isfinite, values)):
+                yield values
 
 
-def _answer_to_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
-    """Wait for a press that begins and ends, and return the largest change of each channel, shape (channels,)."""
+def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
+    """Wait for a press that begins and ends, and return the largest change of each channel, shape (channels,).
+
+    The change is the difference between a block and the rest level, which follows a slow drift until the press begins.
+    The press has ended when the change is small again.
+
+    Raises:
+        PressCheckError: If the press does not begin and end within `timeout_s`.
+    """
     deadline_s = time.monotonic() + timeout_s
-    rest, noise = _rest(blocks, electrode, deadline_s, timeout_s)
-    largest_change = np.zeros_like(rest)
+    rest_level, noise = _wait_for_rest(blocks, electrode, deadline_s, timeout_s)
+    largest_change = np.zeros_like(rest_level)
     is_pressed = False
     while (block := blocks.next_block(deadline_s)) is not None:
-        levels, _ = block
-        change = levels - rest
-        is_pressed = is_pressed or bool(np.any(np.abs(change) > CHANGE_SIGMAS * noise))
+        level, _ = block
+        change = level - rest_level
+        if np.any(np.abs(change) > CHANGE_SIGMAS * noise):
+            is_pressed = True
         if not is_pressed:
-            rest = rest + REST_UPDATE * change
+            rest_level = rest_level + REST_UPDATE * change
             continue
-        if np.abs(change).sum() > np.abs(largest_change).sum():
+
+        change_size = np.abs(change).sum()
+        if change_size > np.abs(largest_change).sum():
             largest_change = change
-        if np.abs(change).sum() < RELEASED_SHARE * np.abs(largest_change).sum():
+        if change_size < RELEASED_SHARE * np.abs(largest_change).sum():
             return largest_change
     raise _timeout_error(electrode, timeout_s, is_pressed=is_pressed)
 
 
-def _rest(blocks: _Blocks, electrode: str, deadline_s: float, timeout_s: float) -> tuple[Array, Array]:
-    """Wait until the channels are quiet, and return their rest and the noise of a frame, each of shape (channels,)."""
-    recent: deque[tuple[Array, Array]] = deque(maxlen=REST_BLOCKS)
+def _wait_for_rest(blocks: _Blocks, electrode: str, deadline_s: float, timeout_s: float) -> tuple[Array, Array]:
+    """Wait until the channels are quiet in `REST_BLOCKS` blocks.
+
+    Args:
+        blocks: Source of the blocks.
+        electrode: Electrode near which the next press is expected, for the error message.
+        deadline_s: Time on the monotonic clock until which the rest is waited for, s.
+        timeout_s: Time to wait for the press, s, for the error message.
+
+    Returns:
+        Rest level of the channels and noise of one frame, each of shape (channels,), in the unit of the board.
+
+    Raises:
+        PressCheckError: If the channels are not quiet before the deadline.
+    """
+    recent_blocks: deque[tuple[Array, Array]] = deque(maxlen=REST_BLOCKS)
     while (block := blocks.next_block(deadline_s)) is not None:
-        recent.append(block)
-        levels = np.array([levels for levels, _ in recent])
-        noise = np.median([noise for _, noise in recent], axis=0)
+        recent_blocks.append(block)
+        levels = np.array([level for level, _ in recent_blocks])  # shape (blocks, channels)
+        noise = np.median([block_noise for _, block_noise in recent_blocks], axis=0)
         is_quiet = bool(np.all(np.ptp(levels, axis=0) <= 0.5 * CHANGE_SIGMAS * noise))
-        if len(recent) == REST_BLOCKS and is_quiet:
+        if len(recent_blocks) == REST_BLOCKS and is_quiet:
             return levels.mean(axis=0), noise
-    raise _timeout_error(electrode, timeout_s, is_pressed=bool(recent))
+    raise _timeout_error(electrode, timeout_s, is_pressed=bool(recent_blocks))
 
 
 def _timeout_error(electrode: str, timeout_s: float, *, is_pressed: bool) -> PressCheckError:
+    """Return the error of a press that has not ended, or has not begun, within `timeout_s`."""
     if is_pressed:
         return PressCheckError(
             f"electrode {electrode}: the charges did not come to rest within {timeout_s:g} s; take the finger away "

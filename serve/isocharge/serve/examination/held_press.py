@@ -1,8 +1,8 @@
 """Description of a press that is held during the port check: its charge is constant, leaks, creeps or drifts.
 
-The gain of the board may be unknown, so a press is not defined by a charge in pC. The press is the first of the largest
-changes of the channels within 0.2 s. Its size is the component of the channels along this change, minus a straight line
-that is fitted to the rest before.
+The gain of the board may be unknown, so a press is not defined by a charge in pC. The press is the first large change
+of the channels within 0.2 s. The size of the press is the component of the channels along this change, minus the rest
+before the press, which is extrapolated along a straight line if it drifts.
 """
 
 from dataclasses import dataclass
@@ -55,7 +55,7 @@ class HeldPress:
     description: str
 
 
-def held_press(values: Array, times_s: Array) -> HeldPress | None:
+def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     """Find a press that is held for at least `MIN_HELD_S`, and describe how its charge changes.
 
     Args:
@@ -68,50 +68,83 @@ def held_press(values: Array, times_s: Array) -> HeldPress | None:
     levels = _block_means(values, times_s)
     if levels is None or len(levels) * BLOCK_S < MIN_REST_S + SETTLE_S + MIN_HELD_S:
         return None
-    steps = levels[2:] - levels[:-2]
-    step_sizes = np.linalg.norm(steps, axis=1)
-    first = int(np.argmax(step_sizes > 0.5 * step_sizes.max()))
-    step_size = step_sizes[first]
-    component = levels @ (steps[first] / max(step_size, 1e-30))
 
-    begin = first + 1
+    # The step of the press is the first change within two blocks that is half as large as the largest one.
+    steps = levels[2:] - levels[:-2]  # shape (blocks - 2, channels)
+    step_sizes = np.linalg.norm(steps, axis=1)
+    rest_blocks = int(np.argmax(step_sizes > 0.5 * step_sizes.max()))  # number of blocks before the press
+    step_size = float(step_sizes[rest_blocks])
+    step_direction = steps[rest_blocks] / max(step_size, 1e-30)
+    component = levels @ step_direction  # shape (blocks,)
+
+    begin = rest_blocks + 1
     settled = begin + round(SETTLE_S / BLOCK_S)
     end = _end_of_press(component, settled, step_size)
     is_large = step_size >= STEP_RATIO * np.median(step_sizes)
-    has_rest = first * BLOCK_S >= MIN_REST_S
+    has_rest = rest_blocks * BLOCK_S >= MIN_REST_S
     is_long = (end - settled) * BLOCK_S >= MIN_HELD_S
     if not (is_large and has_rest and is_long):
         return None
 
     block_times_s = BLOCK_S * (np.arange(len(component)) + 0.5)
-    rest_times_s = block_times_s[:first]
-    (slope, level), covariance = np.polyfit(rest_times_s, component[:first], 1, cov=True)
-    is_significant = abs(slope) > DRIFT_SIGMAS * np.sqrt(covariance[0, 0])
-    has_drift = bool(is_significant and abs(slope) * MIN_HELD_S > STEADY_SHARE * step_size)
-    rest = np.full(len(component), component[:first].mean())
-    if has_drift:
-        rest = level + slope * block_times_s
+    rest, drift_per_s = _extrapolate_rest(component, block_times_s, rest_blocks, step_size)
+    press_size = component - rest
     held_s = block_times_s[settled:end] - BLOCK_S * begin
-    description, sections = _describe(held_s, (component - rest)[settled:end])
-    if has_drift:
-        description, sections = _with_drift(description, sections, percent_per_s=100.0 * slope / step_size)
+    description, sections = _describe(held_s, press_size[settled:end])
+    if drift_per_s != 0.0:
+        description, sections = _with_drift(description, sections, percent_per_s=100.0 * drift_per_s / step_size)
     return HeldPress(BLOCK_S * begin, sections, description)
 
 
+def _extrapolate_rest(
+    component: Reals, block_times_s: Reals, rest_blocks: int, step_size: float
+) -> tuple[Reals, float]:
+    """Extrapolate the rest before a press to the time of the press.
+
+    The rest is taken as constant, unless its slope is significant and large enough to disturb the description.
+
+    Args:
+        component: Mean of each block along the change of the press, shape (blocks,), any unit.
+        block_times_s: Middle of each block, shape (blocks,), s.
+        rest_blocks: Number of blocks before the press.
+        step_size: Change of the component when the press begins, in the unit of the component.
+
+    Returns:
+        The rest in each block, shape (blocks,), and its slope per second, which is 0 if the rest is constant.
+    """
+    rest_component = component[:rest_blocks]
+    (slope, level), covariance = np.polyfit(block_times_s[:rest_blocks], rest_component, 1, cov=True)
+    is_significant = abs(slope) > DRIFT_SIGMAS * np.sqrt(covariance[0, 0])
+    is_disturbing = abs(slope) * MIN_HELD_S > STEADY_SHARE * step_size
+    if is_significant and is_disturbing:
+        return level + slope * block_times_s, float(slope)
+    return np.full(len(component), rest_component.mean()), 0.0
+
+
 def _block_means(values: Array, times_s: Array) -> Array | None:
-    """Compute the means of the channels over whole blocks, shape (blocks, channels); None if a block has no value."""
+    """Compute the means of the channels over blocks of `BLOCK_S`, without the last block, which may be incomplete.
+
+    Returns:
+        Means, shape (blocks, channels); None if a value is not finite, or a block has no value.
+    """
     if not np.isfinite(values).all():
         return None
-    block = (times_s / BLOCK_S).astype(int)
-    counts = np.bincount(block)[:-1]  # The last block may be incomplete.
+    block_numbers = (times_s / BLOCK_S).astype(int)
+    counts = np.bincount(block_numbers)[:-1]
     if not counts.all():
         return None
-    sums = np.stack([np.bincount(block, column)[:-1] for column in values.T], axis=1)
+    sums = np.stack([np.bincount(block_numbers, column)[:-1] for column in values.T], axis=1)
     return np.asarray(sums / counts[:, None])
 
 
 def _end_of_press(component: Array, settled: int, step_size: float) -> int:
-    """Return the first block after the press, or the number of blocks if the press is held to the end."""
+    """Return the first block after the press, or the number of blocks if the press is held to the end.
+
+    Args:
+        component: Mean of each block along the change of the press, shape (blocks,).
+        settled: First block in which the force is constant.
+        step_size: Change of the component when the press begins.
+    """
     changes = component[settled + 2 :] - component[settled:-2]
     releases = np.flatnonzero(changes < -RELEASE_SHARE * step_size)
     if releases.size == 0:
@@ -122,7 +155,13 @@ def _end_of_press(component: Array, settled: int, step_size: float) -> int:
 def _with_drift(
     description: str, sections: dict[str, dict[str, float]], percent_per_s: float
 ) -> tuple[str, dict[str, dict[str, float]]]:
-    """Add the drift of the rest to the description and the sections of a press."""
+    """Return the description and the sections of a press with those that describe a drift of the rest added.
+
+    Args:
+        description: Description of the press.
+        sections: Sections for a device file.
+        percent_per_s: Drift of the rest in percent of the press per second.
+    """
     remedy = f"[leak] tau_s = {LEARNING_TAU_s:g} in a device file lets the drift be learned at rest and taken off"
     if "leak" in sections:
         remedy = "leave the board alone until the rest stands still, and measure again"
@@ -134,25 +173,32 @@ def _describe(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, floa
     """Describe how the charge of a press changes, without the drift of the rest.
 
     Args:
-        held_s: Times since the begin of the press, shape (n,), s.
+        held_s: Times since the beginning of the press, shape (n,), s.
         size: Size of the press at these times, shape (n,), any unit.
 
     Returns:
         A sentence, and sections for a device file.
     """
-    lost_share = 1.0 - float(size[-5:].mean() / size[:5].mean())
+    first_size = size[:5].mean()
+    last_size = size[-5:].mean()
+    lost_share = 1.0 - float(last_size / first_size)
     if abs(lost_share) < STEADY_SHARE:
         return f"a held press keeps its charge for {held_s[-1]:.0f} s", {}
-    law = law_of_fading(list(zip(held_s.tolist(), np.maximum(size, 1e-9).tolist(), strict=True)))
+
+    positive_size = np.maximum(size, 1e-9)  # the logarithm is fitted
+    law = law_of_fading(list(zip(held_s.tolist(), positive_size.tolist(), strict=True)))
     if law.tau_s is not None:
         tau_s = float(f"{law.tau_s:.2g}")
-        return f"a held press leaks: [leak] tau_s = {tau_s:g} in a device file undoes it", {"leak": {"tau_s": tau_s}}
+        sentence = f"a held press leaks: [leak] tau_s = {tau_s:g} in a device file undoes it"
+        return sentence, {"leak": {"tau_s": tau_s}}
     if law.creep is not None:
         sentence = (
             f"a held press creeps by {100.0 * law.creep:.2g} % in each decade of time: the film does, so set no [leak] "
             f"for it, and {law.remedy}"
         )
-        return sentence, {} if law.memory is None else {"memory": law.memory}
+        if law.memory is None:
+            return sentence, {}
+        return sentence, {"memory": law.memory}
     sentence = (
         f"a held press changes by {-100.0 * lost_share:.2g} % in {held_s[-1]:.0f} s, by no law that is clear: hold one "
         "longer, with a weight"

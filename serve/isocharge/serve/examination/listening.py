@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -71,7 +70,8 @@ class ReceivedData:
         if len(self.chunks) < 2:
             return max(self.seconds, MIN_SPAN_S)
         first_to_last_s = self.chunks[-1].timestamp - self.chunks[0].timestamp
-        return max(first_to_last_s * len(self.chunks) / (len(self.chunks) - 1), MIN_SPAN_S)
+        mean_interval_s = first_to_last_s / (len(self.chunks) - 1)
+        return max(first_to_last_s + mean_interval_s, MIN_SPAN_S)
 
     @property
     def are_datagrams(self) -> bool:
@@ -84,7 +84,7 @@ def listen(
     bauds: Sequence[int],
     seconds: float,
     request: Request | None,
-    is_clear: Callable[[ReceivedData], bool],
+    has_frames: Callable[[ReceivedData], bool],
     wait: float = 0.0,
 ) -> ReceivedData:
     """Listen to a port at the first baud rate at which the bytes are frames, or at which no bytes arrive.
@@ -94,8 +94,11 @@ def listen(
         bauds: Baud rates to try, each for a second, bit/s.
         seconds: Time of listening at the right baud rate, s.
         request: Request that the board needs. Whether the line returns it is measured.
-        is_clear: Function that returns whether bytes are frames.
+        has_frames: Function that returns whether most of the bytes are frames.
         wait: Time to wait until the port can be opened, s.
+
+    Returns:
+        The bytes at the baud rate that was chosen; at the first baud rate if there are no frames at any.
 
     Raises:
         PortError: If the port cannot be opened.
@@ -103,23 +106,27 @@ def listen(
     if request is not None and not request.echo:
         received = _listen(url, bauds[0], ECHO_S, request, wait)
         request = replace(request, echo=received.echo_share >= ECHO_SHARE)
-    right_baud = bauds[0]
+
+    chosen_baud = bauds[0]
     if has_speed(url) and len(bauds) > 1:
         for baud in bauds:
             received = _listen(url, baud, TRY_S, request, wait)
-            if not received.chunks or is_clear(received):
-                right_baud = baud
+            if not received.chunks or has_frames(received):
+                chosen_baud = baud
                 break
-    return _listen(url, right_baud, seconds, request, wait)
+    return _listen(url, chosen_baud, seconds, request, wait)
 
 
 def _listen(url: str, baud: int, seconds: float, request: Request | None, wait: float) -> ReceivedData:
-    """Listen for some time, or until the port is lost."""
+    """Listen to a port at one baud rate for some time, s, or until the port is lost, and return the received bytes."""
     received = ReceivedData(url, baud, request)
-    with Port(url, baud=baud, request=request, wait=wait) as port, suppress(PortLost):
+    with Port(url, baud=baud, request=request, wait=wait) as port:
         start_s = time.monotonic()
         while (remaining_s := start_s + seconds - time.monotonic()) > 0.0:
-            chunk = port.read(remaining_s)
+            try:
+                chunk = port.read(remaining_s)
+            except PortLost:
+                break
             if chunk is not None:
                 received.chunks.append(chunk)
     received.seconds = time.monotonic() - start_s
@@ -189,6 +196,9 @@ def read_frames(received: ReceivedData, device: Device) -> Capture:
     Args:
         received: The bytes.
         device: Settings of the board, which define the format.
+
+    Returns:
+        The frames, their times, and the counters of the parser.
     """
     capture = Capture(device.parser(), bytes_seen=received.bytes_seen)
     clock = DeviceClock()

@@ -1,4 +1,4 @@
-"""What prevents a board from giving contacts: one sentence for each reason."""
+"""Sentences for the user that state what prevents a board from providing contacts."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ class BoardFindings:
 
 
 def missing_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield one sentence for each thing that is missing to get a contact."""
+    """Yield one sentence for each condition of a contact that the board does not meet."""
     capture = findings.capture
     if not capture.bytes_seen:
         yield "not one byte came: check power and cable, and whether the board sends unasked (if not: --request)"
@@ -80,7 +80,7 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
 
 
 def _transmission_sentences(capture: Capture) -> Iterator[str]:
-    """Yield what is wrong with the transmission."""
+    """Yield a sentence if bytes are damaged, and one if frames are missing."""
     if capture.intact_share < CLEAN_SHARE:
         damaged_share = 1.0 - capture.intact_share
         yield f"{damaged_share:.1%} of the bytes are no good frames: a bad cable, or a rate that is a little off"
@@ -89,23 +89,28 @@ def _transmission_sentences(capture: Capture) -> Iterator[str]:
 
 
 def _channel_count_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield a sentence if the number of channels is not that of the model's electrodes."""
+    """Yield a sentence if the board has more or fewer channels than the model has electrodes."""
     electrodes = findings.electrodes
     channel_count = len(findings.channels)
-    is_described = set(findings.device.channels) >= set(electrodes)
-    if not electrodes or channel_count == len(electrodes) or is_described:
+    are_channels_assigned = set(findings.device.channels) >= set(electrodes)
+    if not electrodes or channel_count == len(electrodes) or are_channels_assigned:
         return
-    alive = f"{channel_count} channels"
+    channels = f"{channel_count} channels"
     if findings.unused:
-        alive += f" that live, of {len(findings.capture.names)}"
+        channels += f" that live, of {len(findings.capture.names)}"
     yield (
-        f"{alive}, but the model has the electrodes {electrodes}: another model (--model), or [channels] in a device "
-        "file"
+        f"{channels}, but the model has the electrodes {electrodes}: another model (--model), or [channels] in a "
+        "device file"
     )
 
 
 def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
-    """Yield what is wrong with the charges of a channel, pC."""
+    """Yield a sentence for each property of the charges of a channel that prevents a tare or disturbs the contact.
+
+    Args:
+        channel: Health of the channel, whose unit is pC.
+        rule: Conditions of the tare.
+    """
     name = printable(channel.name)
     noise_pC = channel.noise_pC or 0.0
     offset_pC = channel.offset_pC or 0.0
@@ -127,7 +132,7 @@ def _charge_sentences(channel: ChannelHealth, rule: TareRule) -> Iterator[str]:
 
 
 def _leak_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield what is missing to undo the leak of the amplifiers."""
+    """Yield the settings or properties that are missing for a correction of the leak of the amplifiers."""
     device = findings.device
     held = findings.held
     if findings.capture.frames[0].t_us is None and device.leak is not None:

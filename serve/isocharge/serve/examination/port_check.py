@@ -10,8 +10,8 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import IsochargeError
 from isocharge.common.printable_text import printable
-from isocharge.serve.examination.channel_health import ChannelHealth, channel_health
-from isocharge.serve.examination.held_press import HeldPress, held_press
+from isocharge.serve.examination.channel_health import ChannelHealth, measure_channel_health
+from isocharge.serve.examination.held_press import HeldPress, find_held_press
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
 from isocharge.serve.examination.missing import BoardFindings, missing_sentences
 from isocharge.serve.examination.proposal import Proposal, propose, unit_of
@@ -26,7 +26,7 @@ RIGHT_BAUD_SHARE = 0.5
 """Share of bytes in good frames from which a baud rate is assumed to be right, dimensionless."""
 
 PRESS_MARGIN_S = 0.2
-"""Time before the begin of a held press that does not count as rest, s: the force is rising."""
+"""Time before the beginning of a held press that does not count as rest, s: the force is rising."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def examine(
         DeviceError: If the gain is wrong, or for other electrodes.
     """
     received = listen(url, bauds, seconds, request or device.request, lambda part: _is_clear(part, device), wait)
-    return findings(received, device=device, electrodes=electrodes, gain=gain)
+    return examine_received(received, device=device, electrodes=electrodes, gain=gain)
 
 
 def _is_clear(received: ReceivedData, device: Device) -> bool:
@@ -115,14 +115,20 @@ def _is_clear(received: ReceivedData, device: Device) -> bool:
     return read_frames(received, device).intact_share > RIGHT_BAUD_SHARE
 
 
-def findings(
+def examine_received(
     received: ReceivedData,
     *,
     device: Device = ANY_BOARD,
     electrodes: tuple[str, ...] = (),
     gain: Mapping[str, Any] | None = None,
 ) -> Examination:
-    """Examine the bytes that were received from a port; the other arguments are those of `examine`.
+    """Examine the bytes that were received from a port.
+
+    Args:
+        received: The bytes, with the port and the time of listening.
+        device: Settings of the board; by default the format of the frames is recognised and a device file is proposed.
+        electrodes: Electrodes of the model that will be used; empty for any model.
+        gain: Keys of the section `[gain]`, if there is no device file.
 
     Raises:
         DeviceError: If the gain is wrong, or for other electrodes.
@@ -131,19 +137,24 @@ def findings(
     is_proposed = device is ANY_BOARD
     if is_proposed:
         proposal = propose(received, electrodes, gain or {})
-        known_table = {key: value for key, value in proposal.table.items() if gain or key != "gain"}
-        device = device_from_table(known_table, "board")
+        # A proposed section [gain] is only applied if the user has stated the gain.
+        applied_table = {key: value for key, value in proposal.table.items() if gain or key != "gain"}
+        device = device_from_table(applied_table, "board")
         device.check_gain(proposal.electrodes)
+
     capture = read_frames(received, device)
     unit = "pC" if device.gain is not None else unit_of(capture)
     used = electrode_positions(capture, device)
     unused = tuple(name for position, name in enumerate(capture.names) if position not in used)
-    held = held_press(*capture.values()) if capture.frames else None
+    held = find_held_press(*capture.values()) if capture.frames else None
     rest_end_s = math.inf if held is None else held.begin_s
     channels = tuple(_channels(capture, device, used, rest_end_s))
     touch = _touch_sentence(capture, device, used, held, unit)
+
     table = _completed_table(proposal.table, held, without_offsets=is_proposed and bool(touch))
     board = BoardFindings(capture, channels, unused, device, proposal.electrodes, unit, held, touch)
+    is_untouched = bool(used) and not touch
+    works = is_untouched and _can_be_tared(received, table, proposal.electrodes or tuple(used.values()))
     first_frame = capture.frames[0] if capture.frames else Frame(None, None, ())
     is_numbered = first_frame.seq is not None
     counts = capture.parser.counts
@@ -165,13 +176,19 @@ def findings(
         held="" if held is None else held.description,
         touch=touch,
         missing=tuple(missing_sentences(board)),
-        works=bool(used) and not touch and _works(received, table, proposal.electrodes or tuple(used.values())),
+        works=works,
         device=table,
     )
 
 
 def _completed_table(table: Mapping[str, Any], held: HeldPress | None, *, without_offsets: bool) -> dict[str, Any]:
-    """Add the sections that follow from a held press, and remove offsets that were measured on a touched film."""
+    """Return a device file with the sections that follow from a held press.
+
+    Args:
+        table: Content of the device file. Its sections take precedence.
+        held: The press; None if there was none.
+        without_offsets: Whether the offsets are removed, because they were measured on a touched film.
+    """
     completed = dict(table)
     if held is not None:
         for name, section in held.sections.items():
@@ -187,7 +204,15 @@ def _completed_table(table: Mapping[str, Any], held: HeldPress | None, *, withou
 def _touch_sentence(
     capture: Capture, device: Device, used: Mapping[int, str], held: HeldPress | None, unit: str
 ) -> str:
-    """Return a sentence if the charges change as under a touch before any held press; empty otherwise."""
+    """Return a sentence if the charges change as under a touch before any held press; otherwise an empty text.
+
+    Args:
+        capture: The frames.
+        device: Settings of the board, with its gain.
+        used: Name of the electrode by the position of its channel in the frame.
+        held: The held press; None if there was none.
+        unit: Unit of the channels: "pC", "counts" or "V".
+    """
     if not capture.frames or not used:
         return ""
     rest_end_s = math.inf if held is None else held.begin_s - PRESS_MARGIN_S
@@ -195,27 +220,32 @@ def _touch_sentence(
     touch = find_touch(values, times_s, unit_is_pC=unit == "pC")
     if touch is None:
         return ""
-    name = printable(capture.names[[*used][touch.position]])
+    position_in_frame = list(used)[touch.position]
+    name = printable(capture.names[position_in_frame])
     return (
         f"an untouched film: channel {name} changes by {touch.change:.4g} {unit} about {touch.time_s:.1f} s after the "
         "first frame, as under a touch; take the finger away, and try again"
     )
 
 
-def _works(received: ReceivedData, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
-    """Return whether the film is tared with a device file, or there are too few frames for two tares."""
-    count = 0
+def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
+    """Return whether the film is tared with a device file.
+
+    The result is also true if the device file has no tare, or if there are too few frames for two tares, so that a
+    missing tare proves nothing. It is false if there are no frames, or if reading the frames raises an error.
+    """
+    frame_count = 0
     try:
         device = device_from_table(table, "board")
         stream = ReadingStream(electrodes, device)
         for chunk in received.chunks:
             for timed in stream.feed(chunk):
-                count += 1
+                frame_count += 1
                 if timed.reading.tare is not None or device.tare is None:
                     return True
     except IsochargeError:
         return False
-    return device.tare is not None and 0 < count < 2 * device.tare.frames
+    return device.tare is not None and 0 < frame_count < 2 * device.tare.frames
 
 
 def electrode_positions(capture: Capture, device: Device) -> dict[int, str]:
@@ -230,23 +260,36 @@ def electrode_positions(capture: Capture, device: Device) -> dict[int, str]:
 
 
 def _channels(capture: Capture, device: Device, used: Mapping[int, str], until_s: float) -> Iterator[ChannelHealth]:
-    """Yield the health of each channel that is used, from the frames before a time, s from the first frame."""
+    """Yield the health of each channel that an electrode uses.
+
+    Args:
+        capture: The frames.
+        device: Settings of the board, with its gain.
+        used: Name of the electrode by the position of its channel in the frame.
+        until_s: Time until which the film is at rest, s from the first frame. Later frames are left out.
+    """
     if not capture.frames:
         return
     charges_pC, times_s = _rest_charges(capture, device, used, until_s)
     for position, charge_pC in zip(used, charges_pC.T, strict=True):
-        yield channel_health(capture.names[position], charge_pC, times_s, capture.rate_Hz)
+        yield measure_channel_health(capture.names[position], charge_pC, times_s, capture.rate_Hz)
 
 
 def _rest_charges(capture: Capture, device: Device, used: Mapping[int, str], until_s: float) -> tuple[Array, Array]:
-    """Return the charges of the frames before a time, s from the first frame, and the times of these frames.
+    """Return the charges of the frames in which the film is at rest, and the times of these frames.
+
+    Args:
+        capture: The frames.
+        device: Settings of the board, with its gain.
+        used: Name of the electrode by the position of its channel in the frame.
+        until_s: Time until which the film is at rest, s from the first frame.
 
     Returns:
         Charges of the used channels, shape (n, used), in pC if the gain is known; and times, shape (n,), s.
     """
     values, times_s = capture.values()
     is_rest = times_s < until_s
-    charges = values[is_rest][:, [*used]]
+    charges = values[is_rest][:, list(used)]
     if device.gain is not None:
         for column, electrode in enumerate(used.values()):
             with np.errstate(over="ignore"):

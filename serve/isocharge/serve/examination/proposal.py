@@ -1,4 +1,4 @@
-"""The device file that fits a board: its frames, the channels of the electrodes, and their rest.
+"""Proposal of the device file that fits a board: its frames, the channels of the electrodes, and their offsets.
 
 The charge of one count cannot be found from the bytes. The user has to state it, and it is never guessed.
 """
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.examination.held_press import held_press
+from isocharge.serve.examination.held_press import find_held_press
 from isocharge.serve.examination.listening import Capture, ReceivedData, read_frames
 from isocharge.serve.frames.binary import FORMAT as BINARY
 from isocharge.serve.live.device import device_from_table
@@ -55,8 +55,15 @@ def noise_of(values: Array) -> float:
 
     The median step of normally distributed noise is 0.6745 * sqrt(2) standard deviations. If the median step of coarse
     counts is 0, the mean step is used, which is 2 / sqrt(pi) standard deviations.
+
+    Args:
+        values: Values of the channel, shape (n,), any unit. Values that are not finite are left out.
+
+    Returns:
+        The standard deviation in the unit of the values; 0 if there are fewer than two finite values.
     """
-    steps = np.abs(np.diff(values[np.isfinite(values)].astype(float)))
+    finite = values[np.isfinite(values)].astype(float)
+    steps = np.abs(np.diff(finite))
     if not len(steps):
         return 0.0
     median_step = float(np.median(steps))
@@ -85,109 +92,155 @@ def propose(received: ReceivedData, electrodes: tuple[str, ...], gain: Mapping[s
         electrodes: Electrodes of the model; empty for any model.
         gain: Gain as the user states it: pC_per_unit, or V_per_unit and feedback_pF; empty if it is unknown.
     """
-    frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
+    frames = _recognise_frames(received)
     if frames is None:
         return Proposal({}, electrodes)
-    if received.request is not None:
-        frames |= {"request": received.request.data.hex(" ").upper(), "request_Hz": received.request.rate_Hz}
-        if received.request.echo:
-            frames["echo"] = True
     table: dict[str, Any] = {"name": "board", "frames": frames}
     capture = read_frames(received, device_from_table(table, "board"))
     if not capture.frames:
         return Proposal({}, electrodes)
+
     values, times_s = capture.values()
-    chosen = _chosen(capture, values, electrodes)
-    if chosen:
-        table["channels"] = {electrode: capture.names[position] for electrode, position in chosen.items()}
-    held = held_press(values, times_s)
-    at_rest = values if held is None else values[times_s < held.begin_s]
-    columns = {electrode: at_rest[:, position] for electrode, position in chosen.items()}
-    is_far = any(abs(rest_of(column)) > TareRule().offset_limit_pC for column in columns.values())
-    if gain or is_far or unit_of(capture) != "pC":
+    positions = _choose_channels(capture, values, electrodes)
+    if positions:
+        table["channels"] = {electrode: capture.names[position] for electrode, position in positions.items()}
+
+    held = find_held_press(values, times_s)
+    rest_values = values if held is None else values[times_s < held.begin_s]
+    rest_columns = {electrode: rest_values[:, position] for electrode, position in positions.items()}
+    has_large_offset = any(abs(rest_of(column)) > TareRule().offset_limit_pC for column in rest_columns.values())
+    if gain or has_large_offset or unit_of(capture) != "pC":
         known_gain = dict(gain)
         if not known_gain and unit_of(capture) == "pC":
             known_gain = {"pC_per_unit": 1.0}
-        table["gain"] = _offsets(columns, known_gain) | known_gain
-    return Proposal(table, electrodes or tuple(chosen))
+        table["gain"] = _offsets(rest_columns, known_gain) | known_gain
+    return Proposal(table, electrodes or tuple(positions))
+
+
+def _recognise_frames(received: ReceivedData) -> dict[str, Any] | None:
+    """Return the section `[frames]` for the bytes of a board, with its request; None if no format is recognised."""
+    frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
+    request = received.request
+    if frames is None or request is None:
+        return frames
+    frames["request"] = request.data.hex(" ").upper()
+    frames["request_Hz"] = request.rate_Hz
+    if request.echo:
+        frames["echo"] = True
+    return frames
 
 
 def unit_of(capture: Capture) -> str:
     """Return the unit of the values if nothing is known of the gain: "pC", "counts" or "V".
 
-    The binary frames of isocharge contain pC. Whole numbers are counts, small numbers with little noise are volts, and
-    all other numbers are taken for pC.
+    The unit is pC if the frames are the binary frames of isocharge, if all names of channels end in `_pC`, or if no
+    value ever changes and all are small. Otherwise whole numbers are counts, and numbers are volts if they are small
+    and have little noise, or if all names end in `V`. All other numbers are taken for pC.
     """
-    if not capture.frames or capture.parser.format == BINARY or all(name.endswith("_pC") for name in capture.names):
+    names_state_pC = all(name.endswith("_pC") for name in capture.names)
+    if not capture.frames or capture.parser.format == BINARY or names_state_pC:
         return "pC"
     values, _ = capture.values()
-    finite = values[np.isfinite(values).all(axis=1)]
-    varies = bool(len(finite)) and bool(np.ptp(finite, axis=0).any())
-    if not varies and not np.abs(finite).max(initial=0.0) > LARGEST_STILL_PC:
+    finite_rows = values[np.isfinite(values).all(axis=1)]
+    largest = float(np.abs(finite_rows).max(initial=0.0))
+    is_constant = len(finite_rows) == 0 or bool((finite_rows == finite_rows[0]).all())
+    if is_constant and largest <= LARGEST_STILL_PC:
         return "pC"
-    if bool((finite == np.round(finite)).all()):
+    if bool((finite_rows == np.round(finite_rows)).all()):
         return "counts"
-    noise = [noise_of(column) for column in finite.T]
-    is_small = float(np.abs(finite).max()) <= LARGEST_V and 0.0 < max(noise) <= LARGEST_NOISE_V
-    return "V" if is_small or all(name.endswith("V") for name in capture.names) else "pC"
+
+    largest_noise = max(noise_of(column) for column in finite_rows.T)
+    names_state_volts = all(name.endswith("V") for name in capture.names)
+    has_values_of_volts = largest <= LARGEST_V and 0.0 < largest_noise <= LARGEST_NOISE_V
+    if names_state_volts or has_values_of_volts:
+        return "V"
+    return "pC"
 
 
-def _chosen(capture: Capture, values: Array, electrodes: tuple[str, ...]) -> dict[str, int]:
-    """Choose the channel of each electrode, and return its position; empty if there are too few channels."""
+def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...]) -> dict[str, int]:
+    """Choose the channel of each electrode.
+
+    Channels with the names of the electrodes are taken first. Otherwise as many varying channels as there are
+    electrodes are assigned in their order. Without a model, each varying channel is an electrode.
+
+    Args:
+        capture: The frames.
+        values: Values of all channels, shape (n, channels).
+        electrodes: Electrodes of the model; empty for any model.
+
+    Returns:
+        Position of the channel in the frame by the name of the electrode; empty if there are too few channels.
+    """
     names = capture.names
-    by_electrode = {electrode_of(channel): position for position, channel in enumerate(names)}
-    if electrodes and set(electrodes) <= set(by_electrode):
-        return {electrode: by_electrode[electrode] for electrode in electrodes}
-    alive = _alive(values)
+    named_positions = {electrode_of(channel): position for position, channel in enumerate(names)}
+    if electrodes and set(electrodes) <= set(named_positions):
+        return {electrode: named_positions[electrode] for electrode in electrodes}
+
+    candidates = _varying_channels(values)
     if not electrodes:
-        named = [electrode_of(names[position]) for position in alive]
-        electrodes = tuple(named if set(named) <= set(ELECTRODES) else ELECTRODES[: len(alive)])
-    if len(alive) < len(electrodes) == len(names):
-        alive = list(range(len(names)))  # A channel that never changes keeps its place and is reported.
-    if len(alive) < len(electrodes):
+        channel_electrodes = tuple(electrode_of(names[position]) for position in candidates)
+        are_usual_names = set(channel_electrodes) <= set(ELECTRODES)
+        electrodes = channel_electrodes if are_usual_names else tuple(ELECTRODES[: len(candidates)])
+    if len(candidates) < len(electrodes) == len(names):
+        candidates = list(range(len(names)))  # a channel that never changes keeps its place and is reported
+    if len(candidates) < len(electrodes):
         return {}
-    return dict(zip(electrodes, _most_alike(values, alive, len(electrodes)), strict=True))
+    positions = _most_alike(values, candidates, len(electrodes))
+    return dict(zip(electrodes, positions, strict=True))
 
 
-def _alive(values: Array) -> list[int]:
-    """Return the positions of the channels that vary like the others; all positions if no channel varies."""
+def _varying_channels(values: Array) -> list[int]:
+    """Return the positions of the channels that vary like the others; all positions if no channel varies.
+
+    A channel with a value that is not finite does not count as varying.
+    """
     columns = [column if np.isfinite(column).all() else np.zeros(1) for column in values.T]
-    varying = [k for k, column in enumerate(columns) if np.ptp(column) > 0.0]
+    varying = [position for position, column in enumerate(columns) if np.ptp(column) > 0.0]
     if not varying:
         return list(range(len(columns)))
-    noise = {k: noise_of(columns[k]) for k in varying}
-    usual = float(np.median(list(noise.values())))
-    return [k for k in varying if noise[k] >= QUIET_SHARE * usual]
+    noise = {position: noise_of(columns[position]) for position in varying}
+    usual_noise = float(np.median(list(noise.values())))
+    return [position for position in varying if noise[position] >= QUIET_SHARE * usual_noise]
 
 
-def _most_alike(values: Array, alive: list[int], count: int) -> list[int]:
-    """Choose the adjacent channels whose noise is most similar; of several choices the first.
+def _most_alike(values: Array, candidates: list[int], count: int) -> list[int]:
+    """Choose the adjacent channels whose noise is most similar, and return their positions.
+
+    The range of the noise is compared in whole decades. The first of several equal choices is taken.
 
     Args:
         values: Values of all channels, shape (n, channels).
-        alive: Positions of the channels to choose from.
+        candidates: Positions of the channels to choose from.
         count: Number of channels to choose.
     """
-    noise_decades = np.log10([max(noise_of(values[:, position]), 1e-12) for position in alive])
-    begins = range(len(alive) - count + 1)
-    spreads = [round(float(np.ptp(noise_decades[begin : begin + count]))) for begin in begins]
-    best_begin = int(np.argmin(spreads))
-    return alive[best_begin : best_begin + count]
+    noise_decades = np.log10([max(noise_of(values[:, position]), 1e-12) for position in candidates])
+    first_choices = range(len(candidates) - count + 1)
+    ranges = [round(float(np.ptp(noise_decades[first : first + count]))) for first in first_choices]
+    best = int(np.argmin(ranges))
+    return candidates[best : best + count]
 
 
 def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the key `offset` of the section `[gain]`: one value if all electrodes agree; empty if they rest at 0."""
+    """Return the key `offset` of the section `[gain]`: one value if all electrodes agree; empty if they rest at 0.
+
+    Half of a converter's range is preferred to the measured rest, unless the difference would disturb a tare.
+
+    Args:
+        columns: Values of the channel of each electrode at rest, each of shape (n,), in the unit of the board.
+        gain: The other keys of the section; empty if they are not known.
+    """
     rests = {electrode: rest_of(column) for electrode, column in columns.items()}
     offsets = {electrode: _offset(column) for electrode, column in columns.items()}
     if gain:
         limit = 0.5 * TareRule().offset_limit_pC / _largest_pC(gain)
-        is_offset = any(abs(rest) > limit for rest in rests.values())
+        limits = dict.fromkeys(columns, limit)
         if any(abs(rest - offsets[electrode]) > limit for electrode, rest in rests.items()):
             offsets = {electrode: _rounded(rest) for electrode, rest in rests.items()}
     else:
-        noise = {electrode: noise_of(column) for electrode, column in columns.items()}
-        is_offset = any(abs(rest) > max(REST_SIGMAS * noise[electrode], 1e-9) for electrode, rest in rests.items())
-    if not is_offset:
+        limits = {electrode: max(REST_SIGMAS * noise_of(column), 1e-9) for electrode, column in columns.items()}
+
+    all_rest_at_zero = all(abs(rest) <= limits[electrode] for electrode, rest in rests.items())
+    if all_rest_at_zero:
         return {}
     different_offsets = set(offsets.values())
     if len(different_offsets) == 1:
@@ -196,22 +249,26 @@ def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str,
 
 
 def _largest_pC(gain: Mapping[str, Any]) -> float:
-    """Compute the largest magnitude of the charge of one unit, pC."""
-    largest_pC = 1.0
+    """Compute the largest magnitude of the charge of one unit over all electrodes, pC.
+
+    The charge is `pC_per_unit`, or the product of `V_per_unit` and `feedback_pF`.
+    """
+    product_pC = 1.0
     for setting in gain.values():
         numbers = setting.values() if isinstance(setting, Mapping) else [setting]
-        largest_pC *= max(abs(float(number)) for number in numbers)
-    return largest_pC
+        product_pC *= max(abs(float(number)) for number in numbers)
+    return product_pC
 
 
 def _offset(column: Array) -> float | int:
     """Return the value of a channel without charge: half of a converter's range if the rest is near, else the rest."""
     rest = rest_of(column)
-    is_whole = bool((column == np.round(column)).all())
-    for bits in CONVERTER_BITS:
-        half_range = 1 << (bits - 1)
-        if is_whole and abs(rest - half_range) <= HALF_SCALE_SHARE * half_range:
-            return half_range
+    has_whole_numbers = bool((column == np.round(column)).all())
+    if has_whole_numbers:
+        for bits in CONVERTER_BITS:
+            half_range = 1 << (bits - 1)
+            if abs(rest - half_range) <= HALF_SCALE_SHARE * half_range:
+                return half_range
     return _rounded(rest)
 
 

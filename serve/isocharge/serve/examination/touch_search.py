@@ -55,7 +55,8 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
     Args:
         values: Values of the channels, shape (n, channels).
         times_s: Times since the first frame, shape (n,), s.
-        unit_is_pC: Whether the values are charges in pC. Otherwise only the noise tells how large a change must be.
+        unit_is_pC: Whether the values are charges in pC. Otherwise the smallest change of a touch is derived from the
+            noise only.
 
     Returns:
         The channel with the largest change, of those that change as under a touch; None if there is none.
@@ -63,24 +64,35 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
     blocks = block_medians(values, times_s)
     if len(blocks) < MIN_BLOCKS:
         return None
-    levels = np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0)
+    smoothed = np.median([blocks[:-2], blocks[1:-1], blocks[2:]], axis=0)  # shape (blocks - 2, channels)
     touches: list[TouchFound] = []
-    for position, level in enumerate(levels.T):
-        if not np.isfinite(level).all():
+    for position, channel_levels in enumerate(smoothed.T):
+        if not np.isfinite(channel_levels).all():
             continue
-        min_change = CHANGE_SIGMAS * noise_of(values[:, position])
-        if unit_is_pC:
-            min_change = max(min_change, MIN_CHANGE_PC)
-        else:
-            min_change = max(min_change, CHANGE_SIGMAS * resolution_of(values[:, position]))
-        windows = sliding_window_view(level, min(STEEP_BLOCKS, len(level)))
-        steep_change = np.ptp(windows, axis=1)
-        total_change = float(np.ptp(level))
+        min_change = _smallest_touch(values[:, position], unit_is_pC)
+        windows = sliding_window_view(channel_levels, min(STEEP_BLOCKS, len(channel_levels)))
+        window_changes = np.ptp(windows, axis=1)  # shape (windows,)
+        total_change = float(np.ptp(channel_levels))
+        is_fast_touch = window_changes.max() > min_change
         is_slow_touch = unit_is_pC and total_change > max(min_change, MAX_SLOW_CHANGE_PC)
-        if steep_change.max() > min_change or is_slow_touch:
-            middle_block = int(np.argmax(steep_change)) + STEEP_BLOCKS // 2 + 1
+        if is_fast_touch or is_slow_touch:
+            # A window begins one block later than its index, because smoothing has removed the first block.
+            middle_block = int(np.argmax(window_changes)) + STEEP_BLOCKS // 2 + 1
             touches.append(TouchFound(position, total_change, BLOCK_S * middle_block))
     return max(touches, key=lambda touch: touch.change, default=None)
+
+
+def _smallest_touch(channel_values: Array, unit_is_pC: bool) -> float:
+    """Return the smallest change of a channel within half a second that counts as a touch, in the unit of the values.
+
+    Args:
+        channel_values: Values of the channel, shape (n,).
+        unit_is_pC: Whether the values are charges in pC.
+    """
+    noise_limit = CHANGE_SIGMAS * noise_of(channel_values)
+    if unit_is_pC:
+        return max(noise_limit, MIN_CHANGE_PC)
+    return max(noise_limit, CHANGE_SIGMAS * resolution_of(channel_values))
 
 
 def block_medians(values: Array, times_s: Array) -> Array:
@@ -94,17 +106,19 @@ def block_medians(values: Array, times_s: Array) -> Array:
         Medians of the finite values, shape (blocks, channels). Blocks without frames are left out, and so is the last
         block, which may be incomplete. NaN if a block of a channel has no finite value.
     """
-    number = np.floor(times_s / BLOCK_S).astype(int)
-    starts = np.flatnonzero(np.diff(number, prepend=-1))
-    pieces = np.split(values, starts[1:])[:-1]
-    if not pieces:
+    block_numbers = np.floor(times_s / BLOCK_S).astype(int)
+    first_rows = np.flatnonzero(np.diff(block_numbers, prepend=-1))
+    blocks = np.split(values, first_rows[1:])
+    whole_blocks = blocks[:-1]
+    if not whole_blocks:
         return np.zeros((0, values.shape[1]))
-    return np.array([_finite_medians(piece) for piece in pieces])
+    return np.array([_finite_medians(block) for block in whole_blocks])
 
 
-def _finite_medians(piece: Array) -> Array:
-    medians = np.full(piece.shape[1], np.nan)
-    for position, column in enumerate(piece.T):
+def _finite_medians(block: Array) -> Array:
+    """Return the median of the finite values of each column, shape (channels,); NaN for a column without any."""
+    medians = np.full(block.shape[1], np.nan)
+    for position, column in enumerate(block.T):
         finite = column[np.isfinite(column)]
         if finite.size:
             medians[position] = np.median(finite)
