@@ -11,6 +11,7 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Ellipse, Film, Polygon, Probe, Resolution, SolveSettings, Theory
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement
+from isocharge.simulate.mesh.point_location import locate_points
 from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.solver.load_case import LoadCase, choose_mesh
 
@@ -62,7 +63,7 @@ def exact_points(placement: Placement, mesh: Template, xi: np.ndarray, eta: np.n
 
 def found_again(placement: Placement, mesh: Template, film: np.ndarray) -> np.ndarray:
     """Film points of the elements and local coordinates that `locate` gives; these lie in [-1, 1]."""
-    element, xi, eta = (found[0] for found in placement.batch().locate(mesh, film[None]))
+    element, xi, eta = (found[0] for found in locate_points(placement.batch(), mesh, film[None]))
     assert np.abs(np.concatenate([xi, eta])).max() <= 1.0 + 1e-7
     return exact_points(placement, mesh, xi, eta)[element, np.arange(film.size)]
 

@@ -28,6 +28,7 @@ from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mechanics.theory import Theory, theory_for
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placement import Placement
+from isocharge.simulate.mesh.point_location import locate_points
 from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.probe import Probe
@@ -356,7 +357,7 @@ class _PressChunk:
         mesh = self.mesh
         direction = self.direction[press_index]
         position, mirrored = mesh.into_meshed_half(points * np.exp(-1j * direction)[:, None])
-        element, xi, eta = self.placement[press_index].locate(mesh, position)
+        element, xi, eta = locate_points(self.placement[press_index], mesh, position)
         frame_angle = direction if mesh.half else direction + self.probe_angle[press_index]
 
         values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel())

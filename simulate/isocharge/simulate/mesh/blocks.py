@@ -5,8 +5,7 @@ The innermost circle of the mesh encloses the footprint. The mesh consists of th
     1. The core polygon (n corners) is divided into n quadrilaterals that meet at its centroid.
     2. 2 n blocks, or two layers of 2 n blocks, lie between the core polygon and the innermost circle.
     3. Rings of 2 n sectors lie between the innermost circle and the rim of the film. The last rings are thin if the
-    film
-       resists bending.
+       film resists bending.
 
 A polygonal footprint is its own core polygon. A circular footprint has a virtual square as its core polygon, and its
 boundary is the innermost circle. Any other curved footprint has a core polygon, one layer of blocks up to its boundary
@@ -143,11 +142,13 @@ class Blocks:
         corners = np.eye(self.n_corner + 1)[:-1]
         middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
         stops = [middles[-1]]
-        for i in range(self.n_meshed):
-            stops += [corners[i], middles[i]]
-        share = np.arange(self.split)[:, None] / self.split
-        parts = [start + share * (end - start) for start, end in pairwise(stops)]
-        return np.concatenate([*parts, stops[-1][None]])
+        for corner, middle in zip(corners[: self.n_meshed], middles[: self.n_meshed], strict=True):
+            stops += [corner, middle]
+
+        share = np.arange(self.split)[:, None] / self.split  # divides the line between two stops into equal parts
+        points = [start + share * (end - start) for start, end in pairwise(stops)]
+        points.append(stops[-1][None])
+        return np.concatenate(points)
 
     @cached_property
     def straight(self) -> Array:
@@ -157,34 +158,41 @@ class Blocks:
         (1 - v) (a + t (b - a)) + v (c + t (d - c)) with v and t from 0 to 1. The weights of corners on a curved side
         are zero, and `Placement` adds the curved side.
         """
-        quads = [
-            self._quad(corner, v, t)
+        core_elements = [
+            self._quad(corner, v_index, t_index)
             for corner in range(self.n_meshed)
-            for v in range(self.split)
-            for t in range(self.split)
+            for v_index in range(self.split)
+            for t_index in range(self.split)
         ]
         zero = np.zeros(self.n_corner + 1)
-        first_layer = [[a, b, zero, zero] for a, b in pairwise(self.boundary)]
-        second_layer = [[zero] * 4] * (self.n_sector * (self.n_layer - 1))
-        return np.array(quads + first_layer + second_layer)
+        first_layer = [[first, second, zero, zero] for first, second in pairwise(self.boundary)]
+        n_second_layer = self.n_sector * (self.n_layer - 1)
+        second_layer = [[zero, zero, zero, zero] for _ in range(n_second_layer)]
+        return np.array(core_elements + first_layer + second_layer)
 
-    def _quad(self, corner: int, v: int, t: int) -> list[Array]:
+    def _quad(self, corner: int, v_index: int, t_index: int) -> list[Array]:
         """Return the corners (a, b, c, d) of one element of the core polygon, each of shape (n_corner + 1,).
+
+        The quadrilateral of a corner lies between the centroid, the middles of both adjacent edges, and the corner. It
+        consists of `split` times `split` elements.
 
         Args:
             corner: Index of the corner of the core polygon whose quadrilateral contains the element.
-            v: Index of the element along the side from the centroid to the middle of the edge after the corner.
-            t: Index of the element along the side from the centroid to the middle of the edge before the corner.
+            v_index: Index of the element along the side from the centroid to the middle of the edge after the corner.
+            t_index: Index of the element along the side from the centroid to the middle of the edge before the corner.
         """
         centroid = np.eye(self.n_corner + 1)[-1]
-        first = 2 * self.split * corner
-        before = self.boundary[first]
-        at_corner = self.boundary[first + self.split]
-        after = self.boundary[first + 2 * self.split]
+        start = 2 * self.split * corner
+        middle_before = self.boundary[start]
+        corner_point = self.boundary[start + self.split]
+        middle_after = self.boundary[start + 2 * self.split]
+        v_inner = v_index / self.split
+        v_outer = (v_index + 1) / self.split
+        t_first = t_index / self.split
+        t_last = (t_index + 1) / self.split
         return [
-            _bilinear(centroid, after, before, at_corner, (v + dv) / self.split, (t + dt) / self.split)
-            for dv in (0, 1)
-            for dt in (0, 1)
+            _bilinear(centroid, middle_after, middle_before, corner_point, v, t)
+            for v, t in ((v_inner, t_first), (v_inner, t_last), (v_outer, t_first), (v_outer, t_last))
         ]
 
     def rotated(self, fold: int, folds: int) -> Integers:

@@ -30,13 +30,13 @@ class Coating:
     Attributes:
         layers: Areas with at least one layer of the coat, with at least two layers, and so on. Each area consists of
             convex polygons that do not overlap, with anticlockwise corners x + iy, in film radii.
-        band: Width of the band along the edges, in film radii.
+        band_width: Width of the band along the edges, in film radii.
         bare: Elasticity matrix C over E of the film, shape (3, 3).
         added: Addition of one layer of the coat to this matrix, shape (3, 3).
     """
 
     layers: tuple[tuple[Complexes, ...], ...]
-    band: float
+    band_width: float
     bare: Array
     added: Array
 
@@ -58,26 +58,29 @@ class Coating:
             Shape (..., 3, 3).
         """
         laminate = self._laminate(points)
+        # Sum over the phases i and the strain components b: f_i C_i E_i.
         mixture = np.einsum("...i,iab,...ibc->...ac", laminate.shares, laminate.stiffness, laminate.strain)
         return np.asarray(mixture - self.bare)
 
-    def film_strain(self, points: Complexes, strained: Array) -> Array:
+    def film_strain(self, points: Complexes, mean_strain: Array) -> Array:
         """Compute the strain of the phase in which each point lies, from the mean strain of the laminate.
 
         Args:
             points: Film points x + iy, shape (n,), in film radii.
-            strained: Mean strain (E11, E22, 2 E12), shape (n, 3).
+            mean_strain: Mean strain (E11, E22, 2 E12), shape (n, 3).
 
         Returns:
             Strain of the phase, shape (n, 3).
         """
-        strain_of_phase = self._laminate(points).strain[np.arange(points.size), self._layer_count(points)]
-        return np.asarray(np.einsum("nab,nb->na", strain_of_phase, strained))
+        point = np.arange(points.size)
+        phase = self._layer_count(points)
+        strain_of_phase = self._laminate(points).strain[point, phase]  # shape (n, 3, 3)
+        return np.asarray((strain_of_phase @ mean_strain[:, :, None])[:, :, 0])
 
     def _is_near(self, part: Complexes, points: Complexes) -> Booleans:
         """Return whether points lie in the circle round a polygon that is enlarged by the width of the band."""
         middle = part.mean()
-        return np.asarray(np.abs(points - middle) < np.abs(part - middle).max() + self.band)
+        return np.asarray(np.abs(points - middle) < np.abs(part - middle).max() + self.band_width)
 
     def _shares(self, points: Complexes) -> Array:
         """Compute the share of a disk about each point that each layer covers.
@@ -90,12 +93,13 @@ class Coating:
         Returns:
             Shape (..., n_layer).
         """
+        radius = 0.5 * self.band_width
+        disk_area = np.pi * radius**2
         shares = np.zeros((*points.shape, len(self.layers)))
-        radius = 0.5 * self.band
         for number, layer in enumerate(self.layers):
             for part in layer:
-                close = self._is_near(part, points)
-                shares[close, number] += area_in_disk(part, points[close], radius) / (np.pi * radius**2)
+                is_near = self._is_near(part, points)
+                shares[is_near, number] += area_in_disk(part, points[is_near], radius) / disk_area
         return np.minimum(shares, 1.0)
 
     def _layer_count(self, points: Complexes) -> Integers:
@@ -111,14 +115,16 @@ class Coating:
         Returns:
             Components along x and y, each of the shape of `points`. Far from edges both are sqrt(1 / 2).
         """
-        step = NORMAL_STEP * self.band
-        by_x = self._shares(points + step).sum(-1) - self._shares(points - step).sum(-1)
-        by_y = self._shares(points + 1j * step).sum(-1) - self._shares(points - 1j * step).sum(-1)
-        size = np.hypot(by_x, by_y)
-        has_normal = size > 0.0
-        x = np.divide(by_x, size, out=np.full_like(size, np.sqrt(0.5)), where=has_normal)
-        y = np.divide(by_y, size, out=np.full_like(size, np.sqrt(0.5)), where=has_normal)
-        return x, y
+        step = NORMAL_STEP * self.band_width
+        difference_x = self._shares(points + step).sum(-1) - self._shares(points - step).sum(-1)
+        difference_y = self._shares(points + 1j * step).sum(-1) - self._shares(points - 1j * step).sum(-1)
+        length = np.hypot(difference_x, difference_y)
+        has_normal = length > 0.0
+        normal_x = np.full_like(length, np.sqrt(0.5))
+        normal_y = np.full_like(length, np.sqrt(0.5))
+        np.divide(difference_x, length, out=normal_x, where=has_normal)
+        np.divide(difference_y, length, out=normal_y, where=has_normal)
+        return normal_x, normal_y
 
     def _laminate(self, points: Complexes) -> "_Laminate":
         """Compute the laminate at each point; see the module for the formulas."""

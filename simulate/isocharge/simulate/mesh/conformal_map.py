@@ -47,7 +47,7 @@ def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]
     """Compute a circle on the film that encloses each footprint at a distance.
 
     The centre is the centroid if that circle keeps its distance from the rim. Otherwise the centre moves towards the
-    centre of the film.
+    centre of the film. Its position is found by bisection.
 
     Args:
         outline: Points along the boundary of each footprint, shape (..., n), in film radii.
@@ -58,28 +58,40 @@ def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]
     """
     rim_gap = 1.0 - np.abs(outline).max(axis=-1)
     largest_extent = 1.0 - OUTER_GAP_SHARE * rim_gap
+    centroid_radius = _enclosing_radius(outline, centroid)
+    centroid_fits = centroid + centroid_radius <= largest_extent
+    if np.all(centroid_fits):
+        return centroid, centroid_radius
 
-    def radius(centre: Array) -> Array:
-        reach = np.abs(outline - centre[..., None]).max(axis=-1)
-        return np.asarray(reach + np.minimum(CLEARANCE * reach, INNER_GAP_SHARE * rim_gap))
-
-    fits = centroid + radius(centroid) <= largest_extent
-    if np.all(fits):
-        return centroid, radius(centroid)
-
-    low = np.zeros(centroid.shape)
-    high = centroid.copy()
+    lower_bound = np.zeros(centroid.shape)
+    upper_bound = centroid.copy()
     for _ in range(BISECTION_STEPS):
-        middle = 0.5 * (low + high)
-        inside = middle + radius(middle) <= largest_extent
-        low = np.where(inside, middle, low)
-        high = np.where(inside, high, middle)
-    centre = np.where(fits, centroid, low)
-    return centre, radius(centre)
+        middle = 0.5 * (lower_bound + upper_bound)
+        middle_fits = middle + _enclosing_radius(outline, middle) <= largest_extent
+        lower_bound = np.where(middle_fits, middle, lower_bound)
+        upper_bound = np.where(middle_fits, upper_bound, middle)
+    centre = np.where(centroid_fits, centroid, lower_bound)
+    return centre, _enclosing_radius(outline, centre)
+
+
+def _enclosing_radius(outline: Complexes, centre: Array) -> Array:
+    """Return the radius of the circle about a centre on the x axis that encloses a footprint at a distance.
+
+    Args:
+        outline: Points along the boundary of each footprint, shape (..., n), in film radii.
+        centre: Position of the centre of each circle, shape (...), in film radii.
+
+    Returns:
+        Radius, shape (...), in film radii.
+    """
+    rim_gap = 1.0 - np.abs(outline).max(axis=-1)
+    reach = np.abs(outline - centre[..., None]).max(axis=-1)
+    gap = np.minimum(CLEARANCE * reach, INNER_GAP_SHARE * rim_gap)
+    return np.asarray(reach + gap)
 
 
 def sector_angles(
-    blocks: Blocks, stops: Complexes, reach: Array, centroid: Array, centre: Array, radius: Array, pull: Array
+    blocks: Blocks, stops: Complexes, reach: Array, centroid: Array, centre: Array, radius: Array, c_rho: Array
 ) -> Array:
     """Compute the angles of the sides of the sectors on the innermost circle.
 
@@ -96,31 +108,53 @@ def sector_angles(
         centroid: Position of the centroid on the x axis, shape (...), in film radii.
         centre: Centre of the circle on the x axis, shape (...), in film radii.
         radius: Radius of the circle, shape (...), in film radii.
-        pull: Product of the parameters c and rho of the conformal map, shape (...).
+        c_rho: Product of the parameters c and rho of the conformal map, shape (...).
 
     Returns:
         Angles in the template plane, increasing, shape (..., n_sector + 1).
     """
-    hub = centroid[..., None] + 0j
-    stop_angle = np.unwrap(np.angle(stops - hub), axis=-1)
+    origin = centroid[..., None] + 0j  # common origin of the rays
+    ray_angle = _ray_angles(blocks, stops - origin, radius / reach)
+    ray = np.exp(1j * ray_angle)
+
+    # The intersections of the rays with the circle, relative to the centre of the circle.
+    offset = origin - centre[..., None]
+    projection = (offset * np.conj(ray)).real
+    length = np.sqrt(projection**2 + radius[..., None] ** 2 - np.abs(offset) ** 2) - projection
+    intersection = offset + ray * length
+
+    first_angle = np.angle(intersection[..., :1])
+    step = np.mod(np.angle(intersection[..., 1:] / intersection[..., :-1]), 2.0 * np.pi)
+    film_angle = np.concatenate([first_angle, first_angle + np.cumsum(step, axis=-1)], axis=-1)
+    stretch = (1.0 + c_rho) / (1.0 - c_rho)
+    return stretch_angles(film_angle, stretch)
+
+
+def _ray_angles(blocks: Blocks, stops: Complexes, radius_ratio: Array) -> Array:
+    """Compute the directions of the rays from the centroid of the footprint along the sides of the sectors.
+
+    Args:
+        blocks: The elements.
+        stops: The stops of `sector_angles` relative to the centroid, shape (..., n_stop).
+        radius_ratio: Radius of the circle over the distance of the farthest point of the inner side, shape (...).
+
+    Returns:
+        Angles, shape (..., n_sector + 1), rad.
+    """
+    stop_angle = np.unwrap(np.angle(stops), axis=-1)
     even_angle = np.linspace(0.0, 2.0 * np.pi / blocks.copies, stop_angle.shape[-1])
-    even_angle = even_angle + np.mean(stop_angle[..., :-1] - even_angle[:-1], axis=-1)[..., None]
-    evenness = 0.5 * np.minimum((radius / reach - 1.0) / CLEARANCE, 1.0)[..., None]
-    mixed = stop_angle + MAX_TURN * np.tanh(evenness * (even_angle - stop_angle) / MAX_TURN)
+    mean_difference = np.mean(stop_angle[..., :-1] - even_angle[:-1], axis=-1)
+    even_angle = even_angle + mean_difference[..., None]
+    evenness = 0.5 * np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)[..., None]
+    turn = MAX_TURN * np.tanh(evenness * (even_angle - stop_angle) / MAX_TURN)
+    mixed_angle = stop_angle + turn
 
+    # Divide each interval between two stops into `blocks.split` equal parts.
     share = np.arange(blocks.split) / blocks.split
-    steps = (mixed[..., :-1, None] + share * np.diff(mixed, axis=-1)[..., None]).reshape(*mixed.shape[:-1], -1)
-    ray = np.exp(1j * np.concatenate([steps, mixed[..., -1:]], axis=-1))
-
-    # The intersections of the rays from the centroid with the circle, relative to the centre of the circle.
-    offset = hub - centre[..., None]
-    along = (offset * np.conj(ray)).real
-    distance = np.sqrt(along**2 + radius[..., None] ** 2 - np.abs(offset) ** 2) - along
-    point = offset + ray * distance
-    first = np.angle(point[..., :1])
-    turned = np.cumsum(np.mod(np.angle(point[..., 1:] / point[..., :-1]), 2.0 * np.pi), axis=-1)
-    film_angle = np.concatenate([first, first + turned], axis=-1)
-    return stretch_angles(film_angle, (1.0 + pull) / (1.0 - pull))
+    interval = np.diff(mixed_angle, axis=-1)[..., None]
+    divided = mixed_angle[..., :-1, None] + share * interval  # shape (..., n_stop - 1, split)
+    divided = divided.reshape(*mixed_angle.shape[:-1], -1)
+    return np.concatenate([divided, mixed_angle[..., -1:]], axis=-1)
 
 
 def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
@@ -137,7 +171,9 @@ def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
     Returns:
         Angles in the template plane, shape (..., n_sector + 1).
     """
-    stretch = ((1.0 + c) / (1.0 - c)) ** GRADING * (1.0 - c * rho) / (1.0 + c * rho)
+    rim_stretch = ((1.0 + c) / (1.0 - c)) ** GRADING
+    circle_stretch = (1.0 + c * rho) / (1.0 - c * rho)
+    stretch = rim_stretch / circle_stretch
     return stretch_angles(angle, np.maximum(stretch, 1.0))
 
 
@@ -170,11 +206,14 @@ def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
     Returns:
         Shape (..., n_ring + 1).
     """
-    even = np.linspace(0.0, 1.0, resolution.rings + 1)
+    even_edges = np.linspace(0.0, 1.0, resolution.rings + 1)
     if resolution.rim == 0:
-        return np.broadcast_to(even, (*rho.shape, even.size))
-    thin = np.minimum(-layer / np.log(rho), 1.0 / (resolution.rings + 1))[..., None]
-    inner = even * (1.0 - thin)
-    outer = 1.0 - thin * 3.0 ** -np.arange(1.0, resolution.rim + 1)
-    outer[..., -1] = 1.0
-    return np.concatenate([inner, outer], axis=-1)
+        return np.broadcast_to(even_edges, (*rho.shape, even_edges.size))
+
+    # A step of ln |z| in the template plane is a step of the depth times ln(rho).
+    max_thin_depth = 1.0 / (resolution.rings + 1)
+    thin_depth = np.minimum(-layer / np.log(rho), max_thin_depth)[..., None]
+    edges_of_even_rings = even_edges * (1.0 - thin_depth)
+    edges_of_thin_rings = 1.0 - thin_depth * 3.0 ** -np.arange(1.0, resolution.rim + 1)
+    edges_of_thin_rings[..., -1] = 1.0
+    return np.concatenate([edges_of_even_rings, edges_of_thin_rings], axis=-1)

@@ -12,6 +12,7 @@ from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.coating import Coating
 from isocharge.simulate.mesh.placement import Placement
+from isocharge.simulate.mesh.point_location import locate_points
 from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.numerics.interpolation import (
     gauss_reference_square,
@@ -33,7 +34,7 @@ Pressure = Callable[[Complexes], Array]
 """Function that returns the pressure at film points."""
 
 INVERSE_STEPS = 8
-"""Number of Newton steps of `from_oval`, which suffice for round-off up to e = 0.05. The slope is that at the rim."""
+"""Number of Newton steps of `from_oval`, which suffice for round-off up to e = 0.05."""
 
 
 @dataclass(frozen=True)
@@ -73,12 +74,15 @@ class Geometry:
         """
         rule = _quadrature(template.resolution.order)
         gradient, determinant = _film_gradient(rule.derivatives[:, None], points)
-        area = determinant * rule.weights
-        mass = _jacobian(rule.node_derivatives[:, None], points).determinant * rule.node_weights
+        weights = determinant * rule.weights
+        node_jacobian = _jacobian(rule.node_derivatives[:, None], points)
+        mass = node_jacobian.determinant * rule.node_weights
+
         footprint = template.footprint
         if pressure is None:
-            node_load = area[footprint] @ rule.values
-            total_load = area[footprint].sum()
+            footprint_weights = weights[footprint]  # shape (n_footprint_element, n_point)
+            node_load = footprint_weights @ rule.values  # shape (n_footprint_element, n_local)
+            total_load = footprint_weights.sum()
         else:
             node_load = _integrated_pressure(template.resolution.order, points[footprint], pressure)
             total_load = node_load.sum()
@@ -86,7 +90,7 @@ class Geometry:
         load = load / (template.copies * total_load)
         if template.constraint is not None:
             load = template.constraint.T @ load
-        return cls(template.nodes, gradient, area, load, mass, template.constraint)
+        return cls(template.nodes, gradient, weights, load, mass, template.constraint)
 
     @property
     def stacked(self) -> Array:
@@ -104,10 +108,10 @@ class Geometry:
         Returns:
             Sums, shape (n_node,).
         """
-        total = np.asarray(np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64))
+        sums = np.bincount(self.nodes.ravel(), local.ravel(), self.load.size).astype(np.float64)
         if self.constraint is None:
-            return total
-        return np.asarray(self.constraint.T @ total)
+            return np.asarray(sums)
+        return np.asarray(self.constraint.T @ sums)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +122,8 @@ class PlacedMesh:
         template: Template of the mesh.
         placement: Position of the template on a circular film.
         layer: Width of the thin rings at the rim, in film radii.
-        oval: e exp(2 i alpha) of an oval clamp, whose rim lies at 1 + e cos 2 (angle - alpha), in film radii.
+        oval: Shape of the clamp as the complex number e exp(2 i alpha). In the direction `angle`, the rim of the film
+            lies at the distance 1 + e cos(2 (angle - alpha)) from the centre, in film radii. 0 for a circular clamp.
         coat: Coat on parts of the film, in film radii and rotated with the press; None if there is no coat.
     """
 
@@ -151,9 +156,11 @@ class PlacedMesh:
         if self.coat is None:
             return geometry
         xi, eta, _ = gauss_reference_square(self.resolution.order + 1)
-        points = self.points @ tensor_values(self.resolution.order, xi, eta).T
-        coated = np.flatnonzero(self.coat.near(points).any(axis=1))
-        return replace(geometry, coat=(coated, self.coat.moduli(points[coated])))
+        basis_values = tensor_values(self.resolution.order, xi, eta)  # shape (n_point, n_local)
+        quadrature_points = self.points @ basis_values.T  # shape (n_element, n_point)
+        coated_elements = np.flatnonzero(self.coat.near(quadrature_points).any(axis=1))
+        added_stiffness = self.coat.moduli(quadrature_points[coated_elements])
+        return replace(geometry, coat=(coated_elements, added_stiffness))
 
     def _pressure(self, points: Complexes) -> Array:
         """Return the pressure of the probe at film points, shape (..., n), relative to the mean pressure.
@@ -174,9 +181,11 @@ class PlacedMesh:
         Returns:
             Index of the element, xi, eta, and whether the point was reflected into the meshed half, each of shape (n,).
         """
-        position, mirrored = self.template.into_meshed_half(from_oval(points, self.oval))
-        element, xi, eta = self.placement.batch().locate(self.template, position[None])
-        return *self.template.within(element[0], xi[0], eta[0]), mirrored
+        circular_points = from_oval(points, self.oval)
+        meshed_points, is_reflected = self.template.into_meshed_half(circular_points)
+        base_element, base_xi, base_eta = locate_points(self.placement.batch(), self.template, meshed_points[None])
+        element, xi, eta = self.template.within(base_element[0], base_xi[0], base_eta[0])
+        return element, xi, eta, is_reflected
 
     def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:
         """Compute the derivatives of the basis with respect to (X1, X2) at points of elements.
@@ -203,8 +212,10 @@ class PlacedMesh:
             Shape (n_element, n_local, 2, k).
         """
         gradient = self._node_gradient
-        flat = gradient.reshape(len(gradient), -1, gradient.shape[-1])
-        return (flat @ values).reshape(*gradient.shape[:3], -1)
+        n_element, n_local, _, _ = gradient.shape
+        stacked_gradient = gradient.reshape(n_element, n_local * 2, n_local)
+        derivatives = stacked_gradient @ values  # shape (n_element, n_local * 2, k)
+        return derivatives.reshape(n_element, n_local, 2, -1)
 
     @cached_property
     def _node_gradient(self) -> Array:
@@ -225,9 +236,12 @@ def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolut
         layer: Width of the thin rings at the rim, in film radii.
     """
     template = template_for(probe, resolution, whole=not film.is_axisymmetric)
-    angle = float(np.arctan2(at[1], at[0]))
-    placement = Placement.of(template, probe.rotated(-angle), np.array(np.hypot(*at)), film.radius, layer)
-    return PlacedMesh(template, placement, layer, film.oval * np.exp(2j * (film.oval_axis - angle)))
+    x, y = at
+    direction = float(np.arctan2(y, x))
+    distance = np.array(np.hypot(x, y))
+    placement = Placement.of(template, probe.rotated(-direction), distance, film.radius, layer)
+    oval = film.oval * np.exp(2j * (film.oval_axis - direction))
+    return PlacedMesh(template, placement, layer, oval)
 
 
 def to_oval(points: Complexes, oval: complex) -> Complexes:
@@ -240,11 +254,19 @@ def to_oval(points: Complexes, oval: complex) -> Complexes:
     if oval == 0.0:
         return points
     radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
-    return np.asarray(points * (1.0 + _displacement_share(radius) * (np.conj(oval) * (points / radius) ** 2).real))
+    rim_displacement = (np.conj(oval) * (points / radius) ** 2).real
+    return np.asarray(points * (1.0 + _displacement_share(radius) * rim_displacement))
 
 
 def from_oval(points: Complexes, oval: complex) -> Complexes:
-    """Map points of an oval film to a circular film. This is the inverse of `to_oval`."""
+    """Map points of an oval film to a circular film. This is the inverse of `to_oval`.
+
+    The radius is found by Newton's method with a fixed slope.
+
+    Args:
+        points: Points x + iy, any shape, in film radii.
+        oval: e exp(2 i alpha) of the clamp; see `PlacedMesh`.
+    """
     if oval == 0.0:
         return points
     oval_radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
@@ -253,7 +275,8 @@ def from_oval(points: Complexes, oval: complex) -> Complexes:
     for _ in range(INVERSE_STEPS):
         share = _displacement_share(radius)
         residual = radius * (1.0 + share * rim_displacement) - oval_radius
-        radius = radius - residual / (1.0 + 7.0 * rim_displacement * share)
+        slope = 1.0 + 7.0 * rim_displacement * share  # the derivative at the rim, where the share is 1
+        radius = radius - residual / slope
     return np.asarray(points * (radius / oval_radius))
 
 
@@ -294,8 +317,10 @@ def _integrated_pressure(order: int, points: Complexes, pressure: Pressure) -> A
     """
     xi, eta, weights = gauss_reference_square(PRESSURE_POINTS)
     values, derivatives = tensor_basis(order, xi, eta)
-    area = _jacobian(derivatives[:, None], points).determinant * weights
-    return np.asarray((area * pressure(points @ values.T)) @ values)
+    weights_on_film = _jacobian(derivatives[:, None], points).determinant * weights
+    film_points = points @ values.T  # the integration points, shape (n_element, n_point)
+    force_at_points = pressure(film_points) * weights_on_film
+    return np.asarray(force_at_points @ values)
 
 
 class _Jacobian(NamedTuple):
@@ -335,12 +360,16 @@ def _film_gradient(derivatives: Array, points: np.ndarray) -> tuple[Array, Array
     determinant = jacobian.determinant
     adjugate = np.stack([jacobian.y_eta, -jacobian.y_xi, -jacobian.x_eta, jacobian.x_xi], axis=-1)
     inverse = (adjugate / determinant[..., None]).reshape(*determinant.shape, 2, 2)
-    return np.einsum("epab,bepn->epan", inverse, derivatives), determinant
+    # Sum over the local derivative b, for each element e, point p, film derivative a and node n.
+    gradient = np.einsum("epab,bepn->epan", inverse, derivatives)
+    return gradient, determinant
 
 
 def _jacobian(derivatives: Array, points: np.ndarray) -> _Jacobian:
     """Compute the Jacobian of the map from the reference element to the film; arguments as in `_film_gradient`."""
+    # Sum over the nodes n, for each local derivative k, element e and point p.
     tangent = np.einsum("kepn,en->kep", derivatives, points)
     x_xi, x_eta = tangent.real
     y_xi, y_eta = tangent.imag
-    return _Jacobian(x_xi, x_eta, y_xi, y_eta, x_xi * y_eta - x_eta * y_xi)
+    determinant = x_xi * y_eta - x_eta * y_xi
+    return _Jacobian(x_xi, x_eta, y_xi, y_eta, determinant)

@@ -34,6 +34,7 @@ MAX_SPLITS = 12
 NODE_TOLERANCE = 1e-8
 """Distance below which two nodes under the sample press are the same node, in film radii."""
 
+
 EDGE_ELEMENT_SIZE = 0.35
 """Longest side of an element at an edge of the coat, over the square root of the area of the largest part of the
 coat."""
@@ -54,6 +55,14 @@ class RefinedTemplate(Template):
     """
 
     def __init__(self, base: Template, parent: Integers, low: Array, size: Array) -> None:
+        """Number the nodes of the split elements.
+
+        Args:
+            base: The original template.
+            parent: Index of the original element of each element, shape (n_element,).
+            low: Lower left corner (xi, eta) of each element in the original element, shape (n_element, 2).
+            size: Lengths of the sides of each element in the original element, shape (n_element, 2).
+        """
         super().__init__(base.resolution, base.topology, not base.half)
         self.base = base
         self.parent = parent
@@ -61,16 +70,17 @@ class RefinedTemplate(Template):
         self.size = size
         self.n_element = parent.size
         self.splits = np.column_stack([parent, low, size])
+
         points = self.from_base(sample_points(base)).ravel()
-        pairs = cKDTree(np.stack([points.real, points.imag], axis=1)).query_pairs(NODE_TOLERANCE, output_type="ndarray")
-        same_node = csr_array((np.ones(len(pairs)), pairs.T), shape=(points.size, points.size))
-        self.n_node, number = connected_components(same_node, directed=False)
-        self.nodes: Integers = np.asarray(number, dtype=np.intp).reshape(self.n_element, -1)
-        self.first_seen = np.unique(number, return_index=True)[1]
-        outermost = parent >= base.n_element - base.n_sector
-        is_outer_side = self._into_parent(self.xi, self.eta)[0] > 1.0 - 1e-12
+        self.n_node, node_number = _merge_coinciding(points)
+        self.nodes: Integers = node_number.reshape(self.n_element, -1)
+        self.first_seen = np.unique(node_number, return_index=True)[1]
+
+        is_in_last_ring = parent >= base.n_element - base.n_sector
+        parent_xi, _ = self._into_parent(self.xi, self.eta)
+        is_on_outer_side = parent_xi > 1.0 - 1e-12
         self.on_rim = np.zeros(self.n_node, dtype=bool)
-        self.on_rim[self.nodes[outermost[:, None] & is_outer_side]] = True
+        self.on_rim[self.nodes[is_in_last_ring[:, None] & is_on_outer_side]] = True
         self.on_axis = np.zeros(self.n_node, dtype=bool)
         self.constraint = self._hanging_node_matrix(points)
 
@@ -83,9 +93,9 @@ class RefinedTemplate(Template):
         """Interpolate values from the nodes of the original elements, shape (n_original_element, n_local, ...)."""
         xi, eta = self._into_parent(self.xi, self.eta)
         weights = tensor_values(self.resolution.order, xi.ravel(), eta.ravel())
-        return np.asarray(
-            np.einsum("enm,em...->en...", weights.reshape(self.n_element, self.xi.size, -1), values[self.parent])
-        )
+        weights_of_element = weights.reshape(self.n_element, self.xi.size, -1)
+        # Sum over the nodes m of the original element, for each element e and node n.
+        return np.asarray(np.einsum("enm,em...->en...", weights_of_element, values[self.parent]))
 
     def within(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
         """Convert positions in the original elements into positions in the elements; see `Template.within`.
@@ -93,27 +103,43 @@ class RefinedTemplate(Template):
         For each size of elements, an original element is a grid of cells. A cell has a unique code, and the element of
         this size that fills the cell is found by its code.
         """
-        found = np.zeros_like(element)
-        position = np.stack([xi, eta])
-        max_cells = 2 ** round(1.0 - np.log2(self.size.min()))
-
-        def cell_code(parent: Integers, cell: Integers) -> Integers:
-            """Return a unique number for the cells, shape (2, n), of original elements, shape (n,)."""
-            return np.asarray((parent * max_cells + cell[0]) * max_cells + cell[1])
-
+        found_element = np.zeros_like(element)
+        position = np.stack([xi, eta])  # shape (2, n_point)
         for size in np.unique(self.size, axis=0):
             candidates = np.flatnonzero((self.size == size).all(axis=1))
-            side = size[:, None]
-            candidate_cells = np.rint((self.low[candidates].T + 1.0) / side).astype(np.intp)
-            codes = cell_code(self.parent[candidates], candidate_cells)
-            order = np.argsort(codes)
-            point_cells = np.clip(np.floor((position + 1.0) / side), 0, 2.0 / side - 1.0).astype(np.intp)
-            point_codes = cell_code(element, point_cells)
-            match = np.minimum(np.searchsorted(codes[order], point_codes), codes.size - 1)
-            is_match = codes[order][match] == point_codes
-            found[is_match] = candidates[order][match[is_match]]
-        local = (position - self.low[found].T) / (0.5 * self.size[found].T) - 1.0
-        return found, local[0], local[1]
+            cell_size = size[:, None]
+            candidate_cells = np.rint((self.low[candidates].T + 1.0) / cell_size).astype(np.intp)
+            candidate_codes = self._cell_codes(self.parent[candidates], candidate_cells)
+            order = np.argsort(candidate_codes)
+            candidates = candidates[order]
+            candidate_codes = candidate_codes[order]
+
+            point_cells = np.floor((position + 1.0) / cell_size).astype(np.intp)
+            last_cell = np.rint(2.0 / cell_size).astype(np.intp) - 1
+            point_codes = self._cell_codes(element, np.clip(point_cells, 0, last_cell))
+            match = np.searchsorted(candidate_codes, point_codes)
+            match = np.minimum(match, candidates.size - 1)
+            is_match = candidate_codes[match] == point_codes
+            found_element[is_match] = candidates[match[is_match]]
+
+        low = self.low[found_element].T
+        half_size = 0.5 * self.size[found_element].T
+        local_xi, local_eta = (position - low) / half_size - 1.0
+        return found_element, local_xi, local_eta
+
+    def _cell_codes(self, parent: Integers, cell: Integers) -> Integers:
+        """Return a unique code for each cell of the original elements.
+
+        Args:
+            parent: Index of the original element of each cell, shape (n,).
+            cell: Position of each cell in its original element: column along xi and row along eta, shape (2, n).
+
+        Returns:
+            Codes, shape (n,).
+        """
+        max_cells_per_side = 2 ** round(1.0 - np.log2(self.size.min()))
+        column, row = cell
+        return np.asarray((parent * max_cells_per_side + column) * max_cells_per_side + row)
 
     def _into_parent(self, xi: Array, eta: Array) -> Array:
         """Convert local coordinates, shape (n,), of all elements into those of the original elements.
@@ -121,7 +147,10 @@ class RefinedTemplate(Template):
         Returns:
             Shape (2, n_element, n).
         """
-        return self.low.T[:, :, None] + 0.5 * self.size.T[:, :, None] * (np.stack([xi, eta])[:, None] + 1.0)
+        local = np.stack([xi, eta])[:, None]  # shape (2, 1, n)
+        low = self.low.T[:, :, None]  # shape (2, n_element, 1)
+        size = self.size.T[:, :, None]
+        return low + 0.5 * size * (local + 1.0)
 
     def _hanging_node_matrix(self, points: Complexes) -> csr_array:
         """Compute the matrix from the values at the nodes that do not hang to the values at all nodes.
@@ -136,18 +165,24 @@ class RefinedTemplate(Template):
         sources = self._hanging_node_sources(points)
         hanging = np.array(list(sources), dtype=np.intp)
         regular = np.setdiff1d(np.arange(self.n_node), hanging)
+
         row = np.concatenate([regular, np.repeat(hanging, order + 1)])
         column = np.concatenate([regular, *(side_nodes for side_nodes, _ in sources.values())])
         weight = np.concatenate([np.ones(regular.size), *(weights for _, weights in sources.values())])
-        step = csr_array((weight, (row, column)), shape=(self.n_node, self.n_node))
-        constraint = step
+        single_step = csr_array((weight, (row, column)), shape=(self.n_node, self.n_node))
+
+        constraint = single_step
         while np.isin(constraint.indices, hanging).any():  # a hanging node may depend on another hanging node
-            constraint = step @ constraint
+            constraint = single_step @ constraint
             constraint.eliminate_zeros()
         return constraint
 
     def _hanging_node_sources(self, points: Complexes) -> dict[int, tuple[Integers, Array]]:
         """Find the hanging nodes, and the nodes that determine their values.
+
+        A side of an element may be adjacent to 2, 4, 8, ... smaller elements. For each of these numbers, the positions
+        that the nodes of the smaller elements have on the side are computed. A node at such a position hangs, unless it
+        is a node of the side.
 
         Args:
             points: Film points of the nodes of all elements under the sample press, shape (n_element * n_local,).
@@ -160,26 +195,48 @@ class RefinedTemplate(Template):
         line = lobatto_nodes(order)
         local_number = np.arange((order + 1) ** 2).reshape(order + 1, -1)
         sides = np.stack([local_number[0], local_number[-1], local_number[:, 0], local_number[:, -1]])
-        node_points = points[self.first_seen]
-        tree = cKDTree(np.stack([node_points.real, node_points.imag], axis=1))
-        large = np.flatnonzero(self.size.max(axis=1) > self.size.min())
-        nodes_on_sides = self.nodes[large][:, sides]
-        points_on_sides = points.reshape(self.nodes.shape)[large][:, sides]
-        max_level = round(np.log2(self.size.max() / self.size.min()))
+
+        large_elements = np.flatnonzero(self.size.max(axis=1) > self.size.min())
+        nodes_on_sides = self.nodes[large_elements][:, sides]  # shape (n_large, 4, order + 1)
+        points_on_sides = points.reshape(self.nodes.shape)[large_elements][:, sides]
+        node_tree = _tree(points[self.first_seen])
+        max_halvings = round(np.log2(self.size.max() / self.size.min()))
         sources: dict[int, tuple[Integers, Array]] = {}
-        for level in range(1, max_level + 1):
-            parts = 2**level
-            t = ((2.0 * np.arange(parts)[:, None] + 1.0 + line) / parts - 1.0).ravel()
-            values = lagrange_values(line, lobatto_weights(order), t)
-            at = points_on_sides @ values.T
-            position = np.stack([at.real, at.imag], axis=-1)
-            distance, nearest = tree.query(position, distance_upper_bound=NODE_TOLERANCE)
-            for element, side, place in zip(*np.nonzero(np.isfinite(distance)), strict=True):
-                node = int(nearest[element, side, place])
+        for halvings in range(1, max_halvings + 1):
+            n_part = 2**halvings
+            part = np.arange(n_part)[:, None]
+            position_on_side = ((2.0 * part + 1.0 + line) / n_part - 1.0).ravel()  # from -1 to 1 along the side
+            weights = lagrange_values(line, lobatto_weights(order), position_on_side)
+            candidate_points = points_on_sides @ weights.T  # shape (n_large, 4, n_part * (order + 1))
+
+            coordinates = np.stack([candidate_points.real, candidate_points.imag], axis=-1)
+            distance, nearest_node = node_tree.query(coordinates, distance_upper_bound=NODE_TOLERANCE)
+            for element, side, index in np.argwhere(np.isfinite(distance)):
+                node = int(nearest_node[element, side, index])
                 side_nodes = nodes_on_sides[element, side]
                 if node not in side_nodes:
-                    sources[node] = side_nodes, values[place]
+                    sources[node] = side_nodes, weights[index]
         return sources
+
+
+def _tree(points: Complexes) -> cKDTree:
+    """Return a tree for the search of nearest neighbours among points x + iy, shape (n,)."""
+    return cKDTree(np.stack([points.real, points.imag], axis=1))
+
+
+def _merge_coinciding(points: Complexes) -> tuple[int, Integers]:
+    """Number points so that points within `NODE_TOLERANCE` of each other have the same number.
+
+    Args:
+        points: Points x + iy, shape (n,), in film radii.
+
+    Returns:
+        Count of different numbers, and the number of each point, shape (n,).
+    """
+    pairs = _tree(points).query_pairs(NODE_TOLERANCE, output_type="ndarray")
+    is_same = csr_array((np.ones(len(pairs)), pairs.T), shape=(points.size, points.size))
+    count, number = connected_components(is_same, directed=False)
+    return int(count), np.asarray(number, dtype=np.intp)
 
 
 def refine(mesh: PlacedMesh, lines: Complexes, finest: float) -> PlacedMesh:
@@ -195,31 +252,43 @@ def refine(mesh: PlacedMesh, lines: Complexes, finest: float) -> PlacedMesh:
     parent = np.arange(base.n_element)
     low = np.full((base.n_element, 2), -1.0)
     size = np.full((base.n_element, 2), 2.0)
-    tree = cKDTree(np.stack([lines.real, lines.imag], axis=1))
-    corners_and_middle = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.5, 0.5]])
+    line_tree = _tree(lines)
     for _ in range(MAX_SPLITS):
-        at = low[:, None] + size[:, None] * corners_and_middle
-        values = tensor_values(base.resolution.order, *at.reshape(-1, 2).T).reshape(*at.shape[:2], -1)
-        z = np.einsum("ecn,en->ec", values, mesh.points[parent])
-        corners = z[:, :4]
-        middle = z[:, 4]
-        side = np.abs(np.roll(corners, -1, axis=1) - corners)
-        length = np.maximum(side[:, :2], side[:, 2:])  # along xi and along eta
+        corners, middle = _corners_and_middle(mesh, parent, low, size)
+        side_length = np.abs(np.roll(corners, -1, axis=1) - corners)  # shape (n_element, 4)
+        length = np.maximum(side_length[:, :2], side_length[:, 2:])  # along xi and along eta
         longest = length.max(axis=1)
-        distance, _ = tree.query(np.stack([middle.real, middle.imag], axis=1))
+        distance, _ = line_tree.query(np.stack([middle.real, middle.imag], axis=1))
         is_too_large = (longest > finest) & (distance < GRADING * longest)
-        split = is_too_large[:, None] & (length > MIN_SIDE_RATIO * longest[:, None])
-        if not split.any():
+        is_split = is_too_large[:, None] & (length > MIN_SIDE_RATIO * longest[:, None])
+        if not is_split.any():
             break
-        for axis in (0, 1):
-            chosen = split[:, axis]
-            size[chosen, axis] *= 0.5
-            second = low[chosen] + np.eye(2)[axis] * size[chosen]
-            parent = np.concatenate([parent, parent[chosen]])
-            low = np.concatenate([low, second])
-            size = np.concatenate([size, size[chosen]])
-            split = np.concatenate([split, split[chosen]])
+
+        for axis in (0, 1):  # halve along xi first, then along eta
+            halved = is_split[:, axis]
+            size[halved, axis] *= 0.5
+            second_low = low[halved].copy()
+            second_low[:, axis] += size[halved, axis]
+            parent = np.concatenate([parent, parent[halved]])
+            low = np.concatenate([low, second_low])
+            size = np.concatenate([size, size[halved]])
+            is_split = np.concatenate([is_split, is_split[halved]])
     return replace(mesh, template=RefinedTemplate(base, parent, low, size))
+
+
+def _corners_and_middle(mesh: PlacedMesh, parent: Integers, low: Array, size: Array) -> tuple[Complexes, Complexes]:
+    """Compute the film points of the corners and of the middle of split elements; see `RefinedTemplate`.
+
+    Returns:
+        Corners, anticlockwise, shape (n_element, 4), and middles, shape (n_element,), in film radii.
+    """
+    corners_and_middle = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.5, 0.5]])
+    local = low[:, None] + size[:, None] * corners_and_middle  # shape (n_element, 5, 2)
+    xi, eta = local.reshape(-1, 2).T
+    basis_values = tensor_values(mesh.template.resolution.order, xi, eta).reshape(len(parent), 5, -1)
+    # Sum over the nodes n of the original element, for each element e and each of its five points p.
+    points = np.einsum("epn,en->ep", basis_values, mesh.points[parent])
+    return points[:, :4], points[:, 4]
 
 
 def coated(mesh: PlacedMesh, layers: tuple[tuple[Complexes, ...], ...], bare: Array, added: Array) -> PlacedMesh:
@@ -239,19 +308,26 @@ def coated(mesh: PlacedMesh, layers: tuple[tuple[Complexes, ...], ...], bare: Ar
 def _edges(parts: tuple[Complexes, ...], finest: float) -> Complexes:
     """Return points on the edges of the area that parts cover together.
 
+    Points on an edge between two adjacent parts are left out, because another part covers their outer side.
+
     Args:
         parts: Convex polygons with anticlockwise corners x + iy.
         finest: Twice the largest distance between points, in the unit of the corners.
+
+    Returns:
+        Points x + iy, shape (n,), in the unit of the corners.
     """
     points = []
-    outside = []
+    points_just_outside = []
     for part in parts:
         for start, end in zip(part, np.roll(part, -1), strict=True):
-            count = 2 + int(3.0 * abs(end - start) / finest)
-            along = (np.arange(count) + 0.5) / count
-            edge_points = start + along * (end - start)
+            length = abs(end - start)
+            count = 2 + int(3.0 * length / finest)
+            share = (np.arange(count) + 0.5) / count
+            edge_points = start + share * (end - start)
+            outward_normal = -1j * (end - start) / length
             points.append(edge_points)
-            outside.append(edge_points - 1e-3j * finest * (end - start) / abs(end - start))
-    just_outside = np.concatenate(outside)
+            points_just_outside.append(edge_points + 1e-3 * finest * outward_normal)
+    just_outside = np.concatenate(points_just_outside)
     is_inner_edge = np.any([min_edge_cross_product(part, just_outside) > 0.0 for part in parts], axis=0)
     return np.asarray(np.concatenate(points)[~is_inner_edge])

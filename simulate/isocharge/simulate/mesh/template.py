@@ -42,12 +42,13 @@ class Template(Blocks):
 
     def __init__(self, resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> None:
         super().__init__(resolution, topology, whole)
-        points = sample_points(self)
-        flat = points.ravel()
-        _, self.first_seen, number = np.unique(np.round(flat, 9), return_index=True, return_inverse=True)
-        self.nodes: Integers = number.reshape(points.shape)
+        element_points = sample_points(self)
+        all_points = element_points.ravel()
+        rounded_points = np.round(all_points, 9)
+        _, self.first_seen, node_number = np.unique(rounded_points, return_index=True, return_inverse=True)
+        self.nodes: Integers = node_number.reshape(element_points.shape)
         self.n_node = self.first_seen.size
-        node_points = flat[self.first_seen]
+        node_points = all_points[self.first_seen]
         self.on_rim = np.abs(node_points) > 1.0 - 1e-9
         self.on_axis = (np.abs(node_points.imag) < 1e-9) & self.half
 

@@ -82,15 +82,21 @@ def lattice(max_count: int) -> Complexes:
     max_count = max(max_count, 1)
     half_side = int(np.sqrt(max_count / np.pi)) + 2
     line = np.arange(-half_side, half_side + 1)
-    i, j = (index.ravel() for index in np.meshgrid(line, line))
-    squared_distance = i**2 + j**2
+    x_grid, y_grid = np.meshgrid(line, line)
+    squared_distance = x_grid**2 + y_grid**2
+
+    # The largest radius within which the lattice has at most `max_count` points.
     squared_radii, counts = np.unique(squared_distance, return_counts=True)
-    number_of_rings = np.searchsorted(np.cumsum(counts), max_count, side="right")
-    squared_radius = squared_radii[number_of_rings - 1]
-    inside = np.flatnonzero(squared_distance <= squared_radius)
-    inside = inside[np.lexsort((j[inside], i[inside], squared_distance[inside]))]
+    number_of_radii = np.searchsorted(np.cumsum(counts), max_count, side="right")
+    squared_radius = squared_radii[number_of_radii - 1]
+
+    is_inside = squared_distance <= squared_radius
+    x = x_grid[is_inside]
+    y = y_grid[is_inside]
+    order = np.lexsort((y, x, squared_distance[is_inside]))
     radius = max(np.sqrt(squared_radius), 1.0)
-    return np.asarray((i[inside] + 1j * j[inside]) / radius * (1.0 - 1e-15))
+    rounding_margin = 1.0 - 1e-15  # keeps the outermost points within the unit circle
+    return np.asarray((x[order] + 1j * y[order]) / radius * rounding_margin)
 
 
 def square_grid(radius: float, spacing: float) -> Array:

@@ -72,8 +72,10 @@ def minimise(
         Points in D, shape (n, 3), and their residuals, shape (n, k).
     """
     point = into_domain(start).copy()
-    active = np.arange(len(start))
-    residual, slopes = (np.array(values) for values in residuals(active, point))
+    active = np.arange(len(start))  # indices of the problems that have not converged
+    first_residual, first_slopes = residuals(active, point)
+    residual = np.array(first_residual)
+    slopes = np.array(first_slopes)
     square = (residual**2).sum(axis=1)
     damping = np.full(len(point), INITIAL_DAMPING)
     for _ in range(steps):
@@ -92,8 +94,12 @@ def minimise(
         square[accepted] = trial_square[is_accepted]
 
         lower_damping = np.maximum(damping[active] * DAMPING_DECREASE, MIN_DAMPING)
-        damping[active] = np.where(is_accepted, lower_damping, damping[active] * DAMPING_INCREASE)
-        active = active[(np.abs(change) >= min_change) & (damping[active] <= MAX_DAMPING)]
+        higher_damping = damping[active] * DAMPING_INCREASE
+        damping[active] = np.where(is_accepted, lower_damping, higher_damping)
+
+        is_changing = np.abs(change) >= min_change
+        is_damping_allowed = damping[active] <= MAX_DAMPING
+        active = active[is_changing & is_damping_allowed]
     return point, residual
 
 
@@ -109,35 +115,51 @@ def bounded_step(unit: Array, residual: Array, slopes: Array, damping: Array | f
     Returns:
         Points after the step, shape (..., 3).
     """
-    normal: Array = slopes @ slopes.swapaxes(-1, -2)
-    gradient: Array = (slopes @ residual[..., None])[..., 0]
-    trace = normal[..., 0, 0] + normal[..., 1, 1] + normal[..., 2, 2] + 1e-12
-    normal = normal + (damping * trace)[..., None, None] * MEAN_OF_DIAGONAL
-    on_circle, at_end = _is_beyond(unit, 1.0 - EDGE_TOLERANCE)
-    if np.count_nonzero(on_circle | at_end):
-        normal, gradient = _restrict_to_edges(unit, normal, gradient, trace, on_circle, at_end)
-    trial: Array = unit - np.linalg.solve(normal, gradient[..., None])[..., 0]
-    return into_domain(trial)
+    normal_matrix: Array = slopes @ slopes.swapaxes(-1, -2)  # J'J, shape (..., 3, 3)
+    gradient: Array = (slopes @ residual[..., None])[..., 0]  # J'r, shape (..., 3)
+    trace = normal_matrix[..., 0, 0] + normal_matrix[..., 1, 1] + normal_matrix[..., 2, 2] + 1e-12
+    normal_matrix = normal_matrix + (damping * trace)[..., None, None] * MEAN_OF_DIAGONAL
+    is_on_circle, is_at_end = _is_beyond(unit, 1.0 - EDGE_TOLERANCE)
+    if np.count_nonzero(is_on_circle | is_at_end):
+        normal_matrix, gradient = _restrict_to_edges(unit, normal_matrix, gradient, trace, is_on_circle, is_at_end)
+    descent = np.linalg.solve(normal_matrix, gradient[..., None])[..., 0]
+    return into_domain(np.asarray(unit - descent))
 
 
-def _is_beyond(unit: Array, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return which points lie outside a disk of radius `size`, and which outside the interval [-size, size]."""
+def _is_beyond(unit: Array, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Compare points with the domain D scaled by a factor.
+
+    Args:
+        unit: Points, shape (..., 3).
+        scale: Factor of the domain.
+
+    Returns:
+        Whether each point lies outside the disk of radius `scale`, and whether it lies outside the interval
+        [-scale, scale], each of shape (...).
+    """
     squares = unit * unit
-    return squares[..., 0] + squares[..., 1] > size * size, squares[..., 2] > size * size
+    is_outside_disk = squares[..., 0] + squares[..., 1] > scale * scale
+    is_outside_interval = squares[..., 2] > scale * scale
+    return is_outside_disk, is_outside_interval
 
 
 def _restrict_to_edges(
-    unit: Array, normal: Array, gradient: Array, trace: Array, on_circle: np.ndarray, at_end: np.ndarray
+    unit: Array,
+    normal_matrix: Array,
+    gradient: Array,
+    trace: Array,
+    is_on_circle: np.ndarray,
+    is_at_end: np.ndarray,
 ) -> tuple[Array, Array]:
     """Modify the normal equations so that steps follow the edges across which the negative gradient points.
 
     Args:
         unit: Points of D, shape (..., 3).
-        normal: Damped matrices J'J, shape (..., 3, 3).
+        normal_matrix: Damped matrices J'J, shape (..., 3, 3).
         gradient: Gradients J'r, shape (..., 3).
         trace: Traces of J'J, shape (...).
-        on_circle: Whether each point lies on the edge of the disk, shape (...).
-        at_end: Whether each point lies at an end of the interval, shape (...).
+        is_on_circle: Whether each point lies on the edge of the disk, shape (...).
+        is_at_end: Whether each point lies at an end of the interval, shape (...).
 
     Returns:
         Modified matrices, shape (..., 3, 3), and modified gradients, shape (..., 3).
@@ -152,15 +174,21 @@ def _restrict_to_edges(
     end_normal[..., 2] = np.sign(unit[..., 2])
 
     # Outward components of the negative gradient, which are the Lagrange multipliers of the active edges
-    circle_multiplier = np.where(on_circle, np.maximum(-(gradient * circle_normal).sum(axis=-1), 0.0), 0.0)
-    end_multiplier = np.where(at_end, np.maximum(-(gradient * end_normal).sum(axis=-1), 0.0), 0.0)
+    circle_pressure = -(gradient * circle_normal).sum(axis=-1)
+    end_pressure = -(gradient * end_normal).sum(axis=-1)
+    circle_multiplier = np.where(is_on_circle, np.maximum(circle_pressure, 0.0), 0.0)
+    end_multiplier = np.where(is_at_end, np.maximum(end_pressure, 0.0), 0.0)
 
-    normal = normal + _outer_product(circle_tangent, circle_multiplier)
-    circle_stiffness = (circle_multiplier > 0.0) * EDGE_STIFFNESS * trace
-    end_stiffness = (end_multiplier > 0.0) * EDGE_STIFFNESS * trace
-    normal = normal + _outer_product(circle_normal, circle_stiffness) + _outer_product(end_normal, end_stiffness)
-    gradient = gradient + circle_multiplier[..., None] * circle_normal + end_multiplier[..., None] * end_normal
-    return normal, gradient
+    # The curvature of the circle acts along its tangent. The stiffness keeps the point on the active edges.
+    curvature = _outer_product(circle_tangent, circle_multiplier)
+    circle_stiffness = _outer_product(circle_normal, (circle_multiplier > 0.0) * EDGE_STIFFNESS * trace)
+    end_stiffness = _outer_product(end_normal, (end_multiplier > 0.0) * EDGE_STIFFNESS * trace)
+    new_matrix = normal_matrix + curvature + circle_stiffness + end_stiffness
+
+    # The components of the gradient that point out of D do not contribute to the step.
+    circle_component = circle_multiplier[..., None] * circle_normal
+    end_component = end_multiplier[..., None] * end_normal
+    return new_matrix, gradient + circle_component + end_component
 
 
 def _outer_product(vector: Array, factor: Array) -> Array:
@@ -170,8 +198,10 @@ def _outer_product(vector: Array, factor: Array) -> Array:
 
 def into_domain(unit: Array) -> Array:
     """Replace points outside D by the nearest point of D; points and result have the shape (..., 3)."""
-    outside_disk, outside_interval = _is_beyond(unit, 1.0)
-    if not np.count_nonzero(outside_disk | outside_interval):
+    is_outside_disk, is_outside_interval = _is_beyond(unit, 1.0)
+    if not np.count_nonzero(is_outside_disk | is_outside_interval):
         return unit
-    radius = np.maximum(np.sqrt(unit[..., 0] ** 2 + unit[..., 1] ** 2), 1.0)
-    return np.concatenate([unit[..., :2] / radius[..., None], np.clip(unit[..., 2:], -1.0, 1.0)], axis=-1)
+    radius = np.sqrt(unit[..., 0] ** 2 + unit[..., 1] ** 2)
+    in_disk = unit[..., :2] / np.maximum(radius, 1.0)[..., None]
+    in_interval = np.clip(unit[..., 2:], -1.0, 1.0)
+    return np.concatenate([in_disk, in_interval], axis=-1)

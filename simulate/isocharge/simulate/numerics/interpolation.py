@@ -80,23 +80,25 @@ def barycentric_weights(nodes: Array) -> Array:
     return np.asarray(1.0 / difference.prod(axis=1))
 
 
-def lagrange_values(nodes: Array, weights: Array, at: Array) -> Array:
+def lagrange_values(nodes: Array, weights: Array, points: Array) -> Array:
     """Evaluate the Lagrange polynomials of given nodes.
 
     Args:
         nodes: Interpolation nodes, shape (n,).
         weights: Barycentric weights of the nodes, shape (n,).
-        at: Points of evaluation, shape (m,).
+        points: Points of evaluation, shape (m,).
 
     Returns:
-        Value of each polynomial at each point, shape (m, n). Each row adds up to one.
+        Value of each polynomial points each point, shape (m, n). Each row adds up to one.
     """
-    difference = at[:, None] - nodes[None, :]
-    row, node = np.nonzero(np.abs(difference) < MIN_DIFFERENCE)
-    difference[row, node] = 1.0
-    terms = weights / difference
-    values: Array = terms / (terms @ np.ones(nodes.size))[:, None]
-    values[row] = nodes == nodes[node, None]
+    difference = points[:, None] - nodes[None, :]
+    point_on_node, node_index = np.nonzero(np.abs(difference) < MIN_DIFFERENCE)
+    difference[point_on_node, node_index] = 1.0  # avoids a division by zero; these rows are replaced below
+
+    weighted_inverse = weights / difference
+    row_sum = weighted_inverse @ np.ones(nodes.size)
+    values: Array = weighted_inverse / row_sum[:, None]
+    values[point_on_node] = nodes == nodes[node_index, None]  # 1 for the node itself, 0 for all others
     return values
 
 
@@ -117,17 +119,17 @@ def derivative_matrix(order: int) -> Array:
     return _read_only(matrix)
 
 
-def basis(order: int, at: Array) -> tuple[Array, Array]:
+def basis(order: int, points: Array) -> tuple[Array, Array]:
     """Evaluate the Lagrange basis on `lobatto_nodes`, and its derivatives.
 
     Args:
         order: Order of the polynomials.
-        at: Points of evaluation in [-1, 1], shape (m,).
+        points: Points of evaluation in [-1, 1], shape (m,).
 
     Returns:
         Values and derivatives, each of shape (m, order + 1).
     """
-    values = lagrange_values(lobatto_nodes(order), lobatto_weights(order), at)
+    values = lagrange_values(lobatto_nodes(order), lobatto_weights(order), points)
     return values, values @ derivative_matrix(order)
 
 
@@ -155,9 +157,10 @@ def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
     """
     xi_values, xi_slopes = basis(order, xi)
     eta_values, eta_slopes = basis(order, eta)
-    by_xi = _tensor_product(xi_slopes, eta_values)
-    by_eta = _tensor_product(xi_values, eta_slopes)
-    return _tensor_product(xi_values, eta_values), np.stack([by_xi, by_eta])
+    values = _tensor_product(xi_values, eta_values)
+    xi_derivative = _tensor_product(xi_slopes, eta_values)
+    eta_derivative = _tensor_product(xi_values, eta_slopes)
+    return values, np.stack([xi_derivative, eta_derivative])
 
 
 def _tensor_product(xi_values: Array, eta_values: Array) -> Array:
@@ -166,11 +169,13 @@ def _tensor_product(xi_values: Array, eta_values: Array) -> Array:
     return products.reshape(len(xi_values), eta_values.shape[1] * xi_values.shape[1])
 
 
-def cubic_weights(at: Array, count: int, periodic: bool = False) -> tuple[Integers, Array]:
+def cubic_weights(points: Array, count: int, periodic: bool = False) -> tuple[Integers, Array]:
     """Compute the weights of cubic interpolation between the four nearest nodes of a uniform grid.
 
+    The weights are the Lagrange polynomials of four neighbouring nodes.
+
     Args:
-        at: Points of evaluation in units of the spacing, any shape. The nodes are 0, 1, ..., count - 1, and points
+        points: Points of evaluation in units of the spacing, any shape. The nodes are 0, 1, ..., count - 1, and points
             beyond the last node are extrapolated.
         count: Number of nodes, at least four.
         periodic: Whether the grid is periodic, so that node `count` is the same as node 0.
@@ -178,19 +183,25 @@ def cubic_weights(at: Array, count: int, periodic: bool = False) -> tuple[Intege
     Returns:
         Numbers of the four nodes, and their weights, each of shape (..., 4).
     """
-    first = np.floor(at).astype(np.intp) - 1
+    first_node = np.floor(points).astype(np.intp) - 1
     if not periodic:
-        first = np.clip(first, 0, count - 4)
-    t = (at - first)[..., None]
-    a = t
-    b = t - 1.0
-    c = t - 2.0
-    d = t - 3.0
-    weights = np.concatenate([-b * c * d / 6.0, a * c * d / 2.0, -a * b * d / 2.0, a * b * c / 6.0], axis=-1)
-    number = first[..., None] + np.arange(4)
+        first_node = np.clip(first_node, 0, count - 4)
+
+    # Signed distances of the point from the four nodes
+    from_0 = (points - first_node)[..., None]
+    from_1 = from_0 - 1.0
+    from_2 = from_0 - 2.0
+    from_3 = from_0 - 3.0
+    weight_0 = -from_1 * from_2 * from_3 / 6.0
+    weight_1 = from_0 * from_2 * from_3 / 2.0
+    weight_2 = -from_0 * from_1 * from_3 / 2.0
+    weight_3 = from_0 * from_1 * from_2 / 6.0
+    weights = np.concatenate([weight_0, weight_1, weight_2, weight_3], axis=-1)
+
+    nodes = first_node[..., None] + np.arange(4)
     if periodic:
-        number = number % count
-    return number, weights
+        nodes = nodes % count
+    return nodes, weights
 
 
 def gauss_line(count: int) -> tuple[Array, Array]:

@@ -42,10 +42,17 @@ def is_convex(corners: Array) -> bool:
     """
     edge = np.roll(corners, -1, axis=0) - corners
     next_edge = np.roll(edge, -1, axis=0)
-    turn = edge[:, 0] * next_edge[:, 1] - edge[:, 1] * next_edge[:, 0]
-    offset = corners[None, :] - corners[:, None]
-    side = edge[:, None, 0] * offset[..., 1] - edge[:, None, 1] * offset[..., 0]  # positive left of the edge
-    return bool(np.all(turn > 0.0) and side.min() >= -1e-9 * side.max())
+    turn = _cross(edge, next_edge)
+    offset = corners[None, :] - corners[:, None]  # from the start of each edge to each corner
+    side = _cross(edge[:, None], offset)  # positive for corners on the left of the edge
+    turns_left = np.all(turn > 0.0)
+    is_on_left = side.min() >= -1e-9 * side.max()
+    return bool(turns_left and is_on_left)
+
+
+def _cross(first: Array, second: Array) -> Array:
+    """Compute the cross products of plane vectors (x, y) of shape (..., 2), which has the shape (...)."""
+    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
 def overlap(first: Array, second: Array, within: float = 0.0) -> bool:
@@ -87,7 +94,9 @@ def min_edge_cross_product(corners: Complexes, points: Complexes) -> Array:
         Smallest cross product of each point, in the shape of `points` and the square of their unit.
     """
     edge = np.roll(corners, -1) - corners
-    return np.asarray((np.conj(edge) * (points[..., None] - corners)).imag.min(axis=-1))
+    offset = points[..., None] - corners  # shape (..., n): from the start of each edge to the point
+    cross_product = (np.conj(edge) * offset).imag
+    return np.asarray(cross_product.min(axis=-1))
 
 
 def shared_area(first: Complexes, second: Complexes) -> float:
@@ -115,18 +124,26 @@ def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float)
     Returns:
         Common area for each disk, in the shape of `centre`.
     """
+    # Ends of each edge relative to the centre, and their coordinates along and across the edge, shape (..., n).
+    # The product of one complex number with the conjugate of another has the dot product as its real part.
     start = corners - np.asarray(centre)[..., None]
     end = np.roll(start, -1, axis=-1)
     direction = (end - start) / np.abs(end - start)
-    height = (start * np.conj(direction)).imag
-    half_chord = np.sqrt(np.maximum(radius**2 - height**2, 0.0))
-    first_inside = np.clip((start * np.conj(direction)).real, -half_chord, half_chord)
-    last_inside = np.clip((end * np.conj(direction)).real, -half_chord, half_chord)
-    first_point = (first_inside + 1j * height) * direction
-    last_point = (last_inside + 1j * height) * direction
-    sector_angle = np.angle(first_point * np.conj(start)) + np.angle(end * np.conj(last_point))
-    triangle = -0.5 * height * (last_inside - first_inside)
-    sectors = 0.5 * radius**2 * sector_angle
+    start_along = (start * np.conj(direction)).real
+    end_along = (end * np.conj(direction)).real
+    across = (start * np.conj(direction)).imag  # negative if the centre is on the left of the edge, as inside
+
+    # The part of the edge within the circle; both ends coincide if the edge does not meet the circle.
+    half_chord = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
+    chord_start_along = np.clip(start_along, -half_chord, half_chord)
+    chord_end_along = np.clip(end_along, -half_chord, half_chord)
+    chord_start = (chord_start_along + 1j * across) * direction
+    chord_end = (chord_end_along + 1j * across) * direction
+
+    triangle = -0.5 * across * (chord_end_along - chord_start_along)
+    angle_before_chord = np.angle(chord_start * np.conj(start))
+    angle_after_chord = np.angle(end * np.conj(chord_end))
+    sectors = 0.5 * radius**2 * (angle_before_chord + angle_after_chord)
     return np.asarray((triangle + sectors).sum(axis=-1))
 
 
@@ -144,29 +161,34 @@ def gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
         Points (x, y), shape (m, 2), and weights, shape (m,), which add up to one.
     """
     unit_points, unit_weights = gauss_square(count)
-    s = unit_points[:, :1]
-    t = unit_points[:, 1:]
+    radial = unit_points[:, :1]  # 0 at the first corner, 1 on the opposite side
+    angular = unit_points[:, 1:]
     points = []
     weights = []
-    for second, third in pairwise(corners[1:]):
-        first_side = second - corners[0]
-        second_side = third - corners[0]
-        double_area = first_side[0] * second_side[1] - first_side[1] * second_side[0]
-        points.append(corners[0] + s * ((1.0 - t) * first_side + t * second_side))
-        weights.append(unit_weights * s[:, 0] * double_area)
+    for second_corner, third_corner in pairwise(corners[1:]):
+        first_side = second_corner - corners[0]
+        second_side = third_corner - corners[0]
+        double_area = float(_cross(first_side, second_side))
+        direction = (1.0 - angular) * first_side + angular * second_side
+        points.append(corners[0] + radial * direction)
+        weights.append(unit_weights * radial[:, 0] * double_area)
     all_weights = np.concatenate(weights)
     return np.concatenate(points), all_weights / all_weights.sum()
 
 
-def bilinear(z: Complexes, s: Array, t: Array) -> Complexes:
-    """Map points of the unit square bilinearly into a quadrilateral, or into a triangle with a double last corner.
+def bilinear(corners: Complexes, s: Array, t: Array) -> Complexes:
+    """Map points (s, t) of the unit square bilinearly into a quadrilateral, or into a triangle.
 
     Args:
-        z: Corners x + iy of the images of (0, 0), (1, 0), (1, 1) and (0, 1), shape (4,); or of a triangle, shape (3,).
+        corners: Corners x + iy of the images of (0, 0), (1, 0), (1, 1) and (0, 1), shape (4,). For a triangle, shape
+            (3,); its last corner is the image of (1, 1) and of (0, 1).
         s: First coordinate in the unit square.
         t: Second coordinate in the unit square, of a shape that can be broadcast with that of `s`.
+
+    Returns:
+        Points x + iy, in the common shape of `s` and `t`.
     """
-    a, b, c, d = _four_corners(z)
+    a, b, c, d = _four_corners(corners)
     return np.asarray(a + (b - a) * s + (d - a) * t + (a - b + c - d) * s * t)
 
 
@@ -182,20 +204,25 @@ def gauss_quadrilateral(corners: Array, count: int, length: float) -> tuple[Arra
     Returns:
         Points (x, y), shape (n, 2), and weights, shape (n,), which add up to the area of the polygon.
     """
-    z = to_complex(corners)
-    a, b, c, d = _four_corners(z)
-    s, s_weights = _gauss_line_for(max(abs(b - a), abs(c - d)), count, length)
-    t, t_weights = _gauss_line_for(max(abs(d - a), abs(c - b)), count, length)
-    s = s[:, None]
-    by_s = (b - a) * (1.0 - t) + (c - d) * t
-    by_t = (d - a) * (1.0 - s) + (c - b) * s
-    determinant = (np.conj(by_s) * by_t).imag
-    return to_corners(bilinear(z, s, t).ravel()), (np.outer(s_weights, t_weights) * determinant).ravel()
+    complex_corners = to_complex(corners)
+    a, b, c, d = _four_corners(complex_corners)
+    s_side = max(abs(b - a), abs(c - d))
+    t_side = max(abs(d - a), abs(c - b))
+    s_line, s_weights = _gauss_line_for(s_side, count, length)
+    t, t_weights = _gauss_line_for(t_side, count, length)
+    s = s_line[:, None]
+
+    points = bilinear(complex_corners, s, t)  # shape (n_s, n_t)
+    s_derivative = (b - a) * (1.0 - t) + (c - d) * t
+    t_derivative = (d - a) * (1.0 - s) + (c - b) * s
+    determinant = (np.conj(s_derivative) * t_derivative).imag
+    weights = np.outer(s_weights, t_weights) * determinant
+    return to_corners(points.ravel()), weights.ravel()
 
 
-def _four_corners(z: Complexes) -> Complexes:
+def _four_corners(corners: Complexes) -> Complexes:
     """Return the corners of a quadrilateral, or those of a triangle with the last one repeated."""
-    return z if z.size == 4 else np.append(z, z[-1:])
+    return corners if corners.size == 4 else np.append(corners, corners[-1:])
 
 
 def _gauss_line_for(side: float, count: int, length: float) -> tuple[Array, Array]:

@@ -58,20 +58,30 @@ def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> l
         return []
 
     start, end = _edges(region)
-    slope = np.divide((end - start).real, (end - start).imag, out=np.zeros(start.size), where=start.imag != end.imag)
     trapezoids = []
-    for low, high in pairwise(_strip_ends([*front, *back])):
-        middle = 0.5 * (low + high)
-        edges = np.flatnonzero((start.imag < middle) != (end.imag < middle))
-        x_middle = start[edges].real + slope[edges] * (middle - start[edges].imag)
-        from_left = edges[np.argsort(x_middle)]
-        low_corners = start[from_left].real + slope[from_left] * (low - start[from_left].imag) + 1j * low
-        high_corners = start[from_left].real + slope[from_left] * (high - start[from_left].imag) + 1j * high
-        for left in range(0, edges.size, 2):  # the region lies between each edge with an even number and the next one
+    for bottom, top in pairwise(_strip_ends([*front, *back])):
+        middle = 0.5 * (bottom + top)
+        crosses_strip = (start.imag < middle) != (end.imag < middle)
+        crossing_start = start[crosses_strip]
+        crossing_end = end[crosses_strip]
+        x_middle = _x_at_height(crossing_start, crossing_end, middle)
+        from_left = np.argsort(x_middle)
+        x_bottom = _x_at_height(crossing_start, crossing_end, bottom)[from_left]
+        x_top = _x_at_height(crossing_start, crossing_end, top)[from_left]
+        for left in range(0, x_middle.size, 2):  # the region lies between an edge with an even number and the next one
             right = left + 1
-            corners = [low_corners[left], low_corners[right], high_corners[right], high_corners[left]]
-            trapezoids.append(np.array(corners))
+            lower_left = x_bottom[left] + 1j * bottom
+            lower_right = x_bottom[right] + 1j * bottom
+            upper_right = x_top[right] + 1j * top
+            upper_left = x_top[left] + 1j * top
+            trapezoids.append(np.array([lower_left, lower_right, upper_right, upper_left]))
     return trapezoids
+
+
+def _x_at_height(start: Complexes, end: Complexes, y: float) -> Array:
+    """Return the x coordinates at which lines from `start` to `end`, shape (n,), have the height y, shape (n,)."""
+    slope = (end - start).real / (end - start).imag
+    return np.asarray(start.real + slope * (y - start.imag))
 
 
 def _region(polygons: Sequence[Complexes]) -> shapely.Geometry:
@@ -109,15 +119,25 @@ def subdivide(part: Complexes, max_side: float) -> list[Complexes]:
         Polygons of shape (4,) or (3,), mm.
     """
     side_length = np.abs(np.roll(part, -1) - part)
-    s = np.linspace(0.0, 1.0, int(np.ceil(max(side_length[0], side_length[2]) / max_side)) + 1)
-    t = np.linspace(0.0, 1.0, int(np.ceil(max(side_length[1], side_length[3]) / max_side)) + 1)
-    grid = bilinear(part, s[:, None], t)
+    s_count = int(np.ceil(max(side_length[0], side_length[2]) / max_side))
+    t_count = int(np.ceil(max(side_length[1], side_length[3]) / max_side))
+    s = np.linspace(0.0, 1.0, s_count + 1)
+    t = np.linspace(0.0, 1.0, t_count + 1)
+    grid = bilinear(part, s[:, None], t)  # shape (s_count + 1, t_count + 1)
     cells = []
-    for i, j in np.ndindex(s.size - 1, t.size - 1):
-        cell = np.array([grid[i, j], grid[i + 1, j], grid[i + 1, j + 1], grid[i, j + 1]])
-        distinct = cell[np.abs(cell - np.roll(cell, 1)) > MERGE_DISTANCE]
-        if distinct.size > 2:
-            cells.append(distinct)
+    for row in range(s_count):
+        for column in range(t_count):
+            corners = np.array(
+                [
+                    grid[row, column],
+                    grid[row + 1, column],
+                    grid[row + 1, column + 1],
+                    grid[row, column + 1],
+                ]
+            )
+            is_distinct = np.abs(corners - np.roll(corners, 1)) > MERGE_DISTANCE
+            if np.count_nonzero(is_distinct) > 2:
+                cells.append(corners[is_distinct])
     return cells
 
 
