@@ -54,6 +54,17 @@ def test_a_point(command):
     assert re.search(r"charge A +[0-9.]+ pC", out)
 
 
+def test_simulate_point_reports_the_side_force_and_the_friction_of_a_vertical_stage(command):
+    press = (SENSOR, "--at", "3,-4", "--force", "0.5")
+    plain, _ = point(command, *press)
+    pulled, _ = point(command, *press, "--side-force", "-0.06,0.08")
+    rubbed, _ = point(command, *press, "--friction", "0.2")
+    assert "side_force_N" not in plain
+    assert rubbed["side_force_N"] == pytest.approx([-0.06, 0.08])
+    assert rubbed["charge_pC"] == pytest.approx(pulled["charge_pC"], rel=1e-6)
+    assert rubbed["charge_pC"]["A"] != pytest.approx(plain["charge_pC"]["A"], rel=0.005)
+
+
 SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1"]
 """A sweep of a small family."""
 
@@ -207,6 +218,14 @@ BAD = [
     (("simulate", "point", SENSOR, "--force", "-1"), 2, "SceneError: force: expected a positive number of newtons"),
     (("simulate", "point", SENSOR, "--force", "nan"), 2, "SceneError: force"),
     (("simulate", "point", SENSOR, "--at", "44.5,0"), 2, "SceneError: probe off the film: centre (44.5, 0) mm"),
+    (("simulate", "point", SENSOR, "--side-force", "0.1"), 2, "InputError: --side-force: expected two numbers in N"),
+    (("simulate", "point", SENSOR, "--side-force", "3,0"), 2, "SceneError: side force: expected at most 1 times"),
+    (("simulate", "point", SENSOR, "--friction", "-0.1"), 2, "SceneError: friction: expected a coefficient from 0"),
+    (
+        ("simulate", "point", SENSOR, "--friction", "0.1", "--side-force", "0.1,0"),
+        2,
+        "InputError: --side-force and --friction: expected one of them",
+    ),
     (("simulate", "point", SENSOR, "--at", "3"), 2, "InputError: --at: expected two numbers in mm"),
     (("simulate", "point", SENSOR, "--probe", "cube:1"), 2, "SceneError: probe 'cube:1'"),
     (("simulate", "point", SENSOR, "--probe", "circle:0"), 2, "SceneError: probe radius: expected at least 0.02 mm"),

@@ -24,6 +24,7 @@ with require("simulate"):
     from isocharge.simulate.forward.charge_spline import ChargeSpline
     from isocharge.simulate.forward.forward_map import ForwardMap
     from isocharge.simulate.forward.readout import touch_charge
+    from isocharge.simulate.forward.side_force import SideForceMap
     from isocharge.simulate.identifiability.cramer_rao import limits_at
     from isocharge.simulate.identifiability.identification import identify
     from isocharge.simulate.identifiability.working_area import working_area
@@ -67,6 +68,7 @@ __all__ = [
     "Resolution",
     "Samples",
     "Sensor",
+    "SideForceMap",
     "SolveSettings",
     "Sweep",
     "Theory",

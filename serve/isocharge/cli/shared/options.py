@@ -118,11 +118,25 @@ def parse_position(text: str) -> tuple[float, float]:
     Raises:
         InputError: If the text is not two numbers separated by a comma.
     """
+    return _parse_pair(text, "--at: expected two numbers in mm like '3,-2'")
+
+
+def parse_side_force(text: str) -> tuple[float, float]:
+    """Parse the value of `--side-force`, and return the side force (Fx, Fy), N.
+
+    Raises:
+        InputError: If the text is not two numbers separated by a comma.
+    """
+    return _parse_pair(text, "--side-force: expected two numbers in N like '0.1,0'")
+
+
+def _parse_pair(text: str, expected: str) -> tuple[float, float]:
+    """Parse two numbers that are separated by a comma. The error message begins with `expected`."""
     try:
-        x, y = (parse_number(part.strip()) for part in text.split(","))
+        first, second = (parse_number(part.strip()) for part in text.split(","))
     except ValueError as error:
-        raise InputError(f"--at: expected two numbers in mm like '3,-2', got {text!r}") from error
-    return x, y
+        raise InputError(f"{expected}, got {text!r}") from error
+    return first, second
 
 
 def parse_radius_mm(text: str) -> float:

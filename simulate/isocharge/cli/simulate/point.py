@@ -1,18 +1,33 @@
 """Command `isocharge simulate point`: charges and deflection of one press."""
 
+from dataclasses import replace
 from math import isfinite
 from typing import Annotated, Any
 
 import typer
 
-from isocharge.cli.shared.options import ForceOption, JsonOption, SensorArgument, parse_position
+from isocharge.cli.shared.options import (
+    ForceOption,
+    JsonOption,
+    SensorArgument,
+    parse_position,
+    parse_side_force,
+)
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json
 from isocharge.common.errors import InputError
-from isocharge.simulate import Equilibrium, SolveSettings, load_sensor, parse_probe, press, touch_charge
+from isocharge.simulate import (
+    Equilibrium,
+    SolveSettings,
+    load_sensor,
+    parse_probe,
+    press,
+    touch_charge,
+)
 from isocharge.simulate.forward.readout import thermal_charge
 from isocharge.simulate.mechanics.theory import theory_by_name, theory_for
 from isocharge.simulate.solver.error_estimate import estimated_error, summary
+from isocharge.simulate.solver.friction import check_friction, friction_force
 
 
 def point_command(
@@ -39,6 +54,22 @@ def point_command(
         float,
         typer.Option("--temperature", metavar="K", help="Temperature step of the film, K, whose charge is added."),
     ] = 0.0,
+    side_force: Annotated[
+        str | None,
+        typer.Option(
+            "--side-force",
+            metavar="FX,FY",
+            help="Force of the probe on the film along x and y, N. (default: none)",
+        ),
+    ] = None,
+    friction: Annotated[
+        float | None,
+        typer.Option(
+            "--friction",
+            metavar="MU",
+            help="Coefficient of friction of a probe on a vertical stage, which gives the side force. (default: none)",
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Compute the charge of every electrode (pC) and the deflection of the film (mm) under one press.
@@ -53,11 +84,25 @@ def point_command(
         selected_theory = theory_for(film_sensor, footprint, (force, force), accuracy)
     else:
         selected_theory = theory_by_name(theory, film_sensor.film)
+    if side_force is not None and friction is not None:
+        raise InputError("--side-force and --friction: expected one of them, because friction gives the side force")
+    if friction is not None:
+        check_friction(friction)
+    applied_side_force = (0.0, 0.0) if side_force is None else parse_side_force(side_force)
+    if theory == "auto" and (friction is not None or any(applied_side_force)):
+        selected_theory = replace(selected_theory, stretching=True)
     settings = SolveSettings(accuracy=accuracy, theory=selected_theory)
-    equilibrium = press(film_sensor.coated_film, footprint, parse_position(at), force, settings)
+    film = film_sensor.coated_film
+    position = parse_position(at)
+    equilibrium = press(film, footprint, position, force, settings, side_force=applied_side_force)
+    if friction:
+        applied_side_force = friction_force(equilibrium, friction)
+        equilibrium = press(film, footprint, position, force, settings, side_force=applied_side_force)
     charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
     charge_pC = dict(zip(film_sensor.electrode_names, charge.tolist(), strict=True))
     report = {"charge_pC": charge_pC, **summary(equilibrium)}
+    if any(applied_side_force):
+        report["side_force_N"] = list(applied_side_force)
     if json:
         show_json(report)
     else:
@@ -79,9 +124,14 @@ def _cautions(equilibrium: Equilibrium, accuracy: float) -> list[str]:
 def _table(report: dict[str, Any]) -> str:
     """Format the charges, the deflection and the state of the solver."""
     charges = [f"charge {name:<10} {charge:10.2f} pC" for name, charge in report["charge_pC"].items()]
+    side_force = []
+    if "side_force_N" in report:
+        side_x, side_y = report["side_force_N"]
+        side_force = [f"side force        ({side_x:.4g}, {side_y:.4g}) N"]
     return "\n".join(
         [
             *charges,
+            *side_force,
             f"deflection        {report['deflection_mm']:10.4f} mm",
             f"theory            {report['theory']}, estimated error {_percent(report['estimated_error'])}",
             f"solver            {report['status']} in {report['iterations']} steps, residual "

@@ -1,6 +1,9 @@
 """Potential energy of the film under a load, with its first and second derivatives.
 
-    Pi = stretching energy + bending energy - load * mean of W over the footprint, weighted with the pressure
+    Pi = stretching energy + bending energy
+         - load * mean of W over the footprint - side load . mean of (U1, U2) over the footprint
+
+The means are weighted with the pressure.
 
 The energy is a function of the scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3). Lengths are in units
 of the film radius a. With the amplitude A of `isocharge.simulate.mechanics.scaling`, the displacements and the
@@ -53,12 +56,20 @@ class ElasticFilm:
         """Number of unknowns per node of the linear solves."""
         return 3 if self.bending is None else 4
 
+    @property
+    def has_side_load(self) -> bool:
+        """Whether the probe also pulls the film along its plane."""
+        return self.groups.side_load != (0.0, 0.0)
+
     def energy(self, field: Array) -> float:
         """Compute the potential energy Pi of a field, shape (n_node, 3)."""
         elastic = self.membrane.energy(field)
         if self.bending is not None:
             elastic += self.bending.energy(field[:, 2])
-        return elastic - self.groups.load * float(self.geometry.load @ field[:, 2])
+        work = self.groups.load * float(self.geometry.load @ field[:, 2])
+        if self.has_side_load:
+            work += float(self.geometry.load @ field[:, :2] @ np.array(self.groups.side_load))
+        return elastic - work
 
     def residual(self, field: Array) -> Array:
         """Compute the gradient of Pi: internal minus external forces at the nodes.
@@ -74,6 +85,8 @@ class ElasticFilm:
             forces[..., 2] += self.bending.forces(field[:, 2])
         residual = np.stack([self.geometry.gather(forces[..., i]) for i in range(3)], axis=1)
         residual[:, 2] -= self.groups.load * self.geometry.load
+        if self.has_side_load:
+            residual[:, :2] -= np.outer(self.geometry.load, self.groups.side_load)
         return residual
 
     def in_plane_scale(self, field: Array) -> float:

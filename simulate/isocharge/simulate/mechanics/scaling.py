@@ -56,6 +56,7 @@ class DimensionlessGroups:
         bending: Bending stiffness over E h a^2 A^2, which is b / A^2. Zero omits bending.
         poisson: Poisson's ratio.
         anisotropy: Direction-dependent properties; None if the film is isotropic.
+        side_load: Side force (Fx, Fy) over E h a A^2, in axes that are rotated with the press.
     """
 
     amplitude2: float
@@ -64,9 +65,18 @@ class DimensionlessGroups:
     bending: float
     poisson: float
     anisotropy: Anisotropy | None = None
+    side_load: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(cls, film: Film, force: float, *, bending: bool, angle: float = 0.0) -> "DimensionlessGroups":
+    def of(
+        cls,
+        film: Film,
+        force: float,
+        *,
+        bending: bool,
+        angle: float = 0.0,
+        side_force: tuple[float, float] = (0.0, 0.0),
+    ) -> "DimensionlessGroups":
         """Compute the groups of a press.
 
         Args:
@@ -74,8 +84,13 @@ class DimensionlessGroups:
             force: Force, N.
             bending: Whether the theory includes bending.
             angle: Direction of the press from the centre of the film, rad.
+            side_force: Force (Fx, Fy) of the probe on the film along the film, N.
         """
         amplitude2 = float(amplitude_squared(film, force))
+        side_x, side_y = side_force
+        along = side_x * np.cos(angle) + side_y * np.sin(angle)
+        across = side_y * np.cos(angle) - side_x * np.sin(angle)
+        side_unit = side_force_unit(film, amplitude2)
         return cls(
             amplitude2=amplitude2,
             load=force / (film.young * film.thickness * film.radius * amplitude2**1.5),
@@ -83,6 +98,7 @@ class DimensionlessGroups:
             bending=slenderness(film) / amplitude2 if bending else 0.0,
             poisson=film.poisson,
             anisotropy=_anisotropy(film, amplitude2, angle) if film.is_anisotropic else None,
+            side_load=(float(along / side_unit), float(across / side_unit)) if any(side_force) else (0.0, 0.0),
         )
 
     @property
@@ -126,6 +142,19 @@ def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:
     difference, shear_tension = film.deviator
     tension = rotate_stress(np.array([difference, -difference, shear_tension]), -angle) / (film.young * amplitude2)
     return Anisotropy(moduli, tension)
+
+
+def side_force_unit(film: Film, amplitude2: Array | float) -> Any:
+    """Compute the side force that corresponds to a scaled side load of one, E h a A^2.
+
+    Args:
+        film: The film.
+        amplitude2: Square A^2 of the amplitude, a number or an array of any shape.
+
+    Returns:
+        Force, N, of the shape and type of `amplitude2`.
+    """
+    return film.young * film.thickness * film.radius * amplitude2
 
 
 def slenderness(film: Film) -> float:

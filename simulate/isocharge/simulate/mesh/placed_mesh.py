@@ -225,7 +225,9 @@ class PlacedMesh:
         return gradient
 
 
-def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> PlacedMesh:
+def place(
+    film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float, *, whole: bool = False
+) -> PlacedMesh:
     """Place the template of a probe under a press.
 
     Args:
@@ -234,8 +236,10 @@ def place(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolut
         at: Centroid (x, y) of the footprint, mm.
         resolution: Fineness of the mesh.
         layer: Width of the thin rings at the rim, in film radii.
+        whole: Whether to mesh the whole film although film and footprint are symmetric, as a load that is not symmetric
+            requires.
     """
-    template = template_for(probe, resolution, whole=not film.is_axisymmetric)
+    template = template_for(probe, resolution, whole=whole or not film.is_axisymmetric)
     x, y = at
     direction = float(np.arctan2(y, x))
     distance = np.array(np.hypot(x, y))

@@ -34,6 +34,7 @@ class Equilibrium:
         probe: The probe.
         at: Centroid (x, y) of the footprint, mm.
         force: Force, N, positive in the direction of the push.
+        side_force: Force (Fx, Fy) of the probe on the film along the film, N.
         theory: Terms of the film theory that were modelled.
         mesh: Mesh under the press, which is rotated onto the x axis.
         field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3), dimensionless. The press is rotated
@@ -53,6 +54,7 @@ class Equilibrium:
     probe: Probe
     at: tuple[float, float]
     force: float
+    side_force: tuple[float, float] = (0.0, 0.0)
     theory: Theory
     mesh: PlacedMesh
     field: Array

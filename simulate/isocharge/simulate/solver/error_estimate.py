@@ -53,6 +53,10 @@ WRINKLE_SHARE = 1e-3
 """Ratio of the compression to the largest stress above which a warning is given, dimensionless."""
 
 
+GROUPS = ("amplitude2", "load", "tension", "bending", "poisson")
+"""Attributes of `DimensionlessGroups` that the JSON output contains."""
+
+
 def shape_error(mesh: PlacedMesh) -> float:
     """Predict the relative error of a charge from the shapes of the elements.
 
@@ -177,7 +181,7 @@ def summary(equilibrium: Equilibrium) -> dict[str, Any]:
         "seconds": equilibrium.seconds,
         "estimated_error": finite_or_none(estimated_error(equilibrium)),
         "groups": {
-            **{name: value for name, value in vars(equilibrium.groups).items() if name != "anisotropy"},
+            **{name: getattr(equilibrium.groups, name) for name in GROUPS},
             "bending_length": bending_length(equilibrium.film, equilibrium.force),
         },
         "warnings": list(cautions(equilibrium)),

@@ -42,6 +42,9 @@ MAX_AMPLITUDE2 = 0.1
 """Largest squared amplitude A^2, which is the order of the strains, for which St. Venant-Kirchhoff elasticity is
 valid."""
 
+MAX_SIDE_SHARE = 1.0
+"""Largest side force over the force of the press. It corresponds to a coefficient of friction of one."""
+
 MIN_PROBE_REACH = 1e-5
 """Smallest reach of a probe, in film radii. The grading of the mesh for smaller probes exceeds the resolution of
 float64."""
@@ -132,6 +135,23 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
         )
 
 
+def check_side_force(side_force: tuple[float, float], force: float) -> None:
+    """Raise an error if a side force is not finite or exceeds the force of the press.
+
+    Args:
+        side_force: Force (Fx, Fy) along the film, N.
+        force: Force of the press, N.
+
+    Raises:
+        SceneError: If a component is not finite, or the side force exceeds `MAX_SIDE_SHARE` times the force.
+    """
+    size = float(np.hypot(*side_force))
+    if not size <= MAX_SIDE_SHARE * force:
+        raise SceneError(
+            f"side force: expected at most {MAX_SIDE_SHARE:g} times the force of {force:.4g} N, got {side_force} N"
+        )
+
+
 def layer_for(film: Film, force: float) -> float:
     """Return the width of the thin rings at the rim for a force (N), in film radii."""
     return LAYER_WIDTH * bending_length(film, force)
@@ -151,6 +171,7 @@ class LoadCase:
         accuracy: Target of the relative error of a charge.
         tolerance: Out-of-balance force over load at which the solve has converged.
         began: Process CPU time at the beginning of the work on the press, s.
+        side_force: Force (Fx, Fy) of the probe on the film along the film, N.
     """
 
     film: Film
@@ -162,6 +183,7 @@ class LoadCase:
     accuracy: float
     tolerance: float
     began: float
+    side_force: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(
@@ -172,6 +194,7 @@ class LoadCase:
         force: float,
         settings: SolveSettings,
         start: PlacedMesh | None,
+        side_force: tuple[float, float] = (0.0, 0.0),
     ) -> Self:
         """Check a press, and replace the settings that are "auto".
 
@@ -182,26 +205,37 @@ class LoadCase:
             force: Force, N.
             settings: Settings of the solve.
             start: Mesh of the equilibrium from which the solve starts; None if there is none.
+            side_force: Force (Fx, Fy) of the probe on the film along the film, N.
 
         Raises:
-            SceneError: If the press cannot exist.
+            SceneError: If the press cannot exist, or a linear theory is requested for a side force.
         """
         began = process_time()
         check_press(film, probe, at, force)
+        check_side_force(side_force, force)
         theory = settings.theory
         if theory == "auto":
             theory = choose_theory(film, probe, force, settings.accuracy)
+            if any(side_force):  # linear theories omit the effect of the side force on the deflection
+                theory = replace(theory, stretching=True)
+        elif any(side_force) and not theory.stretching:
+            raise SceneError(
+                f"theory {theory.name!r}: a side force changes the deflection through the stress that it induces, "
+                "which a linear theory omits; use 'nonlinear membrane', 'nonlinear membrane + bending' or 'auto'"
+            )
         layer = settings.layer
         if layer == "auto":
             layer = _choose_layer(film, force, probe, settings, start)
-        return cls(film, probe, at, force, theory, layer, settings.accuracy, settings.tolerance, began)
+        return cls(film, probe, at, force, theory, layer, settings.accuracy, settings.tolerance, began, side_force)
 
     def place(self, resolution: Resolution) -> PlacedMesh:
         """Return the mesh of a resolution under this press."""
-        return place_coated(self.film, self.probe, self.at, resolution, self.layer)
+        return place_coated(self.film, self.probe, self.at, resolution, self.layer, whole=any(self.side_force))
 
 
-def place_coated(film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float) -> PlacedMesh:
+def place_coated(
+    film: Film, probe: Probe, at: tuple[float, float], resolution: Resolution, layer: float, *, whole: bool = False
+) -> PlacedMesh:
     """Place a mesh under a press, as `place` does, and refine it along the edges of the coat if the film has one.
 
     Args:
@@ -210,8 +244,9 @@ def place_coated(film: Film, probe: Probe, at: tuple[float, float], resolution: 
         at: Centroid (x, y) of the footprint, mm.
         resolution: Fineness of the mesh.
         layer: Width of the thin rings at the rim, in film radii.
+        whole: Whether to mesh the whole film although film and footprint are symmetric.
     """
-    mesh = place(film, probe, at, resolution, layer)
+    mesh = place(film, probe, at, resolution, layer, whole=whole)
     if film.coat is None:
         return mesh
     angle = float(np.arctan2(at[1], at[0]))

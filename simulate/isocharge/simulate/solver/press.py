@@ -48,6 +48,7 @@ def press(
     force: float,
     settings: SolveSettings = SolveSettings(),
     *,
+    side_force: tuple[float, float] = (0.0, 0.0),
     start: Equilibrium | None = None,
     throw: bool = True,
 ) -> Equilibrium:
@@ -59,6 +60,9 @@ def press(
         at: Centroid (x, y) of the footprint, mm.
         force: Force, N, positive in the direction of the push.
         settings: Accuracy, theory and mesh.
+        side_force: Force (Fx, Fy) of the probe on the film along the film, N. It is spread over the footprint like
+            the pressure and keeps its direction. `solver.friction.friction_force` computes the side force of a probe
+            with friction.
         start: Equilibrium of a similar press on the same mesh, whose field is the first iterate.
         throw: Whether to raise an error if the solve fails. Otherwise `status` of the result is "failed".
 
@@ -69,7 +73,7 @@ def press(
         SceneError: If the press cannot exist, or the mesh is too distorted.
         SolveError: If the solve fails and `throw` is True.
     """
-    case = LoadCase.of(film, probe, at, force, settings, start.mesh if start else None)
+    case = LoadCase.of(film, probe, at, force, settings, start.mesh if start else None, side_force)
     with single_threaded_blas():
         if settings.resolution != "auto":
             solved = _solve(case, case.place(settings.resolution), start)
@@ -155,6 +159,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
         probe=case.probe,
         at=case.at,
         force=case.force,
+        side_force=case.side_force,
         theory=case.theory,
         mesh=mesh,
         field=result.field,
@@ -168,9 +173,18 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 
 
 def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
-    """Return the discrete film for the press with another force (N)."""
+    """Return the discrete film for the press with another force (N). The side force changes in proportion."""
     angle = float(np.arctan2(case.at[1], case.at[0]))
-    return ElasticFilm(geometry, DimensionlessGroups.of(case.film, force, bending=case.theory.bending, angle=angle))
+    share = force / case.force
+    side_x, side_y = case.side_force
+    groups = DimensionlessGroups.of(
+        case.film,
+        force,
+        bending=case.theory.bending,
+        angle=angle,
+        side_force=(share * side_x, share * side_y),
+    )
+    return ElasticFilm(geometry, groups)
 
 
 def _solve_nonlinear(

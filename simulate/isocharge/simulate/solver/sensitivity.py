@@ -12,7 +12,7 @@ the line of symmetry. dR/dm and the change of the stress are central differences
 press.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,6 +97,25 @@ FIELDS = {
 }
 """Fields by the name of the imperfection. Imperfections with two axes have an even and an odd field, in this order."""
 
+
+def _side_load(direction: tuple[float, float]) -> Change:
+    """Return the function for a side load, in units of E h a A^2; `direction` is its direction (x, y)."""
+
+    def change(solved: Equilibrium, value: float) -> Equilibrium:
+        load_x, load_y = solved.groups.side_load
+        added_x, added_y = direction
+        side_load = (load_x + value * added_x, load_y + value * added_y)
+        return replace(solved, groups=replace(solved.groups, side_load=side_load))
+
+    return change
+
+
+SIDE_FORCE_FIELDS = (StressField(_side_load((1.0, 0.0)), False), StressField(_side_load((0.0, 1.0)), True))
+"""Fields of a side force along the direction of the press from the centre (even), and across it (odd)."""
+
+SIDE_FORCE_IS_ODD = np.array([field.odd for field in SIDE_FORCE_FIELDS])
+"""Whether each of `SIDE_FORCE_FIELDS` is odd, shape (2,)."""
+
 IS_ODD = np.array([field.odd for fields in FIELDS.values() for field in fields])
 """Whether each field is odd, in the order of `stress_changes`, shape (n_field,)."""
 
@@ -113,11 +132,32 @@ def stress_changes(solved: Equilibrium, surface: Surface = "middle") -> Array:
     Returns:
         Change of the stress of `nodal_stress`, per unit of the imperfection, shape (n_field, n_element, n_local, 3).
     """
+    return _stress_changes(solved, [field for fields in FIELDS.values() for field in fields], surface)
+
+
+def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
+    """Compute the change of the scaled stress at the nodes by each of `SIDE_FORCE_FIELDS`, per scaled side load.
+
+    The probe and the film are as in `stress_changes`. `scaling.side_force_unit` is the side force of one scaled side
+    load.
+
+    Args:
+        solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
+        surface: Surface in the thickness; see `touch_stress`.
+
+    Returns:
+        Shape (n_element, n_local, 2, 3): the field, then the stress (S11, S22, S12). This is the order of the table
+        of a `ForwardMap` with several fields.
+    """
+    return np.moveaxis(_stress_changes(solved, SIDE_FORCE_FIELDS, surface), 0, 2)
+
+
+def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: Surface) -> Array:
+    """Compute the change of the scaled stress at the nodes by each field, shape (n_field, n_element, n_local, 3)."""
     with single_threaded_blas():
         components = 3 if solved.groups.bending == 0.0 else 4
         tangent = ElasticFilm(solved.mesh.geometry, solved.groups).tangent(solved.field)
         factors = [assembly(solved.mesh.template, components, odd).factor(tangent) for odd in (False, True)]
-        fields = [field for fields_of_kind in FIELDS.values() for field in fields_of_kind]
         return np.stack([_stress_change(solved, field, factors[field.odd].solve, surface) for field in fields])
 
 

@@ -1,0 +1,93 @@
+"""Friction between a probe on a vertical stage and the film.
+
+When the film sinks under a probe that presses beside the centre, the material point under the probe moves along the
+film: the steeper part of the film, towards the near rim, would otherwise stretch more than the rest. A stage that moves
+exactly vertically does not follow this displacement, so the film slips outwards under the probe, and friction pulls the
+film inwards. (Under a probe that hangs freely, the probe follows, and there is no side force.)
+
+The model is Coulomb friction during one monotonic press (Johnson 1985, sec. 7.1). If the side force that holds the
+material point in place is smaller than the coefficient of friction times the force, the film sticks to the probe, and
+this is the side force. Otherwise the film slips, and the side force is the coefficient times the force, against the
+slip. The side force is spread over the footprint like the pressure. When the probe is lifted again, the slip and the
+side force change their sign, which this model does not describe.
+"""
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
+from isocharge.simulate.execution.blas import single_threaded_blas
+from isocharge.simulate.mechanics.energy import ElasticFilm
+from isocharge.simulate.mechanics.scaling import side_force_unit
+from isocharge.simulate.solver.assembly import assembly
+from isocharge.simulate.solver.equilibrium import Equilibrium
+
+MAX_FRICTION = 1.0
+"""Largest coefficient of friction, dimensionless. Steel on PVDF has about 0.2."""
+
+
+def holding_force(solved: Equilibrium) -> tuple[float, float]:
+    """Compute the side force that prevents the mean displacement of the footprint along the film, to first order.
+
+    Args:
+        solved: Press without a side force, solved with a theory that includes stretching.
+
+    Returns:
+        Force (Fx, Fy) of the probe on the film, N. It points inwards if the film would slip outwards.
+    """
+    mesh = solved.mesh
+    geometry = mesh.geometry
+    groups = solved.groups
+    components = 3 if groups.bending == 0.0 else 4
+    with single_threaded_blas():
+        factor = assembly(mesh.template, components).factor(ElasticFilm(geometry, groups).tangent(solved.field))
+        n_direction = 1 if mesh.template.half else 2  # a half template has no displacement across its symmetry line
+        slip = geometry.load @ solved.field[:, :n_direction]
+        compliance = np.empty((n_direction, n_direction))
+        for direction in range(n_direction):
+            unit_load = np.zeros_like(solved.field)
+            unit_load[:, direction] = geometry.load
+            compliance[:, direction] = geometry.load @ factor.solve(unit_load)[:, :n_direction]
+    scaled_force = np.zeros(2)
+    scaled_force[:n_direction] = -np.linalg.solve(compliance, slip)
+    angle = np.arctan2(solved.at[1], solved.at[0])
+    force = complex(*scaled_force) * side_force_unit(solved.film, groups.amplitude2) * np.exp(1j * angle)
+    return float(force.real), float(force.imag)
+
+
+def friction_force(solved: Equilibrium, coefficient: float) -> tuple[float, float]:
+    """Compute the side force of a probe on a vertical stage; see the module.
+
+    Args:
+        solved: Press without a side force, solved with a theory that includes stretching.
+        coefficient: Coefficient of friction, dimensionless.
+
+    Returns:
+        Force (Fx, Fy) of the probe on the film, N, which is an argument of `press`.
+
+    Raises:
+        SceneError: If the coefficient is not between 0 and `MAX_FRICTION`.
+    """
+    check_friction(coefficient)
+    side_x, side_y = limited(np.array([holding_force(solved)]), np.array([coefficient * solved.force]))[0].tolist()
+    return side_x, side_y
+
+
+def check_friction(coefficient: float) -> None:
+    """Raise an error if a coefficient of friction is not between 0 and `MAX_FRICTION`."""
+    if not 0.0 <= coefficient <= MAX_FRICTION:
+        raise SceneError(f"friction: expected a coefficient from 0 to {MAX_FRICTION:g}, got {coefficient}")
+
+
+def limited(holding: Array, largest: Array) -> Array:
+    """Reduce holding forces to the largest friction.
+
+    Args:
+        holding: Forces (Fx, Fy) that prevent the slip, shape (n, 2), N.
+        largest: Largest friction, shape (n,), N.
+
+    Returns:
+        Shape (n, 2), N.
+    """
+    size = np.maximum(np.hypot(holding[:, 0], holding[:, 1]), 1e-300)
+    return np.asarray(holding * np.minimum(1.0, largest / size)[:, None])

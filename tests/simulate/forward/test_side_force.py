@@ -1,0 +1,150 @@
+"""Side forces of the probe and friction: against direct solves, a closed form, reciprocity and the film's symmetry."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.common.errors import SceneError
+from isocharge.simulate import Circle, ForwardMap, Polygon, SolveSettings, Theory, deflection, load_sensor, press
+from isocharge.simulate import touch_charge as charge_of
+from isocharge.simulate.forward.side_force import SideForceMap
+from isocharge.simulate.solver.equilibrium import Equilibrium
+from isocharge.simulate.solver.friction import friction_force, holding_force
+from kept import kept
+
+PROBE = Circle(1.0)
+FULL = SolveSettings(theory=Theory(stretching=True, bending=True, pretensioned=True))
+
+
+def taut(name: str, pretension: float):
+    """Return a built-in sensor with a pretension, MPa."""
+    sensor = load_sensor(name)
+    return replace(sensor, film=replace(sensor.film, pretension=pretension))
+
+
+@pytest.fixture(scope="module")
+def side_force_map() -> SideForceMap:
+    """Side forces on a biaxial film with four electrodes."""
+    return kept(side_force_map_of, taut("four-25um-biaxial", 0.8))
+
+
+def side_force_map_of(sensor) -> SideForceMap:
+    return SideForceMap.build(ForwardMap.build(sensor, PROBE, 8.0, (0.1, 1.0)))
+
+
+@pytest.mark.parametrize("contact", [(3.0, -2.0, 0.5), (-5.0, 4.0, 0.1), (7.5, -0.3, 0.9)])
+def test_side_force_jacobian_equals_differences_of_direct_solves(side_force_map, contact):
+    x, y, force = contact
+    sensor = side_force_map.film.sensor
+    share = 0.1 * force
+    expected = []
+    for side_force in ((share, 0.0), (0.0, share)):
+        above = press(sensor.film, PROBE, (x, y), force, side_force=side_force)
+        below = press(sensor.film, PROBE, (x, y), force, side_force=(-side_force[0], -side_force[1]))
+        expected.append((charge_of(sensor, above) - charge_of(sensor, below)) / (2.0 * share))
+    jacobian = side_force_map.jacobian(np.array([contact]))[0]
+    np.testing.assert_allclose(jacobian.T, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_a_side_force_on_a_taut_film_gives_the_charges_of_a_clamped_disk_in_its_plane():
+    """Muskhelishvili's potentials of a force P at the centre of a clamped disk: phi' = -C (1 / z + 2 z / (kappa a^2)).
+
+    Then s11 + s22 = 4 Re phi', a harmonic function, whose mean over a square with the centre z is its value at z up to
+    the fourth derivative.
+    """
+    sensor = taut("four-25um-biaxial", 1.0)
+    film = sensor.film
+    settings = replace(FULL, accuracy=1e-4)
+    side_force = 1e-5
+    pulled = press(film, Circle(0.5), (0.0, 0.0), 1e-5, settings, side_force=(side_force, 0.0))
+    pushed = press(film, Circle(0.5), (0.0, 0.0), 1e-5, settings)
+    kappa = (3.0 - film.poisson) / (1.0 + film.poisson)
+    strength = side_force / (2.0 * np.pi * film.thickness * (1.0 + kappa))
+    centres = np.array([complex(*electrode.centre) for electrode in sensor.electrodes])
+    potential = -strength * (1.0 / centres + 2.0 * centres / (kappa * film.radius**2))
+    expected = sensor.piezo.d31 * 9.0 * 4.0 * potential.real
+    change = charge_of(sensor, pulled) - charge_of(sensor, pushed)
+    np.testing.assert_allclose(change, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_holding_force_and_slip_are_reciprocal_to_the_deflection():
+    """Betti: the deflection under the probe per side force is the displacement along the film per force."""
+    film = taut("four-25um-biaxial", 0.8).film
+    at = (6.0, 0.0)
+
+    def along_film(solved: Equilibrium) -> float:
+        geometry = solved.mesh.geometry
+        mean = solved.mesh.template.copies * geometry.load @ solved.field[:, 0]
+        return float(film.radius * solved.groups.amplitude2 * mean)
+
+    def into_film(solved: Equilibrium) -> float:
+        geometry = solved.mesh.geometry
+        mean = solved.mesh.template.copies * geometry.load @ solved.field[:, 2]
+        return float(film.radius * np.sqrt(solved.groups.amplitude2) * mean)
+
+    step = 0.01
+    by_force = [along_film(press(film, PROBE, at, 0.5 + sign * step, FULL)) for sign in (1.0, -1.0)]
+    by_side = [into_film(press(film, PROBE, at, 0.5, FULL, side_force=(sign * step, 0.0))) for sign in (1.0, -1.0)]
+    assert by_side[0] - by_side[1] == pytest.approx(by_force[0] - by_force[1], rel=1e-2)
+    outward_force, _ = holding_force(press(film, PROBE, at, 0.5, FULL))
+    held = press(film, PROBE, at, 0.5, FULL, side_force=(outward_force, 0.0))
+    assert abs(along_film(held)) < 0.03 * abs(along_film(press(film, PROBE, at, 0.5, FULL)))
+
+
+def test_friction_pulls_the_film_inwards_and_sticks_near_the_centre(side_force_map):
+    sensor = side_force_map.film.sensor
+    contact = np.array([[3.0, -4.0, 0.5], [0.4, 0.3, 0.5], [0.0, 0.0, 0.5]])
+    force = side_force_map.friction_forces(contact, 0.2)
+    np.testing.assert_allclose(force[0], [-0.06, 0.08], atol=1e-9)  # 0.2 F towards the centre
+    assert 0.0 < np.hypot(*force[1]) < 0.1
+    np.testing.assert_allclose(force[2], 0.0, atol=1e-12)
+    for row, (x, y, newtons) in zip(force, contact, strict=True):
+        direct = friction_force(press(sensor.film, PROBE, (x, y), newtons, FULL), 0.2)
+        np.testing.assert_allclose(row, direct, atol=2e-4)
+
+
+def test_friction_charges_look_like_a_press_farther_outwards(side_force_map):
+    contact = np.array([[3.0, -2.0, 0.5]])
+    change = side_force_map.friction_charges(contact, 0.2)[0]
+    shift = np.linalg.lstsq(side_force_map.film.derivatives(contact)[0], change, rcond=None)[0]
+    assert 0.2 < shift[:2] @ np.array([3.0, -2.0]) / np.hypot(3.0, 2.0) < 0.3
+
+
+def test_side_forces_of_a_square_probe_turn_with_the_film():
+    """A press and its side force that are turned by 90 degrees give the same charges on the turned electrodes."""
+    sensor = taut("four-25um-biaxial", 0.5)
+    square = Polygon.rectangle(2.0, 2.0)
+    first = charge_of(sensor, press(sensor.film, square, (4.0, 1.0), 0.3, FULL, side_force=(0.05, -0.02)))
+    turned = charge_of(sensor, press(sensor.film, square, (-1.0, 4.0), 0.3, FULL, side_force=(0.02, 0.05)))
+    np.testing.assert_allclose(turned, np.roll(first, 1), rtol=1e-3)
+
+
+def test_side_force_map_of_a_square_probe_raises_a_scene_error(side_force_map):
+    map_of_square = replace(side_force_map.film, probe=Polygon.rectangle(2.0, 2.0))
+    with pytest.raises(SceneError, match="expected a circular probe"):
+        SideForceMap.build(map_of_square)
+
+
+def test_a_press_without_a_side_force_is_solved_as_before():
+    film = load_sensor("four-25um-biaxial").film
+    point = np.array([[3.0, -2.0]])
+    plain = press(film, PROBE, (3.0, -2.0), 0.5)
+    zero = press(film, PROBE, (3.0, -2.0), 0.5, side_force=(0.0, 0.0))
+    assert plain.mesh.template.half
+    assert zero.field.tobytes() == plain.field.tobytes()
+    assert deflection(zero, point) == deflection(plain, point)
+
+
+@pytest.mark.parametrize("side_force", [(0.8, 0.8), (np.nan, 0.0), (0.0, np.inf)])
+def test_invalid_side_forces_raise_scene_errors(film, side_force):
+    with pytest.raises(SceneError, match="side force: expected at most 1 times the force of 1 N"):
+        press(film, PROBE, (3.0, 0.0), 1.0, side_force=side_force)
+
+
+def test_a_linear_theory_with_a_side_force_raises_a_scene_error(film):
+    linear = SolveSettings(theory=Theory(stretching=False, bending=True, pretensioned=False))
+    with pytest.raises(SceneError, match="a linear theory omits"):
+        press(film, PROBE, (3.0, 0.0), 0.01, linear, side_force=(0.001, 0.0))
+    with pytest.raises(SceneError, match=r"coefficient from 0 to 1, got 1\.5"):
+        friction_force(press(film, PROBE, (3.0, 0.0), 0.01), 1.5)
