@@ -1,15 +1,36 @@
-"""What pip installs: the base install into an empty environment serves a released model, without torch or scipy."""
+"""What pip installs: the wheel in an empty environment serves a released model, without torch or scipy.
+
+The wheel is built from the source distribution, so both are tested.
+"""
 
 import json
 import re
 import subprocess
 import sys
+import tomllib
 import venv
 from pathlib import Path
 
 import pytest
+from pyarrow import table
+from pyarrow.parquet import write_table
 
 ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+VERSION = PROJECT["version"]
+
+COMMANDS_OF_EXTRAS = {
+    "simulate": "simulate point three-25um-biaxial --at 1 2 --force 1",
+    "train": "train distil --help",
+    "http": "serve http --help",
+    "grpc": "serve http --help",
+    "cluster": "simulate sweep --help",
+    "design": "simulate design --help",
+    "record": "serve stream three-25um-biaxial --port frames.txt --output touch.mcap",
+    "parquet": "serve predict three-25um-biaxial charges.parquet",
+    "all": "simulate design --help",
+}
+"""A command that imports the packages of each extra. It runs in an install with this extra only."""
 
 
 def predicted(bin_folder, folder):
@@ -23,20 +44,53 @@ def predicted(bin_folder, folder):
 
 
 @pytest.fixture(scope="module")
-def base(tmp_path_factory):
-    """The bin folder of an empty environment into which `pip install .` was done, with nothing else in it."""
-    folder = tmp_path_factory.mktemp("fresh")
+def distributions(tmp_path_factory):
+    """The source distribution and the wheel that is built from it."""
+    folder = tmp_path_factory.mktemp("dist")
+    subprocess.run([sys.executable, "-m", "build", "-o", folder, ROOT], check=True, timeout=280, capture_output=True)
+    return sorted(folder.iterdir())
+
+
+@pytest.fixture(scope="module")
+def wheel(distributions):
+    """The wheel."""
+    (path,) = (path for path in distributions if path.suffix == ".whl")
+    return path
+
+
+def install(requirement, folder, timeout):
+    """Install a requirement into an empty environment, and return the bin folder of the environment."""
     venv.create(folder / "env")
     python = folder / "env" / "bin" / "python"
     pip = [sys.executable, "-m", "pip", "--python", python]
-    subprocess.run([*pip, "install", "--quiet", "--no-compile", str(ROOT)], check=True, timeout=280)
+    subprocess.run([*pip, "install", "--quiet", "--no-compile", requirement], check=True, timeout=timeout)
     return python.parent
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory, wheel):
+    """The bin folder of an empty environment into which the wheel was installed, with nothing else in it."""
+    return install(str(wheel), tmp_path_factory.mktemp("fresh"), timeout=280)
 
 
 def run(base, *words, cwd):
     return subprocess.run(
         [base / words[0], *words[1:]], cwd=cwd, capture_output=True, text=True, timeout=60, check=False
     )
+
+
+def test_twine_accepts_both_distributions(distributions):
+    names = [path.name for path in distributions]
+    assert names == [f"isocharge-{VERSION}-py3-none-any.whl", f"isocharge-{VERSION}.tar.gz"]
+    twine = [sys.executable, "-m", "twine", "check", "--strict", *distributions]
+    done = subprocess.run(twine, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_version_is_that_of_the_changelog_and_of_the_citation(base, tmp_path):
+    assert run(base, "isocharge", "--version", cwd=tmp_path).stdout == f"isocharge {VERSION}\n"
+    assert re.search(r"^## (\S+?),? ", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)[1] == VERSION
+    assert f"\nversion: {VERSION}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
 
 
 def test_nothing_heavy_came_along(base, tmp_path):
@@ -68,6 +122,8 @@ def test_a_missing_extra_says_so_in_python_too(base, tmp_path, stage):
 @pytest.mark.parametrize(
     ("words", "extra"),
     [
+        ("demo", "train"),
+        ("demo --live", "simulate,http"),
         ("simulate point three-25um-biaxial", "simulate"),
         ("serve http --port 0", "http"),
         ("serve stream three-25um-biaxial --port - --output touch.mcap", "record"),
@@ -79,3 +135,21 @@ def test_a_missing_extra_says_how_to_get_it(base, tmp_path, words, extra):
     assert done.returncode == 1
     assert f"pip install 'isocharge[{extra}]'" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("extra", sorted(COMMANDS_OF_EXTRAS))
+def test_the_wheel_with_an_extra_runs_the_readme_and_a_command_of_the_extra(wheel, tmp_path, extra):
+    bin_folder = install(f"{wheel}[{extra}]", tmp_path, timeout=3000)
+    example = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)[1]
+    done = run(bin_folder, "python", "-c", example, cwd=tmp_path)
+    assert done.stdout.splitlines() == re.findall(r"^print\(.*\)  # (.+)$", example, re.MULTILINE), done.stderr
+    (tmp_path / "frames.txt").write_text("942.9,910.4,690.8\n" * 200)
+    write_table(table({"A": [942.9], "B": [910.4], "C": [690.8]}), tmp_path / "charges.parquet")
+    done = run(bin_folder, "isocharge", *COMMANDS_OF_EXTRAS[extra].split(), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_extra_has_a_command():
+    assert {*COMMANDS_OF_EXTRAS, "dev"} == {*PROJECT["optional-dependencies"]}

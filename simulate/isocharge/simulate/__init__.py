@@ -96,6 +96,13 @@ __all__ = [
 ]
 
 __version__: str
+
+
+def __dir__() -> list[str]:
+    """List the public names only, for tab completion."""
+    return list(__all__)
+
+
 if not TYPE_CHECKING:  # a type checker would take every misspelt name for a text
     __getattr__ = version_attribute(__name__)
     del TYPE_CHECKING

@@ -77,6 +77,12 @@ __all__ = [
 
 __version__: str
 
+
+def __dir__() -> list[str]:
+    """List the public names only, for tab completion. They include the names that are not imported yet."""
+    return list(__all__)
+
+
 if TYPE_CHECKING:
     from isocharge.train.needs_torch import *
 else:  # hidden from type checkers, which would otherwise accept every misspelt name
@@ -90,9 +96,5 @@ else:  # hidden from type checkers, which would otherwise accept every misspelt 
             value = getattr(import_module("isocharge.train.needs_torch"), name)
         globals()[name] = value
         return value
-
-    def __dir__():
-        """List the public names that are not imported yet as well, for tab completion."""
-        return sorted({*globals(), *__all__})
 
     del TYPE_CHECKING

@@ -4,7 +4,7 @@ NAME = "isocharge_ros"
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="1.0.0",
     packages=[NAME],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
