@@ -218,5 +218,16 @@ class Blocks:
 
 
 def _bilinear(a: Array, b: Array, c: Array, d: Array, v: float, t: float) -> Array:
-    """Return the point (v, t) of the quadrilateral with the corners a, b (v = 0) and c, d (v = 1)."""
-    return (1.0 - v) * (a + t * (b - a)) + v * (c + t * (d - c))
+    """Return the point with the local coordinates (v, t) of a quadrilateral.
+
+    Args:
+        a: Corner at v = 0 and t = 0, as weights of the corners of the core polygon, shape (n_corner + 1,).
+        b: Corner at v = 0 and t = 1.
+        c: Corner at v = 1 and t = 0.
+        d: Corner at v = 1 and t = 1.
+        v: First local coordinate, from 0 to 1.
+        t: Second local coordinate, from 0 to 1.
+    """
+    inner_point = a + t * (b - a)
+    outer_point = c + t * (d - c)
+    return (1.0 - v) * inner_point + v * outer_point

@@ -370,7 +370,15 @@ def _film_gradient(derivatives: Array, points: np.ndarray) -> tuple[Array, Array
 
 
 def _jacobian(derivatives: Array, points: np.ndarray) -> _Jacobian:
-    """Compute the Jacobian of the map from the reference element to the film; arguments as in `_film_gradient`."""
+    """Compute the Jacobian of the map from the reference element to the film.
+
+    Args:
+        derivatives: Derivatives of the basis with respect to (xi, eta); see `_film_gradient`.
+        points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
+
+    Returns:
+        Derivatives of x and y with respect to xi and eta, and their determinant.
+    """
     # Sum over the nodes n, for each local derivative k, element e and point p.
     tangent = np.einsum("kepn,en->kep", derivatives, points)
     x_xi, x_eta = tangent.real

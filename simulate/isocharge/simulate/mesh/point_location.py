@@ -235,11 +235,23 @@ def _correct_sectors(
 
 
 def _inner_corners(placement: Placement, blocks: Blocks) -> QuadCorners:
-    """Return the corners of all elements inside the innermost circle, each of shape (n_placement, n_inner)."""
+    """Return the corners of all elements inside the innermost circle.
+
+    Corners on straight lines are weighted sums of the corners of the core polygon. The other corners lie on the
+    innermost circle or on the boundary of the footprint.
+
+    Args:
+        placement: One or several placements.
+        blocks: The elements.
+
+    Returns:
+        The four corners x + iy of each element, each of shape (n_placement, n_inner), in film radii.
+    """
     # Sum over the corners n of the core polygon, for each element e, its corner k and each placement p.
     weighted_sums = np.einsum("ekn,pn->pek", blocks.straight, placement.corners)
     a, b, c, d = np.moveaxis(weighted_sums, -1, 0)
 
+    # Replace the corners on curved lines: c and d are on the outer side of an element, a and b on its inner side.
     circle = placement.to_film(placement.rho[:, None] * np.exp(1j * placement.circle_angles))
     c[:, blocks.last_layer] = circle[:, :-1]
     d[:, blocks.last_layer] = circle[:, 1:]
@@ -293,11 +305,15 @@ def _sides(placement: Placement, blocks: Blocks, element: Integers, corners: Qua
         element: Index of the element of each point, shape (n,).
         corners: Corners of these elements, each of shape (n,).
         angular: Angular coordinate of each point from 0 to 1, shape (n,).
+
+    Returns:
+        Points of both sides and their derivatives with respect to the angular coordinate, each of shape (n,).
     """
     in_sector = element >= blocks.n_quad
     in_last_layer = element >= blocks.last_layer.start
     sector = np.where(in_sector, (element - blocks.n_quad) % blocks.n_sector, 0)
 
+    # Begin with straight sides, and replace those on the innermost circle.
     straight_inner_derivative = corners.b - corners.a
     straight_outer_derivative = corners.d - corners.c
     inner = corners.a + angular * straight_inner_derivative
@@ -308,6 +324,7 @@ def _sides(placement: Placement, blocks: Blocks, element: Integers, corners: Qua
     if blocks.n_layer == 1:
         return _Sides(inner, straight_inner_derivative, outer, outer_derivative)
 
+    # With two layers, the boundary of the footprint is the outer side of the first and the inner side of the last.
     boundary, boundary_derivative = _boundary_in_sector(placement, blocks, sector, angular)
     in_first_layer = in_sector & ~in_last_layer
     return _Sides(

@@ -90,7 +90,14 @@ class RefinedTemplate(Template):
         return np.flatnonzero(np.isin(self.parent, np.arange(self.base.n_element)[self.base.footprint]))
 
     def from_base(self, values: Array | Complexes) -> np.ndarray:
-        """Interpolate values from the nodes of the original elements, shape (n_original_element, n_local, ...)."""
+        """Interpolate values from the nodes of the original elements to the nodes of the split elements.
+
+        Args:
+            values: Values at the nodes of the original elements, shape (n_original_element, n_local, ...).
+
+        Returns:
+            Values at the nodes of the elements, shape (n_element, n_local, ...).
+        """
         xi, eta = self._into_parent(self.xi, self.eta)
         weights = tensor_values(self.resolution.order, xi.ravel(), eta.ravel())
         weights_of_element = weights.reshape(self.n_element, self.xi.size, -1)
@@ -102,6 +109,14 @@ class RefinedTemplate(Template):
 
         For each size of elements, an original element is a grid of cells. A cell has a unique code, and the element of
         this size that fills the cell is found by its code.
+
+        Args:
+            element: Index of the original element of each point, shape (n,).
+            xi: First local coordinate in the original element, from -1 to 1, shape (n,).
+            eta: Second local coordinate in the original element, from -1 to 1, shape (n,).
+
+        Returns:
+            Index of the element, and its local coordinates xi and eta, each of shape (n,).
         """
         found_element = np.zeros_like(element)
         position = np.stack([xi, eta])  # shape (2, n_point)
@@ -110,7 +125,7 @@ class RefinedTemplate(Template):
             cell_size = size[:, None]
             candidate_cells = np.rint((self.low[candidates].T + 1.0) / cell_size).astype(np.intp)
             candidate_codes = self._cell_codes(self.parent[candidates], candidate_cells)
-            order = np.argsort(candidate_codes)
+            order = np.argsort(candidate_codes)  # the codes are sorted for the search below
             candidates = candidates[order]
             candidate_codes = candidate_codes[order]
 
@@ -277,7 +292,13 @@ def refine(mesh: PlacedMesh, lines: Complexes, finest: float) -> PlacedMesh:
 
 
 def _corners_and_middle(mesh: PlacedMesh, parent: Integers, low: Array, size: Array) -> tuple[Complexes, Complexes]:
-    """Compute the film points of the corners and of the middle of split elements; see `RefinedTemplate`.
+    """Compute the film points of the corners and of the middle of split elements.
+
+    Args:
+        mesh: Mesh of the original elements.
+        parent: Index of the original element of each split element, shape (n_element,).
+        low: Local coordinates of the lower corner of each split element in its original element, shape (n_element, 2).
+        size: Extents of each split element in these local coordinates, shape (n_element, 2).
 
     Returns:
         Corners, anticlockwise, shape (n_element, 4), and middles, shape (n_element,), in film radii.

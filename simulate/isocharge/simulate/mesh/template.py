@@ -41,10 +41,19 @@ class Template(Blocks):
     constraint: csr_array | None = None
 
     def __init__(self, resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> None:
+        """Count the elements and number their nodes.
+
+        Nodes of different elements with equal film points under a sample press are the same node.
+
+        Args:
+            resolution: Fineness of the mesh.
+            topology: Number and kind of the blocks in and around the footprint.
+            whole: Whether to mesh the whole film although the footprint is symmetric.
+        """
         super().__init__(resolution, topology, whole)
         element_points = sample_points(self)
         all_points = element_points.ravel()
-        rounded_points = np.round(all_points, 9)
+        rounded_points = np.round(all_points, 9)  # so that round-off does not separate equal points
         _, self.first_seen, node_number = np.unique(rounded_points, return_index=True, return_inverse=True)
         self.nodes: Integers = node_number.reshape(element_points.shape)
         self.n_node = self.first_seen.size

@@ -192,7 +192,15 @@ def _restrict_to_edges(
 
 
 def _outer_product(vector: Array, factor: Array) -> Array:
-    """Compute factor * v v' for vectors v of shape (..., 3) and factors of shape (...)."""
+    """Return the matrix factor * v v' for each vector v.
+
+    Args:
+        vector: Vectors v, shape (..., 3).
+        factor: Factors, shape (...).
+
+    Returns:
+        Matrices, shape (..., 3, 3).
+    """
     return factor[..., None, None] * vector[..., :, None] * vector[..., None, :]
 
 

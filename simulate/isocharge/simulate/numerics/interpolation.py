@@ -58,9 +58,21 @@ def _read_only(values: Array) -> Array:
 
 
 def chebyshev_nodes(count: int, low: float, high: float) -> Array:
-    """Return the Chebyshev nodes of the first kind on the interval [low, high], ascending, shape (count,)."""
-    angle = (2.0 * np.arange(count, 0, -1) - 1.0) * np.pi / (2.0 * count)
-    return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * np.cos(angle))
+    """Return the Chebyshev nodes of the first kind on the interval [low, high].
+
+    Args:
+        count: Number of nodes.
+        low: Lower end of the interval.
+        high: Upper end of the interval.
+
+    Returns:
+        Nodes, ascending, shape (count,). Both ends of the interval lie outside of them.
+    """
+    number = np.arange(count, 0, -1)
+    angle = (2.0 * number - 1.0) * np.pi / (2.0 * count)
+    middle = 0.5 * (low + high)
+    half_width = 0.5 * (high - low)
+    return np.asarray(middle + half_width * np.cos(angle))
 
 
 def barycentric_weights(nodes: Array) -> Array:
@@ -164,7 +176,15 @@ def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
 
 
 def _tensor_product(xi_values: Array, eta_values: Array) -> Array:
-    """Multiply every value in xi, shape (n, p), by every value in eta, shape (n, q): shape (n, q * p)."""
+    """Multiply every basis value in xi by every basis value in eta.
+
+    Args:
+        xi_values: Values of the basis functions in xi at n points, shape (n, p).
+        eta_values: Values of the basis functions in eta at the same points, shape (n, q).
+
+    Returns:
+        Products, shape (n, q * p). The function in xi changes fastest.
+    """
     products = eta_values[:, :, None] * xi_values[:, None, :]
     return products.reshape(len(xi_values), eta_values.shape[1] * xi_values.shape[1])
 

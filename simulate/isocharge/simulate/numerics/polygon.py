@@ -51,8 +51,20 @@ def is_convex(corners: Array) -> bool:
 
 
 def _cross(first: Array, second: Array) -> Array:
-    """Compute the cross products of plane vectors (x, y) of shape (..., 2), which has the shape (...)."""
-    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
+    """Return the cross products x1 y2 - y1 x2 of plane vectors.
+
+    Args:
+        first: Vectors (x1, y1), shape (..., 2).
+        second: Vectors (x2, y2), shape (..., 2).
+
+    Returns:
+        Cross products, shape (...). They are positive if the second vector points to the left of the first.
+    """
+    x1 = first[..., 0]
+    y1 = first[..., 1]
+    x2 = second[..., 0]
+    y2 = second[..., 1]
+    return np.asarray(x1 * y2 - y1 * x2)
 
 
 def overlap(first: Array, second: Array, within: float = 0.0) -> bool:

@@ -118,6 +118,7 @@ def subdivide(part: Complexes, max_side: float) -> list[Complexes]:
     Returns:
         Polygons of shape (4,) or (3,), mm.
     """
+    # Divide the unit square (s, t), of which the quadrilateral is the bilinear image, into a grid of cells.
     side_length = np.abs(np.roll(part, -1) - part)
     s_count = int(np.ceil(max(side_length[0], side_length[2]) / max_side))
     t_count = int(np.ceil(max(side_length[1], side_length[3]) / max_side))
@@ -136,7 +137,7 @@ def subdivide(part: Complexes, max_side: float) -> list[Complexes]:
                 ]
             )
             is_distinct = np.abs(corners - np.roll(corners, 1)) > MERGE_DISTANCE
-            if np.count_nonzero(is_distinct) > 2:
+            if np.count_nonzero(is_distinct) > 2:  # cells without area are omitted
                 cells.append(corners[is_distinct])
     return cells
 

@@ -54,8 +54,17 @@ def identification_picture(identification: Identification) -> Figure:
 
 
 def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMap) -> Any:
-    """Draw the position errors for one force as colours, with folds, working area and electrodes to scale."""
-    x, y = limit_map.rings.position.reshape(-1, 2).T
+    """Draw the position errors for one force as colours, with folds, working area and electrodes to scale.
+
+    Args:
+        axes: Axes of matplotlib.
+        identification: Result of the identification, which contains the sensor and the working area.
+        limit_map: Lower limits of the position error for one force.
+
+    Returns:
+        The coloured areas, for which a colour bar can be drawn.
+    """
+    x, y = limit_map.rings.position.reshape(-1, 2).T  # mm
     levels = np.geomspace(MIN_ERROR_mm, MAX_ERROR_mm, 25)
     errors = np.clip(limit_map.position.ravel(), MIN_ERROR_mm, MAX_ERROR_mm)
     shades = axes.tricontourf(x, y, errors, levels, norm=LogNorm(), cmap="viridis")
@@ -63,11 +72,11 @@ def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMa
     axes.plot(*folds.T, ".", color=FELT, ms=3)
     draw_circle(axes, identification.area.radius, ls="--", lw=1.8, color="white")
     draw_electrodes(axes, identification.sensor)
-    limits = (-identification.area.searched, identification.area.searched)
+    axis_limits = (-identification.area.searched, identification.area.searched)
     title = f"{limit_map.force:g} N; dashed: working area, {identification.area.radius:g} mm"
     if len(folds):
         title += "; red: folds"
-    axes.set(title=title, xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=limits, ylim=limits)
+    axes.set(title=title, xlabel="x, mm", ylabel="y, mm", aspect="equal", xlim=axis_limits, ylim=axis_limits)
     return shades
 
 
@@ -77,9 +86,11 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
     colours = FORCE_COLOURS[len(FORCE_COLOURS) - len(identification.maps) :]
     for limit_map, colour in zip(identification.maps, colours, strict=True):
         distance = limit_map.rings.distance
-        axes.semilogy(distance, np.median(limit_map.position, axis=1), color=colour, label=f"{limit_map.force:g} N")
-        axes.semilogy(distance, limit_map.position.max(axis=1), ":", color=colour)
-    axes.plot([], [], ":", color=INK, label="worst of the ring")
+        median_error = np.median(limit_map.position, axis=1)
+        largest_error = limit_map.position.max(axis=1)
+        axes.semilogy(distance, median_error, color=colour, label=f"{limit_map.force:g} N")
+        axes.semilogy(distance, largest_error, ":", color=colour)
+    axes.plot([], [], ":", color=INK, label="worst of the ring")  # an entry of the legend for all dotted curves
     axes.axhline(area.error, color=FELT, lw=0.8)
     axes.axvline(area.radius, ls="--", color=INK, label=f"working area, {area.radius:g} mm")
     if np.isfinite(area.fold_radius):
@@ -125,10 +136,22 @@ def error_maps_picture(design: Design) -> Figure:
 
 
 def _draw_errors(axes: Any, sensor: Sensor, errors: ErrorMap, norm: LogNorm) -> Any:
-    """Draw the errors of one layout as colours, the position of the largest error, and the electrodes."""
+    """Draw the errors of one layout as colours, the position of the largest error, and the electrodes.
+
+    Args:
+        axes: Axes of matplotlib.
+        sensor: Sensor with the electrodes of the layout.
+        errors: Position errors of the layout.
+        norm: Range of the colours.
+
+    Returns:
+        The coloured area, for which a colour bar can be drawn.
+    """
     draw_electrodes(axes, sensor)
-    axes.plot(*errors.presses[np.argmax(errors.with_nuisances)], "x", color=FELT, ms=9, mew=2)
-    worst = errors.with_nuisances.max()
-    rms = np.sqrt(np.mean(errors.with_nuisances**2))
-    axes.set_title(f"{sensor.name}\nworst {worst:.3g} mm (cross), rms {rms:.3g} mm")
-    return axes.tripcolor(*errors.presses.T, errors.with_nuisances, norm=norm, cmap="viridis", shading="gouraud")
+    position_error = errors.with_nuisances  # shape (n_press,), mm
+    worst_x, worst_y = errors.presses[np.argmax(position_error)]
+    axes.plot(worst_x, worst_y, "x", color=FELT, ms=9, mew=2)
+    rms = np.sqrt(np.mean(position_error**2))
+    axes.set_title(f"{sensor.name}\nworst {position_error.max():.3g} mm (cross), rms {rms:.3g} mm")
+    x, y = errors.presses.T
+    return axes.tripcolor(x, y, position_error, norm=norm, cmap="viridis", shading="gouraud")

@@ -36,20 +36,40 @@ white."""
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Create a figure without a window; width and height are in inches."""
+    """Return a new figure without a window.
+
+    Args:
+        width: Width, inches.
+        height: Height, inches.
+    """
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def new_axes(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
-    """Create a figure and its axes as `subplots` of matplotlib does; width and height are in inches."""
+    """Return a new figure and its axes, as `subplots` of matplotlib does.
+
+    Args:
+        width: Width, inches.
+        height: Height, inches.
+        rows: Number of rows of axes.
+        columns: Number of columns of axes.
+    """
     figure = new_figure(width, height)
     return figure, figure.subplots(rows, columns)
 
 
 def finish_axes(axes: Any, x: str, y: str, title: str = "", **legend: Any) -> None:
-    """Add labels, title, grid and legend to axes; `legend` contains arguments of the legend."""
+    """Add labels, a title, a grid and a legend to axes.
+
+    Args:
+        axes: Axes of matplotlib.
+        x: Label of the x axis.
+        y: Label of the y axis.
+        title: Title of the axes.
+        **legend: Arguments of `Axes.legend`.
+    """
     axes.set(xlabel=x, ylabel=y, title=title)
     axes.grid(alpha=0.3, which="both")
     axes.legend(**{"fontsize": 8} | legend)
@@ -73,11 +93,21 @@ def check_picture(path: Path) -> None:
 
 
 def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
-    """Convert a figure into the bytes of a PNG, SVG or PDF file. Equal figures give equal bytes."""
-    without_date: dict[str, None] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
+    """Convert a figure into the bytes of an image file.
+
+    The file contains neither a date nor random identifiers, so that equal figures give equal bytes.
+
+    Args:
+        figure: The figure.
+        kind: Format of the file: "png", "svg" or "pdf".
+
+    Returns:
+        The bytes of the file.
+    """
+    date_metadata: dict[str, dict[str, None]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
     buffer = BytesIO()
     with rc_context({"svg.hashsalt": "isocharge", "svg.fonttype": "none"}):
-        figure.savefig(buffer, format=kind, dpi=DPI, metadata=without_date)
+        figure.savefig(buffer, format=kind, dpi=DPI, metadata=date_metadata[kind])
     return buffer.getvalue()
 
 

@@ -44,7 +44,14 @@ def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool 
 
 
 def draw_probe(axes: Any, probe: Probe, at: tuple[float, float], label: str = "") -> None:
-    """Draw the footprint of a press at (x, y), mm."""
+    """Draw the footprint of a press.
+
+    Args:
+        axes: Axes of matplotlib.
+        probe: The probe.
+        at: Position (x, y) of the centroid of the footprint, mm.
+        label: Label in the legend; none if it is empty.
+    """
     style: dict[str, Any] = {"fill": True, "fc": FELT, "ec": FELT, "alpha": 0.35, "zorder": 2, "label": label}
     axes.add_patch(Patch(to_corners(complex(*at) + probe.outline), **style))
 
@@ -69,7 +76,15 @@ def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> Non
 
 
 def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "", highlight: str = "") -> None:
-    """Draw the electrodes and the working area of `radius` (mm), and scale the axes; see `draw_electrodes`."""
+    """Draw the electrodes and the working area, and scale the axes.
+
+    Args:
+        axes: Axes of matplotlib.
+        sensor: Sensor whose electrodes are drawn.
+        radius: Radius of the working area, mm.
+        title: Title of the axes.
+        highlight: Electrode to highlight; see `draw_electrodes`.
+    """
     draw_electrodes(axes, sensor, highlight)
     draw_working_area(axes, radius)
     frame_film(axes, sensor, radius, title)
@@ -106,14 +121,17 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
 
 def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     """Draw the deflection on a section through the probe and the centre of the film, with a stretched vertical axis."""
-    along = np.linspace(-DRAWN_RADIUS, DRAWN_RADIUS, 801) * equilibrium.film.radius
+    distance_along_section = np.linspace(-DRAWN_RADIUS, DRAWN_RADIUS, 801) * equilibrium.film.radius
     x, y = equilibrium.at
     distance = hypot(x, y)
     angle = atan2(y, x)
-    depth = deflection(equilibrium, np.outer(along, [cos(angle), sin(angle)]))
-    axes.plot(along, -depth, color=INK, lw=1.5)
-    half = equilibrium.probe.reach
-    axes.plot([distance - half, distance + half], [0.25, 0.25], color=FELT, lw=5, solid_capstyle="butt")
+    section_points = np.outer(distance_along_section, [cos(angle), sin(angle)])
+    depth = deflection(equilibrium, section_points)
+    axes.plot(distance_along_section, -depth, color=INK, lw=1.5)
+
+    # Mark the probe as a bar above the film, with an arrow to the deepest point.
+    half_width = equilibrium.probe.reach
+    axes.plot([distance - half_width, distance + half_width], [0.25, 0.25], color=FELT, lw=5, solid_capstyle="butt")
     axes.annotate("", (distance, -depth.max()), (distance, 0.2), arrowprops={"arrowstyle": "->", "color": FELT})
     axes.set(
         title=f"cut through probe and centre: {depth.max():.2f} mm deep",

@@ -140,6 +140,13 @@ class FilmParameter:
     def from_values(self, value: float, described: float) -> float:
         """Convert a physical value into the parameter. This is the inverse of `changed`.
 
+        Args:
+            value: Physical value of the film.
+            described: Physical value of the described film, in the same unit.
+
+        Returns:
+            The parameter: ln(value / described), the difference, or the value itself, according to `form`.
+
         Raises:
             ValueError: If the parameter is a logarithm and the values have different signs.
         """

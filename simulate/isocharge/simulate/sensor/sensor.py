@@ -185,7 +185,8 @@ class Electrode:
         low, high = self.boxes
         other_low, other_high = other.boxes
         near = (low[:, None] <= other_high + within) & (other_low - within <= high[:, None])
-        return any(overlap(self.metal[i], other.metal[j], within) for i, j in np.argwhere(near.all(axis=2)))
+        close_pairs = np.argwhere(near.all(axis=2))  # parts whose bounding boxes overlap
+        return any(overlap(self.metal[i], other.metal[j], within) for i, j in close_pairs)
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -221,7 +222,8 @@ class Calibration:
         """
         if self.crosstalk == 0.0:
             return charge
-        return np.asarray(charge + self.crosstalk * (charge.sum(axis=-1, keepdims=True) - charge))
+        charge_of_others = charge.sum(axis=-1, keepdims=True) - charge
+        return np.asarray(charge + self.crosstalk * charge_of_others)
 
     def place(self, points: Array) -> Array:
         """Convert positions in the layout into positions on the real film.
@@ -405,22 +407,29 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
 def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -> None:
     """Raise an error if an electrode does not lie completely on a film.
 
+    Args:
+        electrode: The electrode.
+        film: The film.
+        calibration: Shift and rotation of the electrodes on the film.
+
     Raises:
         SensorError: If a part of the electrode lies beyond the rim.
     """
-    placed = calibration.place(np.concatenate(electrode.collecting_polygons))
-    if np.linalg.norm(placed, axis=1).max() < film.radius:
+    placed_corners = calibration.place(np.concatenate(electrode.collecting_polygons))  # shape (n, 2), mm
+    if np.linalg.norm(placed_corners, axis=1).max() < film.radius:
         return
-    x, y = placed.mean(axis=0)
+
+    centre = placed_corners.mean(axis=0)
+    x, y = centre
     if electrode.square:
-        half_side = 0.5 * (electrode.corners[1][0] - electrode.corners[0][0])
-        size = f"half side {_short(half_side)} mm"
+        (left, _), (right, _), *_ = electrode.corners
+        extent = f"half side {_short(0.5 * (right - left))} mm"
     else:
-        farthest = np.linalg.norm(placed - placed.mean(axis=0), axis=1).max()
-        size = f"corners up to {_short(farthest)} mm from it"
+        farthest = np.linalg.norm(placed_corners - centre, axis=1).max()
+        extent = f"corners up to {_short(farthest)} mm from it"
     hint = "; end its traces before the rim" if electrode.more else ""
     raise SensorError(
-        f"electrode {electrode.name!r} lies outside the film: centre ({_short(x)}, {_short(y)}) mm, {size}, "
+        f"electrode {electrode.name!r} lies outside the film: centre ({_short(x)}, {_short(y)}) mm, {extent}, "
         f"film radius {_short(film.radius)} mm{hint}"
     )
 

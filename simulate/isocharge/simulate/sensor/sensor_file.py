@@ -319,19 +319,33 @@ def _corners(polygon: Corners) -> list[list[float]]:
 
 
 def _film(table: FilmTable) -> Film:
-    """Create the film from the section `film`."""
-    young = table.young_GPa
-    tension = table.pretension_MPa
-    first, second = young if isinstance(young, list) else (young, young)
-    tension_11, tension_22, tension_12 = tension if isinstance(tension, list) else (tension, tension, 0.0)
+    """Create the film from the section `film` of a sensor file, in mm and MPa.
+
+    The section contains one Young's modulus or both moduli (E1, E2), and one pretension or the components (T11, T22,
+    T12).
+    """
+    if isinstance(table.young_GPa, list):
+        young_1, young_2 = table.young_GPa
+    else:
+        young_1 = young_2 = table.young_GPa
+    # The mean of equal values is not computed, so that it has no round-off.
+    mean_young = young_1 if young_1 == young_2 else float(np.sqrt(young_1 * young_2))
+
+    if isinstance(table.pretension_MPa, list):
+        tension_11, tension_22, tension_12 = table.pretension_MPa
+    else:
+        tension_11 = tension_22 = table.pretension_MPa
+        tension_12 = 0.0
+    mean_tension = tension_11 if tension_11 == tension_22 else 0.5 * (tension_11 + tension_22)
+
     return Film(
         radius=table.radius_mm,
         thickness=table.thickness_um * 1e-3,
-        young=first * 1e3 if first == second else float(np.sqrt(first * second)) * 1e3,
+        young=mean_young * 1e3,
         poisson=table.poisson,
-        pretension=tension_11 if tension_11 == tension_22 else 0.5 * (tension_11 + tension_22),
+        pretension=mean_tension,
         deviator=(0.5 * (tension_11 - tension_22), tension_12),
-        young_ratio=first / second,
+        young_ratio=young_1 / young_2,
         shear=None if table.shear_GPa is None else table.shear_GPa * 1e3,
         axis=float(np.deg2rad(table.axis_deg)),
         oval=table.oval,
@@ -340,7 +354,10 @@ def _film(table: FilmTable) -> Film:
 
 
 def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:
-    """Create the electrodes from the section `electrodes`."""
+    """Yield the electrodes of the section `electrodes`.
+
+    A value of the section is a table of polygons, the centre of a square, or a number that applies to all electrodes.
+    """
     side = table.get(SIDE)
     for name, value in table.items():
         if isinstance(value, PolygonTable):

@@ -115,7 +115,9 @@ class Polygon(Probe):
             angle: Rotation about the centroid, anticlockwise, rad.
         """
         check_side("probe side", side)
-        corners = np.exp(1j * (0.5 * np.pi + 2.0 * np.pi / 3.0 * np.arange(3))) * side / np.sqrt(3.0)
+        circumradius = side / np.sqrt(3.0)
+        corner_angles = 0.5 * np.pi + 2.0 * np.pi / 3.0 * np.arange(3)
+        corners = np.exp(1j * corner_angles) * circumradius
         return cls(tuple((float(corner.real), float(corner.imag)) for corner in corners), angle, "triangle")
 
     @property
