@@ -78,16 +78,25 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
 
 
 def _draw_ruler(space: Any, y: float) -> None:
-    """Draw a horizontal ruler with ticks and a label at the height `y`, mm, centred at x = 0."""
-    left = -0.5 * RULER_LENGTH
-    layer = {"layer": "RULER"}
-    space.add_line((left, y), (-left, y), dxfattribs=layer)
-    for number in range(round(RULER_LENGTH / TICK_DISTANCE) + 1):
-        x = left + TICK_DISTANCE * number
-        space.add_line((x, y), (x, y - TICK_LENGTH), dxfattribs=layer)
-    text = f"{RULER_LENGTH:g} mm along x, the drawn direction"
-    label = space.add_text(text, height=TEXT_HEIGHT, dxfattribs=layer)
-    label.set_placement((left, y - TICK_LENGTH - 1.5 * TEXT_HEIGHT))
+    """Draw a horizontal ruler with ticks and a label, centred at x = 0.
+
+    Args:
+        space: Model space of the drawing.
+        y: Height of the ruler, mm.
+    """
+    left_end = -0.5 * RULER_LENGTH
+    right_end = 0.5 * RULER_LENGTH
+    attributes = {"layer": "RULER"}
+    space.add_line((left_end, y), (right_end, y), dxfattribs=attributes)
+    n_ticks = round(RULER_LENGTH / TICK_DISTANCE) + 1
+    for tick in range(n_ticks):
+        x = left_end + TICK_DISTANCE * tick
+        space.add_line((x, y), (x, y - TICK_LENGTH), dxfattribs=attributes)
+    label = space.add_text(
+        f"{RULER_LENGTH:g} mm along x, the drawn direction", height=TEXT_HEIGHT, dxfattribs=attributes
+    )
+    label_y = y - TICK_LENGTH - 1.5 * TEXT_HEIGHT
+    label.set_placement((left_end, label_y))
 
 
 def to_dxf(document: Drawing) -> str:

@@ -49,18 +49,21 @@ def straight_leads(sensor: Sensor, width: float = 0.3, clearance: float = 0.3) -
         sensor: Sensor with the layout.
         width: Width of the leads, mm.
         clearance: Smallest distance between a lead and other leads and electrodes, mm.
+
+    Returns:
+        The leads, and the names of the electrodes that cannot have a straight lead.
     """
     paths: dict[str, Array] = {}
-    from_outside = sorted(sensor.electrodes, key=lambda electrode: -float(np.hypot(*electrode.centre)))
-    for electrode in from_outside:
-        others = [other for other in sensor.electrodes if other != electrode]
+    outermost_first = sorted(sensor.electrodes, key=lambda electrode: -float(np.hypot(*electrode.centre)))
+    for electrode in outermost_first:
+        other_electrodes = [other for other in sensor.electrodes if other != electrode]
         for path in _possible_paths(np.array(electrode.centre), sensor.film.radius):
-            if _clearance(path, width, others, list(paths.values())) >= clearance:
+            if _clearance(path, width, other_electrodes, list(paths.values())) >= clearance:
                 paths[electrode.name] = path
                 break
-    ordered = {name: paths[name] for name in sensor.electrode_names if name in paths}
-    without = tuple(name for name in sensor.electrode_names if name not in paths)
-    return Leads(ordered, without, width)
+    ordered_paths = {name: paths[name] for name in sensor.electrode_names if name in paths}
+    electrodes_without_lead = tuple(name for name in sensor.electrode_names if name not in paths)
+    return Leads(ordered_paths, electrodes_without_lead, width)
 
 
 def _possible_paths(centre: Array, radius: float) -> Array:
@@ -75,13 +78,24 @@ def _possible_paths(centre: Array, radius: float) -> Array:
 
 
 def _clearance(path: Array, width: float, electrodes: list[Electrode], leads: list[Array]) -> float:
-    """Return the smallest distance of the edge of a lead from electrodes and other leads, mm; infinite without them."""
-    step = path[1] - path[0]
-    count = int(np.ceil(np.hypot(*step) / SAMPLE_DISTANCE)) + 1
-    points = path[0] + np.linspace(0.0, 1.0, count)[:, None] * step
-    to_electrodes = [_distance_from_boxes(points, electrode) - 0.5 * width for electrode in electrodes]
-    to_leads = [_distance_from_lead(points, lead) - width for lead in leads]
-    return min([*to_electrodes, *to_leads], default=np.inf)
+    """Return the smallest distance of the edge of a lead from electrodes and other leads.
+
+    Args:
+        path: Both ends (x, y) of the centre line of the lead, shape (2, 2), mm.
+        width: Width of this lead and of the other leads, mm.
+        electrodes: Electrodes to which the lead does not belong.
+        leads: Centre lines of the other leads, each of shape (2, 2), mm.
+
+    Returns:
+        Distance, mm; infinite if there are neither electrodes nor leads.
+    """
+    start, end = path
+    length = np.hypot(*(end - start))
+    n_points = int(np.ceil(length / SAMPLE_DISTANCE)) + 1
+    points = start + np.linspace(0.0, 1.0, n_points)[:, None] * (end - start)
+    electrode_clearances = [_distance_from_boxes(points, electrode) - 0.5 * width for electrode in electrodes]
+    lead_clearances = [_distance_from_lead(points, lead) - width for lead in leads]
+    return min([*electrode_clearances, *lead_clearances], default=np.inf)
 
 
 def _distance_from_boxes(points: Array, electrode: Electrode) -> float:

@@ -125,17 +125,27 @@ def _width(line: Any) -> float:
 
 
 def _names(document: Any, groups: list[list[Electrode]], scale: float) -> list[str]:
-    """Return the text nearest to the first polygon of each group, or letters if two groups have the same text."""
-    texts = {
+    """Return the names of groups of polygons, each of which becomes an electrode.
+
+    The name of a group is the text of the drawing that is nearest to the first polygon of the group. If two groups have
+    the same text, or there are no texts, letters and numbers are returned instead.
+
+    Args:
+        document: The drawing.
+        groups: Polygons of each group.
+        scale: Length of a unit of the drawing, mm.
+    """
+    text_positions = {
         text.plain_text(): scale * complex(*text.dxf.insert.vec2)
         for text in document.modelspace().query(" ".join(TEXT_TYPES))
     }
     names = []
     for group in groups:
         corners = to_complex(np.array(group[0].corners))
-        distance = {text: float(np.abs(corners - position).min()) for text, position in texts.items()}
-        if distance:
-            names.append(min(distance, key=lambda text: distance[text]))
+        distances = {text: float(np.abs(corners - position).min()) for text, position in text_positions.items()}
+        if distances:
+            names.append(min(distances, key=lambda text: distances[text]))
     if len(set(names)) == len(groups):
         return names
-    return [*ascii_uppercase, *(str(number) for number in range(MAX_ELECTRODES))]
+    numbers = [str(number) for number in range(MAX_ELECTRODES)]
+    return [*ascii_uppercase, *numbers]

@@ -109,23 +109,27 @@ class SeedGrid:
     @classmethod
     def of(cls, charge_map: ChargeMap) -> "SeedGrid":
         """Create the grid over the domain of a charge map, including the edge of the disk."""
+        # The nodes of a square grid that lie on the disk or slightly outside; the latter are moved onto its edge.
         radius = charge_map.domain.radius
-        low, high = charge_map.domain.force_range
         side = 2 * max(4, int(np.ceil(radius / NODE_SPACING))) + 1
         line = np.linspace(-radius, radius, side)
-        grid = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
-        index = np.flatnonzero(np.hypot(*grid.T) <= radius * (1.0 + 1.0 / side))
-        position = onto_disk(grid[index], INNER_RADIUS * radius)
-        logs = np.linspace(np.log(low), np.log(high), FORCES if high > low else 1)
-        forces = np.clip(np.exp(logs), low, high)
-        nodal = np.stack(
-            [charge_map.charges(np.column_stack([position, np.full(len(position), force)])) for force in forces]
-        )
-        middle = np.column_stack([position, np.full(len(position), forces[forces.size // 2])])
-        slope = np.linalg.norm(charge_map.derivatives(middle)[..., :2], axis=2)
-        size = np.sqrt(np.mean(nodal**2, axis=(1, 2)))
+        square_grid = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
+        index = np.flatnonzero(np.hypot(*square_grid.T) <= radius * (1.0 + 1.0 / side))
+        position = onto_disk(square_grid[index], INNER_RADIUS * radius)
+
+        min_force, max_force = charge_map.domain.force_range
+        n_force = FORCES if max_force > min_force else 1
+        logs = np.linspace(np.log(min_force), np.log(max_force), n_force)
+        forces = np.clip(np.exp(logs), min_force, max_force)
+        contacts = [np.column_stack([position, np.full(len(position), force)]) for force in forces]
+        nodal = np.stack([charge_map.charges(contact) for contact in contacts])
+
+        middle = forces.size // 2
+        position_derivatives = charge_map.derivatives(contacts[middle])[..., :2]
+        slope = np.linalg.norm(position_derivatives, axis=2)
         slope = np.maximum(slope, MIN_SLOPE * np.median(slope, axis=0))
-        return cls(position, index, side, logs, nodal, slope, size / size[size.size // 2])
+        rms_charge = np.sqrt(np.mean(nodal**2, axis=(1, 2)))
+        return cls(position, index, side, logs, nodal, slope, rms_charge / rms_charge[middle])
 
     def growth(self, force: Array) -> Array:
         """Interpolate the relative size of the charges at forces (N) of any shape; the result is dimensionless."""

@@ -72,16 +72,20 @@ class Mapping:
         centre = sensor.electrodes[electrode_index(sensor, electrode)].centre
         x, y = sensor.calibration.place(np.array(centre))
         inwards = np.arctan2(-y, -x) % (2.0 * np.pi)
-        first, last = angles if angles is not None else (inwards - HALF_ANGLE, inwards + HALF_ANGLE)
-        if not (-np.inf < first <= last < np.inf and 0.0 < angle_step < np.inf and 0.0 < step <= length < np.inf):
+        if angles is None:
+            angles = (inwards - HALF_ANGLE, inwards + HALF_ANGLE)
+        first_angle, last_angle = angles
+        are_angles_valid = -np.inf < first_angle <= last_angle < np.inf and 0.0 < angle_step < np.inf
+        if not (are_angles_valid and 0.0 < step <= length < np.inf):
             raise SceneError(
-                f"expected first <= last angle and 0 < step <= length, got {np.rad2deg(first):g} to "
-                f"{np.rad2deg(last):g} degrees in steps of {np.rad2deg(angle_step):g}, and lines of {length:g} mm in "
-                f"steps of {step:g} mm"
+                f"expected first <= last angle and 0 < step <= length, got {np.rad2deg(first_angle):g} to "
+                f"{np.rad2deg(last_angle):g} degrees in steps of {np.rad2deg(angle_step):g}, and lines of {length:g} "
+                f"mm in steps of {step:g} mm"
             )
-        angle = np.arange(first, last - 1e-9, angle_step)
-        distance: Array = step * np.arange(1.0, int(length / step * (1.0 + 1e-9)) + 1.0)
-        return cls(electrode, (float(x), float(y)), np.append(angle, last), distance)
+        angle = np.append(np.arange(first_angle, last_angle - 1e-9, angle_step), last_angle)
+        presses_per_line = int(length / step * (1.0 + 1e-9))
+        distance: Array = step * np.arange(1.0, presses_per_line + 1.0)
+        return cls(electrode, (float(x), float(y)), angle, distance)
 
     @property
     def points(self) -> Array:

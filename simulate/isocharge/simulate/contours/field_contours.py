@@ -93,8 +93,11 @@ class ContourField:
         """
         radius = TRACED_RADIUS * self.charge_map.domain.radius
         line = np.linspace(-1.0, 1.0, 2 * int(np.ceil(radius / GRID_SPACING)) + 1)
-        u, v = np.meshgrid(line, line)
-        return radius * u * np.sqrt(1.0 - 0.5 * v**2), radius * v * np.sqrt(1.0 - 0.5 * u**2)
+        square_x, square_y = np.meshgrid(line, line)
+        # Elliptical grid mapping of the square [-1, 1] x [-1, 1] onto the unit disk (Nowell 2005)
+        disk_x = square_x * np.sqrt(1.0 - 0.5 * square_y**2)
+        disk_y = square_y * np.sqrt(1.0 - 0.5 * square_x**2)
+        return radius * disk_x, radius * disk_y
 
     @cached_property
     def _every_charge(self) -> Array:

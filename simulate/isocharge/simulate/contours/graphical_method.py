@@ -68,32 +68,57 @@ class DrawnContour:
         return np.asarray(np.append(inner, knots[-1]))
 
     def crossings(self, other: "DrawnContour") -> Array:
-        """Find the positions at which this contour crosses another contour, shape (n, 2), mm."""
+        """Find the positions at which this contour crosses another contour.
+
+        The splines are first approximated by chords. Newton's method then solves spline(p) = other_spline(q) for the
+        parameters p and q of both splines, beginning at each crossing of two chords.
+
+        Returns:
+            Positions (x, y), shape (n, 2), mm.
+        """
         crossings = []
         for own_chord, other_chord in _chord_crossings(self.points, other.points):
-            at = np.array([self._parameters[own_chord], other._parameters[other_chord]])
+            parameters = np.array([self._parameters[own_chord], other._parameters[other_chord]])
             for _ in range(NEWTON_STEPS):
-                gap = self._spline(at[0]) - other._spline(at[1])
-                matrix = np.stack([self._spline(at[0], 1), -other._spline(at[1], 1)], axis=1)
-                at = at - np.linalg.lstsq(matrix, gap, rcond=None)[0]
-            crossings.append(self._spline(at[0]))
+                own_parameter, other_parameter = parameters
+                gap = self._spline(own_parameter) - other._spline(other_parameter)
+                own_tangent = self._spline(own_parameter, 1)
+                other_tangent = other._spline(other_parameter, 1)
+                jacobian = np.stack([own_tangent, -other_tangent], axis=1)
+                # Tangents may be parallel, so the step is the least-squares solution.
+                parameters = parameters - np.linalg.lstsq(jacobian, gap, rcond=None)[0]
+            crossings.append(self._spline(parameters[0]))
         return np.array(crossings).reshape(-1, 2)
 
 
 def _chord_crossings(first: Array, second: Array) -> Integers:
-    """Find the pairs of chords of two polylines, each of shape (m, 2), that cross.
+    """Find the pairs of chords of two polylines that cross.
+
+    Args:
+        first: Points (x, y) of the first polyline, shape (n_first, 2).
+        second: Points (x, y) of the second polyline, shape (n_second, 2).
 
     Returns:
         Indices of the chord of the first and of the second polyline, shape (n, 2).
     """
-    a = np.diff(first, axis=0)[:, None]
-    b = np.diff(second, axis=0)[None]
-    between = second[None, :-1] - first[:-1, None]
+    # Combine every chord of the first polyline with every chord of the second, shape (n_first - 1, n_second - 1, 2).
+    first_chord = np.diff(first, axis=0)[:, None]
+    second_chord = np.diff(second, axis=0)[None]
+    start_difference = second[None, :-1] - first[:-1, None]
+
+    # The crossing lies at these shares of the lengths of both chords (Cramer's rule).
     with np.errstate(divide="ignore", invalid="ignore"):  # parallel chords do not cross
-        area = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-        s = (between[..., 0] * b[..., 1] - between[..., 1] * b[..., 0]) / area
-        t = (between[..., 0] * a[..., 1] - between[..., 1] * a[..., 0]) / area
-        return np.argwhere((s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0))
+        determinant = _cross_product(first_chord, second_chord)
+        first_share = _cross_product(start_difference, second_chord) / determinant
+        second_share = _cross_product(start_difference, first_chord) / determinant
+        is_on_first = (first_share >= 0.0) & (first_share < 1.0)
+        is_on_second = (second_share >= 0.0) & (second_share < 1.0)
+        return np.argwhere(is_on_first & is_on_second)
+
+
+def _cross_product(first: Array, second: Array) -> Array:
+    """Return the cross products x1 y2 - y1 x2 of plane vectors of shape (..., 2); they have the shape (...)."""
+    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
 def draw_contour(curves: Curves, charge: float, degree: int = DEGREE) -> DrawnContour | None:

@@ -107,16 +107,34 @@ class Triangulation:
         return self._in_chunks(as_charges(charge, self.charge_map.electrodes), None)
 
     def _in_chunks(self, charge: Array, force: Array | None) -> Fix:
-        """Locate presses in chunks of `CHUNK`."""
-        parts = [Fix(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.intp))]
+        """Locate presses in chunks of `CHUNK`, which limits the memory.
+
+        Args:
+            charge: Touch charges, shape (n, n_electrode), pC.
+            force: Force of each press, shape (n,), N; None if the forces are to be estimated.
+
+        Returns:
+            Positions of all presses in the order of the charges.
+        """
+        no_press = Fix(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.intp))
+        fixes = [no_press]
         for start in range(0, len(charge), CHUNK):
-            rows = slice(start, start + CHUNK)
-            chunk_force = force[rows] if force is not None else None
-            parts.append(self._locate_chunk(charge[rows], chunk_force))
-        return Fix(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(Fix)))
+            chunk = slice(start, start + CHUNK)
+            chunk_force = force[chunk] if force is not None else None
+            fixes.append(self._locate_chunk(charge[chunk], chunk_force))
+        columns = {column.name: np.concatenate([getattr(fix, column.name) for fix in fixes]) for column in fields(Fix)}
+        return Fix(**columns)
 
     def _locate_chunk(self, charge: Array, force: Array | None) -> Fix:
-        """Locate presses; the force is estimated if it is None."""
+        """Locate the presses of one chunk.
+
+        Args:
+            charge: Touch charges, shape (n, n_electrode), pC.
+            force: Force of each press, shape (n,), N; None if the forces are to be estimated.
+
+        Returns:
+            Position of each press.
+        """
         fixed = force is not None
         closest = self._approach(charge, self._seeds(charge, force), fixed=fixed)
         second = self._approach(charge, self._second_seeds(closest, fixed=fixed), fixed=fixed)
@@ -126,22 +144,35 @@ class Triangulation:
         return self._choose(charge, force, closest)
 
     def _choose(self, charge: Array, force: Array | None, candidates: Candidates) -> Fix:
-        """Choose the best candidate of each press, unless it is ambiguous."""
-        count = len(charge)
-        first = np.searchsorted(candidates.press, np.arange(count))
-        matches = np.bincount(candidates.press, minlength=count)
+        """Choose the best candidate of each press, unless the second candidate is almost as good.
+
+        Args:
+            charge: Touch charges, shape (n, n_electrode), pC.
+            force: Force of each press, shape (n,), N; None if the forces are estimated.
+            candidates: Candidates, ordered by press and then by spread.
+
+        Returns:
+            Contact, spread and status of each press.
+        """
+        n_press = len(charge)
+        n_candidates = np.bincount(candidates.press, minlength=n_press)
+        first_row = np.searchsorted(candidates.press, np.arange(n_press))
+        second_row = np.minimum(first_row + 1, candidates.press.size)
         spread = np.append(candidates.spread, np.inf)  # the last value is for presses without candidates
-        best = np.where(matches > 0, spread[first], np.nan)
-        second = np.where(matches > 1, spread[np.minimum(first + 1, candidates.press.size)], np.inf)
-        status = np.where(matches > 0, int(Meeting.met), int(Meeting.apart))
-        status[(matches == 0) & self._grid.is_out_of_range(charge, force)] = Meeting.no_contour
-        status[second <= np.maximum(AMBIGUOUS_RATIO * best, AMBIGUOUS_SPREAD)] = Meeting.twice
-        met = status == Meeting.met
-        contact = np.full((count, 3), np.nan)
-        contact[met] = candidates.contact[first[met]]
+        smallest_spread = np.where(n_candidates > 0, spread[first_row], np.nan)
+        second_spread = np.where(n_candidates > 1, spread[second_row], np.inf)
+
+        status = np.where(n_candidates > 0, int(Meeting.met), int(Meeting.apart))
+        status[(n_candidates == 0) & self._grid.is_out_of_range(charge, force)] = Meeting.no_contour
+        is_ambiguous = second_spread <= np.maximum(AMBIGUOUS_RATIO * smallest_spread, AMBIGUOUS_SPREAD)
+        status[is_ambiguous] = Meeting.twice
+
+        is_met = status == Meeting.met
+        contact = np.full((n_press, 3), np.nan)
+        contact[is_met] = candidates.contact[first_row[is_met]]
         if force is not None:
             contact[:, 2] = force
-        return Fix(contact, best, status)
+        return Fix(contact, smallest_spread, status)
 
     # Starting points
 
@@ -156,19 +187,35 @@ class Triangulation:
         return SeedGrid.of(self._charges)
 
     def _seeds(self, charge: Array, force: Array | None) -> Candidates:
-        """Select the nodes of the grid that are nearer to the contours than their neighbours."""
+        """Select the nodes of the grid that are nearer to the contours than their neighbours.
+
+        Args:
+            charge: Touch charges, shape (n, n_electrode), pC.
+            force: Force of each press, shape (n,), N; None if the best force of each node is to be used.
+
+        Returns:
+            Starting points, at most `MAX_SEEDS` for each press.
+        """
         grid = self._grid
         forces = grid.matching_force(charge) if force is None else force[:, None]
         press, node = grid.lowest(grid.distance(charge, forces), MAX_SEEDS)
-        chosen = forces[press, node] if force is None else force[press]
-        return Candidates.begin(press, np.column_stack([grid.position[node], chosen]))
+        seed_force = forces[press, node] if force is None else force[press]
+        return Candidates.begin(press, np.column_stack([grid.position[node], seed_force]))
 
     def _second_seeds(self, closest: Candidates, *, fixed: bool) -> Candidates:
         """Create starting points for a second meeting across a fold.
 
         They lie on both sides of each meeting in the direction in which the distances from the contours change least.
+
+        Args:
+            closest: Meetings of the contours that have been found.
+            fixed: Whether the force keeps its value.
+
+        Returns:
+            Two starting points for each meeting.
         """
-        _, slopes = self._distances(closest.contact, 0.0, fixed=fixed)
+        any_charge = 0.0  # the slopes do not depend on the charge
+        _, slopes = self._distances(closest.contact, any_charge, fixed=fixed)
         right_singular_vectors = np.linalg.svd(slopes)[2]
         weakest_direction = right_singular_vectors[:, -1]
         step = SECOND_START_DISTANCE * self.tolerance * weakest_direction
@@ -194,23 +241,36 @@ class Triangulation:
             contact = self._moved(contact, gauss_newton_step(slopes, distance))
         return best[best.spread <= self.tolerance].distinct(MIN_DISTANCE)
 
-    def _cross(self, charge: Array, near: Candidates) -> Candidates:
-        """Average the crossings of each triple of contours near the candidates, over the triples that meet there."""
-        count = len(self.charge_map.electrodes)
-        crossing = {pair: self._crossing(charge, near, pair) for pair in combinations(range(count), 2)}
-        total = np.zeros((len(near.press), 2))
-        met = np.zeros_like(near.press)
-        spread = np.zeros_like(near.spread)
-        for triple in combinations(range(count), 3):
-            corners = np.stack([crossing[pair] for pair in combinations(triple, 2)], axis=1)
+    def _cross(self, charge: Array, candidates: Candidates) -> Candidates:
+        """Replace candidates by the crossings of contours near them.
+
+        Three contours have three crossings of two contours. The contours meet if all three crossings lie within the
+        tolerance of their mean. The new position of a candidate is the average of this mean over all triples of
+        contours that meet near the candidate.
+
+        Args:
+            charge: Touch charges, shape (n, n_electrode), pC.
+            candidates: Candidates near which crossings are searched for.
+
+        Returns:
+            The candidates near which at least one triple meets, without duplicates.
+        """
+        n_electrode = len(self.charge_map.electrodes)
+        crossings = {pair: self._crossing(charge, candidates, pair) for pair in combinations(range(n_electrode), 2)}
+        position_sum = np.zeros((len(candidates.press), 2))
+        n_meeting = np.zeros_like(candidates.press)
+        spread = np.zeros_like(candidates.spread)
+        for triple in combinations(range(n_electrode), 3):
+            corners = np.stack([crossings[pair] for pair in combinations(triple, 2)], axis=1)  # (n_candidate, 3, 2)
             mean = corners.mean(axis=1)
             distance = np.linalg.norm(corners - mean[:, None], axis=2).max(axis=1)
-            meets = distance <= self.tolerance  # False if a pair does not cross, because its distance is NaN
-            total[meets] += mean[meets]
-            spread[meets] = np.maximum(spread[meets], distance[meets])
-            met += meets
-        contact = np.column_stack([total / np.maximum(met, 1)[:, None], near.contact[:, 2]])
-        return Candidates(near.press, contact, spread)[met > 0].distinct(MIN_DISTANCE)
+            is_meeting = distance <= self.tolerance  # False if a pair does not cross, because its distance is NaN
+            position_sum[is_meeting] += mean[is_meeting]
+            spread[is_meeting] = np.maximum(spread[is_meeting], distance[is_meeting])
+            n_meeting += is_meeting
+        position = position_sum / np.maximum(n_meeting, 1)[:, None]
+        contact = np.column_stack([position, candidates.contact[:, 2]])
+        return Candidates(candidates.press, contact, spread)[n_meeting > 0].distinct(MIN_DISTANCE)
 
     def _crossing(self, charge: Array, near: Candidates, pair: tuple[int, int]) -> Array:
         """Find the crossing of two contours by Newton's method from each candidate.
@@ -227,15 +287,17 @@ class Triangulation:
         crossing = np.full((len(near.press), 2), np.nan)
         active = np.arange(len(contact))
         for _ in range(STEPS):
-            distance, slopes = self._distances(contact[active], charge[near.press[active]], fixed=True)
-            distance = distance[:, pair]
-            slopes = slopes[:, pair]
-            moving = np.abs(distance).max(axis=1) >= CONVERGED_DISTANCE
-            crossing[active[~moving]] = contact[active[~moving], :2]
-            active = active[moving]
+            distances, slopes = self._distances(contact[active], charge[near.press[active]], fixed=True)
+            pair_distances = distances[:, pair]
+            pair_slopes = slopes[:, pair]
+            is_moving = np.abs(pair_distances).max(axis=1) >= CONVERGED_DISTANCE
+            converged = active[~is_moving]
+            crossing[converged] = contact[converged, :2]
+            active = active[is_moving]
             if active.size == 0:
                 break
-            contact[active] = self._moved(contact[active], gauss_newton_step(slopes[moving], distance[moving]))
+            step = gauss_newton_step(pair_slopes[is_moving], pair_distances[is_moving])
+            contact[active] = self._moved(contact[active], step)
         return crossing
 
     def _distances(self, contact: Array, charge: Array | float, *, fixed: bool) -> tuple[Array, Array]:
@@ -250,13 +312,18 @@ class Triangulation:
             Distances, shape (n, n_electrode), mm, and their derivatives with respect to x, y and, unless the force is
             fixed, ln F times the radius, shape (n, n_electrode, 2 or 3), dimensionless.
         """
-        predicted, slopes = linearised(self._charges, contact)
+        predicted, charge_derivatives = linearised(self._charges, contact)
         typical_slope = np.median(self._grid.slope, axis=0) * self._grid.growth(contact[:, 2])[:, None]
-        slope = np.maximum(np.linalg.norm(slopes[..., :2], axis=2), MIN_SLOPE * typical_slope)
-        lengths = slopes / (slope[..., None] * np.array([1.0, 1.0, self.charge_map.domain.radius]))
+        gradient_length = np.linalg.norm(charge_derivatives[..., :2], axis=2)
+        slope = np.maximum(gradient_length, MIN_SLOPE * typical_slope)  # pC/mm
+
+        # To first order, the distance from a contour is the difference of the charges over the slope.
+        distance = (predicted - charge) / slope
+        unknown_scales = np.array([1.0, 1.0, self.charge_map.domain.radius])  # the third unknown is ln F times radius
+        distance_derivatives = charge_derivatives / (slope[..., None] * unknown_scales)
         if fixed:
-            lengths = lengths[..., :2]
-        return (predicted - charge) / slope, lengths
+            distance_derivatives = distance_derivatives[..., :2]
+        return distance, distance_derivatives
 
     def _moved(self, contact: Array, step: Array) -> Array:
         """Move contacts by a step, and keep them within the domain of the charge map.
@@ -284,7 +351,11 @@ def gauss_newton_step(slopes: Array, distance: Array) -> Array:
     Returns:
         Step, shape (n, n_unknown), mm, not longer than `MAX_STEP`.
     """
-    square = np.einsum("nij,nik->njk", slopes, slopes) + DAMPING * np.eye(slopes.shape[2])
-    step: Array = -np.linalg.solve(square, np.einsum("nij,ni->nj", slopes, distance)[..., None])[..., 0]
-    step *= np.minimum(1.0, MAX_STEP / np.maximum(np.linalg.norm(step, axis=1), 1e-300))[:, None]
+    # Normal equations (J' J + damping) step = -J' distance, with sums over the distances i of each row n
+    normal_matrix = np.einsum("nij,nik->njk", slopes, slopes) + DAMPING * np.eye(slopes.shape[2])
+    gradient = np.einsum("nij,ni->nj", slopes, distance)
+    step: Array = -np.linalg.solve(normal_matrix, gradient[..., None])[..., 0]
+
+    length = np.linalg.norm(step, axis=1)
+    step *= np.minimum(1.0, MAX_STEP / np.maximum(length, 1e-300))[:, None]
     return step

@@ -143,12 +143,21 @@ class Sweep:
         return SweepPresses(np.full(position.size, number), contact, rotation)
 
     def _unit_cube(self, count: int, number: int) -> Array:
-        """Draw points (distance, angle, force, rotation) of the unit cube for one probe, shape (count, 4)."""
+        """Draw points of the unit cube for the presses of one probe.
+
+        Args:
+            count: Number of presses.
+            number: Number of the probe. Each probe has its own sequence of random numbers.
+
+        Returns:
+            Points (distance, angle, force, rotation), each coordinate from 0 to 1, shape (count, 4).
+        """
         rng = np.random.default_rng([self.seed, number])
         if self.sampling == "random":
             return rng.random((count, 4))
-        bits = int(np.ceil(np.log2(max(count, 2))))
-        return np.asarray(scipy.stats.qmc.Sobol(4, rng=rng).random_base2(bits)[:count])
+        # A Sobol sequence is balanced if the number of points is a power of two.
+        log2_count = int(np.ceil(np.log2(max(count, 2))))
+        return np.asarray(scipy.stats.qmc.Sobol(4, rng=rng).random_base2(log2_count)[:count])
 
     def _force(self, share: Array) -> Array:
         """Return the forces (N) at shares (0 to 1) of the range in ln F."""

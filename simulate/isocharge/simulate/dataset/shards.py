@@ -282,13 +282,22 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
 
 
 def _differs(sensor: Sensor, expected: Sensor) -> str:
-    """Describe how a sensor differs from the expected sensor, by its name or by the keys that differ."""
+    """Return a text for an error message that says how a sensor differs from the expected sensor.
+
+    Args:
+        sensor: Sensor that was given.
+        expected: Sensor that was expected.
+
+    Returns:
+        The name of the sensor, or, if the names are equal, the keys of the sensor file with different values.
+    """
     if sensor.name != expected.name:
         return repr(sensor.name)
-    actual = sensor_to_dict(sensor)
-    target = sensor_to_dict(expected)
-    keys = sorted(key for key in actual.keys() | target.keys() if actual.get(key) != target.get(key))
-    return f"one of that name with another {', '.join(keys)}"
+    table = sensor_to_dict(sensor)
+    expected_table = sensor_to_dict(expected)
+    all_keys = table.keys() | expected_table.keys()
+    different_keys = sorted(key for key in all_keys if table.get(key) != expected_table.get(key))
+    return f"one of that name with another {', '.join(different_keys)}"
 
 
 class _Shard(Struct):
@@ -328,8 +337,20 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
 
 
 def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
-    """Read a shard, and check its checksum and its columns."""
-    path = folder / Path(entry.file).name
+    """Read a shard, and check its checksum and its columns.
+
+    Args:
+        folder: Folder of the dataset.
+        entry: Entry of the shard in the manifest.
+        sensor: Sensor of the dataset.
+
+    Returns:
+        Samples of the shard.
+
+    Raises:
+        DatasetError: If the file is missing or damaged, or has other columns.
+    """
+    path = folder / Path(entry.file).name  # the name alone, so that a manifest cannot refer to other folders
     if not path.is_file():
         raise DatasetError(f"{path}: the manifest lists this shard, but the file is missing; make the dataset again")
     data = read_needed(path, DatasetError, "make the dataset again", MAX_SHARD_BYTES)
@@ -345,7 +366,18 @@ def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
 
 
 def _unpacked(data: bytes, where: str) -> Samples:
-    """Convert the bytes of a shard into columns without executing any code in them."""
+    """Convert the bytes of a shard into samples without executing any code in them.
+
+    Args:
+        data: Contents of the file.
+        where: Beginning of the error message.
+
+    Returns:
+        Samples of the shard, whose columns are not checked.
+
+    Raises:
+        DatasetError: If the bytes are not an NPZ file with the columns of a shard.
+    """
     try:
         return Samples(**npz_arrays(data, COLUMNS))
     except Exception as error:  # zipfile, zlib and NumPy raise many types of exceptions

@@ -165,24 +165,36 @@ def _manifest_entries(maps: Sequence[ForwardMap], sweep: Sweep) -> dict[str, Any
 def _finish_shards(
     run: ResumableRun, maps: Sequence[ForwardMap], presses: SweepPresses, executor: Executor | None, shard: int
 ) -> list[dict[str, Any]]:
-    """Compute and write the shards that are not saved yet, and return the manifest entries of all shards in order."""
-    parts = list(_split(presses, shard))
+    """Compute and write the shards that an earlier run has not saved.
+
+    Args:
+        run: Run whose folder contains the shards.
+        maps: Forward map of each probe.
+        presses: All presses of the sweep.
+        executor: Executor that computes the charges; this process if None.
+        shard: Number of presses in a shard.
+
+    Returns:
+        Manifest entries of all shards, in order.
+    """
+    presses_of_shards = list(_split(presses, shard))
     entries: dict[int, dict[str, Any]] = {}
-    for number, part in enumerate(parts):
+    for number, shard_presses in enumerate(presses_of_shards):
         data = run.load(shard_name(number), bytes, final=True)
         if data is not None:
-            entries[number] = shard_entry(shard_name(number), len(part), data)
-    done = sum(entry["samples"] for entry in entries.values())
-    missing = [number for number in range(len(parts)) if number not in entries]
-    report("pressing", done, len(presses))
-    missing_samples = _samples(maps, (parts[number] for number in missing), executor)
-    for number, samples in zip(missing, missing_samples, strict=True):
+            entries[number] = shard_entry(shard_name(number), len(shard_presses), data)
+    finished_presses = sum(entry["samples"] for entry in entries.values())
+    missing_shards = [number for number in range(len(presses_of_shards)) if number not in entries]
+    report("pressing", finished_presses, len(presses))
+
+    missing_samples = _samples(maps, (presses_of_shards[number] for number in missing_shards), executor)
+    for number, samples in zip(missing_shards, missing_samples, strict=True):
         name, data = pack_shard(number, samples, maps[0].sensor)
         run.save(name, data, final=True)
         entries[number] = shard_entry(name, len(samples), data)
-        done += len(samples)
-        report("pressing", done, len(presses))
-    return [entry for _, entry in sorted(entries.items())]
+        finished_presses += len(samples)
+        report("pressing", finished_presses, len(presses))
+    return [entries[number] for number in sorted(entries)]
 
 
 def _split(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
@@ -194,31 +206,47 @@ def _split(presses: SweepPresses, size: int) -> Iterator[SweepPresses]:
 def _samples(
     maps: Sequence[ForwardMap], shards: Iterable[SweepPresses], executor: Executor | None
 ) -> Iterator[Samples]:
-    """Compute the samples of each shard in order. The workers compute later shards in advance."""
+    """Yield the samples of each shard in order. The workers compute later shards in advance.
+
+    Args:
+        maps: Forward map of each probe.
+        shards: Presses of each shard.
+        executor: Executor that computes the charges; this process if None.
+    """
+    # The tasks are consumed earlier than the results, so both have an iterator over the shards of their own.
     shards, shards_for_tasks = tee(shards)
     tasks = (
-        (maps[number], part.contact[rows], part.rotation[rows])
-        for part in shards_for_tasks
-        for number, rows in _tasks(part, len(maps))
+        (maps[probe], presses.contact[rows], presses.rotation[rows])
+        for presses in shards_for_tasks
+        for probe, rows in _tasks(presses, len(maps))
     )
-    charges = in_order(executor, _charges, tasks)
-    notation = np.array([forward_map.probe.notation for forward_map in maps])
-    angle = np.array([forward_map.probe.angle for forward_map in maps])
-    for part in shards:
-        charge = np.empty((len(part), len(maps[0].electrodes)))
-        for _, rows in _tasks(part, len(maps)):
-            charge[rows] = next(charges)
-        x, y, force = (np.ascontiguousarray(column) for column in part.contact.T)
-        rotation = np.mod(np.round(np.rad2deg(angle[part.probe] + part.rotation), 9), 360.0)
-        yield Samples(x, y, force, notation[part.probe], rotation, charge)
+    charges_of_tasks = in_order(executor, _charges, tasks)
+    probe_notations = np.array([forward_map.probe.notation for forward_map in maps])
+    probe_angles = np.array([forward_map.probe.angle for forward_map in maps])
+    for presses in shards:
+        charge = np.empty((len(presses), len(maps[0].electrodes)))
+        for _, rows in _tasks(presses, len(maps)):
+            charge[rows] = next(charges_of_tasks)
+        x, y, force = (np.ascontiguousarray(column) for column in presses.contact.T)
+        rotation_deg = np.rad2deg(probe_angles[presses.probe] + presses.rotation)
+        rotation_deg = np.mod(np.round(rotation_deg, 9), 360.0)
+        yield Samples(x, y, force, probe_notations[presses.probe], rotation_deg, charge)
 
 
-def _tasks(part: SweepPresses, probes: int) -> Iterator[tuple[int, Integers]]:
-    """Return the tasks of a shard as the number of the probe and the rows of the shard."""
-    for number in range(probes):
-        rows = np.flatnonzero(part.probe == number)
+def _tasks(presses: SweepPresses, n_probes: int) -> Iterator[tuple[int, Integers]]:
+    """Divide the presses of a shard into tasks of at most `TASK_SIZE` presses with the same probe.
+
+    Args:
+        presses: Presses of the shard.
+        n_probes: Number of probes of the sweep.
+
+    Yields:
+        Number of the probe, and the rows of the shard that belong to the task.
+    """
+    for probe in range(n_probes):
+        rows = np.flatnonzero(presses.probe == probe)
         for start in range(0, rows.size, TASK_SIZE):
-            yield number, rows[start : start + TASK_SIZE]
+            yield probe, rows[start : start + TASK_SIZE]
 
 
 def _charges(task: tuple[ForwardMap, Array, Array]) -> Array:
