@@ -15,6 +15,11 @@ from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import scaled_derivatives, singular_values
+from isocharge.simulate.identifiability.side_force_limits import (
+    MAX_SIDE_FORCE_ERROR,
+    SideForceLimits,
+    side_force_limits,
+)
 from isocharge.simulate.identifiability.working_area import (
     DEFAULT_ERROR,
     Bound,
@@ -119,6 +124,8 @@ class Identification:
         area: Working area with folds and ambiguous pairs.
         maps: Limits for the smallest force, for 1 N if it is in the range of forces, and for the largest force.
         inner_maps: Limits for the same forces within the working area; empty if the working area has the radius 0.
+        side_force: Limits for the same forces if the side force of the probe is unknown; empty with fewer than six
+            electrodes.
     """
 
     sensor: Sensor
@@ -128,15 +135,24 @@ class Identification:
     area: WorkingArea
     maps: tuple[LimitMap, ...] = field(repr=False)
     inner_maps: tuple[LimitMap, ...] = field(repr=False)
+    side_force: tuple[SideForceLimits, ...] = field(repr=False, default=())
 
     @classmethod
-    def of(cls, forward_map: ForwardMap, noise: NoiseModel, *, error: float = DEFAULT_ERROR) -> "Identification":
+    def of(
+        cls,
+        forward_map: ForwardMap,
+        noise: NoiseModel,
+        *,
+        error: float = DEFAULT_ERROR,
+        executor: Executor | None = None,
+    ) -> "Identification":
         """Identify the sensor of a forward map within the radius and the forces of the map.
 
         Args:
             forward_map: Solved forward map.
             noise: Noise of the readings. The white noise must be positive.
             error: Largest Cramer-Rao position error allowed in the working area, mm.
+            executor: Executor that runs the solves of the side forces; this process if absent.
         """
         check_determined(len(forward_map.electrodes))
         charges = with_fast_derivatives(forward_map)
@@ -145,7 +161,8 @@ class Identification:
         area = working_area(charges, noise, error=error)
         maps = _limit_maps(charges, noise, forces, charges.domain.radius)
         inner_maps = _limit_maps(charges, noise, forces, area.radius)
-        return cls(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inner_maps)
+        side_force = side_force_limits(forward_map, charges, noise, forces, area.radius, executor)
+        return cls(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inner_maps, side_force)
 
     @property
     def determined_share(self) -> float:
@@ -159,7 +176,14 @@ class Identification:
 
     @property
     def summary(self) -> str:
-        """Description of the working area in a few sentences."""
+        """Description of the working area and, with six electrodes or more, of the side force in a few sentences."""
+        if not self.side_force:
+            return self._area_summary
+        return f"{self._area_summary} {self._side_force_summary}"
+
+    @property
+    def _area_summary(self) -> str:
+        """Description of the working area."""
         area = self.area
         if not (len(area.folds) or len(area.pairs)):
             return area.summary
@@ -169,6 +193,21 @@ class Identification:
             f"{area.searched:.3g} mm searched, of which the working area is "
             f"{100.0 * (area.radius / area.searched) ** 2:.0f} %."
         )
+
+    @property
+    def _side_force_summary(self) -> str:
+        """Statement of the forces at which the side force can be estimated, and of its error."""
+        estimable = [limits for limits in self.side_force if limits.is_estimable]
+        if not estimable:
+            return (
+                f"The side force of the probe cannot be estimated to {100.0 * MAX_SIDE_FORCE_ERROR:g} % of the force "
+                "at any of these forces."
+            )
+        parts = []
+        for limits in estimable:
+            statistics = limits.statistics()
+            parts.append(f"to {statistics['side_force_median_percent']:.2g} % of the force at {limits.force:g} N")
+        return f"The side force of the probe can be estimated {', '.join(parts)} (median)."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the results for JSON, in which infinite radii are None."""
@@ -192,6 +231,7 @@ class Identification:
                 "words": self.summary,
             },
             "limits_in_working_area": [limits.statistics() for limits in self.inner_maps],
+            "limits_with_side_force": [limits.statistics() for limits in self.side_force],
             "by_distance": {
                 "distance_mm": self.maps[0].rings.distance.tolist(),
                 **{
@@ -250,7 +290,7 @@ def identify(
         forward_map = map_to_search(sensor, probe, force_range, executor)
     else:
         forward_map = ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
-    return Identification.of(forward_map, noise, error=error)
+    return Identification.of(forward_map, noise, error=error, executor=executor)
 
 
 def search_radius(sensor: Sensor, probe: Probe) -> float:

@@ -1,0 +1,120 @@
+"""Cramer-Rao limits of contacts with an unknown side force.
+
+Such a contact has five parameters: x, y, the force F, and the side force (Fx, Fy). The limits of the five parameters
+are computed for a side force of zero. They are computed for sensors with at least six electrodes, because a sensor with
+five electrodes has no charge left that could show a wrong model.
+"""
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.simulate.forward.charge_map import ChargeMap, linearised
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.forward.side_force import SideForceMap
+from isocharge.simulate.identifiability.cramer_rao import cramer_rao
+from isocharge.simulate.measuring_chain.noise import NoiseModel
+from isocharge.simulate.numerics.disk import Rings
+
+MIN_ELECTRODES = 6
+"""Smallest number of electrodes for which the limits are computed."""
+
+MAX_SIDE_FORCE_ERROR = 0.1
+"""Largest median standard deviation of the side force, over the force, at which the side force counts as estimable."""
+
+RING_COUNT = 10
+"""Number of rings on which the limits are computed."""
+
+ANGLE_COUNT = 36
+"""Number of positions on each ring."""
+
+
+@dataclass(frozen=True)
+class SideForceLimits:
+    """Limits of contacts with one force whose side force is unknown, at positions in the working area.
+
+    Attributes:
+        force: Force of the contacts, N.
+        side_force: Root mean square error of the side force divided by the force, shape (n,), dimensionless.
+        position: Root mean square error of the position, shape (n,), mm.
+        relative_force: Standard deviation of the force divided by the force, shape (n,), dimensionless.
+    """
+
+    force: float
+    side_force: Array
+    position: Array
+    relative_force: Array
+
+    @classmethod
+    def of(
+        cls, side_force_map: SideForceMap, charge_map: ChargeMap, noise: NoiseModel, force: float, radius: float
+    ) -> "SideForceLimits":
+        """Compute the limits at positions that are spread evenly over a disk.
+
+        Args:
+            side_force_map: Derivatives of the charges with respect to the side force.
+            charge_map: Charges of contacts without a side force.
+            noise: Noise of the readings.
+            force: Force of the contacts, N.
+            radius: Radius of the disk, mm.
+        """
+        contact = Rings.spread(radius, RING_COUNT, ANGLE_COUNT).contacts(force)
+        charge, contact_jacobian = linearised(charge_map, contact)
+        share_jacobian = force * side_force_map.jacobian(contact)
+        limits = cramer_rao(charge, np.concatenate([contact_jacobian, share_jacobian], axis=2), noise)
+        side_force_variance = limits.covariance[:, 3, 3] + limits.covariance[:, 4, 4]
+        return cls(force, np.sqrt(side_force_variance), limits.position, limits.force)
+
+    @property
+    def is_estimable(self) -> bool:
+        """Whether the median error of the side force is at most `MAX_SIDE_FORCE_ERROR`."""
+        return self._median(self.side_force) <= MAX_SIDE_FORCE_ERROR
+
+    def statistics(self) -> dict[str, Any]:
+        """Compute statistics of the errors, in which each position is weighted with the area that it represents."""
+        return {
+            "force_N": self.force,
+            "side_force_median_percent": 100.0 * self._median(self.side_force),
+            "side_force_worst_percent": 100.0 * float(self.side_force.max()),
+            "position_median_mm": self._median(self.position),
+            "position_worst_mm": float(self.position.max()),
+            "force_median_percent": 100.0 * self._median(self.relative_force),
+            "force_worst_percent": 100.0 * float(self.relative_force.max()),
+            "side_force_is_estimable": self.is_estimable,
+        }
+
+    def _median(self, values: Array) -> float:
+        """Compute the median of values at the positions, weighted with the area of each position."""
+        area = np.repeat(np.arange(1, RING_COUNT + 1), ANGLE_COUNT)
+        order = np.argsort(values)
+        total_area = np.cumsum(area[order])
+        return float(values[order][np.searchsorted(total_area, 0.5 * total_area[-1])])
+
+
+def side_force_limits(
+    forward_map: ForwardMap,
+    charge_map: ChargeMap,
+    noise: NoiseModel,
+    forces: list[float],
+    radius: float,
+    executor: Executor | None = None,
+) -> tuple[SideForceLimits, ...]:
+    """Compute the limits for each force, or return nothing if the sensor has too few electrodes or no working area.
+
+    Only circular probes have a side force map. For other probes the result is empty.
+
+    Args:
+        forward_map: Forward map of the sensor.
+        charge_map: Map with the same charges and fast derivatives.
+        noise: Noise of the readings.
+        forces: Forces, N.
+        radius: Radius of the working area, mm.
+        executor: Executor that runs the solves; None for this process.
+    """
+    if len(forward_map.electrodes) < MIN_ELECTRODES or radius <= 0.0 or not forward_map.probe.is_axisymmetric:
+        return ()
+    side_force_map = SideForceMap.build(forward_map, executor=executor)
+    return tuple(SideForceLimits.of(side_force_map, charge_map, noise, force, radius) for force in forces)

@@ -1,0 +1,91 @@
+"""Limits of contacts with an unknown side force, against the Fisher information of direct solves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.simulate import (
+    Circle,
+    Electrode,
+    ForwardMap,
+    Sensor,
+    SolveSettings,
+    load_sensor,
+    noise_model,
+    press,
+    touch_charge,
+)
+from isocharge.simulate.forward.side_force import SideForceMap
+from isocharge.simulate.identifiability.identification import Identification
+from isocharge.simulate.identifiability.side_force_limits import ANGLE_COUNT, SideForceLimits
+from kept import kept
+
+REFERENCE = noise_model("reference")
+PROBE = Circle(1.0)
+ACCURATE = SolveSettings(accuracy=1e-4)
+
+
+def sensor_with_electrodes(count: int) -> Sensor:
+    """Return a film of 0.8 MPa whose electrodes have alternating distances of 10 and 14 mm from the centre."""
+    sensor = load_sensor("four-25um-biaxial")
+    distance = np.where(np.arange(count) % 2, 14.0, 10.0)
+    centres = distance * np.exp(2j * np.pi * np.arange(count) / count)
+    electrodes = tuple(
+        Electrode.of_square("ABCDEF"[number], (centre.real, centre.imag), 3.0) for number, centre in enumerate(centres)
+    )
+    return replace(sensor, film=replace(sensor.film, pretension=0.8), electrodes=electrodes)
+
+
+@pytest.fixture(scope="module")
+def forward_map() -> ForwardMap:
+    return kept(ForwardMap.build, sensor_with_electrodes(6), PROBE, 6.0, (0.2, 1.0))
+
+
+@pytest.fixture(scope="module")
+def side_force_map(forward_map) -> SideForceMap:
+    return kept(SideForceMap.build, forward_map)
+
+
+def test_side_force_limit_equals_that_of_direct_solves(forward_map, side_force_map):
+    """The Jacobian of (x, y, ln F, Fx / F, Fy / F) by differences of direct solves, at one position of the rings."""
+    sensor = forward_map.sensor
+    force = 0.5
+
+    def charges(parameters: np.ndarray) -> np.ndarray:
+        x, y, log_force, share_x, share_y = parameters.tolist()
+        newtons = float(np.exp(log_force))
+        side_force = (newtons * share_x, newtons * share_y)
+        return touch_charge(sensor, press(sensor.film, PROBE, (x, y), newtons, ACCURATE, side_force=side_force))
+
+    centre = np.array([0.0, 3.0, np.log(force), 0.0, 0.0])
+    steps = np.diag([0.05, 0.05, 0.02, 0.05, 0.05])
+    jacobian = np.stack([(charges(centre + step) - charges(centre - step)) / (2.0 * step.max()) for step in steps], 1)
+    variance = 1.0 + (0.002 * charges(centre)) ** 2
+    covariance = np.linalg.inv(jacobian.T @ (jacobian / variance[:, None]))
+
+    limits = SideForceLimits.of(side_force_map, forward_map, REFERENCE, force, 6.0)
+    ring = 4  # the rings lie at 0.6, 1.2, ... 6.0 mm
+    angle = 9  # 90 degrees
+    number = ring * ANGLE_COUNT + angle
+    assert limits.side_force[number] == pytest.approx(np.sqrt(covariance[3, 3] + covariance[4, 4]), rel=0.02)
+    assert limits.position[number] == pytest.approx(np.sqrt(covariance[0, 0] + covariance[1, 1]), rel=0.02)
+    assert limits.relative_force[number] == pytest.approx(np.sqrt(covariance[2, 2]), rel=0.02)
+
+
+def test_identify_reports_the_side_force_with_six_electrodes(forward_map):
+    identification = Identification.of(forward_map, REFERENCE)
+    rows = identification.to_dict()["limits_with_side_force"]
+    contact_rows = identification.to_dict()["limits_in_working_area"]
+    assert [row["force_N"] for row in rows] == [0.2, 1.0]
+    for row, contact_row in zip(rows, contact_rows, strict=True):
+        assert row["position_median_mm"] > contact_row["position_median_mm"]
+        assert row["side_force_is_estimable"] == (row["side_force_median_percent"] <= 10.0)
+    assert "The side force of the probe can" in identification.summary
+
+
+def test_identify_with_five_electrodes_omits_the_side_force(forward_map):
+    sensor = sensor_with_electrodes(5)
+    identification = Identification.of(replace(forward_map, sensor=sensor), REFERENCE)
+    assert identification.to_dict()["limits_with_side_force"] == []
+    assert "side force" not in identification.summary
