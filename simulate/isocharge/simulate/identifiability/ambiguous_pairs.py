@@ -102,19 +102,26 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
         noise: Noise of the readings.
         force: Force of the first contact of each pair, N. The second contact may have any force of the map.
         places: Number of positions of the lattice.
+
+    Returns:
+        The pairs, ordered by the distance of the outer contact from the centre.
     """
-    unit = lattice(places)
-    position = INNER_RADIUS * charge_map.domain.radius * np.stack([unit.real, unit.imag], axis=1)
-    first = np.column_stack([position, np.full(len(position), force)])
-    charge = charge_map.charges(first)
-    min_distance = np.maximum(MIN_DISTANCE, MIN_DISTANCE_SIGMAS * limits_at(charge_map, first, noise).position)
-    first_number, start = _candidates(charge_map, noise, position, charge, min_distance)
-    if not first_number.size:
+    unit_lattice = lattice(places)
+    position = INNER_RADIUS * charge_map.domain.radius * np.stack([unit_lattice.real, unit_lattice.imag], axis=1)
+    contact = np.column_stack([position, np.full(len(position), force)])
+    charge = charge_map.charges(contact)
+    position_std = limits_at(charge_map, contact, noise).position
+    min_distance = np.maximum(MIN_DISTANCE, MIN_DISTANCE_SIGMAS * position_std)
+    first_index, start = _candidates(charge_map, noise, position, charge, min_distance)
+    if not first_index.size:
         return AmbiguousPairs.none()
-    second, difference = nearest_contact(charge_map, noise, charge[first_number], start)
-    distance = np.hypot(*(second - first[first_number])[:, :2].T)
-    is_ambiguous = (distance > min_distance[first_number]) & (difference < INDISTINGUISHABLE_SIGMAS)
-    pairs = AmbiguousPairs(first[first_number[is_ambiguous]], second[is_ambiguous], difference[is_ambiguous])
+
+    first = contact[first_index]
+    second, charge_difference = nearest_contact(charge_map, noise, charge[first_index], start)
+    distance = np.hypot(*(second - first)[:, :2].T)
+    is_distant = distance > min_distance[first_index]
+    is_ambiguous = is_distant & (charge_difference < INDISTINGUISHABLE_SIGMAS)
+    pairs = AmbiguousPairs(first[is_ambiguous], second[is_ambiguous], charge_difference[is_ambiguous])
     order = np.argsort(pairs.outer_radius, kind="stable")
     return AmbiguousPairs(pairs.first[order], pairs.second[order], pairs.distance[order])
 
@@ -134,34 +141,52 @@ def _candidates(
     Returns:
         Numbers of the first contacts, shape (m,), and a candidate (x, y, F) for each, shape (m, 3), mm and N.
     """
-    profile, terms = _tabulate(charge_map, position)
+    profile, force_coefficients = _tabulate(charge_map, position)
     neighbours = cKDTree(position).query(position, min(NEIGHBOURS, len(position)))[1]
-    numbers = []
-    contacts = []
-    for number, row in enumerate(charge):
-        observed = np.broadcast_to(row, charge.shape)
-        logs = profile.best(terms, observed, noise)
-        predicted = profile.charge(logs, terms)
+    first_indices = []
+    second_contacts = []
+    for first_index, first_charge in enumerate(charge):
+        # Press every position of the lattice with the force that explains the charges of the first contact best.
+        observed = np.broadcast_to(first_charge, charge.shape)
+        log_force = profile.best(force_coefficients, observed, noise)
+        predicted = profile.charge(log_force, force_coefficients)
         chi2 = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)
+
         is_local_minimum = chi2 <= chi2[neighbours].min(axis=1)
-        is_distant = np.hypot(*(position - position[number]).T) > min_distance[number]
+        is_distant = np.hypot(*(position - position[first_index]).T) > min_distance[first_index]
         candidates = np.flatnonzero(is_local_minimum & is_distant)
-        best = candidates[np.argsort(chi2[candidates])[:MAX_CANDIDATES]]
-        numbers.append(np.full(best.size, number))
-        contacts.append(np.concatenate([position[best], np.exp(logs[best])[:, None]], axis=1))
-    return np.concatenate(numbers), np.concatenate(contacts)
+        best_candidates = candidates[np.argsort(chi2[candidates])[:MAX_CANDIDATES]]
+        first_indices.append(np.full(best_candidates.size, first_index))
+        second_contacts.append(np.column_stack([position[best_candidates], np.exp(log_force[best_candidates])]))
+    return np.concatenate(first_indices), np.concatenate(second_contacts)
 
 
 def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Array]:
-    """Tabulate the charges at every position, shape (n, 2), mm, as a function of the force."""
-    low, high = np.log(charge_map.domain.force_range)
-    nodes = chebyshev_nodes(FORCES, low, high) if high > low else np.array([low])
-    forces = np.clip(np.exp(nodes), *charge_map.domain.force_range)
-    rows = [charge_map.charges(np.column_stack([position, np.full(len(position), force)])) for force in forces]
-    terms = np.stack([row / force**EXPONENT for row, force in zip(rows, forces, strict=True)], axis=1)
-    barycentric = barycentric_weights(nodes)
+    """Tabulate the charges at every position as a function of the force.
 
-    def weights(logs: Array) -> Array:
-        return np.asarray(lagrange_values(nodes, barycentric, logs) * np.exp(EXPONENT * logs)[:, None])
+    Q / F^EXPONENT is interpolated by a polynomial in ln F, because this ratio varies slowly with the force.
 
-    return ForceProfile.of(weights, charge_map.domain.force_range), terms
+    Args:
+        charge_map: Charges as a function of the contact.
+        position: Positions (x, y), shape (n, 2), mm.
+
+    Returns:
+        Weights of the interpolation as a function of the force, and the values of Q / F^EXPONENT at the nodes, shape
+        (n, n_node, n_electrode).
+    """
+    force_range = charge_map.domain.force_range
+    min_log, max_log = np.log(force_range)
+    log_nodes = chebyshev_nodes(FORCES, min_log, max_log) if max_log > min_log else np.array([min_log])
+    force_nodes = np.clip(np.exp(log_nodes), *force_range)
+    nodal_values = []
+    for force in force_nodes:
+        contact = np.column_stack([position, np.full(len(position), force)])
+        nodal_values.append(charge_map.charges(contact) / force**EXPONENT)
+    barycentric = barycentric_weights(log_nodes)
+
+    def weights(log_force: Array) -> Array:
+        """Return the weights of the nodal values in the charge for each ln F, shape (n, n_node)."""
+        interpolation_weights = lagrange_values(log_nodes, barycentric, log_force)
+        return np.asarray(interpolation_weights * np.exp(EXPONENT * log_force)[:, None])
+
+    return ForceProfile.of(weights, force_range), np.stack(nodal_values, axis=1)

@@ -55,11 +55,16 @@ def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Arra
         nuisance: Change of the charges by one prior standard deviation of each nuisance parameter, such as the radius
             of the probe or the pretension, shape (n, n_electrode, n_nuisance), pC. The priors of the nuisance
             parameters are added to the information (Van Trees 1968, sec. 2.4.3).
+
+    Returns:
+        The limits, from the inverse of the Fisher information J' W J + prior information.
     """
     prior_information = np.zeros(jacobian.shape[2])
     if nuisance is not None:
+        # A nuisance parameter in units of its prior standard deviation has the prior information 1.
         prior_information = np.concatenate([prior_information, np.ones(nuisance.shape[2])])
         jacobian = np.concatenate([jacobian, nuisance], axis=2)
+    # Sum over the electrodes e, for each press n and each pair of parameters i and j.
     information = np.einsum("nei,ne,nej->nij", jacobian, noise.information(charge), jacobian, optimize=True)
     return CramerRao(_invert(information + np.diag(prior_information)))
 
@@ -77,9 +82,21 @@ def limits_at(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> Crame
 
 
 def _invert(information: Array) -> Array:
-    """Invert symmetric matrices, shape (n, p, p), with parameters of any scale. Singular matrices are regularised."""
-    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), MIN_INFORMATION))
-    scales = scale[:, :, None] * scale[:, None, :]
-    values, vectors = np.linalg.eigh(information / scales)
-    inverse_values = 1.0 / np.maximum(values, MIN_EIGENVALUE)
-    return np.asarray(np.einsum("nik,nk,njk->nij", vectors, inverse_values, vectors) / scales)
+    """Invert information matrices. Singular matrices are regularised.
+
+    The matrices are first scaled to a unit diagonal, because the units of the parameters differ.
+
+    Args:
+        information: Symmetric matrices, shape (n, p, p).
+
+    Returns:
+        Inverse matrices, shape (n, p, p).
+    """
+    diagonal = np.diagonal(information, axis1=1, axis2=2)
+    parameter_scale = np.sqrt(np.maximum(diagonal, MIN_INFORMATION))
+    matrix_scale = parameter_scale[:, :, None] * parameter_scale[:, None, :]
+    eigenvalues, eigenvectors = np.linalg.eigh(information / matrix_scale)
+    inverse_eigenvalues = 1.0 / np.maximum(eigenvalues, MIN_EIGENVALUE)
+    # Inverse V diag(1 / eigenvalues) V' of each matrix n
+    scaled_inverse = np.einsum("nik,nk,njk->nij", eigenvectors, inverse_eigenvalues, eigenvectors)
+    return np.asarray(scaled_inverse / matrix_scale)

@@ -158,21 +158,30 @@ class _FoldSearch:
         Args:
             rings: Positions.
             scaled: J / sigma at all positions, shape (n_ring, n_angle, n_electrode, 3).
+
+        Returns:
+            Positions on folds, shape (n, 2), mm.
         """
         position = rings.position
-        next_position = np.roll(position, -1, axis=1)
-        radially = has_reversed_orientation(scaled[:-1], scaled[1:])
-        along_ring = has_reversed_orientation(scaled, np.roll(scaled, -1, axis=1))
-        first = np.concatenate([position[:-1][radially], position[along_ring]])
-        second = np.concatenate([position[1:][radially], next_position[along_ring]])
+        next_on_ring = np.roll(position, -1, axis=1)
+        has_radial_fold = has_reversed_orientation(scaled[:-1], scaled[1:])  # between neighbours on a radius
+        has_ring_fold = has_reversed_orientation(scaled, np.roll(scaled, -1, axis=1))  # between neighbours on a ring
+        first = np.concatenate([position[:-1][has_radial_fold], position[has_ring_fold]])
+        second = np.concatenate([position[1:][has_radial_fold], next_on_ring[has_ring_fold]])
         return self._bisect(first, second)
 
     def _bisect(self, first: Array, second: Array) -> Array:
-        """Bisect segments with reversed orientation, and return the centres of those of the length `SEGMENT_LENGTH`.
+        """Bisect segments between whose ends the orientation of the map is reversed.
+
+        In each round, a segment is replaced by the half in which the orientation is reversed, until it is shorter than
+        `SEGMENT_LENGTH`.
 
         Args:
             first: First ends of the segments.
             second: Second ends of the segments.
+
+        Returns:
+            Centres of the final segments.
         """
         points = [np.empty((0, 2))]
         if len(first):
@@ -186,12 +195,13 @@ class _FoldSearch:
             middle_scaled = self.scaled(middle)
             in_first_half = has_reversed_orientation(first_scaled, middle_scaled)
             in_second_half = has_reversed_orientation(middle_scaled, second_scaled)
-            rest = ~is_short & (in_first_half | in_second_half)
-            take_second = (in_second_half & ~in_first_half)[rest, None]
-            first = np.where(take_second, middle[rest], first[rest])
-            second = np.where(take_second, second[rest], middle[rest])
-            first_scaled = np.where(take_second[..., None], middle_scaled[rest], first_scaled[rest])
-            second_scaled = np.where(take_second[..., None], second_scaled[rest], middle_scaled[rest])
+            remaining = ~is_short & (in_first_half | in_second_half)
+            use_second_half = (in_second_half & ~in_first_half)[remaining, None]
+            first = np.where(use_second_half, middle[remaining], first[remaining])
+            second = np.where(use_second_half, second[remaining], middle[remaining])
+            use_second_half = use_second_half[..., None]  # for matrices of shape (n, n_electrode, 3)
+            first_scaled = np.where(use_second_half, middle_scaled[remaining], first_scaled[remaining])
+            second_scaled = np.where(use_second_half, second_scaled[remaining], middle_scaled[remaining])
         return np.concatenate(points)
 
     def weakest_positions(self, rings: Rings, scaled: Array) -> Array:
@@ -200,18 +210,32 @@ class _FoldSearch:
         Args:
             rings: Positions.
             scaled: J / sigma at all positions, shape (n_ring, n_angle, n_electrode, 3).
+
+        Returns:
+            Positions of the minima, shape (n, 2), mm.
         """
-        values = singular_values(scaled.reshape(-1, *scaled.shape[2:]))[:, 1].reshape(scaled.shape[:2])
-        is_minimum = values == scipy.ndimage.minimum_filter(values, 3, mode=("nearest", "wrap"))
-        spacing = np.maximum(rings.distance[0], rings.distance * 2.0 * np.pi / scaled.shape[1])
+        n_ring, n_angle = scaled.shape[:2]
+        values = singular_values(scaled.reshape(-1, *scaled.shape[2:]))[:, 1].reshape(n_ring, n_angle)
+        smallest_nearby = scipy.ndimage.minimum_filter(values, 3, mode=("nearest", "wrap"))
+        is_minimum = values == smallest_nearby
+        spacing_on_ring = rings.distance * 2.0 * np.pi / n_angle
+        spacing = np.maximum(rings.distance[0], spacing_on_ring)
         ring, _ = np.nonzero(is_minimum)  # there is at least one, the global minimum
         return self._minimise(rings.position[is_minimum], values[is_minimum], spacing[ring])
 
     def folds_about(self, position: Array) -> Array:
-        """Return those positions about which the orientation is reversed within `SEGMENT_LENGTH`."""
-        around = self.scaled((position[:, None] + 0.5 * SEGMENT_LENGTH * COMPASS).reshape(-1, 2))
-        around = around.reshape(len(position), len(COMPASS), *around.shape[1:])
-        is_fold = has_reversed_orientation(around[:, :4], around[:, 4:]).any(axis=1)
+        """Return those positions about which the orientation is reversed within `SEGMENT_LENGTH`.
+
+        The orientations at opposite points of a small circle about each position are compared.
+
+        Args:
+            position: Positions, shape (n, 2), mm.
+        """
+        circle_points = position[:, None] + 0.5 * SEGMENT_LENGTH * COMPASS  # shape (n, 8, 2)
+        scaled = self.scaled(circle_points.reshape(-1, 2))
+        scaled = scaled.reshape(len(position), len(COMPASS), *scaled.shape[1:])
+        half = len(COMPASS) // 2
+        is_fold = has_reversed_orientation(scaled[:, :half], scaled[:, half:]).any(axis=1)
         return np.asarray(position[is_fold])
 
     def _minimise(self, position: Array, value: Array, step: Array) -> Array:
@@ -220,21 +244,25 @@ class _FoldSearch:
         Args:
             position: Starting positions, which are overwritten.
             value: Smallest singular value at these positions, shape (n,), 1/mm.
-            step: First step of each search, shape (n,), mm.
+            step: First step of each search, shape (n,), mm. It is halved where no neighbour has a smaller value.
+
+        Returns:
+            Positions of the minima, shape (n, 2), mm.
         """
         active = np.flatnonzero(step > MIN_COMPASS_STEP)
         for _ in range(MAX_STEPS):
             if not active.size:
                 break
+            # Evaluate the neighbours of each position in the directions of the compass.
             trial = position[active, None] + step[active, None, None] * COMPASS
             trial = onto_disk(trial.reshape(-1, 2), self.radius)
             trial_values = self.smallest_singular_value(trial).reshape(-1, len(COMPASS))
-            best = trial_values.argmin(axis=1)
-            best_value = np.take_along_axis(trial_values, best[:, None], axis=1)[:, 0]
+            best_direction = trial_values.argmin(axis=1)
+            best_value = np.take_along_axis(trial_values, best_direction[:, None], axis=1)[:, 0]
             is_lower = best_value < value[active]
 
             moved = active[is_lower]
-            position[moved] = trial.reshape(-1, len(COMPASS), 2)[is_lower, best[is_lower]]
+            position[moved] = trial.reshape(-1, len(COMPASS), 2)[is_lower, best_direction[is_lower]]
             value[moved] = best_value[is_lower]
             step[active[~is_lower]] *= 0.5
             active = active[step[active] > MIN_COMPASS_STEP]

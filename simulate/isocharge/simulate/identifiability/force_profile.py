@@ -36,11 +36,20 @@ class ForceProfile:
 
     @classmethod
     def of(cls, weights: Callable[[Array], Array], force_range: tuple[float, float]) -> "ForceProfile":
-        """Tabulate the exponent for a range of forces, N."""
-        low, high = (float(end) for end in np.log(force_range))
-        logs = np.linspace(low, high, EXPONENT_NODES) if high > low else np.array([low - 1e-3, low + 1e-3])
-        exponent = np.gradient(np.log(weights(logs).sum(axis=1)), logs)
-        return cls(weights, (low, high), logs, exponent)
+        """Create a profile, for which the exponent is tabulated.
+
+        Args:
+            weights: Function from ln F, shape (n,), to weights, shape (n, n_term).
+            force_range: Smallest and largest force, N. They may be equal.
+        """
+        min_log, max_log = (float(end) for end in np.log(force_range))
+        if max_log > min_log:
+            logs = np.linspace(min_log, max_log, EXPONENT_NODES)
+        else:
+            logs = np.array([min_log - 1e-3, min_log + 1e-3])
+        log_sum = np.log(weights(logs).sum(axis=1))
+        exponent = np.gradient(log_sum, logs)
+        return cls(weights, (min_log, max_log), logs, exponent)
 
     def charge(self, logs: Array, terms: Array) -> Array:
         """Compute the charges for logarithms of the force.
@@ -67,7 +76,10 @@ class ForceProfile:
         return np.asarray(np.interp(logs, self.logs, self.exponent)[:, None] * charge)
 
     def best(self, terms: Array, charge: Array, noise: NoiseModel) -> Array:
-        """Find the force that explains the charges best.
+        """Find the force that explains the charges best, by weighted least squares.
+
+        In each step, the factor by which the predicted charges should be multiplied is converted into a change of ln F
+        with the exponent of the profile.
 
         Args:
             terms: Terms of each position, shape (n, n_term, n_electrode).
@@ -81,8 +93,9 @@ class ForceProfile:
         for _ in range(STEPS):
             predicted = self.charge(logs, terms)
             weighted = predicted / noise.variance(predicted)
-            scale = np.einsum("ne,ne->n", weighted, charge) / np.einsum("ne,ne->n", weighted, predicted)
-            log_change = np.clip(np.log(np.maximum(scale, 1e-300)), -MAX_LOG_CHANGE, MAX_LOG_CHANGE)
+            # The best factor is sum(w Q_predicted Q) / sum(w Q_predicted^2), with sums over the electrodes e.
+            factor = np.einsum("ne,ne->n", weighted, charge) / np.einsum("ne,ne->n", weighted, predicted)
+            log_change = np.clip(np.log(np.maximum(factor, 1e-300)), -MAX_LOG_CHANGE, MAX_LOG_CHANGE)
             exponent = np.interp(logs, self.logs, self.exponent)
             logs = np.clip(logs + log_change / exponent, *self.log_range)
         return np.asarray(logs)

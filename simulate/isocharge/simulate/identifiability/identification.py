@@ -156,8 +156,9 @@ class Identification:
         """
         check_determined(len(forward_map.electrodes))
         charges = with_fast_derivatives(forward_map)
-        low, high = charges.domain.force_range
-        forces = sorted({low, min(max(low, 1.0), high), high})
+        min_force, max_force = charges.domain.force_range
+        middle_force = min(max(min_force, 1.0), max_force)
+        forces = sorted({min_force, middle_force, max_force})
         area = working_area(charges, noise, error=error)
         maps = _limit_maps(charges, noise, forces, charges.domain.radius)
         inner_maps = _limit_maps(charges, noise, forces, area.radius)
@@ -308,6 +309,15 @@ def map_to_search(
 ) -> ForwardMap:
     """Solve a forward map over the search radius, or over a smaller radius if the charges cannot be interpolated.
 
+    Args:
+        sensor: Sensor.
+        probe: Probe of the presses.
+        force_range: Smallest and largest force, N.
+        executor: Executor that runs the solves; this process if absent.
+
+    Returns:
+        The forward map, whose domain has the radius that was reached.
+
     Raises:
         SceneError: If the film cannot be pressed as required.
         SolveError: If an equilibrium or the allowed interpolation error is not reached.
@@ -322,7 +332,17 @@ def map_to_search(
 
 
 def _limit_maps(charges: ChargeMap, noise: NoiseModel, forces: list[float], radius: float) -> tuple[LimitMap, ...]:
-    """Compute the limits for each force up to a radius, mm; no limits if the radius is 0."""
+    """Compute the lower limits of the errors for each force.
+
+    Args:
+        charges: Charges as a function of the contact.
+        noise: Noise of the readings.
+        forces: Forces, N.
+        radius: Largest distance of a position from the centre, mm.
+
+    Returns:
+        A map of the limits for each force. There are no maps if the radius is 0.
+    """
     if radius <= 0.0:
         return ()
     rings = Rings.spread(radius)

@@ -39,10 +39,11 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
         standard deviations of the noise, shape (n,).
     """
 
-    def sigma(_: Integers, predicted: Array) -> Array:
+    def predicted_sigma(_: Integers, predicted: Array) -> Array:
+        """Return the standard deviations of the noise of the predicted charges, pC."""
         return noise.sigma(predicted)
 
-    contact, residual = _descend(charge_map, charge, sigma, start, STEPS)
+    contact, residual = _descend(charge_map, charge, predicted_sigma, start, STEPS)
     return contact, np.linalg.norm(residual, axis=1)
 
 
@@ -59,43 +60,54 @@ def explain(charge_map: ChargeMap, charge: Array, sigma: Array, start: Array) ->
         Contacts within the domain of the map, shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
 
-    def sigma_of(rows: Integers, _: Array) -> Array:
+    def given_sigma(rows: Integers, _: Array) -> Array:
+        """Return the given standard deviations of these rows of the charges, pC."""
         return np.asarray(sigma[rows])
 
-    return _descend(charge_map, charge, sigma_of, start, MAX_STEPS)
+    return _descend(charge_map, charge, given_sigma, start, MAX_STEPS)
 
 
 def _descend(
-    charge_map: ChargeMap, charge: Array, sigma_of: Callable[[Integers, Array], Array], start: Array, steps: int
+    charge_map: ChargeMap, charge: Array, sigma_of: Callable[[Integers, Array], Array], start: Array, max_steps: int
 ) -> tuple[Array, Array]:
-    """Run the least-squares descent of `explain`.
+    """Run a least-squares descent from a start to the nearest local minimum.
+
+    The unknowns are x, y and ln F in unit coordinates, in which the domain is the unit disk times [-1, 1].
 
     Args:
         charge_map: Charges as a function of the contact.
         charge: Charges to explain, shape (n, n_electrode), pC.
         sigma_of: Function from rows of the charges and the predicted charges to standard deviations, pC.
         start: Contacts (x, y, F), shape (n, 3), mm and N.
-        steps: Largest number of steps.
+        max_steps: Largest number of steps.
+
+    Returns:
+        Contacts (x, y, F), shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
     radius = INNER_RADIUS * charge_map.domain.radius
     force_range = charge_map.domain.force_range
-    low, high = np.log(force_range)
-    centre = charge_map.domain.centre
-    scale = np.array([radius, radius, 0.5 * (high - low)])
-    divisor = np.where(scale > 0.0, scale, 1.0)  # the range of ln F is zero if the map has a single force
+    min_log, max_log = np.log(force_range)
+    centre = charge_map.domain.centre  # (x, y, ln F)
+    half_width = np.array([radius, radius, 0.5 * (max_log - min_log)])
+    divisor = np.where(half_width > 0.0, half_width, 1.0)  # the range of ln F is zero if the map has a single force
 
-    def to_contact(unit: Array) -> Array:
-        logs = unit * scale + centre
-        return np.column_stack([logs[:, :2], np.clip(np.exp(logs[:, 2]), *force_range)])
+    def to_contact(unit_coordinates: Array) -> Array:
+        """Convert unit coordinates into contacts (x, y, F), both of shape (k, 3)."""
+        log_contact = unit_coordinates * half_width + centre
+        force = np.clip(np.exp(log_contact[:, 2]), *force_range)
+        return np.column_stack([log_contact[:, :2], force])
 
-    def residuals(rows: Integers, unit: Array) -> tuple[Array, Array]:
-        predicted, slopes = linearised(charge_map, to_contact(unit))
+    def residuals(rows: Integers, unit_coordinates: Array) -> tuple[Array, Array]:
+        """Return the residuals of rows, shape (k, n_electrode), and their derivatives, shape (k, 3, n_electrode)."""
+        predicted, slopes = linearised(charge_map, to_contact(unit_coordinates))
         sigma = sigma_of(rows, predicted)
-        return (charge[rows] - predicted) / sigma, -(slopes * scale / sigma[..., None]).swapaxes(1, 2)
+        derivatives = -slopes * half_width / sigma[..., None]
+        return (charge[rows] - predicted) / sigma, derivatives.swapaxes(1, 2)
 
     log_start = np.column_stack([start[:, :2], np.log(start[:, 2])])
-    unit, residual = minimise(residuals, (log_start - centre) / divisor, steps)
-    return to_contact(unit), residual
+    unit_start = (log_start - centre) / divisor
+    unit_solution, residual = minimise(residuals, unit_start, max_steps)
+    return to_contact(unit_solution), residual
 
 
 def search(
@@ -119,12 +131,13 @@ def search(
     for first in range(0, max(len(charge), 1), CHUNK):
         chunk = slice(first, first + CHUNK)
         start_rows.append(_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, starts))
-    answers = [explain(charge_map, charge, sigma, candidate_contacts[rows]) for rows in np.concatenate(start_rows).T]
-    contacts = np.stack([contact for contact, _ in answers])
-    residuals = np.stack([residual for _, residual in answers])
-    best = (residuals**2).sum(axis=2).argmin(axis=0)
-    each = np.arange(len(charge))
-    return contacts[best, each], residuals[best, each]
+    rows_of_starts = np.concatenate(start_rows).T  # shape (starts, n)
+    solutions = [explain(charge_map, charge, sigma, candidate_contacts[rows]) for rows in rows_of_starts]
+    contacts = np.stack([contact for contact, _ in solutions])
+    residuals = np.stack([residual for _, residual in solutions])  # shape (starts, n, n_electrode)
+    best_start = (residuals**2).sum(axis=2).argmin(axis=0)
+    row = np.arange(len(charge))
+    return contacts[best_start, row], residuals[best_start, row]
 
 
 def _unit_candidates(count: int) -> Array:

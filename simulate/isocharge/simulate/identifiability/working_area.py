@@ -103,9 +103,10 @@ def working_area(
     check_determined(len(charge_map.electrodes))
     charge_map = with_fast_derivatives(charge_map)
     searched = charge_map.domain.radius
-    low, high = charge_map.domain.force_range
+    min_force, max_force = charge_map.domain.force_range
     rings = Rings.spread(searched)
-    forces = sorted({low, float(np.sqrt(low * high)), high})
+    middle_force = float(np.sqrt(min_force * max_force))
+    forces = sorted({min_force, middle_force, max_force})
     searches = [find_folds(charge_map, rings, force, noise) for force in forces]
     folds = np.concatenate([search.points for search in searches])
     fold_radius = float(np.hypot(*folds.T).min(initial=np.inf))
@@ -116,7 +117,7 @@ def working_area(
         weakest_radius = _nearest_exceeding(charge_map, search.weakest, force, noise, error)
         error_radius = min(error_radius, ring_radius, weakest_radius)
     error_radius = _confirmed(charge_map, error_radius, forces, noise, error)
-    pairs = find_ambiguous_pairs(charge_map, noise, low) if search_pairs else AmbiguousPairs.none()
+    pairs = find_ambiguous_pairs(charge_map, noise, min_force) if search_pairs else AmbiguousPairs.none()
 
     radii: dict[Bound, float] = {
         "search": searched,
@@ -132,7 +133,7 @@ def working_area(
         error_radius=error_radius,
         error=error,
         searched=searched,
-        force_range=(low, high),
+        force_range=(min_force, max_force),
         folds=folds,
         pairs=pairs,
         electrodes=len(charge_map.electrodes),

@@ -110,6 +110,9 @@ def read_goal(text: str) -> Goal:
     Args:
         text: "worst", "rms", or the path of a CSV file with the header `WEIGHT_MAP_HEADER`.
 
+    Returns:
+        The name of the goal, or the weights in the file.
+
     Raises:
         InputError: If the text is not a goal, or the file cannot be read.
     """
@@ -120,7 +123,8 @@ def read_goal(text: str) -> Goal:
         if header.replace(" ", "") != WEIGHT_MAP_HEADER:
             raise ValueError(f"the columns are {header!r}")
         table = np.loadtxt(lines, delimiter=",", ndmin=2)
-        if table.shape[1:] != (3,) or not len(table) or not np.isfinite(table).all() or table[:, 2].min() < 0.0:
+        has_three_columns = len(table) > 0 and table.shape[1] == 3
+        if not has_three_columns or not np.isfinite(table).all() or table[:, 2].min() < 0.0:
             raise ValueError("expected rows of three finite numbers, the weight from 0")
     except (OSError, ValueError) as error:
         raise InputError(
@@ -201,9 +205,14 @@ class DesignCase:
             )
         if self.kept_electrodes and self.sensor.calibration != Calibration():
             raise InputError(f"keep: {self.sensor.name} is calibrated; start from its layout without [calibration]")
-        sides = {e.corners[1][0] - e.corners[0][0] for e in self.kept_electrodes if e.square}
-        if self.sensor.readout == "edge" and any(abs(side - self.square_side) > 1e-6 for side in sides):
-            raise InputError(f"side: with the readout 'edge' all squares have one side, got {self.square_side:g} mm")
+        if self.sensor.readout != "edge":
+            return
+        for electrode in self.kept_electrodes:
+            (left, _), (right, _), *_ = electrode.corners
+            if electrode.square and abs(right - left - self.square_side) > 1e-6:
+                raise InputError(
+                    f"side: with the readout 'edge' all squares have one side, got {self.square_side:g} mm"
+                )
 
     @property
     def square_side(self) -> float:

@@ -167,27 +167,34 @@ class _PressedFilm:
 
     @classmethod
     def of(cls, table: ChargeTable, presses: Array) -> "_PressedFilm":
-        """Interpolate the table for presses at positions (x, y), shape (n, 2), mm."""
-        z = presses @ np.array([1.0, 1j])
-        distance = np.abs(z)
-        direction = np.exp(1j * np.angle(z))
+        """Interpolate the table for presses.
 
-        # Charge per stress in the frame of the press, from the rotation of the stress tensor
+        Args:
+            table: Charge table.
+            presses: Positions (x, y) of the presses, shape (n, 2), mm.
+        """
+        position = presses @ np.array([1.0, 1j])
+        distance = np.abs(position)
+        direction = np.exp(1j * np.angle(position))
+
+        # Piezoelectric coefficients in the frame of the press, from the rotation of the stress tensor
         d31, d32 = table.piezo
         mean = 0.5 * (d31 + d32)
         half_difference = 0.5 * (d31 - d32)
         double_angle = direction**2
-        by_s11 = mean + half_difference * double_angle.real
-        by_s22 = mean - half_difference * double_angle.real
-        by_s12 = -2.0 * half_difference * double_angle.imag
-        by_stress = np.stack([by_s11, by_s22, by_s12], axis=1)
+        s11_coefficient = mean + half_difference * double_angle.real
+        s22_coefficient = mean - half_difference * double_angle.real
+        s12_coefficient = -2.0 * half_difference * double_angle.imag
+        coefficients = np.stack([s11_coefficient, s22_coefficient, s12_coefficient], axis=1)
 
-        by_distance = lagrange_values(table.distance, barycentric_weights(table.distance), distance)
-        weights = (by_distance[:, :, None] * by_stress[:, None, :]).reshape(len(z), -1)
-        density = (weights.astype(np.float32) @ table.stress).reshape(-1, len(COLUMNS))
-        relative_radius = np.full(len(z), table.probe.radius / table.film_radius)
+        # Interpolation over the distance and sum over the components of the stress in one matrix product
+        distance_weights = lagrange_values(table.distance, barycentric_weights(table.distance), distance)
+        weights = distance_weights[:, :, None] * coefficients[:, None, :]  # shape (n, n_distance, 3)
+        weights = weights.reshape(len(position), -1).astype(np.float32)
+        density = (weights @ table.stress).reshape(-1, len(COLUMNS))
+        relative_radius = np.full(len(position), table.probe.radius / table.film_radius)
         pole, rho = automorphism_onto(distance / table.film_radius, relative_radius)
-        return cls(table, z, direction, pole, rho, density)
+        return cls(table, position, direction, pole, rho, density)
 
     def squares(self, centres: Array, side: float) -> Array:
         """Compute the rows of all presses and squares; the number of Gauss points depends on the distance.
@@ -215,7 +222,14 @@ class _PressedFilm:
         return rows
 
     def electrode(self, electrode: Electrode) -> Array:
-        """Compute the rows of all presses for one electrode of any shape, shape (n, 1, 6)."""
+        """Compute the charge and its derivatives for one electrode of any shape and all presses.
+
+        Args:
+            electrode: Electrode, at its nominal position.
+
+        Returns:
+            Rows with the columns `COLUMNS`, shape (n, 1, 6).
+        """
         points, weights = electrode_rule(electrode, "area", GAUSS_RULES[0][1])
         chunk_count = -(-len(self.presses) * len(points) // POINT_CHUNK)
         means = []
@@ -239,16 +253,19 @@ class _PressedFilm:
         row, column = self._grid_coordinates(which, points @ np.array([1.0, 1j]) / direction[:, None])
         rows, row_weights = _row_weights(row)
         columns, column_weights = cubic_weights(column, ANGLES, periodic=True)
+
+        # Nodes of the grid around each point and their weights, shape (k, n_point, n_row, n_column)
         first_row = which[:, None, None, None] * (INNER_ROWS + OUTER_ROWS)
-        node = (first_row + rows[..., None]) * ANGLES + columns[..., None, :]
+        nodes = (first_row + rows[..., None]) * ANGLES + columns[..., None, :]
         node_weights = weights[:, None, None] * row_weights[..., None] * column_weights[..., None, :]
         flat_weights = node_weights.reshape(len(which), 1, -1).astype(np.float32)
-        mean: Array = np.matmul(flat_weights, self.density[node.reshape(len(which), -1)])[:, 0].astype(float)
+        node_density = self.density[nodes.reshape(len(which), -1)]
+        mean: Array = np.matmul(flat_weights, node_density)[:, 0].astype(float)
 
         # Rotation of the derivatives with respect to x and y from the frame of the press
-        by_position = (mean[:, 1] + 1j * mean[:, 2]) * direction
-        mean[:, 1] = by_position.real
-        mean[:, 2] = by_position.imag
+        position_derivative = (mean[:, 1] + 1j * mean[:, 2]) * direction
+        mean[:, 1] = position_derivative.real
+        mean[:, 2] = position_derivative.imag
         return mean
 
     def _grid_coordinates(self, which: Integers, points: Complexes) -> tuple[Array, Array]:
@@ -306,34 +323,59 @@ def _stress_at(
         Stress (s11, s22, s12), MPa, and its derivatives in the order of `COLUMNS`, shape (6, n_node, 3).
     """
     points = _grid_points(film.radius, probe.radius, distance)
-    step = RELATIVE_STEP * probe.radius
-    first = press(film, probe, (distance, 0.0), force, settings)
+    unchanged_press = press(film, probe, (distance, 0.0), force, settings)
 
-    def stress(
+    def changed_stress(
         x: float = 0.0, y: float = 0.0, log_force: float = 0.0, radius: float = 0.0, pretension: float = 0.0
     ) -> Array:
-        """Stress on the grid for changed parameters."""
+        """Return the stress on the grid after a change of each parameter, shape (n_node, 3), MPa."""
         changed_film = replace(film, pretension=film.pretension + pretension)
         changed_probe = Circle(probe.radius + radius)
         changed_force = force * float(np.exp(log_force))
-        pressed = press(changed_film, changed_probe, (distance + x, y), changed_force, settings, start=first)
-        return touch_stress(pressed, points, surface)
+        position = (distance + x, y)
+        changed_press = press(changed_film, changed_probe, position, changed_force, settings, start=unchanged_press)
+        return touch_stress(changed_press, points, surface)
 
-    base = touch_stress(first, points, surface)
-    by_x = (stress(x=step) - stress(x=-step)) / (2.0 * step)
-    by_y = (stress(y=step) - stress(y=-step)) / (2.0 * step)
-    by_log_force = (stress(log_force=LOG_FORCE_STEP) - stress(log_force=-LOG_FORCE_STEP)) / (2.0 * LOG_FORCE_STEP)
-    by_radius = (stress(radius=step) - stress(radius=-step)) / (2.0 * step)
-    by_pretension = (stress(pretension=PRETENSION_STEP) - base) / PRETENSION_STEP
-    return np.stack([base, by_x, by_y, by_log_force, by_radius, by_pretension])
+    def central_difference(parameter: str, step: float) -> Array:
+        """Return the derivative of the stress with respect to a parameter of `changed_stress`."""
+        return (changed_stress(**{parameter: step}) - changed_stress(**{parameter: -step})) / (2.0 * step)
+
+    stress = touch_stress(unchanged_press, points, surface)
+    length_step = RELATIVE_STEP * probe.radius
+    # The pretension may be zero and cannot become negative, so its difference is one-sided.
+    pretension_derivative = (changed_stress(pretension=PRETENSION_STEP) - stress) / PRETENSION_STEP
+    return np.stack(
+        [
+            stress,
+            central_difference("x", length_step),
+            central_difference("y", length_step),
+            central_difference("log_force", LOG_FORCE_STEP),
+            central_difference("radius", length_step),
+            pretension_derivative,
+        ]
+    )
 
 
 def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Array:
-    """Compute the points (x, y) of the grid of a press on the positive x axis, shape (n_node, 2), mm."""
+    """Compute the points of the grid of a press on the positive x axis.
+
+    The grid is polar in the coordinates z of a conformal map, in which the footprint is a circle about the centre. Its
+    rows are equally spaced inside the footprint, and equally spaced in the logarithm of |z| outside.
+
+    Args:
+        film_radius: Radius of the film, mm.
+        probe_radius: Radius of the probe, mm.
+        distance: Distance of the press from the centre, mm.
+
+    Returns:
+        Points (x, y), shape (n_node, 2), mm.
+    """
     pole, rho = automorphism_onto(np.array(distance / film_radius), np.array(probe_radius / film_radius))
     inner_radii = rho * (1.0 - MARGIN) * np.linspace(0.0, 1.0, INNER_ROWS)
     outer_radii = (rho * (1.0 + MARGIN)) ** np.linspace(1.0, 0.0, OUTER_ROWS)
+    radii = np.concatenate([inner_radii, outer_radii])
     directions = np.exp(2j * np.pi * np.arange(ANGLES) / ANGLES)
-    z = np.concatenate([inner_radii, outer_radii])[:, None] * directions
-    points = film_radius * ((z + pole) / (1.0 + pole * z)).ravel() * (1.0 - 1e-12)
+    z = radii[:, None] * directions
+    unit_points = ((z + pole) / (1.0 + pole * z)).ravel()
+    points = film_radius * unit_points * (1.0 - 1e-12)  # the outermost points remain on the film despite round-off
     return np.stack([points.real, points.imag], axis=1)

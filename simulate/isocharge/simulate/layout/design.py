@@ -109,6 +109,9 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
         executor: Executor that runs the solves and the refinements; this process if absent. The result does not depend
             on the executor.
 
+    Returns:
+        The layout, its errors, and the errors of the initial sensor if it has at least three electrodes.
+
     Raises:
         InputError: If the electrodes do not fit.
         SolveError: If an equilibrium is not reached.
@@ -117,20 +120,23 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     table = ChargeTable.solve(case.sensor, case.probe, case.force, case.radius, executor)
     search = Search(case, table)
     optima = search.optima(grid, initial_layouts)
-    refined = list(track(in_order(executor, search.refine, optima), "refining", len(optima)))
-    refined.sort(key=lambda row: row[0])
+    refined_layouts = list(track(in_order(executor, search.refine, optima), "refining", len(optima)))
+    refined_layouts.sort(key=lambda layout: layout[0])
 
+    # Check the layouts in the order of their errors, up to the first one that is not ambiguous.
     candidates: list[tuple[Sensor, float, str]] = []
-    for value, *coordinates in track(refined, "looking for folds and ambiguous pairs"):
-        sensor = case.layout(np.round(np.array(coordinates).reshape(-1, 2), DECIMALS))
+    for error, *coordinates in track(refined_layouts, "looking for folds and ambiguous pairs"):
+        centres = np.round(np.array(coordinates).reshape(-1, 2), DECIMALS)
+        sensor = case.layout(centres)
         summary = ambiguities(case, sensor)
-        candidates.append((sensor, float(value), summary))
+        candidates.append((sensor, float(error), summary))
         if summary == UNAMBIGUOUS:
             break
-    refused = len(candidates) - 1 if summary == UNAMBIGUOUS else 0
-    sensor, value, summary = candidates[refused]
-    before = error_map(case, table, case.sensor) if len(case.sensor.electrodes) >= 3 else None
-    return Design(case, sensor, value, summary, refused, before, error_map(case, table, sensor))
+    n_refused = len(candidates) - 1 if summary == UNAMBIGUOUS else 0
+    sensor, error, summary = candidates[n_refused]
+    errors_before = error_map(case, table, case.sensor) if len(case.sensor.electrodes) >= 3 else None
+    errors_after = error_map(case, table, sensor)
+    return Design(case, sensor, error, summary, n_refused, errors_before, errors_after)
 
 
 def ambiguities(case: DesignCase, sensor: Sensor) -> str:
@@ -162,8 +168,18 @@ def ambiguities(case: DesignCase, sensor: Sensor) -> str:
 
 
 def error_map(case: DesignCase, table: ChargeTable, sensor: Sensor) -> ErrorMap:
-    """Compute the errors of the electrodes of a sensor at their nominal positions."""
-    rows = table.rows(case.fine_grid, np.empty((0, 2)), 1.0, sensor.electrodes)
-    noise_alone = np.sqrt(ErrorModel.of(case.noise, NO_NUISANCES).squared(rows))
-    with_nuisances = np.sqrt(ErrorModel.of(case.noise, case.nuisances).squared(rows))
-    return ErrorMap(case.fine_grid, noise_alone, with_nuisances)
+    """Compute the position errors of a sensor whose electrodes lie at their nominal positions.
+
+    Args:
+        case: Design case, which contains the positions, the noise and the nuisances.
+        table: Charge table of the case.
+        sensor: Sensor with the layout.
+
+    Returns:
+        Position errors for the noise alone, and for the noise and the nuisances, mm.
+    """
+    no_squares = np.empty((0, 2))
+    charge_rows = table.rows(case.fine_grid, no_squares, 1.0, sensor.electrodes)
+    error_by_noise = np.sqrt(ErrorModel.of(case.noise, NO_NUISANCES).squared(charge_rows))
+    error_with_nuisances = np.sqrt(ErrorModel.of(case.noise, case.nuisances).squared(charge_rows))
+    return ErrorMap(case.fine_grid, error_by_noise, error_with_nuisances)

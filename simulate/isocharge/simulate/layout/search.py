@@ -117,11 +117,23 @@ def random_layouts(case: DesignCase) -> tuple[Array, list[Integers]]:
 
 
 def _random_layout(case: DesignCase, grid: Array, rng: np.random.Generator) -> Integers:
-    """Choose positions of the grid in random order, as many as fit and at most the number of new squares."""
+    """Choose random positions of the grid for the new squares, with the required distances between them.
+
+    Args:
+        case: Design case.
+        grid: Allowed positions, shape (n, 2), mm.
+        rng: Random number generator.
+
+    Returns:
+        Indices of the positions: as many as fit, and at most the number of new squares.
+    """
     chosen: list[int] = []
-    for number in rng.permutation(len(grid)).tolist():
-        if len(chosen) < case.new_count and (case.pair_clearance(grid[[number]], grid[chosen]) >= 0.0).all():
-            chosen.append(number)
+    for candidate in rng.permutation(len(grid)).tolist():
+        if len(chosen) == case.new_count:
+            break
+        clearance = case.pair_clearance(grid[[candidate]], grid[chosen])
+        if (clearance >= 0.0).all():
+            chosen.append(candidate)
     return np.array(chosen)
 
 
@@ -195,7 +207,16 @@ class Search:
         return float(np.exp(self._log_errors(positions, ALL_PRESSES).max()))
 
     def _log_errors(self, positions: Array, which: Integers | slice) -> Array:
-        """Compute the logarithm of the error of each press, or, for other goals, that of their weighted mean."""
+        """Compute the logarithms of the position errors, from which the goal of the search is computed.
+
+        Args:
+            positions: Centres of the new squares, shape (n_new, 2), mm.
+            which: Selection of presses.
+
+        Returns:
+            ln of the error of each press if the goal is the worst error, shape (n_press,). For other goals ln of the
+            weighted root mean square, shape (1,).
+        """
         squared = self.squared(positions, which)
         if self.case.goal != "worst":
             squared = np.average(squared, weights=self.weights, keepdims=True)
@@ -277,21 +298,31 @@ class _Exchange:
 
     @classmethod
     def of(cls, search: Search, grid: Array) -> "_Exchange":
-        """Evaluate the sensitivities of a square at every position of the grid, shape (n, 2), mm."""
+        """Evaluate the sensitivities of a square at every position of a grid.
+
+        Args:
+            search: Search with its design case and charge table.
+            grid: Positions of the grid, shape (n, 2), mm.
+        """
         case = search.case
         presses = case.search_presses
-        kept = search.model.sensitivity(search.table.rows(presses, grid[:0], case.square_side, case.kept_electrodes))
-        squares = search.model.sensitivity(search.table.rows(presses, grid, case.square_side))
-        candidates = np.ascontiguousarray(squares.swapaxes(1, 2))
-        is_allowed = case.pair_clearance(grid, grid) >= 0.0
+        no_squares = grid[:0]
+        kept_rows = search.table.rows(presses, no_squares, case.square_side, case.kept_electrodes)
+        kept_sensitivity = search.model.sensitivity(kept_rows)
+        square_sensitivity = search.model.sensitivity(search.table.rows(presses, grid, case.square_side))
+        candidates = np.ascontiguousarray(square_sensitivity.swapaxes(1, 2))
+        is_allowed_pair = case.pair_clearance(grid, grid) >= 0.0  # shape (n, n)
         weights = case.weights(presses)
         power = WORST_POWER if case.goal == "worst" else RMS_POWER
 
-        def mean_error(others: Integers) -> Array:
-            present = np.concatenate([kept, candidates[:, :, others].swapaxes(1, 2)], axis=1)
-            squared = np.maximum(with_one_more(present, candidates), 1e-12)
-            mean = np.average(squared ** (0.5 * power), axis=0, weights=weights)
-            mean[~is_allowed[others].all(axis=0)] = np.inf
+        def mean_error(other_squares: Integers) -> Array:
+            """Return the power mean of the errors for each position of one further square; see `_Exchange`."""
+            others_sensitivity = candidates[:, :, other_squares].swapaxes(1, 2)
+            present = np.concatenate([kept_sensitivity, others_sensitivity], axis=1)
+            squared_error = np.maximum(with_one_more(present, candidates), 1e-12)  # shape (n_press, n)
+            mean = np.average(squared_error ** (0.5 * power), axis=0, weights=weights)
+            is_allowed = is_allowed_pair[other_squares].all(axis=0)
+            mean[~is_allowed] = np.inf
             return np.asarray(mean)
 
         return cls(mean_error, power)

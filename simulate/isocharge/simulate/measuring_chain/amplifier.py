@@ -196,21 +196,34 @@ class Measurement:
         return self._convert(noisy)
 
     def _relaxed(self, charge: Array) -> Array:
-        """Apply creep and the thermoelastic effect to touch charges, shape (n, electrodes), pC."""
+        """Apply creep and the thermoelastic effect to touch charges.
+
+        Both effects are sums of exponentials. Each exponential is a recursive filter of the changes of the charge, and
+        the state of the filter is kept for the next call.
+
+        Args:
+            charge: Touch charges, shape (n, n_electrode), pC.
+
+        Returns:
+            Charges with creep and thermoelastic effect, same shape, pC.
+        """
         chain = self.amplifier
         if not chain.creep and not chain.thermoelastic:
             return charge
         changes = np.diff(charge, axis=0, prepend=self._touch_charge[np.newaxis])
         self._touch_charge = charge[-1]
-        relaxed: Array = (1.0 - 0.5 * chain.creep * np.exp(-1.0 / CREEP_TIMES).sum()) * charge
+
         time_constants = np.append(CREEP_TIMES, chain.film_time)
-        shares = np.append(np.full(CREEP_TIMES.size, 0.5 * chain.creep), chain.thermoelastic)
-        for number, (time_constant, share) in enumerate(zip(time_constants, shares, strict=True)):
+        creep_shares = np.full(CREEP_TIMES.size, 0.5 * chain.creep)
+        shares = np.append(creep_shares, chain.thermoelastic)
+        # The factor makes the charge equal to the touch charge one second after the touch.
+        relaxed: Array = (1.0 - 0.5 * chain.creep * np.exp(-1.0 / CREEP_TIMES).sum()) * charge
+        for index, (time_constant, share) in enumerate(zip(time_constants, shares, strict=True)):
             decay = math.exp(-1.0 / (self.rate * time_constant))
-            term, self._relaxation[number] = scipy.signal.lfilter(
-                [share], [1.0, -decay], changes, axis=0, zi=self._relaxation[number]
+            exponential, self._relaxation[index] = scipy.signal.lfilter(
+                [share], [1.0, -decay], changes, axis=0, zi=self._relaxation[index]
             )
-            relaxed = relaxed + term
+            relaxed = relaxed + exponential
         return relaxed
 
     @property
@@ -232,13 +245,19 @@ class Measurement:
         chain = self.amplifier
         air_decay = math.exp(-1.0 / (self.rate * chain.temperature_time))
         film_decay = math.exp(-1.0 / (self.rate * chain.film_time))
+
+        # Drift of the air, with the innovations that give the film the rms value `temperature_rms`
         innovation_std = math.sqrt((1.0 - air_decay * air_decay) / self._variance_ratio) * chain.temperature_rms
         innovations = innovation_std * self.rng.standard_normal(time.size)
         air_start = [air_decay * self._air_temperature]
         drift = scipy.signal.lfilter([1.0], [1.0, -air_decay], innovations, zi=air_start)[0]
+
+        # Trapezoidal change of the temperature of the air: ramp up, constant value, ramp down
         time_since_step = time - chain.step_at
-        rise = np.clip(np.minimum(time_since_step, chain.step_for - time_since_step) / chain.step_time, 0.0, 1.0)
-        air = drift + chain.step * rise
+        time_until_end = chain.step_for - time_since_step
+        step_share = np.clip(np.minimum(time_since_step, time_until_end) / chain.step_time, 0.0, 1.0)
+        air = drift + chain.step * step_share
+
         film_start = [film_decay * self._film_temperature]
         film: Array = scipy.signal.lfilter([1.0 - film_decay], [1.0, -film_decay], air, zi=film_start)[0]
         self._air_temperature = float(drift[-1])
@@ -246,26 +265,42 @@ class Measurement:
         return film
 
     def _integrate(self, film_charge: Array) -> Array:
-        """Compute the output of the charge amplifier for film charges; both have the shape (n, electrodes), pC."""
+        """Compute the output of the charge amplifiers, which are leaky integrators.
+
+        Args:
+            film_charge: Charges of the film, shape (n, n_electrode), pC.
+
+        Returns:
+            Output charges, same shape, pC.
+        """
         changes = np.diff(film_charge, axis=0, prepend=self._film_charge[np.newaxis])
-        inputs = self.gain * changes + self.bias / self.rate
         self._film_charge = film_charge[-1]
-        decay = np.exp(-1.0 / (self.rate * self.tau))
+        bias_charge = self.bias / self.rate  # charge of the bias current between two readings
+        inputs = self.gain * changes + bias_charge
+        decays = np.exp(-1.0 / (self.rate * self.tau))
         output = np.empty_like(inputs)
-        for channel, channel_decay in enumerate(decay):
-            start = [channel_decay * self._output[channel]]
-            output[:, channel] = scipy.signal.lfilter([1.0], [1.0, -channel_decay], inputs[:, channel], zi=start)[0]
+        for channel, decay in enumerate(decays):
+            start = [decay * self._output[channel]]
+            output[:, channel] = scipy.signal.lfilter([1.0], [1.0, -decay], inputs[:, channel], zi=start)[0]
         self._output = output[-1]
         return output
 
     def _convert(self, output: Array) -> Array:
-        """Clip the output (pC) at the limit, and round it to the steps of the converter."""
+        """Clip the output at the limit of the amplifier, and round it to the steps of the analogue-digital converter.
+
+        Args:
+            output: Output charges, shape (n, n_electrode), pC.
+
+        Returns:
+            Readings, same shape, pC.
+        """
         limit = self.amplifier.limit
         bits = self.amplifier.bits
         clipped = np.clip(output, -limit, limit)
         if not bits:
             return clipped
-        step = 2.0 * limit / (1 << bits)
+        charge_per_code = 2.0 * limit / (1 << bits)
         lowest_code = -(1 << (bits - 1))
         highest_code = (1 << (bits - 1)) - 1
-        return np.asarray(np.clip(np.round(clipped / step), lowest_code, highest_code) * step)
+        codes = np.clip(np.round(clipped / charge_per_code), lowest_code, highest_code)
+        return np.asarray(codes * charge_per_code)
