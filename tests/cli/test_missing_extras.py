@@ -112,3 +112,22 @@ def test_commands_are_imported_or_name_the_one_extra_that_is_missing(missing, in
         if message:
             assert f"pip install 'isocharge[{extra_of(command)}]'" in message
             assert PACKAGES[extra_of(command)] & PACKAGES[missing]
+
+
+def test_the_base_install_writes_the_playground(installed, tmp_path):
+    done = run(["demo", "--playground", "pages/playground.html"], installed(), tmp_path)
+    assert done.returncode == 0
+    assert done.stderr == "wrote pages/playground.html; open it in a browser\n"
+    text = (tmp_path / "pages" / "playground.html").read_text("utf-8")
+    assert text.startswith("<!doctype html>")
+    assert "{{" not in text
+    again = run(["demo", "--playground", "pages/playground.html"], installed(), tmp_path)
+    assert again.returncode == 2
+    assert "is already there" in again.stderr
+
+
+def test_the_playground_is_refused_together_with_another_option(installed, tmp_path):
+    done = run(["demo", "--playground", "playground.html", "--seconds", "5"], installed(), tmp_path)
+    assert done.returncode == 2
+    assert "expected --playground without another option" in done.stderr
+    assert list(tmp_path.iterdir()) == []

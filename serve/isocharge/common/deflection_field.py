@@ -63,8 +63,7 @@ class DeflectionField:
 
     def fits(self, film: Any) -> bool:
         """Return whether a film, as a sensor file describes it, has the properties of this field's film."""
-        given = {"pretension_MPa": 0.0, **film} if isinstance(film, Mapping) else {}
-        return all(_is_close(given.get(key), self.film[key]) for key in FILM_KEYS)
+        return is_same_film(film, self.film)
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of the file."""
@@ -81,6 +80,17 @@ class DeflectionField:
             "scale_mm": scale_mm,
             "deflection": base64.b64encode(steps.tobytes()).decode(),
         }
+
+
+def is_same_film(film: Any, properties: Mapping[str, float]) -> bool:
+    """Return whether a film has some properties.
+
+    Args:
+        film: The film as a sensor file describes it.
+        properties: The properties by `FILM_KEYS`.
+    """
+    given = {"pretension_MPa": 0.0, **film} if isinstance(film, Mapping) else {}
+    return all(_is_close(given.get(key), properties[key]) for key in FILM_KEYS)
 
 
 def _is_close(given: object, value: float) -> bool:

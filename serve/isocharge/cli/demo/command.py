@@ -1,4 +1,4 @@
-"""`isocharge demo`: simulate, train, serve and draw the results once; or show a virtual sensor on the live page."""
+"""`isocharge demo`: simulate, train, serve and draw the results; or show a virtual sensor; or write the playground."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +7,10 @@ import typer
 
 from isocharge.cli.shared.live_page import LiveOption, page_address
 from isocharge.cli.shared.options import ConfigOption
+from isocharge.cli.shared.terminal import say
+from isocharge.common.errors import InputError
 from isocharge.common.extras import require
+from isocharge.common.files import refuse_existing, write_whole
 from isocharge.serve.virtual_sensor.sensor import posix_modules
 
 
@@ -32,14 +35,29 @@ def demo_command(
     ] = None,
     config: ConfigOption = None,
     live: LiveOption = None,
+    playground: Annotated[
+        Path | None,
+        typer.Option(
+            "--playground",
+            metavar="FILE.html",
+            help="Only write the playground: a page on which a simulated film is pressed with the mouse. The file must "
+            "not exist yet. (default: no file)",
+        ),
+    ] = None,
 ) -> None:
     """Show what isocharge does: simulate a film, train a model, follow a virtual sensor live, and draw the results.
 
     Takes about two minutes. Writes dataset, model and one page of pictures (mm, N, pC) into a new folder. --live only
     follows a virtual sensor on a page for browsers, with the released model; it trains and writes nothing.
+    --playground only writes one HTML file, which needs no server and no other file.
 
     Example: isocharge demo -o first-light
     """
+    if playground is not None:
+        if any(option is not None for option in (output, seconds, config, live)):
+            raise InputError("expected --playground without another option, got another option with it")
+        _write_playground(playground)
+        return
     posix_modules()  # raises an error before anything is computed if there are no pseudo-terminals
     if live is None:
         with require("train"):
@@ -51,3 +69,20 @@ def demo_command(
         from isocharge.cli.demo.live_film import show_live_film
 
         show_live_film(address, seconds)
+
+
+def _write_playground(path: Path) -> None:
+    """Write the playground, and print how it is opened.
+
+    Args:
+        path: Path of the HTML file. Missing folders are made.
+
+    Raises:
+        OutputExists: If there is a file already.
+    """
+    from isocharge.serve.viewer.playground_page import playground_html  # imported late, because the import is slow
+
+    refuse_existing(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, playground_html().encode())
+    say(f"wrote {path}; open it in a browser")

@@ -1,0 +1,141 @@
+// The film of the playground from above: the plan of the live page with isocharge curves, mirror region and press.
+
+import { DASHES, fit, theme } from "./theme.js";
+import { Plan } from "./plan.js";
+
+const VIEW_MM = 24, LENS_REACH_MM = 1, CURVE_PX = 1.8, HATCH_MM = 1.5;
+
+class Stage extends Plan {
+  constructor(canvas, film) {
+    super(canvas, film);
+    this.reach = VIEW_MM;
+  }
+
+  /** @param view {{press, sample, kind, trail, curves, lensCurves, mirror}} what is drawn over the film */
+  draw(view) {
+    if (fit(this.canvas) || this.isStale) this.drawBase();
+    const g = this.canvas.getContext("2d");
+    g.setTransform(1, 0, 0, 1, 0, 0);
+    g.clearRect(0, 0, this.canvas.width, this.canvas.height);
+    g.drawImage(this.base, 0, 0);
+    this.toMillimetres(g);
+    if (view.mirror) {
+      this.drawMirror(g, view.mirror);
+      this.drawWhole(g, this.css);
+      this.drawScale(g, this.css);
+    }
+    view.curves.forEach((segments, electrode) => this.drawCurve(g, segments, electrode, CURVE_PX * this.css, this.css));
+    this.lensCurves = view.lensCurves;
+    this.drawTouch(g, view);
+    this.drawPress(g, view.press);
+  }
+
+  /** Return the point of the film, mm, under a point of the window. */
+  place(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const x = (2 * (event.clientX - box.left) / box.width - 1) * this.reach;
+    const y = (1 - 2 * (event.clientY - box.top) / box.height) * this.reach;
+    return { x, y };
+  }
+
+  drawMirror(g, { cells, grid }) {
+    g.save();
+    g.beginPath();
+    for (const [x, y] of cells) g.rect(x - grid.step / 2, y - grid.step / 2, grid.step, grid.step);
+    g.fillStyle = theme.warn;
+    g.globalAlpha = 0.1;
+    g.fill();
+    g.clip();
+    g.globalAlpha = 0.45;
+    g.strokeStyle = theme.warn;
+    g.lineWidth = this.css;
+    g.beginPath();
+    for (let offset = -2 * this.reach; offset <= 2 * this.reach; offset += HATCH_MM) {
+      g.moveTo(offset - this.reach, -this.reach);
+      g.lineTo(offset + this.reach, this.reach);
+    }
+    g.stroke();
+    g.restore();
+  }
+
+  drawCurve(g, segments, electrode, width, dashUnit) {
+    g.save();
+    g.strokeStyle = theme[`c${electrode % 6}`];
+    g.lineWidth = width;
+    g.lineCap = "round";
+    g.beginPath();
+    for (const polyline of joined(segments)) {
+      polyline.forEach(([x, y], k) => { if (k === 0) g.moveTo(x, y); else g.lineTo(x, y); });
+    }
+    g.setLineDash(DASHES[electrode % 6].map((dash) => dash * dashUnit));
+    g.stroke();
+    g.restore();
+  }
+
+  drawPress(g, press) {
+    const px = this.css;
+    const { x, y } = this.inView(press);
+    g.save();
+    for (const [colour, width] of [[theme.card, 5], [theme.ink, 2.4]]) {
+      g.strokeStyle = colour;
+      g.lineWidth = width * px;
+      g.beginPath();
+      g.moveTo(x - 11 * px, y);
+      g.lineTo(x + 11 * px, y);
+      g.moveTo(x, y - 11 * px);
+      g.lineTo(x, y + 11 * px);
+      g.stroke();
+    }
+    g.restore();
+  }
+
+  drawTrail() {} // The trail is drawn in the lens only.
+
+  drawLens(g, sample, trail, px) {
+    super.drawLens(g, sample, trail, px);
+    const { x, y, size } = this.lens;
+    const scale = size / LENS_REACH_MM;
+    g.save();
+    g.beginPath();
+    g.arc(x, y, size, 0, 2 * Math.PI);
+    g.clip();
+    g.translate(x, y);
+    g.scale(scale, scale);
+    g.translate(-sample.x, -sample.y);
+    this.lensCurves.forEach((segments, electrode) => this.drawCurve(g, segments, electrode, CURVE_PX * px / scale, px / scale));
+    g.restore();
+  }
+}
+
+/** Join segments that share an end into polylines, so that dashes go on from segment to segment. */
+function joined(segments) {
+  const key = (x, y) => `${x.toFixed(6)} ${y.toFixed(6)}`;
+  const neighbours = new Map();
+  segments.forEach(([x0, y0, x1, y1], index) => {
+    for (const end of [key(x0, y0), key(x1, y1)]) {
+      if (!neighbours.has(end)) neighbours.set(end, []);
+      neighbours.get(end).push(index);
+    }
+  });
+  const isUsed = new Set();
+  const follow = (start) => {
+    const points = [];
+    let [x, y] = start;
+    for (;;) {
+      const index = neighbours.get(key(x, y)).find((candidate) => !isUsed.has(candidate));
+      if (index === undefined) return points;
+      isUsed.add(index);
+      const [x0, y0, x1, y1] = segments[index];
+      [x, y] = key(x0, y0) === key(x, y) ? [x1, y1] : [x0, y0];
+      points.push([x, y]);
+    }
+  };
+  const polylines = [];
+  segments.forEach(([x, y], index) => {
+    if (isUsed.has(index)) return;
+    const forwards = follow([x, y]);
+    const backwards = follow([x, y]).reverse();
+    polylines.push([...backwards, [x, y], ...forwards]);
+  });
+  return polylines;
+}

@@ -1,0 +1,112 @@
+"""The playground: one HTML file in which a visitor presses a simulated film and sees the answer of a released network.
+
+The file contains everything that it needs: the networks as compressed ONNX files, the stress of the film as a series,
+and the scripts. It loads nothing from the network. Its charges come from `isocharge.common.stress_series`, so it can
+show every model of a biaxial film that this series describes.
+"""
+
+import base64
+import gzip
+import json
+import re
+from importlib.resources import as_file, files
+from typing import Any
+
+from isocharge.common.errors import ModelError
+from isocharge.common.stress_series import StressSeries, read_stress_series
+from isocharge.serve.flags import BEYOND, MEANINGS, MISFIT, OUTSIDE, STRESS
+from isocharge.serve.model.model_folder import find_model, load_model
+from isocharge.serve.prediction.contact import Validity
+from isocharge.serve.viewer.messages import describe_film
+
+MODELS = ("three-25um-biaxial", "four-25um-biaxial")
+"""Names of the released models that the page shows, in the order of its buttons."""
+
+SCRIPTS = (
+    "page/theme.js",
+    "page/plan.js",
+    "playground/network.js",
+    "playground/charges.js",
+    "playground/contours.js",
+    "playground/sensor.js",
+    "playground/stage.js",
+    "playground/main.js",
+)
+"""Scripts of the page in the order in which they are joined."""
+
+STYLES = ("page/style.css", "playground/playground.css")
+"""Style sheets of the page."""
+
+SERIES_FILE = "playground/film-25um.json"
+"""File with the stress of the film of the models."""
+
+MODULE_SYNTAX = re.compile(r"^import .*;\n|^export (?=\w)", re.MULTILINE)
+"""Import statements and the word `export`, which the joined scripts do not need."""
+
+QUADRILATERAL = 4
+"""Number of corners of an electrode that the page can integrate over."""
+
+
+def playground_html(models: tuple[str, ...] = MODELS) -> str:
+    """Return the playground as HTML.
+
+    Args:
+        models: Names or paths of the models.
+
+    Raises:
+        ModelError: If a model is missing, or its film or electrodes cannot be shown.
+    """
+    with as_file(files("isocharge.serve.viewer")) as folder:
+        series = read_stress_series(folder / SERIES_FILE)
+        parts = {
+            "icon": base64.b64encode((folder / "page/icon.svg").read_bytes()).decode(),
+            "style": "\n".join((folder / name).read_text("utf-8") for name in STYLES),
+            "script": "\n".join(MODULE_SYNTAX.sub("", (folder / name).read_text("utf-8")) for name in SCRIPTS),
+            "data": _as_json(_page_data(series, models)),
+        }
+        html = (folder / "playground/index.html").read_text("utf-8")
+    for name, text in parts.items():
+        html = html.replace("{{" + name + "}}", text)
+    return html
+
+
+def _page_data(series: StressSeries, models: tuple[str, ...]) -> dict[str, Any]:
+    """Return the data of the page: the stress of the film, the models and the meanings of their flags."""
+    return {
+        "stress": series.to_json(),
+        "models": [_describe_model(model, series) for model in models],
+        "flags": {flag: MEANINGS[flag] for flag in (OUTSIDE, BEYOND, MISFIT, STRESS)},
+    }
+
+
+def _describe_model(name: str, series: StressSeries) -> dict[str, Any]:
+    """Return the description of a model for the page, with its network.
+
+    Raises:
+        ModelError: If the model is missing, or its film or electrodes cannot be shown.
+    """
+    model = load_model(find_model(name))
+    metadata = model.metadata
+    piezo = metadata.sensor.get("piezo", {})
+    if not series.fits(metadata.sensor.get("film")) or piezo.get("d31") != piezo.get("d32"):
+        raise ModelError(
+            f"{name}: expected a model of the biaxial film of 25 um without pretension, whose stress the playground "
+            f"contains, got the film {metadata.sensor.get('film')} with {piezo}; choose another model"
+        )
+    description = describe_film(metadata.name, metadata, None)
+    outlines = description["outlines_mm"]
+    if any(len(outlines.get(electrode, ())) != QUADRILATERAL for electrode in metadata.electrodes):
+        raise ModelError(f"{name}: expected electrodes with four corners, got {outlines}; choose another model")
+    validity = Validity.of(metadata)
+    return description | {
+        "piezo_pC_per_N": piezo["d31"],
+        "noise": {"white_pC": metadata.noise.white_pC, "gain": metadata.noise.gain},
+        "misfit_limit": validity.misfit_limit,
+        "yield_force_N": metadata.yield_force_N,
+        "network": base64.b64encode(gzip.compress((model.folder / "model.onnx").read_bytes(), 9, mtime=0)).decode(),
+    }
+
+
+def _as_json(data: dict[str, Any]) -> str:
+    """Return data as JSON that can stand in an HTML script element."""
+    return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")

@@ -1,0 +1,121 @@
+"""Chebyshev series of the stress of a film under a round probe, for the playground.
+
+The module is also a command, which writes the file of the built-in film of 25 um:
+
+    python -m isocharge.simulate.forward.stress_series FILE.json
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from isocharge.common.arrays import Array, Complexes
+from isocharge.common.files import write_whole
+from isocharge.common.stress_series import StressSeries
+from isocharge.simulate.forward.forward_map import EVEN_FIELD, ForwardMap
+from isocharge.simulate.forward.readout import ReadoutPoints
+from isocharge.simulate.sensor.probe import Circle
+from isocharge.simulate.sensor.sensor_file import film_to_dict, load_sensor
+
+SENSOR = "three-25um-biaxial"
+"""Built-in sensor with the film of 25 um. Its electrodes do not matter."""
+
+PROBE = Circle(1.0)
+"""Probe of the released models."""
+
+FORCE_RANGE_N = (0.05, 2.0)
+"""Range of forces of the released models, N."""
+
+MAX_DISTANCE_mm = 30.0
+"""Largest distance of a press from the centre, mm. It is four times the radius of the smallest working area."""
+
+MAX_RING = 0.97
+"""Largest |z| of the series, in film radii. The rim of the film, where no electrode lies, is left out."""
+
+N_DISTANCES = 7
+N_FORCES = 4
+N_INNER_RINGS = 6
+N_OUTER_RINGS = 14
+N_ANGLES = 7
+"""Numbers of Chebyshev polynomials. With them, charges agree with the forward map to 5e-5 (rms) and 4e-4 (largest)."""
+
+
+def stress_series(forward_map: ForwardMap) -> StressSeries:
+    """Fit the series to the stress field of a forward map, which must have a round probe.
+
+    Args:
+        forward_map: Forward map of the film. The series covers its distances and forces.
+    """
+    distance, force, angle_cosine = _nodes(N_DISTANCES), _nodes(N_FORCES), _nodes(N_ANGLES)
+    max_distance_mm = forward_map.domain.radius
+    low_N, high_N = forward_map.domain.force_range
+    film = forward_map.sensor.film
+    inner = np.empty((N_DISTANCES, N_FORCES, N_INNER_RINGS, N_ANGLES))
+    outer = np.empty((N_DISTANCES, N_FORCES, N_OUTER_RINGS, N_ANGLES))
+    direction: Complexes = np.exp(1j * np.arccos(angle_cosine))
+    for row, distance_mm in enumerate(0.5 * max_distance_mm * (distance + 1.0)):
+        shift, probe_ring = _automorphism(distance_mm / film.radius, forward_map.probe.reach / film.radius)
+        inner_rings = probe_ring * np.sqrt(0.5 * (_nodes(N_INNER_RINGS) + 1.0))
+        outer_rings = probe_ring * (MAX_RING / probe_ring) ** (0.5 * (_nodes(N_OUTER_RINGS) + 1.0))
+        for column, force_N in enumerate(low_N * (high_N / low_N) ** (0.5 * (force + 1.0))):
+            for table, rings in ((inner, inner_rings), (outer, outer_rings)):
+                before: Complexes = rings[:, None] * direction
+                points_mm = film.radius * (before + shift) / (1.0 + shift * before)
+                table[row, column] = np.log(_stress_sum(forward_map, distance_mm, force_N, points_mm))
+    return StressSeries(
+        film=film_to_dict(film),
+        probe_radius_mm=forward_map.probe.reach,
+        max_distance_mm=max_distance_mm,
+        force_range_N=(low_N, high_N),
+        max_ring=MAX_RING,
+        inner=_coefficients(inner),
+        outer=_coefficients(outer),
+    )
+
+
+def _nodes(count: int) -> Array:
+    """Return the zeros of the Chebyshev polynomial of degree `count`."""
+    return np.asarray(chebyshev.chebpts1(count))
+
+
+def _automorphism(distance: float, probe_radius: float) -> tuple[float, float]:
+    """Return c of the automorphism (z + c) / (1 + c z), and the ring that becomes the edge of the probe.
+
+    Args:
+        distance: Distance of the probe from the centre, in film radii.
+        probe_radius: Radius of the probe, in film radii.
+    """
+    outer_edge = np.arctanh(distance + probe_radius)
+    inner_edge = np.arctanh(distance - probe_radius)
+    return float(np.tanh(0.5 * (outer_edge + inner_edge))), float(np.tanh(0.5 * (outer_edge - inner_edge)))
+
+
+def _stress_sum(forward_map: ForwardMap, distance_mm: float, force_N: float, points_mm: Complexes) -> Array:
+    """Compute s11 + s22 at points x + iy under a press on the x axis, MPa."""
+    count = points_mm.size
+    points = np.stack([points_mm.real.ravel(), points_mm.imag.ravel()], axis=1)
+    weights = np.tile([1.0, 1.0, 0.0], (count, 1, 1))
+    readout = ReadoutPoints(points[:, None], weights, np.ones(count, dtype=int))
+    stress = forward_map.field_charges(np.array([[distance_mm, 0.0, force_N]]), EVEN_FIELD, readout)
+    return np.asarray(stress[0, :, 0].reshape(points_mm.shape))
+
+
+def _coefficients(values: Array) -> Array:
+    """Return the coefficients of the interpolating polynomial in all axes, from values at the Chebyshev nodes."""
+    for axis, count in enumerate(values.shape):
+        inverse = np.linalg.inv(chebyshev.chebvander(_nodes(count), count - 1))
+        values = np.moveaxis(np.tensordot(inverse, values, (1, axis)), 0, axis)
+    return values
+
+
+def main() -> None:
+    """Write the file of the built-in film."""
+    forward_map = ForwardMap.build(load_sensor(SENSOR), PROBE, MAX_DISTANCE_mm, FORCE_RANGE_N)
+    write_whole(Path(sys.argv[1]), json.dumps(stress_series(forward_map).to_json()).encode())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,248 @@
+"""The playground in headless Chromium: its answers, charges and flags against the golden vectors and the simulator."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from isocharge.common.errors import InputError, ModelError
+from isocharge.common.stress_series import read_stress_series
+from isocharge.serve import Predictor, find_model, load_model
+from isocharge.serve.viewer.playground_page import MODELS, playground_html
+from isocharge.simulate import Circle, ForwardMap, load_sensor, press, touch_charge
+from isocharge.simulate.forward.stress_series import FORCE_RANGE_N, PROBE, SENSOR, MAX_DISTANCE_mm, stress_series
+from kept import ROOT
+
+CHROMIUM = "/usr/bin/chromium"
+ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
+MAX_SIZE_BYTES = 1_000_000
+MAX_ANSWER_MS = 2.0
+SERIES = ROOT / "serve/isocharge/serve/viewer/playground/film-25um.json"
+
+ANSWERS = """([index, rows]) => {
+  const sensor = isocharge.playground.sensors[index];
+  return rows.map((charges) => {
+    const answer = sensor.answer(charges);
+    return { ...answer, flags: sensor.flags(answer) };
+  });
+}"""
+
+CHARGES = """([index, presses]) => {
+  const sensor = isocharge.playground.sensors[index];
+  return presses.map(([x, y, force]) => sensor.charges(x, y, force));
+}"""
+
+CURVES = """([index, [x, y, force]]) => {
+  const { playground } = isocharge;
+  const sensor = playground.sensors[index];
+  const charges = sensor.charges(x, y, force);
+  const grid = playground.grids.get(index);
+  return charges.map((charge, electrode) => grid.isocharge(electrode, charge, force));
+}"""
+
+MIRROR = """() => {
+  const { playground } = isocharge;
+  const region = playground.mirrorRegion(playground.grids.get(playground.sensorIndex));
+  return region.isComplete ? { cells: region.cells, force: region.force, step: region.grid.step } : null;
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if shutil.which(CHROMIUM) is None:
+        pytest.skip(f"needs {CHROMIUM} (apt-get install chromium)")
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("playground") / "playground.html"
+    path.write_text(playground_html(), "utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def open_page(browser, file):
+    """Open the playground, offline, in a window of a given size, with its errors and its requests as lists.
+
+    Scripts of a test do not run under the security policy of the page, so it is bypassed unless it is tested.
+    """
+
+    def open_window(width, height, bypass_csp=True, **options):
+        viewport = {"width": width, "height": height}
+        context = browser.new_context(viewport=viewport, offline=True, bypass_csp=bypass_csp, **options)
+        page = context.new_page()
+        page.errors, page.requests = [], []
+        page.on("pageerror", lambda error: page.errors.append(str(error)))
+        page.on("console", lambda message: page.errors.append(message.text) if message.type == "error" else None)
+        page.on("request", lambda request: page.requests.append(request.url))
+        page.goto(file.as_uri())
+        page.locator("#verdict .text:not(:empty)").wait_for()
+        return page
+
+    return open_window
+
+
+@pytest.fixture(scope="module")
+def page(open_page):
+    return open_page(1280, 800)
+
+
+def random_presses(count, radius_mm, seed=0):
+    """Return presses (x, y, F) in a disk, mm and N, with log-uniform forces."""
+    random = np.random.default_rng(seed)
+    radius = radius_mm * np.sqrt(random.random(count))
+    angle = 2 * np.pi * random.random(count)
+    force = np.exp(random.uniform(*np.log(FORCE_RANGE_N), count))
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force])
+
+
+def test_the_file_is_small_and_loads_nothing_from_elsewhere(open_page, file):
+    page = open_page(1280, 800, bypass_csp=False)
+    assert file.stat().st_size <= MAX_SIZE_BYTES
+    assert [url for url in page.requests if not url.startswith("data:")] == [file.as_uri()]
+    assert page.errors == []
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_answers_are_the_golden_vectors(page, name):
+    model = load_model(find_model(name))
+    golden = model.golden
+    answers = page.evaluate(ANSWERS, [MODELS.index(name), golden.charge_pC.tolist()])
+    computed = np.array([[answer[key] for key in ("x", "y", "force")] for answer in answers])
+    std = np.array([[answer[key] for key in ("xStd", "yStd", "forceStd")] for answer in answers])
+    np.testing.assert_allclose(computed, golden.outputs["contact"], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(std, golden.outputs["contact_std"], rtol=1e-4, atol=1e-4)
+    misfit = [answer["misfit"] for answer in answers]
+    np.testing.assert_allclose(misfit, np.ravel(golden.outputs["misfit"]), rtol=1e-4, atol=1e-4)
+    correlation = [answer["correlation"] for answer in answers]
+    np.testing.assert_allclose(correlation, golden.outputs["contact_correlation"][:, 0], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("index", range(len(MODELS)))
+def test_charges_are_those_of_the_solver(page, index):
+    """Under the centre, between the electrodes, on an electrode, and far outside of the working area."""
+    sensor = load_sensor(MODELS[index])
+    on_electrode = np.mean(sensor.electrodes[0].corners, axis=0)
+    presses = [(0.0, 0.0, 1.0), (3.0, -2.0, 0.05), (*on_electrode, 0.3), (-14.0, 11.0, 2.0), (5.0, 24.0, 0.5)]
+    expected = [touch_charge(sensor, press(sensor.film, Circle(1.0), (x, y), force)) for x, y, force in presses]
+    charges = page.evaluate(CHARGES, [index, presses])
+    np.testing.assert_allclose(charges, expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("index", range(len(MODELS)))
+def test_flags_are_those_of_the_predictor(page, index):
+    """With a dead electrode, a wrong gain, and presses outside of the working area."""
+    charges = np.array(page.evaluate(CHARGES, [index, random_presses(120, 24.0).tolist()]))
+    charges[::3, 0] = 0.0
+    charges[1::3, 1] *= 1.2
+    predictor = Predictor(MODELS[index])
+    answers = page.evaluate(ANSWERS, [index, charges.tolist()])
+    flags = [set(answer["flags"]) for answer in answers]
+    assert flags == [set(predictor.flags(predictor.predict(row))) for row in charges]
+    assert len({frozenset(row) for row in flags}) > 2
+
+
+@pytest.mark.parametrize("press", [(3.0, -2.0, 0.5), (-5.0, 4.0, 1.5), (0.5, 6.0, 0.1)])
+def test_the_isocharge_curves_cross_at_the_press(page, press):
+    page.wait_for_function("isocharge.playground.grids.get(0).isComplete")
+    for segments in page.evaluate(CURVES, [0, press]):
+        starts, ends = np.array(segments)[:, :2], np.array(segments)[:, 2:]
+        along = ends - starts
+        share = np.clip(np.sum((press[:2] - starts) * along, axis=1) / np.sum(along**2, axis=1), 0.0, 1.0)
+        nearest = starts + share[:, None] * along
+        assert np.linalg.norm(nearest - press[:2], axis=1).min() < 0.1
+
+
+def test_presses_in_the_mirror_region_are_answered_elsewhere_without_a_flag(page):
+    page.wait_for_function(f"({MIRROR})()", timeout=60_000)
+    region = page.evaluate(MIRROR)
+    cells = np.array(region["cells"])[:: max(1, len(region["cells"]) // 100)]
+    presses = np.column_stack([cells, np.full(len(cells), region["force"])])
+    charges = page.evaluate(CHARGES, [0, presses.tolist()])
+    predictor = Predictor(MODELS[0])
+    is_wrong = []
+    for (x_mm, y_mm), row in zip(cells, charges, strict=True):
+        contact = predictor.predict(row)
+        is_unnoticed = not {*predictor.flags(contact)} - {"stress"}
+        is_wrong.append(is_unnoticed and np.hypot(contact.x_mm - x_mm, contact.y_mm - y_mm) > 0.9)
+    assert np.mean(is_wrong) > 0.97
+
+
+def test_a_press_with_the_mouse_gives_its_place_and_force(open_page):
+    page = open_page(1280, 800)
+    box = page.locator("#stage").bounding_box()
+    page.evaluate("isocharge.playground.setFaults({ noise: 0 })")
+    page.mouse.move(box["x"] + 0.45 * box["width"], box["y"] + 0.4 * box["height"])
+    page.mouse.down()
+    page.wait_for_function("Math.abs(isocharge.playground.press.x + 0.1 * 24) < 0.2")
+    page.wait_for_timeout(300)
+    x, y, force = page.evaluate("(({ x, y, force }) => [x, y, force])(isocharge.playground.result.answer)")
+    assert (x, y) == pytest.approx((-0.1 * 24, 0.2 * 24), abs=0.2)
+    assert force == pytest.approx(0.5, rel=0.05)
+    assert "mm from your press" in page.inner_text("#verdict")
+    assert page.errors == []
+
+
+def test_a_dead_electrode_and_a_wrong_gain_are_flagged_with_four_electrodes(open_page):
+    page = open_page(1280, 800)
+    page.click("#models button:nth-of-type(2)")
+    page.select_option("#dead", "0")
+    page.wait_for_function("document.querySelector('#flags').innerText.includes('misfit')")
+    assert "cannot be trusted" in page.inner_text("#verdict")
+    page.select_option("#dead", "-1")
+    page.wait_for_function("!document.querySelector('#flags').innerText.includes('misfit')")
+
+
+def test_an_answer_takes_less_than_two_milliseconds(page):
+    shortest_ms = min(page.evaluate("isocharge.playground.measureLatency(50)") for _ in range(5))
+    assert shortest_ms < MAX_ANSWER_MS
+
+
+def test_a_phone_shows_the_whole_width_and_is_pressed_with_a_finger(open_page):
+    page = open_page(360, 740, has_touch=True, is_mobile=True)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    box = page.locator("#stage").bounding_box()
+    assert box["width"] > 300
+    assert box["y"] + box["height"] < 740
+    page.touchscreen.tap(box["x"] + 0.5 * box["width"], box["y"] + 0.4 * box["height"])
+    page.wait_for_function("Math.abs(isocharge.playground.press.y - 0.2 * 24) < 0.5")
+    for button in page.locator("button").all():
+        assert button.bounding_box()["height"] >= 36.0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_series_of_the_package_is_that_of_the_simulator():
+    made = stress_series(ForwardMap.build(load_sensor(SENSOR), PROBE, MAX_DISTANCE_mm, FORCE_RANGE_N))
+    stored = read_stress_series(SERIES)
+    assert made.to_json().keys() == stored.to_json().keys()
+    np.testing.assert_allclose(stored.inner, made.inner, atol=2e-5)
+    np.testing.assert_allclose(stored.outer, made.outer, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"isocharge_stress": 1', '"isocharge_stress": 9', "isocharge_stress"),
+        ('"max_ring"', '"ring"', "ring"),
+        ('"shape": [7,', '"shape": [8,', "data"),
+    ],
+)
+def test_a_damaged_series_is_refused(tmp_path, old, new, words):
+    text = SERIES.read_text("utf-8").replace('":', '": ').replace('":  ', '": ').replace(", ", ",")
+    assert old in text
+    path = tmp_path / "series.json"
+    path.write_text(text.replace(old, new), "utf-8")
+    with pytest.raises(InputError, match=words):
+        read_stress_series(path)
+
+
+@pytest.mark.parametrize(("name", "words"), [("four-25um-uniaxial", "biaxial film"), ("no-model", "no-model")])
+def test_a_model_that_cannot_be_shown_is_refused(name, words):
+    with pytest.raises(ModelError, match=words):
+        playground_html((name,))
