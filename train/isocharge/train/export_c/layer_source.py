@@ -136,26 +136,26 @@ def _add_product(name: str, block: Block, values: NDArray[Any]) -> list[str]:
         block: Rows and columns of the block.
         values: Weights of the block.
     """
-    n_row, width = values.shape
+    n_row, n_column = values.shape
     rows, columns = block
     is_int8 = values.dtype == np.int8
     number_type = "signed char" if is_int8 else "float"
     cast = "(float)" if is_int8 else ""
-    n_grouped = n_row - n_row % N_ROWS
+    n_grouped = n_row - n_row % N_ROWS  # these rows are added in groups of N_ROWS, the remaining rows in one group
     lines = []
     for begin, end in ((0, n_grouped), (n_grouped, n_row)):
-        count = min(N_ROWS, end - begin)
-        if count == 0:
+        group_size = min(N_ROWS, end - begin)
+        if group_size == 0:
             continue
-        loads = ", ".join(f"x{k} = x[{rows.start + k} + i]" for k in range(count))
-        terms = " + ".join(f"x{k} * {cast}w[{k * width} + j]" for k in range(count))
+        inputs = ", ".join(f"x{row} = x[{rows.start + row} + i]" for row in range(group_size))
+        products = " + ".join(f"x{row} * {cast}w[{row * n_column} + j]" for row in range(group_size))
         lines += [
-            f"    for (int i = {begin}; i < {end}; i += {count}) {{",
-            f"        const {number_type} *w = {name} + {width} * i;",
-            f"        const float {loads};",
+            f"    for (int i = {begin}; i < {end}; i += {group_size}) {{",
+            f"        const {number_type} *w = {name} + {n_column} * i;",
+            f"        const float {inputs};",
             "",
-            f"        for (int j = 0; j < {width}; ++j)",
-            f"            y[{columns.start} + j] += {terms};",
+            f"        for (int j = 0; j < {n_column}; ++j)",
+            f"            y[{columns.start} + j] += {products};",
             "    }",
         ]
     return lines

@@ -53,16 +53,24 @@ def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
 
 
 def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
-    """Return the text of `isocharge_model.c`."""
+    """Return the text of `isocharge_model.c`.
+
+    Args:
+        metadata: Metadata of the model, of which the label appears in a comment.
+        network: The network.
+    """
     hidden, skip, last = _layer_sources(network)
     activation = network.layers.activation
     widest = max(layer.weight.shape[1] for layer in hidden)
+
+    # The hidden layers read and write two buffers alternately; the first one reads the logarithms of the charges.
     buffers = ["logs", *islice(cycle(["one", "other"]), len(hidden))]
-    calls = [
-        f"{layer.name}({x}, {layer.name}_bias, {y});" for layer, (x, y) in zip(hidden, pairwise(buffers), strict=True)
-    ]
-    calls += [f"skip({buffers[0]}, skip_bias, skipped);", f"last({buffers[-1]}, skipped, answers);"]
-    hidden_buffers = dict.fromkeys(buffers[1:])
+    calls = []
+    for layer, (input_buffer, output_buffer) in zip(hidden, pairwise(buffers), strict=True):
+        calls.append(f"{layer.name}({input_buffer}, {layer.name}_bias, {output_buffer});")
+    calls.append(f"skip({buffers[0]}, skip_bias, skipped);")
+    calls.append(f"last({buffers[-1]}, skipped, answers);")
+    hidden_buffers = dict.fromkeys(buffers[1:])  # each name once
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),

@@ -61,11 +61,17 @@ class FilmInputs:
 
     @classmethod
     def fit(cls, scaling: FilmScaling, presses: FilmPresses) -> "FilmInputs":
-        """Fit mean and whitening to charges without noise of many films."""
-        logarithms = np.log(np.clip(presses.charge()[:N_WHITENING_FILMS], LOWEST_CHARGE, HIGHEST_CHARGE))
+        """Fit mean and whitening to charges without noise of many films.
+
+        Args:
+            scaling: Exact scales and contexts of films.
+            presses: Presses on films, of which the first `N_WHITENING_FILMS` films are used.
+        """
+        charge = presses.charge()[:N_WHITENING_FILMS]
+        log_charge = np.log(np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE))
         log_scale = scaling.log_charge_scale(presses.parameters[:N_WHITENING_FILMS])
-        scaled = logarithms - log_scale[:, None]
-        mean, matrix = whitening(scaled.reshape(-1, scaled.shape[-1]))
+        scaled_log_charge = log_charge - log_scale[:, None]
+        mean, matrix = whitening(scaled_log_charge.reshape(-1, charge.shape[-1]))
         return cls(scaling, mean, matrix)
 
     @property
@@ -111,6 +117,15 @@ class ConditionalPerceptron(TrainableNetwork):
         n_context: int,
         activation: Activation = TANH,
     ) -> None:
+        """Create the layers with random weights. At the beginning, the biases do not depend on the film.
+
+        Args:
+            n_input: Number of inputs.
+            hidden: Widths of the hidden layers.
+            n_output: Number of outputs.
+            n_context: Number of values that describe a film.
+            activation: Activation of the hidden layers.
+        """
         super().__init__()
         self.activation = activation
         sizes = list(pairwise((n_input, *hidden, n_output)))

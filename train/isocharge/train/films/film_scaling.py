@@ -119,14 +119,22 @@ class FilmScaling:
         return ContextStatistics(raw.mean(axis=0), raw.std(axis=0))
 
     def _raw_context(self, parameters: Array) -> Array:
-        """Compute the context before it is standardised."""
+        """Compute the numbers that describe films, before they are standardised.
+
+        Args:
+            parameters: Parameters of the films, shape (..., n_parameter).
+
+        Returns:
+            Contexts, shape (..., n_context).
+        """
         film = self.prior.sensor.film
         described_shift = np.array(self.prior.sensor.calibration.shift)
         young = film.young * np.exp(_shared(parameters, "young"))
         strain = _shared(parameters, "pretension") / young
-        to_electrodes = _rotation(-_shared(parameters, "rotation"))
         shift = described_shift + _shift(parameters)
-        centre = described_shift - (to_electrodes @ shift[..., None])[..., 0]
+        rotation_to_electrodes = _rotation(-_shared(parameters, "rotation"))
+        # Centre of the film in the axes of the electrodes, relative to its described position
+        centre = described_shift - (rotation_to_electrodes @ shift[..., None])[..., 0]
         gains = _gains(parameters)
         shared_columns = [
             np.log(strain + SOFTENING),

@@ -70,6 +70,7 @@ class FilmPresses:
         d33_factor = np.ones(len(self))
         part_factors = np.stack([d31_factor, d32_factor, d33_factor], axis=1)
         gain_factors = np.exp(self.parameters[:, GAINS])
+        # Sum over the parts c, for each film f, press p and electrode e.
         return np.asarray(np.einsum("fpec,fc,fe->fpe", self.response.astype(float), part_factors, gain_factors))
 
 
@@ -149,6 +150,7 @@ def _response(prior: FilmPrior, family: FilmFamily, parameters: Array, contact: 
     no_charge = np.zeros((len(contact), len(prior.sensor.electrodes)))
 
     def charges(d31: float, d32: float, d33: float = 0.0) -> Array:
+        """Return the charges of the film with other piezoelectric coefficients, shape (n_press, n_electrode), pC."""
         if d31 == 0.0 and d32 == 0.0:
             return no_charge
         sensor = replace(forward_map.sensor, piezo=Piezo(d31, d32, d33))
@@ -240,16 +242,23 @@ def draw_misfit_films(
 
 
 def _charges_of_every_kind(source: FilmsSource, charges: int, seed: int, job: tuple[int, Array]) -> Array:
-    """Draw charges on one film, given by its number and parameters.
+    """Draw charges of every kind on one film, from good presses to charges that no contact explains.
+
+    Args:
+        source: Films, domain and noise.
+        charges: Number of charges.
+        seed: Seed of the random numbers.
+        job: Number of the film, and its parameters, shape (n_parameter,).
 
     Returns:
         Charges, pC, and residuals, shape (2, charges, n_electrode).
     """
-    number, parameters = job
+    film_number, parameters = job
     charge_map = source.charge_map(parameters)
-    contact = draw_contacts(np.random.default_rng([seed, 3, number]), source.domain, charges)
+    rng = np.random.default_rng([seed, 3, film_number])
+    contact = draw_contacts(rng, source.domain, charges)
     presses = LabelledPresses(contact, charge_map.charges(contact))
-    return draw_misfit_examples(presses, charge_map, source.noise, charges, seed + number, candidates=N_CANDIDATES)
+    return draw_misfit_examples(presses, charge_map, source.noise, charges, seed + film_number, candidates=N_CANDIDATES)
 
 
 def draw_near_films(
@@ -277,14 +286,23 @@ def draw_near_films(
 
 
 def _good_presses(source: FilmsSource, presses: int, seed: int, job: tuple[int, Array]) -> Array:
-    """Draw good presses on one film, given by its number and parameters.
+    """Draw good presses on one film, with the matrices that compute their residuals from their noise.
+
+    Args:
+        source: Films, domain and noise.
+        presses: Number of presses.
+        seed: Seed of the random numbers.
+        job: Number of the film, and its parameters, shape (n_parameter,).
 
     Returns:
         Charges, pC, and then projection matrices, shape (presses, n_electrode, 1 + n_electrode).
     """
-    number, parameters = job
-    contact = draw_contacts(np.random.default_rng([seed, 5, number]), source.domain, presses)
+    film_number, parameters = job
+    rng = np.random.default_rng([seed, 5, film_number])
+    contact = draw_contacts(rng, source.domain, presses)
     charge, slopes = linearised(source.charge_map(parameters), contact)
-    basis, _ = np.linalg.qr(slopes / source.noise.sigma(charge)[:, :, None])
+    scaled_slopes = slopes / source.noise.sigma(charge)[:, :, None]
+    # The projection removes the changes of the charges that a change of the contact explains.
+    basis, _ = np.linalg.qr(scaled_slopes)
     projection = np.eye(charge.shape[1]) - basis @ basis.transpose(0, 2, 1)
     return np.concatenate([charge[:, :, None], projection], axis=2)

@@ -59,11 +59,13 @@ class ConditionalWeights:
         n_layer = sum(name.startswith("constant.") for name in self.arrays)
         phi = self._apply_linear("phi", psi).reshape(n_layer + 1, -1)
         layers = []
-        for number in range(n_layer):
-            weight = self._mix(f"constant.{number}", f"bases.{number}", phi[number])
-            layers.append(Layer(weight, self._apply_linear(f"bias.{number}", psi)))
-        *hidden, last = layers
-        return Perceptron(tuple(hidden), last, self._mix("skip", "skip_bases", phi[n_layer]), self.activation)
+        for index in range(n_layer):
+            weight = self._mix(f"constant.{index}", f"bases.{index}", phi[index])
+            bias = self._apply_linear(f"bias.{index}", psi)
+            layers.append(Layer(weight, bias))
+        *hidden, output_layer = layers
+        skip_weight = self._mix("skip", "skip_bases", phi[n_layer])
+        return Perceptron(tuple(hidden), output_layer, skip_weight, self.activation)
 
     def _linear(self, name: str) -> Layer[Array]:
         """Return a linear layer; the file holds its weight with shape (n_output, n_input)."""
@@ -161,6 +163,9 @@ class FilmsModel:
             correlation: Whether to fit the correlations, which takes one or two seconds.
             n_test: Number of test presses, at most `N_TEST_PRESSES`.
 
+        Returns:
+            The network with test presses on the simulated film.
+
         Raises:
             InputError: If there are not as many finite parameters as the prior names.
             SceneError: If the film is outside the family.
@@ -169,22 +174,20 @@ class FilmsModel:
         sensor, probe = self.prior.film(parameters)
         rng = np.random.default_rng(SEED)
         n_train = N_CORRELATION_PRESSES if correlation else N_REGRESSION_PRESSES
-        drawn = draw_contacts(rng, self.domain, N_TEST_PRESSES + N_CORRELATION_PRESSES)
-        contacts = [
-            drawn[N_TEST_PRESSES - n_test : N_TEST_PRESSES],
-            drawn[N_TEST_PRESSES : N_TEST_PRESSES + n_train],
-            np.empty((0, 3)) if added_variance is None else added_variance.contact,
-        ]
-        contact = np.concatenate(contacts)
-        simulated_charge = self.forward_map(parameters).charges(contact)
-        factor = np.ones(simulated_charge.shape) if charge_factor is None else charge_factor(contact)
-        presses = LabelledPresses(contact, simulated_charge * factor)
+        drawn_contact = draw_contacts(rng, self.domain, N_TEST_PRESSES + N_CORRELATION_PRESSES)
+        test_contact = drawn_contact[N_TEST_PRESSES - n_test : N_TEST_PRESSES]
+        train_contact = drawn_contact[N_TEST_PRESSES : N_TEST_PRESSES + n_train]
+        uncertain_contact = np.empty((0, 3)) if added_variance is None else added_variance.contact
+        contact = np.concatenate([test_contact, train_contact, uncertain_contact])
         test, train, uncertain = np.split(np.arange(len(contact)), [n_test, n_test + n_train])
 
+        simulated_charge = self.forward_map(parameters).charges(contact)
+        factors = np.ones(simulated_charge.shape) if charge_factor is None else charge_factor(contact)
+        presses = LabelledPresses(contact, simulated_charge * factors)
         if charge_factor is not None:
-            rows = train[:N_REGRESSION_PRESSES].repeat(N_COPIES)
-            noisy = self.noise.add(presses.charge[rows], rng)
-            network = adapt_to_charges(network, noisy, noisy / factor[rows], contact[rows])
+            copies = train[:N_REGRESSION_PRESSES].repeat(N_COPIES)
+            noisy = self.noise.add(presses.charge[copies], rng)
+            network = adapt_to_charges(network, noisy, noisy / factors[copies], contact[copies])
         if correlation:
             network = with_correlation(network, presses[train], self.noise, SEED)
         if added_variance is not None:

@@ -142,6 +142,7 @@ def fit_films(
     noise = noise_model(config.noise)  # an unknown name raises before the long computation
 
     def saving_executor(name: str) -> Executor | None:
+        """Return an executor that saves the results of its tasks in the run, if there is a run."""
         return executor if run is None else run.keeping(name, executor)
 
     with threads_and_seed(1, config.seed):
@@ -188,13 +189,24 @@ def films_identity(prior: FilmPrior, config: FilmsConfig) -> dict[str, Any]:
 
 
 def _build_family(prior: FilmPrior, config: FilmsConfig, executor: Executor | None) -> FilmFamily:
-    """Simulate the forward maps of the films, with the resolution of the films file."""
-    smallest, largest = config.force_range
-    smallest_factor, largest_factor = FORCE_MARGINS
-    forces = (smallest * smallest_factor, largest * largest_factor)
-    family = FilmFamily.build(prior, config.radius + RADIUS_MARGIN, forces, executor=executor)
+    """Simulate the forward maps of the films that the prior describes.
+
+    Args:
+        prior: Distribution of the films.
+        config: Radius and range of forces, to which margins are added.
+        executor: Executor of the simulations; None for this process.
+
+    Returns:
+        The family of forward maps, rounded as in a films file.
+    """
+    min_force, max_force = config.force_range
+    min_factor, max_factor = FORCE_MARGINS
+    force_range = (min_force * min_factor, max_force * max_factor)
+    family = FilmFamily.build(prior, config.radius + RADIUS_MARGIN, force_range, executor=executor)
     modes = FilmModes.build(family, prior.sensor.film, executor)
-    return FilmFamily.from_arrays(replace(family, imperfections=modes).to_arrays())
+    family_with_modes = replace(family, imperfections=modes)
+    # The arrays for the file have fewer digits, and the network is trained on the rounded maps.
+    return FilmFamily.from_arrays(family_with_modes.to_arrays())
 
 
 def _new_perceptron(
@@ -230,54 +242,98 @@ def contact_stage(
         noise: Noise that is added to the charges in every step.
         config: Numbers of steps and films, and sizes of the batches.
     """
-    scaling = inputs.scaling
-    warm_up_steps = round(WARM_UP_FRACTION * config.steps)
-    n_train = len(presses) - config.watched
-    n_press = presses.contact.shape[1]
+    training = _ContactTraining(network, inputs, presses, noise, config)
+    return TrainingStage(
+        "contact", network, training.loss, training.score, config.steps, training.warm_up_steps, LARGEST_GRADIENT
+    )
 
-    def evaluate_batch(films: np.ndarray, rows: np.ndarray, parameters: Array, random: torch.Generator) -> _Batch:
+
+@dataclass(frozen=True, eq=False)
+class _ContactTraining:
+    """Loss and validation of the contact network. The attributes are the arguments of `contact_stage`."""
+
+    network: ConditionalPerceptron
+    inputs: FilmInputs
+    presses: FilmPresses
+    noise: NoiseModel
+    config: FilmsConfig
+
+    @property
+    def warm_up_steps(self) -> int:
+        """Number of steps with the warm-up loss."""
+        return round(WARM_UP_FRACTION * self.config.steps)
+
+    @property
+    def n_train(self) -> int:
+        """Number of films for the training. The other films are used for validation."""
+        return len(self.presses) - self.config.watched
+
+    def loss(self, step: int, random: torch.Generator) -> Tensor:
+        """Return the loss of a random batch, in which d31, d32 and the gains of the films are drawn again."""
+        config = self.config
+        n_press = self.presses.contact.shape[1]
+        films = torch.randint(self.n_train, (config.batch_films,), generator=random).numpy()
+        press_rows = torch.randint(n_press, (config.batch_films, config.batch_presses), generator=random).numpy()
+        prior = self.inputs.scaling.prior
+        parameters = _with_fresh_factors(prior, self.presses.parameters[films], random)
+        loss_function = warm_up_loss if step < self.warm_up_steps else likelihood_loss
+        return loss_function(*self.evaluate_batch(films, press_rows, parameters, random))
+
+    def score(self) -> tuple[float, str]:
+        """Return the loss on the films for validation, and a text with the errors."""
+        films = np.arange(self.n_train, len(self.presses))
+        n_press = self.presses.contact.shape[1]
+        all_press_rows = np.tile(np.arange(n_press), (self.config.watched, 1))
+        random = torch.Generator().manual_seed(self.config.seed)
+        batch = self.evaluate_batch(films, all_press_rows, self.presses.parameters[films], random)
+        return validation_score(*batch, self.inputs.scaling.domain, "films")
+
+    def evaluate_batch(
+        self, films: np.ndarray, press_rows: np.ndarray, parameters: Array, random: torch.Generator
+    ) -> _Batch:
         """Evaluate the network on charges with noise.
 
         Args:
             films: Numbers of the films, shape (n_film,).
-            rows: Numbers of the presses on each film, shape (n_film, n_row).
+            press_rows: Numbers of the presses on each film, shape (n_film, n_row).
             parameters: Parameters of these films, shape (n_film, n_parameter).
             random: Generator of the noise.
         """
-        films = films[:, None]
-        batch = FilmPresses(parameters, presses.contact[films, rows], presses.response[films, rows])
-        noisy = with_fresh_noise(as_tensor(batch.charge()), noise, random)
-        outputs = network(inputs.values(noisy, parameters), inputs.context(parameters))
+        film_column = films[:, None]
+        contact = self.presses.contact[film_column, press_rows]
+        response = self.presses.response[film_column, press_rows]
+        charge = as_tensor(FilmPresses(parameters, contact, response).charge())
+        noisy_charge = with_fresh_noise(charge, self.noise, random)
+        outputs = self.network(self.inputs.values(noisy_charge, parameters), self.inputs.context(parameters))
+
+        # The network works in the axes of the electrodes; rotate and shift its answer into those of the film.
+        scaling = self.inputs.scaling
         rotation = as_tensor(scaling.rotation(parameters))
         offset = as_tensor(scaling.offset(parameters))
         mean = torch.baddbmm(offset[:, None], outputs[..., MEAN], rotation.transpose(1, 2))
-        target = as_tensor(scaling.domain.to_unit(batch.contact.reshape(-1, 3).astype(float)))
+        target = as_tensor(scaling.domain.to_unit(contact.reshape(-1, 3).astype(float)))
         return _Batch(mean.reshape(-1, 3), outputs[..., LOG_STD].reshape(-1, 3), target)
-
-    def loss(step: int, random: torch.Generator) -> Tensor:
-        films = torch.randint(n_train, (config.batch_films,), generator=random).numpy()
-        rows = torch.randint(n_press, (config.batch_films, config.batch_presses), generator=random).numpy()
-        parameters = _with_fresh_factors(scaling.prior, presses.parameters[films], random)
-        loss_function = warm_up_loss if step < warm_up_steps else likelihood_loss
-        return loss_function(*evaluate_batch(films, rows, parameters, random))
-
-    def score() -> tuple[float, str]:
-        films = np.arange(n_train, len(presses))
-        rows = np.tile(np.arange(n_press), (config.watched, 1))
-        random = torch.Generator().manual_seed(config.seed)
-        batch = evaluate_batch(films, rows, presses.parameters[films], random)
-        return validation_score(*batch, scaling.domain, "films")
-
-    return TrainingStage("contact", network, loss, score, config.steps, warm_up_steps, LARGEST_GRADIENT)
 
 
 def _with_fresh_factors(prior: FilmPrior, parameters: Array, random: torch.Generator) -> Array:
-    """Return films, shape (n_film, n_parameter), with d31, d32 and the gains drawn again."""
-    columns = [D31, D32, *range(len(SHARED), parameters.shape[1])]
+    """Return films for which d31, d32 and the gains are drawn again from the prior.
+
+    These parameters are factors of the charges, so new values need no simulation.
+
+    Args:
+        prior: Distribution of the films.
+        parameters: Parameters of the films, shape (n_film, n_parameter).
+        random: Random number generator.
+
+    Returns:
+        Parameters with new factors, same shape.
+    """
+    gain_columns = range(len(SHARED), parameters.shape[1])
+    columns = [D31, D32, *gain_columns]
     deviation = torch.randn((len(parameters), len(columns)), generator=random).clamp(-MAX_DEVIATION, MAX_DEVIATION)
-    fresh = parameters.copy()
-    fresh[:, columns] = prior.mean[columns] + prior.std[columns] * deviation.double().numpy()
-    return fresh
+    changed = parameters.copy()
+    changed[:, columns] = prior.mean[columns] + prior.std[columns] * deviation.double().numpy()
+    return changed
 
 
 def misfit_stage(
@@ -299,41 +355,82 @@ def misfit_stage(
         noise: Noise of good presses.
         config: Number of steps and sizes of the batches.
     """
-    values = inputs.values(as_tensor(examples.charge), examples.parameters)
-    context = inputs.context(examples.parameters)
-    targets = compress_length(torch.tensor(examples.target)).float()
-    n_train = len(values) - max(1, round(MISFIT_VALIDATION_FRACTION * len(values)))
-    n_charge = values.shape[1]
-    good_charge = as_tensor(good.charge)
-    projection = as_tensor(good.target)
-    n_good_film, n_good_press = good_charge.shape[:2]
+    training = _MisfitTraining(network, inputs, examples, good, noise, config)
+    return TrainingStage(
+        "misfit", network, training.loss, training.score, config.misfit_steps, largest_gradient=LARGEST_GRADIENT
+    )
 
-    def good_press_loss(n_film: int, n_press: int, random: torch.Generator) -> Tensor:
+
+class _MisfitTraining:
+    """Loss and validation of the misfit network.
+
+    The loss consists of the loss of examples, whose residuals were found by a search, and of the loss of good presses,
+    whose residuals follow from their noise.
+    """
+
+    def __init__(
+        self,
+        network: ConditionalPerceptron,
+        inputs: FilmInputs,
+        examples: DrawnFilms,
+        good: DrawnFilms,
+        noise: NoiseModel,
+        config: FilmsConfig,
+    ) -> None:
+        """Compute the inputs and targets of the examples; the arguments are those of `misfit_stage`."""
+        self.network = network
+        self.inputs = inputs
+        self.good = good
+        self.noise = noise
+        self.config = config
+        self.example_inputs = inputs.values(as_tensor(examples.charge), examples.parameters)
+        self.example_context = inputs.context(examples.parameters)
+        self.example_targets = compress_length(torch.tensor(examples.target)).float()
+        self.good_charge = as_tensor(good.charge)
+        self.good_projection = as_tensor(good.target)
+        n_example_film = len(self.example_inputs)
+        self.n_train = n_example_film - max(1, round(MISFIT_VALIDATION_FRACTION * n_example_film))
+
+    def loss(self, _: int, random: torch.Generator) -> Tensor:
+        """Return the weighted sum of both losses for a random batch."""
+        n_film = self.config.batch_films // 2
+        n_press = self.config.batch_presses
+        n_charge = self.example_inputs.shape[1]
+        films = torch.randint(self.n_train, (n_film,), generator=random)
+        rows = torch.randint(n_charge, (n_film, n_press), generator=random)
+        misfit_vector = self.network(self.example_inputs[films[:, None], rows], self.example_context[films])
+        example_loss = mean_squared_distance(misfit_vector, self.example_targets[films[:, None], rows])
+        return GOOD_PRESS_WEIGHT * self.good_press_loss(n_film, n_press, random) + example_loss
+
+    def score(self) -> tuple[float, str]:
+        """Return the loss on the examples for validation and on good presses, and a text with both parts."""
+        validation = slice(self.n_train, None)
+        misfit_vector = self.network(self.example_inputs[validation], self.example_context[validation])
+        example_loss = mean_squared_distance(misfit_vector, self.example_targets[validation]).item()
+        random = torch.Generator().manual_seed(0)
+        good_loss = self.good_press_loss(len(self.good_charge), N_VALIDATION_PRESSES, random).item()
+        description = f"{example_loss:.4f} on watched films, {good_loss:.5f} on good presses"
+        return GOOD_PRESS_WEIGHT * good_loss + example_loss, description
+
+    def good_press_loss(self, n_film: int, n_press: int, random: torch.Generator) -> Tensor:
+        """Return the loss of random good presses with new noise.
+
+        Args:
+            n_film: Number of films.
+            n_press: Number of presses on each film.
+            random: Random number generator.
+        """
+        n_good_film, n_good_press = self.good_charge.shape[:2]
         films = torch.randint(n_good_film, (n_film,), generator=random)
         rows = torch.randint(n_good_press, (n_film, n_press), generator=random)
-        clean = good_charge[films[:, None], rows]
+        charge = self.good_charge[films[:, None], rows]
         noise_factor = 1.0 + (MAX_NOISE_FACTOR - 1.0) * torch.rand((n_film, n_press, 1), generator=random) ** 3
-        deviation = noise_factor * torch.randn(clean.shape, generator=random)
-        noisy = clean + torch.hypot(torch.tensor(noise.white), noise.gain * clean) * deviation
-        residual = (projection[films[:, None], rows] @ deviation[..., None])[..., 0]
-        parameters = good.parameters[films.numpy()]
-        vector = network(inputs.values(noisy, parameters), inputs.context(parameters))
-        return mean_squared_distance(vector, compress_length(residual))
+        deviation = noise_factor * torch.randn(charge.shape, generator=random)  # in standard deviations of the noise
+        noise_std = torch.hypot(torch.tensor(self.noise.white), self.noise.gain * charge)
+        noisy_charge = charge + noise_std * deviation
 
-    def loss(_: int, random: torch.Generator) -> Tensor:
-        n_film = config.batch_films // 2
-        films = torch.randint(n_train, (n_film,), generator=random)
-        rows = torch.randint(n_charge, (n_film, config.batch_presses), generator=random)
-        vector = network(values[films[:, None], rows], context[films])
-        example_loss = mean_squared_distance(vector, targets[films[:, None], rows])
-        return GOOD_PRESS_WEIGHT * good_press_loss(n_film, config.batch_presses, random) + example_loss
-
-    def score() -> tuple[float, str]:
-        vector = network(values[n_train:], context[n_train:])
-        example_loss = mean_squared_distance(vector, targets[n_train:]).item()
-        random = torch.Generator().manual_seed(0)
-        good_loss = good_press_loss(n_good_film, N_VALIDATION_PRESSES, random).item()
-        text = f"{example_loss:.4f} on watched films, {good_loss:.5f} on good presses"
-        return GOOD_PRESS_WEIGHT * good_loss + example_loss, text
-
-    return TrainingStage("misfit", network, loss, score, config.misfit_steps, largest_gradient=LARGEST_GRADIENT)
+        # The residual is the part of the noise that no change of the contact explains.
+        residual = (self.good_projection[films[:, None], rows] @ deviation[..., None])[..., 0]
+        parameters = self.good.parameters[films.numpy()]
+        misfit_vector = self.network(self.inputs.values(noisy_charge, parameters), self.inputs.context(parameters))
+        return mean_squared_distance(misfit_vector, compress_length(residual))

@@ -67,42 +67,58 @@ def evaluate_films(films: FilmsModel, n_film: int = N_FILMS, n_press: int = N_PR
         n_film: Number of films.
         n_press: Number of presses on each film.
         seed: Seed of films, presses and noise.
+
+    Returns:
+        Errors if the network of the right film is used, and if the network of one assumed film is used for all films.
+        The assumed film is that with the smaller error: the described film, or the mean of the prior.
     """
     rng = np.random.default_rng(seed)
-    parameters = films.prior.draw(rng, n_film)
+    true_films = films.prior.draw(rng, n_film)
     contacts = []
     charges = []
-    for film in parameters:
+    for parameters in true_films:
         contact = draw_contacts(rng, films.domain, n_press)
+        charge = films.forward_map(parameters).charges(contact)
         contacts.append(contact)
-        charges.append(films.noise.add(films.forward_map(film).charges(contact), rng))
-    truth = np.stack(contacts)
+        charges.append(films.noise.add(charge, rng))
+    true_contact = np.stack(contacts)
 
-    def errors_with(assumed_films: Array) -> Mapping[str, float]:
-        answers = [films.fold(film).predict(charge) for film, charge in zip(assumed_films, charges, strict=True)]
-        contact = np.stack([contact for contact, _, _ in answers])
-        std = np.stack([std for _, std, _ in answers])
-        return _errors(contact, std, truth)
+    def errors_with(network_films: Array) -> Mapping[str, float]:
+        """Return the errors if the contacts of each film are estimated with the network of another film."""
+        estimates = [films.fold(film).predict(charge) for film, charge in zip(network_films, charges, strict=True)]
+        contact = np.stack([contact for contact, _, _ in estimates])
+        std = np.stack([std for _, std, _ in estimates])
+        return _errors(contact, std, true_contact)
 
-    choices = {"as described": films.prior.described, "in the middle of all": films.prior.mean}
-    choice_errors = {name: errors_with(np.tile(film, (n_film, 1))) for name, film in choices.items()}
-    rms_mm = {name: errors["position_rms_mm"] for name, errors in choice_errors.items()}
-    best, other = sorted(rms_mm, key=lambda name: rms_mm[name])
-    pretension_MPa = choices[best][films.prior.index("pretension")]
+    assumed_films = {"as described": films.prior.described, "in the middle of all": films.prior.mean}
+    assumed_errors = {name: errors_with(np.tile(film, (n_film, 1))) for name, film in assumed_films.items()}
+    rms_mm = {name: errors["position_rms_mm"] for name, errors in assumed_errors.items()}
+    best, second = sorted(rms_mm, key=lambda name: rms_mm[name])
+    best_film = assumed_films[best]
+    pretension_MPa = best_film[films.prior.index("pretension")]
     description = (
         f"the film {best}, with a pretension of {pretension_MPa:g} MPa.\nThe error over all films is then "
-        f"{rms_mm[best]:g} mm rms (with the film {other}: {rms_mm[other]:g} mm)"
+        f"{rms_mm[best]:g} mm rms (with the film {second}: {rms_mm[second]:g} mm)"
     )
-    return FilmsErrors(errors_with(parameters), choice_errors[best], choices[best], description)
+    return FilmsErrors(errors_with(true_films), assumed_errors[best], best_film, description)
 
 
 def _errors(contact: Array, std: Array, truth: Array) -> Mapping[str, float]:
-    """Compute the errors of contacts; all arrays have the shape (n_film, n_press, 3), mm and N."""
+    """Compute statistics of the errors of contacts on several films.
+
+    Args:
+        contact: Estimated contacts (x, y, F), shape (n_film, n_press, 3), mm and N.
+        std: Reported standard deviations, same shape.
+        truth: True contacts, same shape.
+
+    Returns:
+        Statistics over all presses, and the rms position errors of the median film and of the worst film, by name.
+    """
     all_contacts = contact.reshape(-1, 3)
     all_truth = truth.reshape(-1, 3)
     errors = contact_errors(all_contacts, std.reshape(-1, 3), all_truth)
-    position = position_error(all_contacts, all_truth).reshape(truth.shape[:2])
-    film_rms = np.sqrt((position**2).mean(axis=1))
+    position_errors = position_error(all_contacts, all_truth).reshape(truth.shape[:2])
+    film_rms = np.sqrt((position_errors**2).mean(axis=1))
     return {
         **{name: error for name, error in errors.items() if name not in ONLY_SIMULATED},
         "position_rms_median_film_mm": rounded(np.median(film_rms)),

@@ -51,14 +51,24 @@ class Residuals:
 
     @classmethod
     def of(cls, presses: MeasuredPresses, charge_map: ChargeMap, noise: NoiseModel) -> "Residuals":
-        """Compute the residuals of presses whose places, forces and charges are known."""
+        """Compute the residuals of presses whose places, forces and charges are known.
+
+        Args:
+            presses: Measured presses without missing values.
+            charge_map: Charges as a function of the contact.
+            noise: Noise of the charges.
+        """
         charge = charge_map.charges(presses.contact)
-        slopes = differences(charge_map.charges, presses.contact, CONTACT_STEPS) / charge[:, :, None]
+        log_ratio = _log_ratio(presses.charge_pC / charge)
+
+        # Covariance by errors of the contacts: J diag(std^2) J' for each press n, with J = d ln Q / d(x, y, ln F)
+        log_slopes = differences(charge_map.charges, presses.contact, CONTACT_STEPS) / charge[:, :, None]
         contact_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
-        contact_covariance = np.einsum("nei,ni,nfi->nef", slopes, contact_std**2, slopes)
+        contact_covariance = np.einsum("nei,ni,nfi->nef", log_slopes, contact_std**2, log_slopes)
+
         noise_variance = (noise.sigma(charge) / charge) ** 2
         noise_covariance = noise_variance[:, :, None] * np.eye(charge.shape[1])
-        return cls(presses.contact, _log_ratio(presses.charge_pC / charge), contact_covariance + noise_covariance)
+        return cls(presses.contact, log_ratio, contact_covariance + noise_covariance)
 
     def chi2(self, correction: Array) -> Array:
         """Return the squared residual of each press after a correction.
@@ -98,12 +108,20 @@ class Correction:
 
 
 def fit_correction(residuals: Residuals) -> Correction:
-    """Fit a correction to residuals. It is zero if the residuals are most probable without a correction."""
+    """Fit a correction to residuals by generalised least squares.
+
+    Args:
+        residuals: Differences between measured presses and a forward map.
+
+    Returns:
+        The correction. It is zero if the residuals are most probable without a correction.
+    """
     x, y, force = residuals.contact.T
     n_electrode = residuals.log_ratio.shape[1]
     domain = Domain(float(np.hypot(x, y).max()), (float(force.min()), float(force.max())))
     n_coefficient = term_count() * n_electrode
 
+    # Sum the normal equations over chunks of presses, which limits the memory.
     normal = np.zeros((n_coefficient, n_coefficient))
     moment = np.zeros(n_coefficient)
     square = 0.0
@@ -114,6 +132,7 @@ def fit_correction(residuals: Residuals) -> Correction:
         moment += chunk.moment
         square += chunk.square
 
+    # Average over the hypotheses about the size of the correction, with their probabilities as weights.
     hypotheses = [Hypothesis(size=size) for size in SIZES]
     mixture = weigh(
         {0.0: Linearised(normal, moment, square)},
@@ -122,18 +141,25 @@ def fit_correction(residuals: Residuals) -> Correction:
     )
     if mixture.best.size == 0.0:
         return Correction(domain, np.zeros((term_count(), n_electrode)), 0.0)
-    freedom = float(np.einsum("pq,qp->", mixture.covariance, normal))
-    return Correction(domain, mixture.mean.reshape(term_count(), -1), freedom)
+    degrees_of_freedom = float(np.trace(mixture.covariance @ normal))
+    return Correction(domain, mixture.mean.reshape(term_count(), -1), degrees_of_freedom)
 
 
 def _linearised(residuals: Residuals, domain: Domain) -> Linearised:
-    """Return the squared residuals as a function of the coefficients."""
+    """Return the sum of the squared residuals as a function of the coefficients of the correction.
+
+    Args:
+        residuals: Residuals of n presses.
+        domain: Domain of the polynomials.
+    """
+    # The whitened residuals have unit covariance.
     whitening = np.linalg.inv(np.linalg.cholesky(residuals.covariance))
+    whitened_residuals = -(whitening @ residuals.log_ratio[:, :, None])[:, :, 0]
     polynomials = terms(residuals.contact, domain)
+    # Derivatives of residual g of press n with respect to the coefficient of term t for electrode e
     design = polynomials[:, None, :, None] * whitening[:, :, None, :]
-    whitened = -np.einsum("nge,ne->ng", whitening, residuals.log_ratio)
     n_coefficient = term_count() * residuals.log_ratio.shape[1]
-    return Linearised.of(design.reshape(-1, n_coefficient), whitened.ravel(), np.zeros(n_coefficient))
+    return Linearised.of(design.reshape(-1, n_coefficient), whitened_residuals.ravel(), np.zeros(n_coefficient))
 
 
 def _log_ratio(ratio: Array) -> Array:

@@ -75,16 +75,18 @@ def rig_data(rig: Rig, *, drawn: int = DRAWN_PRESSES, seed: int = 0) -> Training
         drawn: Number of presses of the corrected map on which the network is trained.
         seed: Seed of these presses.
 
+    Returns:
+        Presses of the corrected map for the training, and the held-out presses for the test.
+
     Raises:
         PressError: If there are too few presses.
     """
     domain = Domain(rig.radius, DEFAULT_FORCE_RANGE)
     presses = _usable_presses(rig, domain)
     is_held_out = held_out(presses.contact)
-    low, high = domain.force_range
-    forward_map = ForwardMap.build(
-        rig.sensor, rig.probe, domain.radius * MAP_MARGIN, (low / MAP_MARGIN, high * MAP_MARGIN)
-    )
+    min_force, max_force = domain.force_range
+    map_force_range = (min_force / MAP_MARGIN, max_force * MAP_MARGIN)
+    forward_map = ForwardMap.build(rig.sensor, rig.probe, domain.radius * MAP_MARGIN, map_force_range)
     film = correct_film(presses[~is_held_out], forward_map, domain, noise_model("reference"))
     if film.is_scattered:
         _log.warning(
@@ -101,7 +103,11 @@ def rig_data(rig: Rig, *, drawn: int = DRAWN_PRESSES, seed: int = 0) -> Training
 
 
 def _usable_presses(rig: Rig, domain: Domain) -> MeasuredPresses:
-    """Return the complete presses within the domain, and warn about the others.
+    """Return the complete presses within the domain, and log a warning about the others.
+
+    Args:
+        rig: Measured presses and the sensor on which they were made.
+        domain: Positions and forces that are used.
 
     Raises:
         PressError: If too few presses remain.
@@ -126,7 +132,13 @@ def _usable_presses(rig: Rig, domain: Domain) -> MeasuredPresses:
 
 
 def _draw_dataset(film: CorrectedFilm, count: int, seed: int) -> Dataset:
-    """Draw presses of the corrected map."""
+    """Draw presses of the corrected map, as a dataset on which a network can be trained.
+
+    Args:
+        film: Corrected film.
+        count: Number of presses.
+        seed: Seed of the presses.
+    """
     contact = draw_contacts(np.random.default_rng(seed), film.domain, count)
     charge = film.charges(contact)
     manifest = {
@@ -163,7 +175,13 @@ def _provenance(film: CorrectedFilm, presses: MeasuredPresses, is_held_out: Bool
 
 
 def _sentences(film: CorrectedFilm, presses: MeasuredPresses, is_held_out: Booleans) -> Iterator[str]:
-    """Yield the sentences of the card about the presses and the correction."""
+    """Yield the sentences of the card about the presses and the correction.
+
+    Args:
+        film: Corrected film.
+        presses: All usable presses.
+        is_held_out: Whether each press is held out for the test, shape (n_press,).
+    """
     yield (
         f"The model was fitted to {(~is_held_out).sum()} measured presses of one film. {is_held_out.sum()} other "
         f"presses, in `{HELD_OUT}`, were held out, and the errors below are those of these presses."
@@ -177,15 +195,15 @@ def _sentences(film: CorrectedFilm, presses: MeasuredPresses, is_held_out: Boole
         "the sensor as described. Where the presses are far apart, the film may differ from the corrected sensor."
     )
     correction = film.correction
-    low, high = correction.domain.force_range
+    min_force, max_force = correction.domain.force_range
     if correction.is_zero:
         yield "The charges are not corrected, because the presses are most probable without a correction."
     else:
         yield (
             f"The charges are corrected by {film.correction_percent(presses.contact):.2g} % (root mean square), "
             "smoothly in place and logarithm of the force. No press was made farther than "
-            f"{correction.domain.radius:.3g} mm from the centre, or outside {low:.3g} to {high:.3g} N; there the "
-            "correction is that of the nearest press."
+            f"{correction.domain.radius:.3g} mm from the centre, or outside {min_force:.3g} to {max_force:.3g} N; "
+            "there the correction is that of the nearest press."
         )
     if film.is_scattered:
         yield (
