@@ -93,50 +93,67 @@ def test_it_is_the_minimum_of_the_joint_problem(count, seed, problem, monkeypatc
     np.testing.assert_allclose(std, np.sqrt(np.diag(joint_covariance)), rtol=0.05)
 
 
-def test_hypotheses_are_weighed_by_their_evidence():
-    """Against SciPy's density of the data, and against Gaussian conditioning in the space of the data."""
+def test_evidence_and_posterior_of_a_linear_model():
+    """The evidence is SciPy's density of the residuals; the posterior is that of Gaussian conditioning on them."""
     rng = np.random.default_rng(2)
-    design, data = rng.normal(size=(12, 5)), rng.normal(size=12)
-    before = np.diag([1.0, 0.25, 4.0, 1.0, 0.0])  # the last is excluded
-    mean, covariance = (linearised := hypotheses.Linearised.of(design, data, np.zeros(5))).given(before)
-    of_data = np.eye(12) + design @ before @ design.T
-    density = multivariate_normal(np.zeros(12), of_data).logpdf(data) + 6.0 * np.log(2.0 * np.pi)
-    assert linearised.evidence(before) == pytest.approx(density, rel=1e-9)
-    gain = before @ design.T @ np.linalg.inv(of_data)
-    np.testing.assert_allclose(mean, -gain @ data, rtol=1e-9)
-    np.testing.assert_allclose(covariance, before - gain @ design @ before, atol=1e-12)
+    jacobian = rng.normal(size=(12, 5))
+    residual = rng.normal(size=12)
+    prior_covariance = np.diag([1.0, 0.25, 4.0, 1.0, 0.0])  # the last unknown is excluded
+    model = hypotheses.LinearModel.of(jacobian, residual, np.zeros(5))
+    mean, covariance = model.posterior(prior_covariance)
+
+    residual_covariance = np.eye(12) + jacobian @ prior_covariance @ jacobian.T
+    log_density = multivariate_normal(np.zeros(12), residual_covariance).logpdf(residual) + 6.0 * np.log(2.0 * np.pi)
+    assert model.log_evidence(prior_covariance) == pytest.approx(log_density, rel=1e-9)
+    gain = prior_covariance @ jacobian.T @ np.linalg.inv(residual_covariance)
+    np.testing.assert_allclose(mean, -gain @ residual, rtol=1e-9)
+    np.testing.assert_allclose(covariance, prior_covariance - gain @ jacobian @ prior_covariance, atol=1e-12)
 
 
-def test_a_mixture_has_the_moments_of_its_parts():
-    """Second moments about zero, weighed by evidence and belief."""
+def test_mixture_has_the_mean_and_second_moments_of_its_hypotheses():
+    """Each hypothesis is weighted by the product of its evidence and its prior probability."""
     rng = np.random.default_rng(4)
-    linearised = hypotheses.Linearised.of(rng.normal(size=(12, 3)), rng.normal(size=12), np.zeros(3))
-    before = {
-        hypotheses.Hypothesis(belief=0.7): np.eye(3),
-        hypotheses.Hypothesis(size=1.0, belief=0.3): np.eye(3) / 4,
+    model = hypotheses.LinearModel.of(rng.normal(size=(12, 3)), rng.normal(size=12), np.zeros(3))
+    prior_covariances = {
+        hypotheses.Hypothesis(prior_probability=0.7): np.eye(3),
+        hypotheses.Hypothesis(discrepancy=1.0, prior_probability=0.3): np.eye(3) / 4,
     }
-    parts = [(linearised.evidence(each), *linearised.given(each)) for each in before.values()]
-    weight = np.exp([logs for logs, *_ in parts]) * [0.7, 0.3]
-    weight /= weight.sum()
-    second = sum(w * (own + np.outer(mean, mean)) for w, (_, mean, own) in zip(weight, parts, strict=True))
-    found = hypotheses.weigh({0.0: linearised}, before.get, before)
-    np.testing.assert_allclose(found.mean, weight @ [mean for _, mean, _ in parts])
-    np.testing.assert_allclose(found.covariance + np.outer(found.mean, found.mean), second)
-    assert list(found.weights.values()) == pytest.approx(weight)
+    log_evidences = [model.log_evidence(each) for each in prior_covariances.values()]
+    posteriors = [model.posterior(each) for each in prior_covariances.values()]
+    weights = np.exp(log_evidences) * [0.7, 0.3]
+    weights /= weights.sum()
+    second_moments = [covariance + np.outer(mean, mean) for mean, covariance in posteriors]
+
+    mixture = hypotheses.mix_hypotheses({0.0: model}, prior_covariances.get, prior_covariances)
+    np.testing.assert_allclose(mixture.mean, weights @ [mean for mean, _ in posteriors])
+    found_second_moment = mixture.covariance + np.outer(mixture.mean, mixture.mean)
+    np.testing.assert_allclose(found_second_moment, np.einsum("h,hij->ij", weights, second_moments))
+    assert list(mixture.probabilities.values()) == pytest.approx(weights)
 
 
 def test_scatter_of_forces_is_noise_along_one_direction_of_each_press():
-    """Three presses of four residuals, against SciPy's density with the widened covariance of the data."""
+    """Three presses of four residuals, compared with SciPy's density for the full covariance of the residuals."""
     rng = np.random.default_rng(5)
-    design, data, direction = rng.normal(size=(3, 4, 2)), rng.normal(size=(3, 4)), rng.normal(size=(3, 4))
+    jacobian = rng.normal(size=(3, 4, 2))
+    residual = rng.normal(size=(3, 4))
+    direction = rng.normal(size=(3, 4))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
-    variance, none = np.array([0.0, 0.5, 9.0]), np.zeros(2)
-    along = np.einsum("nk,nku->nu", direction, design), (direction * data).sum(axis=1)
-    linearised = hypotheses.Linearised.of(design.reshape(12, 2), data.ravel(), none).less(*along, none, variance)
-    noise = block_diag(*(np.eye(4) + v * np.outer(d, d) for v, d in zip(variance, direction, strict=True)))
-    of_data = noise + design.reshape(12, 2) @ design.reshape(12, 2).T
-    density = multivariate_normal(np.zeros(12), of_data).logpdf(data.ravel()) + 6.0 * np.log(2.0 * np.pi)
-    assert linearised.evidence(np.eye(2)) == pytest.approx(density, rel=1e-9)
+    noise_variance = np.array([0.0, 0.5, 9.0])
+    at_mean = np.zeros(2)
+
+    jacobian_along = np.einsum("nk,nku->nu", direction, jacobian)
+    residual_along = (direction * residual).sum(axis=1)
+    model = hypotheses.LinearModel.of(jacobian.reshape(12, 2), residual.ravel(), at_mean)
+    noisy_model = model.with_added_noise(jacobian_along, residual_along, at_mean, noise_variance)
+
+    press_noises = [
+        np.eye(4) + variance * np.outer(unit_vector, unit_vector)
+        for variance, unit_vector in zip(noise_variance, direction, strict=True)
+    ]
+    residual_covariance = block_diag(*press_noises) + jacobian.reshape(12, 2) @ jacobian.reshape(12, 2).T
+    distribution = multivariate_normal(np.zeros(12), residual_covariance)
+    log_density = distribution.logpdf(residual.ravel()) + 6.0 * np.log(2.0 * np.pi)
+    assert noisy_model.log_evidence(np.eye(2)) == pytest.approx(log_density, rel=1e-9)
 
 
 @pytest.mark.parametrize(("pretension", "force"), [(0.8, 0.2), (1.6, 0.1)])
@@ -241,7 +258,7 @@ def test_a_leak_at_random_is_said_and_widens_the_force(problem):
     """0 to 10 % of the charge of each press: 5 % of it are in all of them, and look like a gain."""
     leak = np.exp(-0.1 * np.random.default_rng(4).random((10, 1)))
     truth, result = on_a_film(problem, lambda _, charge: leak * charge, 10, seed=44)
-    assert any(re.search(r"forces scatter [2-9](\.\d)? % about", sentence) for sentence in result.cautions)
+    assert any(re.search(r"the forces scatter by [2-9](\.\d)? % about", sentence) for sentence in result.cautions)
     at = draw_contacts(np.random.default_rng(8), problem.domain.within(6.0), 200)
     charge = problem.charges.charges(truth, at)
     force = problem.films.fold(result.posterior.parameters).predict(charge)[0][:, 2]

@@ -121,7 +121,7 @@ def test_any_covariance_survives_the_round_trip(data, bent, problem, read):
     prior = problem.prior
     covariance = data.draw(covariances(len(prior.names) + 1))
     warming = Warming(-0.3, float(np.sqrt(covariance[-1, -1])), 21.5, covariance[-1, :-1])
-    posterior = replace(bent.posterior, covariance=covariance[:-1, :-1], weights={}, warming=warming)
+    posterior = replace(bent.posterior, covariance=covariance[:-1, :-1], probabilities={}, warming=warming)
     film = read(film_table(prior, posterior))
     std = np.sqrt(np.diag(covariance))
     tolerance = 1e-5 * np.outer(std, std)  # correlations have six digits

@@ -22,7 +22,7 @@ def test_the_slices_of_the_layout_hold_every_unknown_once(problem):
 def test_a_hypothesis_gives_each_kind_of_unknown_its_variance(problem):
     layout = problem.charges.layout
     stds = tuple(float(number) for number in range(1, len(NUISANCES) + 1))
-    covariance = Hypothesis(modes=2.0, size=0.1, traces=3.0, nuisance_stds=stds).covariance(layout)
+    covariance = Hypothesis(modes=2.0, discrepancy=0.1, traces=3.0, nuisance_stds=stds).covariance(layout)
     variance = np.diag(covariance)
     assert (variance[layout.parameters] == 0.0).all()
     assert (variance[layout.modes] == 4.0).all()
@@ -35,7 +35,7 @@ def test_a_hypothesis_gives_each_kind_of_unknown_its_variance(problem):
 
 def test_the_probabilities_of_all_hypotheses_add_up():
     """The modes alone, without a discrepancy, are left out, and traces come on top."""
-    assert 0.7 < sum(hypothesis.belief for hypothesis in hypotheses()) < 1.01
+    assert 0.7 < sum(hypothesis.prior_probability for hypothesis in hypotheses()) < 1.01
 
 
 @pytest.mark.parametrize("nuisance", NUISANCES, ids=lambda nuisance: nuisance.name)

@@ -16,7 +16,7 @@ from isocharge.simulate import Circle, Sensor
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
 from isocharge.train.calibration.cross_validation import HeldOutAnswers, cross_validate
 from isocharge.train.calibration.diagnosis import check_channels, check_places, explain, find_mistakes, misfit
-from isocharge.train.calibration.film_fit import MISTAKEN, PROBABLE, FilmPosterior, fit_film
+from isocharge.train.calibration.film_fit import MISTAKE_PROBABILITY, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.hypotheses import Hypothesis
 from isocharge.train.calibration.nuisances import NUISANCES, NuisanceEstimate
 from isocharge.train.calibration.press_data import PressData, temperatures
@@ -348,11 +348,11 @@ def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved:
         warming=film.warming and film.warming.with_unknowns(layout.film_count),
         contact=np.empty((0, 3)),
         chi2=np.empty(0),
-        freedom=np.empty(0),
+        degrees_of_freedom=np.empty(0),
         bad=np.empty(0, dtype=bool),
         nuisances={nuisance.name: NuisanceEstimate(0.0, 0.0) for nuisance in NUISANCES},
-        scatter=0.0,
-        weights={Hypothesis(modes=float(has_coefficients)): 1.0},
+        force_scatter=0.0,
+        probabilities={Hypothesis(modes=float(has_coefficients)): 1.0},
     )
     return CalibrationResult(problem, no_presses(problem.electrodes), posterior, moved=moved)
 
@@ -401,7 +401,7 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
     left_out_count = int(posterior.bad.sum())
     probability = min(left_out_count / (good_count * good_count), 0.5)
     if good_count <= FEW:
-        probability += MISTAKEN * good_count
+        probability += MISTAKE_PROBABILITY * good_count
     joint = (1.0 - probability) * posterior.joint
     estimated = slice(0, len(before.unknowns))
     joint[estimated, estimated] += probability * before.unknown_covariance
@@ -427,11 +427,11 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
     for nuisance in NUISANCES:
         if posterior.probability(nuisance.name) > PROBABLE:
             yield nuisance.caution(posterior.nuisances[nuisance.name])
-    if posterior.probability("scatter") > PROBABLE:
+    if posterior.probability("force_scatter") > PROBABLE:
         yield (
-            f"forces scatter {100.0 * posterior.scatter:.2g} % about those of the charges, over what they are said to: "
-            "are both read at the same moment, or does charge leak in between? What lowers charges at random lowers "
-            "them on average as well: the errors allow for as much"
+            f"the forces scatter by {100.0 * posterior.force_scatter:.2g} % about those of the charges, in addition to "
+            "their stated standard deviation: are force and charges read at the same moment, or does charge leak in "
+            "between? An effect that lowers charges at random also lowers their mean. The stated errors include it"
         )
     held = _parameters_at_bounds(problem, posterior)
     if held:

@@ -22,7 +22,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import FORCE_STD, POSITION_STD_MM
 from isocharge.simulate.numerics.disk import sunflower
-from isocharge.train.calibration.contacts import projected
+from isocharge.train.calibration.contacts import derivatives_with_adjusted_contacts
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 
 CONTACTS = 200
@@ -110,7 +110,7 @@ class ContactSensitivity:
         precision = np.einsum("nki,nkj->nij", contact_slopes, contact_slopes) + np.diag(prior_std**-2)
         noise = np.linalg.inv(precision)
         by_parameter = -np.einsum("nij,nkj,nkp->nip", noise, contact_slopes, film_slopes)
-        return cls(contact, by_parameter, noise, misfit=projected(film_slopes, contact_slopes))
+        return cls(contact, by_parameter, noise, misfit=derivatives_with_adjusted_contacts(film_slopes, contact_slopes))
 
     def contact_error(self, covariance: Array) -> ContactError:
         """Return the errors for a covariance of the film's unknowns."""
@@ -174,7 +174,7 @@ def _rows_of(
     rig_weights = np.array([1.0 / position_std_mm, 1.0 / position_std_mm, 1.0 / force_std])
     rig_contact_slopes = np.broadcast_to(np.diag(rig_weights), (len(contact), 3, 3))
     rig_film_slopes = np.zeros((len(contact), 3, film_slopes.shape[2]))
-    return projected(
+    return derivatives_with_adjusted_contacts(
         np.concatenate([film_slopes, rig_film_slopes], axis=1),
         np.concatenate([contact_slopes, rig_contact_slopes], axis=1),
     )

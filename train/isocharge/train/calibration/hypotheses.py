@@ -1,8 +1,9 @@
-"""Hypotheses of what a session had besides a film of the prior, weighed by how well each predicts the presses.
+"""Hypotheses about what affected the presses of a session besides the parameters of the film, and their probabilities.
 
-A film may have modes of imperfections, a discrepancy of some size and traces that are not described. A session may have
-nuisances, and forces that scatter. Every combination is a hypothesis, and so are traces in a session without any of
-these. The presses weigh them by the evidence of a linear Gaussian model (MacKay 1992), and the estimate is the mixture.
+The film may have imperfections (modes), a discrepancy of some size, and traces that nobody described. The session may
+have nuisances, and the stated forces may scatter. Each combination of these effects is a hypothesis; traces are only
+combined with modes and a discrepancy. The presses determine the probability of each hypothesis by the evidence of a
+linear model with Gaussian noise (MacKay 1992). The estimate is the mixture of the estimates of all hypotheses.
 """
 
 import math
@@ -20,93 +21,114 @@ from isocharge.train.calibration.discrepancy import COMMON, term_count
 from isocharge.train.calibration.nuisances import NUISANCES
 from isocharge.train.calibration.unknowns import UnknownLayout
 
-IMPERFECT = {0.0: 0.5, 1.0: 0.5}
-"""Sizes of the modes of imperfections that are weighed, with what each is believed to beforehand."""
+MODE_SIZES = {0.0: 0.5, 1.0: 0.5}
+"""Considered sizes of the modes relative to those of typical films, each with its prior probability."""
 
-SIZES = {0.0: 0.5, 0.003: 0.1, 0.01: 0.15, 0.03: 0.15, 0.1: 0.1}
-"""Sizes s that are weighed, dimensionless, with what each is believed to beforehand."""
+DISCREPANCY_SIZES = {0.0: 0.5, 0.003: 0.1, 0.01: 0.15, 0.03: 0.15, 0.1: 0.1}
+"""Considered relative sizes of the discrepancy of the charges, each with its prior probability."""
 
-TRACED = 0.01
-"""Probability beforehand of traces that collect and are not described."""
+TRACES_PROBABILITY = 0.01
+"""Prior probability that traces collect charge and are not described in the sensor file."""
 
-SCATTERS = {0.0: 0.95, 0.03: 0.03, 0.1: 0.02}
-"""The same for the standard deviation of a press's force about the one that its charges show, a share, over what the
-rig is said to have."""
+FORCE_SCATTERS = {0.0: 0.95, 0.03: 0.03, 0.1: 0.02}
+"""Considered relative standard deviations of the forces in addition to that of the rig, each with its prior
+probability."""
 
-
-NO_WEIGHT = 1e-7
-"""Largest probability of a hypothesis whose answer does not count."""
+NEGLIGIBLE_PROBABILITY = 1e-7
+"""Probability up to which a hypothesis is left out of the mixture."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What a session may have had besides a film of the prior.
+    """A combination of effects that a session may have besides the parameters of the film.
 
     Attributes:
-        modes: Size of the modes of imperfections over what films have, dimensionless.
-        size: Size of the discrepancy, dimensionless.
-        nuisance_stds: Standard deviation of each nuisance before the presses, in its unit, in the order of `NUISANCES`;
-            without one that temperatures bring along.
-        scatter: Standard deviation of the stated forces besides that of the rig, a share.
-        belief: Probability before the presses.
-        traces: Size of the traces that are not described over what films have, dimensionless.
+        modes: Size of the modes relative to those of typical films, dimensionless.
+        discrepancy: Relative size of the discrepancy of the charges, dimensionless.
+        nuisance_stds: Standard deviation of each nuisance before the presses, in its unit, in the order of `NUISANCES`,
+            without the part that known temperatures add.
+        force_scatter: Relative standard deviation of the forces in addition to that of the rig.
+        prior_probability: Probability before the presses.
+        traces: Size of the traces that are not described, relative to those of typical films, dimensionless.
     """
 
     modes: float = 0.0
-    size: float = 0.0
+    discrepancy: float = 0.0
     nuisance_stds: tuple[float, ...] = (0.0,) * len(NUISANCES)
-    scatter: float = 0.0
-    belief: float = 1.0
+    force_scatter: float = 0.0
+    prior_probability: float = 1.0
     traces: float = 0.0
 
     def covariance(self, layout: UnknownLayout) -> Array:
         """Return what the hypothesis adds to the covariance of the unknowns, shape (n_unknown, n_unknown)."""
         electrode_count = len(layout.electrode_names)
+        # The coefficients of one term are correlated, because part of a discrepancy is common to all electrodes.
         electrode_covariance = np.eye(electrode_count) + COMMON**2
         variance = np.zeros(layout.count)
         variance[layout.modes] = self.modes**2
         variance[layout.traces] = self.traces**2
         variance[layout.nuisances] = np.square(self.nuisance_stds)
         covariance = np.diag(variance)
-        covariance[layout.terms, layout.terms] = self.size**2 * np.kron(np.eye(term_count()), electrode_covariance)
+        term_covariance = np.kron(np.eye(term_count()), electrode_covariance)
+        covariance[layout.terms, layout.terms] = self.discrepancy**2 * term_covariance
         return covariance
 
-    def has(self, cause: str) -> bool:
-        """Return whether the session has a cause: "modes", "size", "traces", "scatter", or the name of a nuisance."""
-        names = [nuisance.name for nuisance in NUISANCES]
-        sizes = dict(zip(names, self.nuisance_stds, strict=True))
-        sizes.update(modes=self.modes, size=self.size, traces=self.traces, scatter=self.scatter)
-        return sizes[cause] > 0.0
+    def has(self, effect: str) -> bool:
+        """Return whether the hypothesis includes an effect.
+
+        Args:
+            effect: "modes", "discrepancy", "traces", "force_scatter", or the name of a nuisance.
+        """
+        nuisance_names = [nuisance.name for nuisance in NUISANCES]
+        sizes = dict(zip(nuisance_names, self.nuisance_stds, strict=True))
+        sizes["modes"] = self.modes
+        sizes["discrepancy"] = self.discrepancy
+        sizes["traces"] = self.traces
+        sizes["force_scatter"] = self.force_scatter
+        return sizes[effect] > 0.0
 
 
 def hypotheses() -> Iterator[Hypothesis]:
-    """Yield all hypotheses that are weighed."""
-    nuisance_probabilities = [nuisance.probabilities for nuisance in NUISANCES]
-    for chosen in product(IMPERFECT.items(), SIZES.items(), *nuisance_probabilities, SCATTERS.items()):
-        modes_size, terms_size, *nuisance_stds, scatter_std = [std for std, _ in chosen]
-        if modes_size > 0.0 and terms_size == 0.0:
-            continue  # the modes are computed to first order, so that they never explain everything
+    """Yield all hypotheses that are considered.
+
+    A hypothesis with modes always has a discrepancy as well, because the modes are computed to first order and never
+    explain the charges completely.
+    """
+    nuisance_stds_and_probabilities = [nuisance.probabilities for nuisance in NUISANCES]
+    combinations = product(
+        MODE_SIZES.items(), DISCREPANCY_SIZES.items(), *nuisance_stds_and_probabilities, FORCE_SCATTERS.items()
+    )
+    for combination in combinations:
+        modes, discrepancy, *nuisance_stds, force_scatter = [size for size, _ in combination]
+        if modes > 0.0 and discrepancy == 0.0:
+            continue
         yield Hypothesis(
-            modes=modes_size,
-            size=terms_size,
+            modes=modes,
+            discrepancy=discrepancy,
             nuisance_stds=tuple(nuisance_stds),
-            scatter=scatter_std,
-            belief=math.prod(probability for _, probability in chosen),
+            force_scatter=force_scatter,
+            prior_probability=math.prod(probability for _, probability in combination),
         )
-    for size_of_terms, belief in SIZES.items():
-        if size_of_terms > 0.0:
-            yield Hypothesis(modes=1.0, size=size_of_terms, belief=TRACED * belief, traces=1.0)
+    for discrepancy, probability in DISCREPANCY_SIZES.items():
+        if discrepancy > 0.0:
+            yield Hypothesis(
+                modes=1.0,
+                discrepancy=discrepancy,
+                prior_probability=TRACES_PROBABILITY * probability,
+                traces=1.0,
+            )
 
 
-class Linearised(NamedTuple):
-    """Residuals of presses about a film, linear in the unknowns: |r|^2 = square + 2 moment u + u normal u.
+class LinearModel(NamedTuple):
+    """Linear dependence of the residuals of presses on the unknowns, in the form of normal equations.
 
-    The logarithm of the determinant of the residuals' covariance is part of the square.
+    If u is the deviation of the unknowns from their mean before the presses, the sum of squared residuals is
+    `square` + 2 `moment` u + u `normal` u.
 
     Attributes:
-        normal: Shape (n_unknown, n_unknown).
-        moment: Shape (n_unknown,).
-        square: Value at the mean of the unknowns before the presses, u = 0.
+        normal: Matrix of the normal equations, shape (n_unknown, n_unknown).
+        moment: Half the gradient of the sum of squares at u = 0, shape (n_unknown,).
+        square: Sum of squares at u = 0, plus the logarithm of the determinant of the covariance of the residuals.
     """
 
     normal: Array
@@ -114,75 +136,101 @@ class Linearised(NamedTuple):
     square: float
 
     @classmethod
-    def of(cls, jacobian: Array, residual: Array, at: Array) -> "Linearised":
-        """Return the expansion of a residual with its derivatives at unknowns that differ by `at` from their mean."""
-        residual_at_mean = residual - jacobian @ at
+    def of(cls, jacobian: Array, residual: Array, deviation: Array) -> "LinearModel":
+        """Return the model of residuals whose values and derivatives are known at one point.
+
+        Args:
+            jacobian: Derivatives of the residuals by the unknowns, shape (n, n_unknown).
+            residual: Residuals in units of their standard deviations, shape (n,).
+            deviation: Unknowns at this point less their mean before the presses, shape (n_unknown,).
+        """
+        residual_at_mean = residual - jacobian @ deviation
         return cls(
             normal=jacobian.T @ jacobian,
             moment=jacobian.T @ residual_at_mean,
             square=float(residual_at_mean @ residual_at_mean),
         )
 
-    def less(self, jacobian: Array, residual: Array, at: Array, variance: Array) -> "Linearised":
-        """Return the expansion for residuals that have more noise, along directions at right angles to each other.
+    def with_added_noise(
+        self, jacobian: Array, residual: Array, deviation: Array, noise_variance: Array
+    ) -> "LinearModel":
+        """Return the model of the same residuals with additional noise along some orthogonal directions.
+
+        Noise of the variance v reduces the weight of the squared residual along its direction from 1 to 1 / (1 + v).
 
         Args:
-            jacobian: Derivatives along each direction, shape (n, n_unknown).
-            residual: Residual along each direction, shape (n,).
-            at: Unknowns less their mean, as in `of`, shape (n_unknown,).
-            variance: Variance of the noise that comes in along each direction, over the residual's, shape (n,).
+            jacobian: Derivatives of the residuals along the directions, shape (n_direction, n_unknown).
+            residual: Residuals along the directions, shape (n_direction,).
+            deviation: As in `of`, shape (n_unknown,).
+            noise_variance: Variance of the additional noise along each direction, shape (n_direction,).
         """
-        share = np.sqrt(variance / (1.0 + variance))
-        removed = Linearised.of(share[:, None] * jacobian, share * residual, at)
-        log_determinant = float(np.log1p(variance).sum())
-        return Linearised(
+        removed_share = np.sqrt(noise_variance / (1.0 + noise_variance))
+        removed = LinearModel.of(removed_share[:, None] * jacobian, removed_share * residual, deviation)
+        log_determinant = float(np.log1p(noise_variance).sum())
+        return LinearModel(
             normal=self.normal - removed.normal,
             moment=self.moment - removed.moment,
             square=self.square - removed.square + log_determinant,
         )
 
-    def evidence(self, covariance: Array) -> float:
-        """Return the logarithm of the evidence for a covariance of the unknowns before the presses."""
-        solved = self._solve(covariance)
-        reduction = solved.pull @ solved.step
-        return float(-0.5 * (self.square - reduction) - np.log(np.diag(solved.factor)).sum())
+    def log_evidence(self, prior_covariance: Array) -> float:
+        """Return the logarithm of the evidence of the presses, except for a constant.
 
-    def given(self, covariance: Array) -> tuple[Array, Array]:
-        """Return mean and covariance of the unknowns after the presses, for a covariance before them."""
-        solved = self._solve(covariance)
-        active = solved.active
+        Args:
+            prior_covariance: Covariance of the unknowns before the presses, shape (n_unknown, n_unknown).
+        """
+        solution = self._solve(prior_covariance)
+        explained_square = solution.moment @ solution.step
+        half_log_determinant = np.log(np.diag(solution.precision_factor)).sum()
+        return float(-0.5 * (self.square - explained_square) - half_log_determinant)
+
+    def posterior(self, prior_covariance: Array) -> tuple[Array, Array]:
+        """Return mean and covariance of the unknowns after the presses.
+
+        Args:
+            prior_covariance: Covariance of the unknowns before the presses, shape (n_unknown, n_unknown).
+
+        Returns:
+            The mean less the mean before the presses, shape (n_unknown,), and the covariance, shape (n_unknown,
+            n_unknown). Unknowns without a variance before the presses keep their mean.
+        """
+        solution = self._solve(prior_covariance)
+        active = solution.active
         mean = np.zeros(len(active))
-        mean[active] = -solved.root @ solved.step
-        posterior_covariance = np.zeros_like(covariance)
-        posterior_covariance[np.ix_(active, active)] = solved.root @ cho_solve((solved.factor, True), solved.root.T)
-        return mean, posterior_covariance
+        mean[active] = -solution.prior_root @ solution.step
+        covariance = np.zeros_like(prior_covariance)
+        whitened_covariance = cho_solve((solution.precision_factor, True), solution.prior_root.T)
+        covariance[np.ix_(active, active)] = solution.prior_root @ whitened_covariance
+        return mean, covariance
 
-    def _solve(self, covariance: Array) -> "_Solution":
+    def _solve(self, prior_covariance: Array) -> "_Solution":
         """Solve the normal equations of the unknowns that have a variance before the presses."""
-        active = np.diag(covariance) > 0.0
+        active = np.diag(prior_covariance) > 0.0
         active_block = np.ix_(active, active)
-        root = np.asarray(np.linalg.cholesky(covariance[active_block]), np.float64)
-        posterior_precision = np.eye(len(root)) + root.T @ self.normal[active_block] @ root
-        factor = np.asarray(np.linalg.cholesky(posterior_precision), np.float64)
-        pull = root.T @ self.moment[active]
-        return _Solution(active, root, factor, pull, step=cho_solve((factor, True), pull))
+        prior_root = np.asarray(np.linalg.cholesky(prior_covariance[active_block]), np.float64)
+        # In units of this root, the unknowns have the covariance 1 before the presses.
+        precision = np.eye(len(prior_root)) + prior_root.T @ self.normal[active_block] @ prior_root
+        precision_factor = np.asarray(np.linalg.cholesky(precision), np.float64)
+        moment = prior_root.T @ self.moment[active]
+        step = cho_solve((precision_factor, True), moment)
+        return _Solution(active, prior_root, precision_factor, moment, step)
 
 
 class _Solution(NamedTuple):
-    """Solved normal equations of the unknowns in units of the root of their covariance.
+    """Solved normal equations, for unknowns in units in which their covariance before the presses is 1.
 
     Attributes:
         active: Which unknowns have a variance before the presses, shape (n_unknown,).
-        root: Cholesky factor of their covariance before the presses.
-        factor: Cholesky factor of their precision after the presses.
-        pull: Moment of the residuals in these units.
-        step: The precision's inverse times the pull.
+        prior_root: Cholesky factor of the covariance of these unknowns before the presses.
+        precision_factor: Cholesky factor of the inverse of their covariance after the presses.
+        moment: Half the gradient of the sum of squares, in these units.
+        step: Inverse of the precision times `moment`; the mean after the presses is at minus this step.
     """
 
     active: Booleans
-    root: Array
-    factor: Array
-    pull: Array
+    prior_root: Array
+    precision_factor: Array
+    moment: Array
     step: Array
 
 
@@ -192,44 +240,49 @@ class Mixture(NamedTuple):
     Attributes:
         mean: Mean less the mean before the presses, shape (n_unknown,).
         covariance: Covariance, shape (n_unknown, n_unknown).
-        weights: Probability of each hypothesis.
-        evidence: Logarithm of the presses' probability density, over that of presses without any residual.
+        probabilities: Probability of each hypothesis after the presses.
+        log_evidence: Logarithm of the evidence of the presses, except for a constant.
     """
 
     mean: Array
     covariance: Array
-    weights: dict[Hypothesis, float]
-    evidence: float
+    probabilities: dict[Hypothesis, float]
+    log_evidence: float
 
     @property
     def best(self) -> Hypothesis:
         """The most probable hypothesis."""
-        return max(self.weights, key=lambda hypothesis: self.weights[hypothesis])
+        return max(self.probabilities, key=lambda hypothesis: self.probabilities[hypothesis])
 
 
-def weigh(
-    linearised: Mapping[float, Linearised],
+def mix_hypotheses(
+    models: Mapping[float, LinearModel],
     prior_covariance: Callable[[Hypothesis], Array],
-    tried: Iterable[Hypothesis] | None = None,
+    considered: Iterable[Hypothesis] | None = None,
 ) -> Mixture:
-    """Return the mixture of hypotheses.
+    """Compute the probability of each hypothesis, and return the mixture of their estimates.
 
     Args:
-        linearised: The expansion of the presses' residuals by the scatter of their forces.
-        prior_covariance: Function that returns the covariance of the unknowns before the presses by a hypothesis.
-        tried: The hypotheses; all if absent.
+        models: Linear model of the residuals for each value of `Hypothesis.force_scatter`.
+        prior_covariance: Function that returns the covariance of the unknowns before the presses for a hypothesis.
+        considered: The hypotheses; by default all.
     """
-    tried = list(tried or hypotheses())
+    considered = list(considered or hypotheses())
     log_weights = np.array(
-        [linearised[each.scatter].evidence(prior_covariance(each)) + np.log(each.belief) for each in tried]
+        [
+            models[each.force_scatter].log_evidence(prior_covariance(each)) + np.log(each.prior_probability)
+            for each in considered
+        ]
     )
-    evidence = float(logsumexp(log_weights))
-    weights = np.exp(log_weights - evidence)
-    counted = np.flatnonzero(weights > NO_WEIGHT)
-    answers = [linearised[tried[i].scatter].given(prior_covariance(tried[i])) for i in counted]
-    mean = np.einsum("h,hp->p", weights[counted], [answer_mean for answer_mean, _ in answers])
-    covariance = sum(
-        weight * (answer_covariance + np.outer(answer_mean - mean, answer_mean - mean))
-        for weight, (answer_mean, answer_covariance) in zip(weights[counted], answers, strict=True)
-    )
-    return Mixture(mean, np.asarray(covariance), dict(zip(tried, weights.tolist(), strict=True)), evidence)
+    log_evidence = float(logsumexp(log_weights))
+    probabilities = np.exp(log_weights - log_evidence)
+
+    relevant = np.flatnonzero(probabilities > NEGLIGIBLE_PROBABILITY)
+    relevant_hypotheses = [considered[number] for number in relevant]
+    estimates = [models[each.force_scatter].posterior(prior_covariance(each)) for each in relevant_hypotheses]
+    # Law of total covariance: covariance within each hypothesis plus covariance of the means.
+    mean = np.einsum("h,hu->u", probabilities[relevant], [each_mean for each_mean, _ in estimates])
+    covariance = np.zeros((len(mean), len(mean)))
+    for probability, (each_mean, each_covariance) in zip(probabilities[relevant], estimates, strict=True):
+        covariance += probability * (each_covariance + np.outer(each_mean - mean, each_mean - mean))
+    return Mixture(mean, covariance, dict(zip(considered, probabilities.tolist(), strict=True)), log_evidence)

@@ -93,7 +93,7 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
 def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
     posterior = result.posterior
     lines = result.presses.lines
-    residual = np.sqrt(posterior.chi2 / np.maximum(posterior.freedom, 1.0))
+    residual = np.sqrt(posterior.chi2 / np.maximum(posterior.degrees_of_freedom, 1.0))
     colours = [FELT if bad else FITTED for bad in posterior.bad]
     axes.bar(np.arange(len(lines)), np.minimum(residual, 10.0), color=colours)
     axes.axhline(1.0, color=INK, lw=0.8, ls="--")

@@ -38,7 +38,7 @@ THERMOMETER = 0.1
 """Standard deviation of the change of the pretension, over that of the prior, if the temperatures of both calibrations
 are known. The remaining change is creep."""
 
-LIKELY = Hypothesis(modes=0.5, size=0.01)
+LIKELY = Hypothesis(modes=0.5, discrepancy=0.01)
 """Imperfections for which presses are planned: half of those that imperfect films have.
 
 Plans for smaller imperfections leave errors on imperfect films that are half as large again. On a film without

@@ -16,7 +16,7 @@ from isocharge.simulate import NoiseModel
 from isocharge.simulate.forward.charge_map import ChargeMap, Domain, differences
 from isocharge.train.calibration.discrepancy import term_count, terms
 from isocharge.train.calibration.film_charges import CONTACT_STEPS
-from isocharge.train.calibration.hypotheses import Hypothesis, Linearised, weigh
+from isocharge.train.calibration.hypotheses import Hypothesis, LinearModel, mix_hypotheses
 
 SIZES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Sizes of the correction that are weighed, dimensionless: a sensor that is not calibrated may be far off."""
@@ -133,19 +133,19 @@ def fit_correction(residuals: Residuals) -> Correction:
         square += chunk.square
 
     # Average over the hypotheses about the size of the correction, with their probabilities as weights.
-    hypotheses = [Hypothesis(size=size) for size in SIZES]
-    mixture = weigh(
-        {0.0: Linearised(normal, moment, square)},
-        lambda hypothesis: hypothesis.size**2 * np.eye(n_coefficient),
+    hypotheses = [Hypothesis(discrepancy=size) for size in SIZES]
+    mixture = mix_hypotheses(
+        {0.0: LinearModel(normal, moment, square)},
+        lambda hypothesis: hypothesis.discrepancy**2 * np.eye(n_coefficient),
         hypotheses,
     )
-    if mixture.best.size == 0.0:
+    if mixture.best.discrepancy == 0.0:
         return Correction(domain, np.zeros((term_count(), n_electrode)), 0.0)
     degrees_of_freedom = float(np.trace(mixture.covariance @ normal))
     return Correction(domain, mixture.mean.reshape(term_count(), -1), degrees_of_freedom)
 
 
-def _linearised(residuals: Residuals, domain: Domain) -> Linearised:
+def _linearised(residuals: Residuals, domain: Domain) -> LinearModel:
     """Return the sum of the squared residuals as a function of the coefficients of the correction.
 
     Args:
@@ -159,7 +159,7 @@ def _linearised(residuals: Residuals, domain: Domain) -> Linearised:
     # Derivatives of residual g of press n with respect to the coefficient of term t for electrode e
     design = polynomials[:, None, :, None] * whitening[:, :, None, :]
     n_coefficient = term_count() * residuals.log_ratio.shape[1]
-    return Linearised.of(design.reshape(-1, n_coefficient), whitened_residuals.ravel(), np.zeros(n_coefficient))
+    return LinearModel.of(design.reshape(-1, n_coefficient), whitened_residuals.ravel(), np.zeros(n_coefficient))
 
 
 def _log_ratio(ratio: Array) -> Array:

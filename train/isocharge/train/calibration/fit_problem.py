@@ -1,0 +1,414 @@
+"""Least-squares problem of a calibration: the unknowns of a film that explain presses, with the prior of the films.
+
+The unknowns minimise
+
+    sum over presses of  min over its contact of |residuals of charges and rig|^2   +   |(p - mean) / std|^2,
+
+by SciPy's trust-region method. The contacts are eliminated in every step (variable projection, Golub and Pereyra 1973),
+so that only the unknowns of the film remain.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # loads a part when it is used
+from scipy.optimize import least_squares
+
+from isocharge.common.arrays import Array, Booleans
+from isocharge.train.calibration.contacts import (
+    AdjustedContacts,
+    adjust_contacts,
+    derivatives_with_adjusted_contacts,
+    neighbouring_films,
+    start_contacts,
+    weighted_sum,
+    with_force,
+)
+from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.hypotheses import (
+    FORCE_SCATTERS,
+    Hypothesis,
+    LinearModel,
+    Mixture,
+    mix_hypotheses,
+)
+from isocharge.train.calibration.nuisances import (
+    NUISANCES,
+    PRETENSION_PER_KELVIN,
+    NuisanceEstimate,
+    nuisance_derivatives,
+    without_nuisances,
+)
+from isocharge.train.calibration.press_data import PressData
+from isocharge.train.calibration.problem import FilmEstimate
+from isocharge.train.calibration.unknowns import UnknownLayout
+
+BAD_PROBABILITY = 1e-4
+"""Probability with which a good press has a larger residual than the limit for bad presses."""
+
+TOLERANCE = 1e-4
+"""Relative change of the sum of squares, or of the unknowns, at which a fit ends."""
+
+MAX_STEPS = 25
+"""Largest number of steps of a fit. A fit that begins at the mean of the prior takes about eight."""
+
+MAX_ROUNDS = 3
+"""Largest number of fits, each with the most probable hypothesis of the one before."""
+
+MEAN_OVER_STD = 1.7
+"""Mean of an effect that only lowers charges at random, such as a leak, over its standard deviation.
+
+The value is that of a share with a uniform distribution from zero upwards. Presses cannot distinguish the mean of such
+an effect from a gain.
+"""
+
+MAX_LINEAR_STEP = 0.2
+"""Largest change of a parameter, in standard deviations of its prior, after which the derivatives are still used."""
+
+SMALLEST_DERIVATIVE = 1e-12
+"""Length by which the derivatives of the residuals by the force are divided at least."""
+
+BOUND_MARGIN = 1e-3
+"""Smallest distance of a start from the bounds, in standard deviations, because the method must start inside them."""
+
+BOUND_TOLERANCE = 1e-9
+"""Distance beyond a bound that is ignored, in standard deviations."""
+
+
+class SolvedFilm(NamedTuple):
+    """The film that explains presses best.
+
+    Attributes:
+        unknowns: Its unknowns, parameters in units of their prior standard deviations, shape (n_unknown,).
+        contacts: The contacts adjusted to it.
+    """
+
+    unknowns: Array
+    contacts: AdjustedContacts
+
+
+class SettledFit(NamedTuple):
+    """A fit in which neither the film nor the selection of presses changes any more.
+
+    Attributes:
+        is_kept: Which presses are kept, shape (n,).
+        solved: The film.
+        mixture: The estimate over all hypotheses.
+    """
+
+    is_kept: Booleans
+    solved: SolvedFilm
+    mixture: Mixture
+
+
+@dataclass(frozen=True)
+class FitProblem:
+    """Films, and the estimate of their unknowns before the presses.
+
+    Attributes:
+        charges: The films.
+        mean: Mean of the unknowns before the presses, shape (n_unknown,). Parameters are in units of their prior
+            standard deviations.
+        covariance: Covariance of the unknowns before the presses without a hypothesis, shape (n_unknown, n_unknown).
+    """
+
+    charges: FilmCharges
+    mean: Array
+    covariance: Array
+
+    @classmethod
+    def of(cls, charges: FilmCharges, initial: FilmEstimate, *, knows_temperature: bool) -> "FitProblem":
+        """Return the problem of a film.
+
+        Args:
+            charges: The films.
+            initial: Estimate of the film before the presses. Coefficients that it does not have are zero.
+            knows_temperature: Whether the temperatures of the presses are known, so that the nuisances of temperature
+                are unknowns.
+        """
+        layout = charges.layout
+        mean = np.zeros(layout.count)
+        covariance = np.zeros((layout.count, layout.count))
+        mean[layout.parameters] = initial.parameters / charges.prior.std
+        if initial.coefficients.size:
+            mean[layout.coefficients] = initial.coefficients
+        estimated = slice(0, initial.unknowns.size)
+        covariance[estimated, estimated] = initial.unknown_covariance
+        if knows_temperature:
+            for nuisance in NUISANCES:
+                place = layout.nuisance(nuisance.name)
+                covariance[place, place] = nuisance.std_with_temperatures**2
+        if knows_temperature and initial.warming is not None:
+            place = layout.nuisance(PRETENSION_PER_KELVIN.name)
+            mean[place] = initial.warming.MPa_per_K
+            covariance[place, place] = initial.warming.std**2
+            covariance[estimated, place] = initial.warming.covariance
+            covariance[place, estimated] = initial.warming.covariance
+        return cls(charges, mean, covariance)
+
+    @property
+    def layout(self) -> UnknownLayout:
+        """Places of the unknowns in their vector."""
+        return self.charges.layout
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of the unknowns, each of shape (n_unknown,); infinite except for parameters."""
+        lower = np.full(self.layout.count, -np.inf)
+        upper = np.full(self.layout.count, np.inf)
+        parameter_lower, parameter_upper = self.charges.prior.bounds
+        lower[self.layout.parameters] = parameter_lower / self.charges.prior.std
+        upper[self.layout.parameters] = parameter_upper / self.charges.prior.std
+        return lower, upper
+
+    def solve(self, data: PressData, weight: Array | Booleans, start: Array, hypothesis: Hypothesis) -> SolvedFilm:
+        """Return the film that explains weighted presses best.
+
+        Args:
+            data: The presses.
+            weight: Weight of the squared residuals of each press, shape (n,).
+            start: Unknowns at which the search begins, shape (n_unknown,).
+            hypothesis: Effects that the session may have. Unknowns that the hypothesis excludes stay at their mean.
+        """
+        data = data.with_force_scatter(hypothesis.force_scatter)
+        covariance = self._prior_covariance(hypothesis)
+        root_weight = np.sqrt(weight)
+        active = np.diag(covariance) > 0.0
+        has_coefficients = bool(active[self.layout.coefficients].any())
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(active, active)]))
+        lower, upper = (bound[active] for bound in self.bounds)
+        latest: list[tuple[Array, SolvedFilm]] = []
+
+        def film_at(active_unknowns: Array) -> SolvedFilm:
+            """Adjust the contacts to a film. The latest film is stored, because SciPy asks for each film twice."""
+            if latest and np.array_equal(latest[0][0], active_unknowns):
+                return latest[0][1]
+            unknowns = self.mean.copy()
+            unknowns[active] = active_unknowns
+            start_of_contacts = latest[0][1].contacts.contact if latest else None
+            film = SolvedFilm(unknowns, self.adjusted_contacts(unknowns, data, start_of_contacts))
+            latest[:] = [(active_unknowns.copy(), film)]
+            return film
+
+        def residual(active_unknowns: Array) -> Array:
+            """Return the residuals of all presses and of the prior, shape (n_residual,)."""
+            press_residual = film_at(active_unknowns).contacts.residual * root_weight[:, None]
+            prior_residual = whitening @ (active_unknowns - self.mean[active])
+            return np.concatenate([press_residual.ravel(), prior_residual])
+
+        def jacobian(active_unknowns: Array) -> Array:
+            """Return the derivatives of these residuals, shape (n_residual, n_active)."""
+            film = film_at(active_unknowns)
+            derivatives = self.derivatives(film, data, with_coefficients=has_coefficients)
+            press_rows = derivatives[:, :, active] * root_weight[:, None, None]
+            return np.concatenate([press_rows.reshape(-1, active_unknowns.size), whitening])
+
+        result = least_squares(
+            residual,
+            np.clip(start[active], lower + BOUND_MARGIN, upper - BOUND_MARGIN),
+            jacobian,
+            (lower, upper),
+            x_scale=1.0,
+            ftol=TOLERANCE,
+            xtol=TOLERANCE,
+            max_nfev=MAX_STEPS,
+        )
+        return film_at(result.x)
+
+    def settle(
+        self,
+        data: PressData,
+        is_kept: Booleans,
+        degrees_of_freedom: Array,
+        solved: SolvedFilm,
+        hypothesis: Hypothesis,
+    ) -> SettledFit:
+        """Repeat the fit until the film and the selection of presses no longer change, for `MAX_ROUNDS` at most.
+
+        Each round fits the film with the most probable hypothesis of the previous round. It readmits presses that were
+        left out before and agree with the film now.
+
+        Args:
+            data: All presses.
+            is_kept: Which presses are kept at first, shape (n,).
+            degrees_of_freedom: Measured numbers beyond three for each press, shape (n,).
+            solved: The film that explains the kept presses without any hypothesis.
+            hypothesis: Hypothesis of the first round.
+        """
+        if hypothesis != Hypothesis():
+            solved = self.solve(data[is_kept], is_kept[is_kept], solved.unknowns, hypothesis)
+        for remaining_rounds in reversed(range(MAX_ROUNDS)):
+            mixture = self.mixture(data[is_kept], solved)
+            step = self.mean + mixture.mean - solved.unknowns
+            is_step_small = np.abs(step[self.layout.parameters]).max() < MAX_LINEAR_STEP
+            kept_next = is_kept
+            if not is_kept.all():
+                kept_next = is_kept | self.agrees(data, solved, mixture, degrees_of_freedom)
+            is_selection_stable = np.array_equal(kept_next, is_kept)
+            if remaining_rounds == 0 or (is_step_small and is_selection_stable):
+                break
+            is_kept = kept_next
+            solved = self.solve(data[is_kept], is_kept[is_kept], solved.unknowns, mixture.best)
+        return SettledFit(is_kept, solved, mixture)
+
+    def agrees(self, data: PressData, solved: SolvedFilm, mixture: Mixture, degrees_of_freedom: Array) -> Booleans:
+        """Return which presses agree with a film, given its uncertainty, shape (n,).
+
+        Args:
+            data: The presses, of which the fit need not have used all.
+            solved: The film at which the residuals are linearised.
+            mixture: The estimate of the unknowns.
+            degrees_of_freedom: Measured numbers beyond three for each press, shape (n,).
+        """
+        data = data.with_force_scatter(mixture.best.force_scatter)
+        contacts = self.adjusted_contacts(solved.unknowns, data)
+        jacobian = self.derivatives(SolvedFilm(solved.unknowns, contacts), data)
+        residual = contacts.residual + jacobian @ (self.mean + mixture.mean - solved.unknowns)
+        # Covariance of the residuals of each press: measurement noise (1) plus the uncertainty of the film.
+        covariance = np.eye(jacobian.shape[1]) + jacobian @ mixture.covariance @ jacobian.swapaxes(1, 2)
+        whitened = np.linalg.solve(covariance, residual[:, :, None])[:, :, 0]
+        chi2 = (residual * whitened).sum(axis=1)
+        limit = scipy.stats.chi2.isf(BAD_PROBABILITY / len(data), np.maximum(degrees_of_freedom, 1.0))
+        return np.asarray(chi2 <= limit)
+
+    def mixture(self, data: PressData, solved: SolvedFilm) -> Mixture:
+        """Return the estimate of the unknowns from presses over all hypotheses, within the bounds.
+
+        The residuals are linearised about a film that explains the presses.
+
+        Args:
+            data: The presses.
+            solved: This film.
+        """
+        unknowns = solved.unknowns
+        contacts = self.adjusted_contacts(unknowns, data, solved.contacts.contact)
+        jacobian = self.derivatives(SolvedFilm(unknowns, contacts), data)
+        deviation = unknowns - self.mean
+        model = LinearModel.of(jacobian.reshape(-1, unknowns.size), contacts.residual.ravel(), deviation)
+
+        # A scatter of the forces is additional noise of each press, along the derivative of its residuals by the force.
+        force_derivative = self._force_derivative(unknowns, data, contacts)
+        length = np.linalg.norm(force_derivative, axis=1)
+        direction = force_derivative / np.maximum(length, SMALLEST_DERIVATIVE)[:, None]
+        jacobian_along = np.einsum("nk,nku->nu", direction, jacobian)
+        residual_along = (direction * contacts.residual).sum(axis=1)
+        models = {
+            scatter: model.with_added_noise(jacobian_along, residual_along, deviation, (scatter * length) ** 2)
+            for scatter in FORCE_SCATTERS
+        }
+        mixture = mix_hypotheses(models, self._prior_covariance)
+        bounded = _most_probable_within(self.bounds, self.mean + mixture.mean, mixture.covariance)
+        return mixture._replace(mean=bounded - self.mean)
+
+    def adjusted_contacts(self, unknowns: Array, data: PressData, start: Array | None = None) -> AdjustedContacts:
+        """Return the contacts of the presses that fit a film best.
+
+        Args:
+            unknowns: Unknowns of the film, shape (n_unknown,).
+            data: The presses.
+            start: Contacts (x, y, ln F) at which the search begins, shape (n, 3); by default from the presses.
+        """
+        film = self._film(unknowns)
+        corrected = self._without_nuisances(unknowns, data)
+        if start is None:
+            start = start_contacts(self.charges, film, corrected)
+        return adjust_contacts(self.charges, film, corrected, start)
+
+    def derivatives(self, solved: SolvedFilm, data: PressData, *, with_coefficients: bool = True) -> Array:
+        """Return the derivatives of the residuals by the unknowns. The contacts are adjusted to each film.
+
+        Args:
+            solved: The film, and the contacts of the presses on it.
+            data: The presses.
+            with_coefficients: Whether to compute the derivatives by coefficients, which takes time. They are zero
+                otherwise.
+
+        Returns:
+            Shape (n, n_electrode + 3, n_unknown).
+        """
+        layout = self.layout
+        film_unknowns = layout.film if with_coefficients else layout.parameters
+        contact = with_force(solved.contacts.contact)
+        films, shares = self._neighbouring_films(solved.unknowns, data)
+        charge_by_contact = [self.charges.by_contact(film, contact) for film in films]
+        charge_by_film = [
+            self.charges.by_parameter(film[film_unknowns], contact, by_contact)
+            for film, by_contact in zip(films, charge_by_contact, strict=True)
+        ]
+
+        jacobian = np.zeros((*data.measured.shape, layout.count))
+        charge_rows = slice(0, data.charge.shape[1])
+        jacobian[:, charge_rows, film_unknowns] = data.weight[:, :, None] * weighted_sum(charge_by_film, shares)
+        pretension = layout.parameter("pretension")
+        by_pretension = jacobian[:, :, pretension] / self.charges.prior.std[pretension]
+        jacobian[:, :, layout.nuisances] = nuisance_derivatives(data, by_pretension)
+
+        residual_by_contact = data.residual_slopes(weighted_sum(charge_by_contact, shares))
+        return derivatives_with_adjusted_contacts(jacobian, residual_by_contact)
+
+    def gain_covariance(self, nuisances: dict[str, NuisanceEstimate], force_scatter: float) -> Array:
+        """Return the additional covariance of the film's unknowns when the film is used after the session.
+
+        A drift or a scatter of the forces in the session leaves the mean of all gains uncertain, because later presses
+        may be affected differently.
+
+        Args:
+            nuisances: Estimates of the nuisances of the session by name.
+            force_scatter: Relative standard deviation of the forces.
+        """
+        std = 0.0
+        for nuisance in NUISANCES:
+            std = float(np.hypot(std, nuisance.gain_std(nuisances[nuisance.name])))
+        std = float(np.hypot(std, MEAN_OVER_STD * force_scatter))
+        direction = np.zeros(self.layout.film_count)
+        direction[self.charges.prior.gains] = std / self.charges.prior.spread.gain
+        return np.outer(direction, direction)
+
+    def _prior_covariance(self, hypothesis: Hypothesis) -> Array:
+        """Return the covariance of the unknowns before the presses for a hypothesis, shape (n_unknown, n_unknown)."""
+        return self.covariance + hypothesis.covariance(self.layout)
+
+    def _film(self, unknowns: Array) -> Array:
+        """Return the unknowns of the film with parameters in their own units, as `FilmCharges.film` takes them."""
+        film = unknowns[self.layout.film].copy()
+        film[self.layout.parameters] *= self.charges.prior.std
+        return film
+
+    def _without_nuisances(self, unknowns: Array, data: PressData) -> PressData:
+        """Return the presses without the effect of the nuisances of the session."""
+        return without_nuisances(data, unknowns[self.layout.nuisances])
+
+    def _neighbouring_films(self, unknowns: Array, data: PressData) -> tuple[list[Array], Array]:
+        """Return the films between which the presses are interpolated; see `neighbouring_films`."""
+        return neighbouring_films(self.charges, self._film(unknowns), self._without_nuisances(unknowns, data))
+
+    def _force_derivative(self, unknowns: Array, data: PressData, contacts: AdjustedContacts) -> Array:
+        """Return the derivatives of the residuals by the stated force, shape (n, n_electrode + 3).
+
+        The contacts are adjusted to the stated force.
+        """
+        contact = with_force(contacts.contact)
+        films, shares = self._neighbouring_films(unknowns, data)
+        charge_by_contact = weighted_sum([self.charges.by_contact(film, contact) for film in films], shares)
+        by_force = data.force_derivative()[:, :, None]
+        return derivatives_with_adjusted_contacts(by_force, data.residual_slopes(charge_by_contact))[:, :, 0]
+
+
+def _most_probable_within(bounds: tuple[Array, Array], mean: Array, covariance: Array) -> Array:
+    """Return the most probable unknowns within bounds for a normal distribution, shape (n_unknown,).
+
+    The unknown that is farthest beyond its bound is moved onto the bound, and the others change by their correlation
+    with it. This is repeated until no unknown is beyond its bound.
+    """
+    unknowns = mean
+    for _ in range(len(mean)):
+        excess = unknowns - np.clip(unknowns, *bounds)
+        farthest = int(np.abs(excess).argmax())
+        if abs(excess[farthest]) < BOUND_TOLERANCE:
+            break
+        regression = covariance[:, farthest] / covariance[farthest, farthest]
+        unknowns = unknowns - excess[farthest] * regression
+        covariance = covariance - np.outer(regression, covariance[farthest])
+    return np.clip(unknowns, *bounds)
