@@ -139,10 +139,16 @@ def _fit(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationRe
 
 
 def _print_result(result: CalibrationResult | None, proposed: list[ProposedPress], *, json: bool) -> None:
-    """Print a calibration, if there is one, and the presses that are proposed."""
+    """Print a calibration, if there is one, and the presses that are proposed.
+
+    Args:
+        result: Result of the calibration; None if only presses are proposed.
+        proposed: Presses that should be made next.
+        json: Whether to print JSON instead of sentences.
+    """
     if json:
-        table = {} if result is None else result_table(result)
-        show_json(table | {"next": [vars(press) for press in proposed]})
+        fields = {} if result is None else result_table(result)
+        show_json(fields | {"next": [vars(press) for press in proposed]})
         return
     if result is not None:
         for sentence in result.summary:

@@ -63,6 +63,7 @@ def distil_command(
     data = student_data(model_folder, presses)
 
     def train(run: ResumableRun) -> Fitted:
+        """Train the student, and save the state in the run."""
         return fit(data, fit_config, run=run)
 
     train_and_release(train, fit_identity(data, fit_config), version_folder, options, release)

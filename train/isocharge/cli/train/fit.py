@@ -157,11 +157,18 @@ def fit_command(
 
 
 def _release_films_model(film_prior: FilmPrior, films_config: FilmsConfig, options: ReleaseOptions) -> None:
-    """Train a network for all films of a sensor, and release it."""
+    """Train a network for all films of a sensor, and release it.
+
+    Args:
+        film_prior: Distribution of the films.
+        films_config: Settings of the training.
+        options: Folder and version of the model.
+    """
     version_folder = options.check_version_folder(film_prior.sensor.electrode_names)
     warn_of_stress(film_prior.sensor.film, [film_prior.probe], films_config.force_range[1])
 
     def train(run: ResumableRun) -> FilmsModel:
+        """Train the network on all cores of this machine."""
         with local_workers(worker_count(None)) as executor:
             return fit_films(film_prior, films_config, executor=executor, run=run)
 
@@ -189,12 +196,19 @@ def _release_presses_model(
 
 
 def _release_data_model(data: TrainingData, fit_config: FitConfig, options: ReleaseOptions) -> None:
-    """Train a network on the training data of a known sensor, and release it."""
+    """Train a network on the training data of a known sensor, and release it.
+
+    Args:
+        data: Presses of the sensor for training and test.
+        fit_config: Settings of the training.
+        options: Folder and version of the model.
+    """
     version_folder = options.check_version_folder(data.sensor.electrode_names)
     probes = [parse_probe(notation) for notation in data.probes]
     warn_of_stress(data.sensor.film, probes, data.domain.force_range[1])
 
     def train(run: ResumableRun) -> Fitted:
+        """Train the network, and save the state in the run."""
         return fit(data, fit_config, run=run)
 
     train_and_release(train, fit_identity(data, fit_config), version_folder, options, release)

@@ -139,7 +139,17 @@ class Dialogue:
             ) from end
 
     def _follow_press(self, number: int, contact: Array) -> None:
-        """Take the press of one row of a machine's list."""
+        """Wait for the press of one row of a machine's list, and take it.
+
+        A press that is refused is left out, because the machine has moved to the next row.
+
+        Args:
+            number: Number of the row.
+            contact: Contact (x, y, F) of the row, shape (3,), mm and N.
+
+        Raises:
+            PortLost: If the connection to the board was lost during the press.
+        """
         self._screen.say(f"{number}. {describe_press(contact)}")
         event = self._wait_for(Phase.taken, Phase.refused)
         if event.press is not None:
@@ -207,7 +217,19 @@ class Dialogue:
             return False
 
     def _act_on(self, answer: Answer, press: SteadyPress | None, proposed: Array) -> bool:
-        """Act on an answer; arguments and result as `_handle_line`."""
+        """Carry out the command of an answer: quit, skip, take a press or remove one.
+
+        Args:
+            answer: Answer of the user.
+            press: The steady press about which the user was asked; None before the press.
+            proposed: Contact (x, y, F) that was proposed, shape (3,), mm and N.
+
+        Returns:
+            Whether the dialogue continues with the next proposed press.
+
+        Raises:
+            SessionEnd: If the user quits.
+        """
         if answer.reply == "quit":
             raise SessionEnd
         if answer.reply == "skip":

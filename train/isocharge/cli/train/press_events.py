@@ -75,6 +75,11 @@ class PressEvents:
                 return event
 
     def _read_port(self) -> None:
+        """Read the port until its end, and put the events of the readings into the queue.
+
+        Each event has the number of times that the watch was armed before it, so that events from before the last
+        `arm` can be discarded. This method runs in a thread of its own.
+        """
         arm_count = self._arm_count
         try:
             for chunk in self._chunks:

@@ -141,6 +141,12 @@ class ComparedMethod:
     def fit(self, task: FittingTask) -> "ComparedMethod":
         """Fit the method with each candidate and return the one with the smallest error on validation presses.
 
+        Args:
+            task: Presses for the fit and for the validation.
+
+        Returns:
+            The fitted method, with a text about the chosen parameters.
+
         Raises:
             DatasetError: If the method cannot be fitted to these presses.
         """
@@ -150,23 +156,35 @@ class ComparedMethod:
         grid = list(ParameterGrid(dict(self.candidates)))
         if task.quick:
             grid = grid[:1]
-        fitted = []
-        errors = []
+        regressors = []
+        errors_mm = []
         for parameters in grid:
             regressor = clone(self.regressor).set_params(**parameters)
             regressor.fit(presses.charge, presses.contact)
-            fitted.append(regressor)
-            errors.append(rms(position_error(regressor.predict(inputs), validation.contact)))
-        best = int(np.argmin(errors))
-        words = [describe_parameter(name, value) for name, value in grid[best].items()]
-        words.append(f"{len(presses)} {'noisy' if self.copies else 'clean'} presses")
+            estimate = regressor.predict(inputs)
+            regressors.append(regressor)
+            errors_mm.append(rms(position_error(estimate, validation.contact)))
+        best = int(np.argmin(errors_mm))
+
+        descriptions = [describe_parameter(name, value) for name, value in grid[best].items()]
+        kind = "noisy" if self.copies else "clean"
+        descriptions.append(f"{len(presses)} {kind} presses")
         if len(grid) > 1:
-            words.append(f"best of {len(grid)} by validation ({errors[best]:.3f} mm rms)")
-        return replace(self, regressor=fitted[best], choice=self.choice or ", ".join(words))
+            descriptions.append(f"best of {len(grid)} by validation ({errors_mm[best]:.3f} mm rms)")
+        return replace(self, regressor=regressors[best], choice=self.choice or ", ".join(descriptions))
 
 
 def describe_parameter(name: str, value: object) -> str:
-    """Describe a parameter of a pipeline in words; factors of axes are described by the names of the axes."""
+    """Return a text that describes a parameter of a pipeline.
+
+    Args:
+        name: Name of the parameter, after the names of the steps: "step__parameter".
+        value: Value of the parameter. A mapping contains factors by the names of axes.
+
+    Example:
+        >>> describe_parameter("regressor__neighbours", 8)
+        'neighbours 8'
+    """
     if isinstance(value, Mapping):
         return ", ".join(f"{axis} axis x {factor:g}" for axis, factor in value.items())
     _, _, short_name = name.rpartition("__")

@@ -55,6 +55,9 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         Args:
             charge: Charges without noise, shape (n, n_electrode), pC.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            This estimator.
         """
         presses = LabelledPresses(contact, charge)
         if self.charge_map is not None:
@@ -63,10 +66,11 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
             names = tuple(str(number) for number in range(charge.shape[1]))
             train, validation = split_by_position(presses, VALIDATION_FRACTION, self.seed)
             self.map_ = ChargeField.fit(self.domain, names, train, validation)
-        rows = np.random.default_rng(self.seed).permutation(len(presses))[:N_STARTS]
+        # The search for a contact starts at the start with the most similar charges.
+        start_rows = np.random.default_rng(self.seed).permutation(len(presses))[:N_STARTS]
         self.features_ = whitening().fit(charge)
-        self.starts_ = contact[rows]
-        self.tree_ = cKDTree(self.features_.transform(charge[rows]))
+        self.starts_ = contact[start_rows]
+        self.tree_ = cKDTree(self.features_.transform(charge[start_rows]))
         return self
 
     def predict(self, charge: Array) -> Array:

@@ -56,7 +56,15 @@ class Logarithms(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Transformer that computes ln(max(Q, 1 pC)), or asinh(2 Q / usual size) if the charges have both signs."""
 
     def fit(self, charge: Array, target: object = None) -> "Logarithms":
-        """Determine whether charges, shape (n, n_electrode), pC, have both signs; noise alone does not count."""
+        """Determine whether the charges of an electrode have both signs. Noise alone does not count.
+
+        Args:
+            charge: Charges, shape (n, n_electrode), pC.
+            target: Not used; it is an argument of every transformer of scikit-learn.
+
+        Returns:
+            This transformer.
+        """
         del target
         is_negative = charge <= 0.0
         has_both_signs = (is_negative.mean(axis=0) > BOTH_SIGNS).any()

@@ -85,6 +85,15 @@ class TrainedNetwork(OnnxContact):
     """
 
     def __init__(self, data: TrainingData, hidden: tuple[int, ...], steps: int, noise: NoiseModel, seed: int) -> None:
+        """Store the settings of the training.
+
+        Args:
+            data: Presses of the sensor.
+            hidden: Widths of the hidden layers.
+            steps: Number of optimiser steps.
+            noise: Noise that is added to the charges.
+            seed: Seed of weights, batches and noise.
+        """
         self.data = data
         self.hidden = hidden
         self.steps = steps

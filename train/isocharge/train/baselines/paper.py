@@ -94,42 +94,59 @@ class LinearBand(BaseEstimator, RegressorMixin):  # type: ignore[misc]
             charge: Shape (n, n_electrode), pC.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
+        Returns:
+            This estimator.
+
         Raises:
             DatasetError: If there are too few presses in the band, or charges that are not positive.
         """
-        in_band = contact[:, 2] <= MAX_BAND_FORCE
-        n_band = np.count_nonzero(in_band)
+        is_in_band = contact[:, 2] <= MAX_BAND_FORCE
+        n_band = np.count_nonzero(is_in_band)
         if n_band < MIN_BAND_PRESSES:
             raise DatasetError(
                 f"linear band: expected at least {MIN_BAND_PRESSES} presses of at most {MAX_BAND_FORCE} N, got "
                 f"{n_band}; sweep smaller forces"
             )
-        if (charge[in_band] <= 0.0).any():
+        if (charge[is_in_band] <= 0.0).any():
             raise DatasetError("linear band: expected positive charges, for it interpolates their logarithms")
-        log_slope = np.log(charge[in_band] / contact[in_band, 2:])
-        terms = self._terms(contact[in_band, :2] / self.radius)
-        series, *_ = np.linalg.lstsq(terms, log_slope, rcond=LEAST_SQUARES_TOLERANCE)
+        log_charge_per_force = np.log(charge[is_in_band] / contact[is_in_band, 2:])
+        polynomials = self._terms(contact[is_in_band, :2] / self.radius)
+        coefficients, *_ = np.linalg.lstsq(polynomials, log_charge_per_force, rcond=LEAST_SQUARES_TOLERANCE)
 
+        # Tabulate Q / F and its derivatives with respect to x and y on a grid of the unit disk.
         axis = np.linspace(-1.0, 1.0, GRID_POINTS)
-        square = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-        grid = square[np.hypot(square[:, 0], square[:, 1]) <= 1.0]
-        slope = np.exp(self._terms(grid) @ series)
-        columns = [slope]
+        square_grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        grid = square_grid[np.hypot(square_grid[:, 0], square_grid[:, 1]) <= 1.0]
+        charge_per_force = np.exp(self._terms(grid) @ coefficients)
+        columns = [charge_per_force]
         for step in DIFFERENCE_STEP * np.eye(2):
-            log_difference = (self._terms(grid + step) - self._terms(grid - step)) @ series
-            columns.append(slope * log_difference / (2.0 * DIFFERENCE_STEP * self.radius))
+            log_difference = (self._terms(grid + step) - self._terms(grid - step)) @ coefficients
+            columns.append(charge_per_force * log_difference / (2.0 * DIFFERENCE_STEP * self.radius))
+
+        # Near a grid point, Q is linear in (F, F dx, F dy), so that the pseudoinverse estimates these from the charges.
         self.position_ = grid * self.radius
         self.inverse_ = np.linalg.pinv(np.stack(columns, axis=2))
-        self.tree_ = cKDTree(unit_vectors(slope))
+        self.tree_ = cKDTree(unit_vectors(charge_per_force))
         return self
 
     def predict(self, charge: Array) -> Array:
-        """Estimate contacts, shape (n, 3), mm and N, from charges of shape (n, n_electrode), pC."""
-        _, rows = self.tree_.query(unit_vectors(charge))
-        force, force_times_shift = np.split(np.einsum("nke,ne->nk", self.inverse_[rows], charge), [1], axis=1)
+        """Estimate contacts from charges.
+
+        The grid point is that whose charges have the most similar ratios. The linear map of this grid point then
+        estimates the force and the shift from the grid point.
+
+        Args:
+            charge: Charges, shape (n, n_electrode), pC.
+
+        Returns:
+            Contacts (x, y, F), shape (n, 3), mm and N.
+        """
+        _, grid_rows = self.tree_.query(unit_vectors(charge))
+        estimates = (self.inverse_[grid_rows] @ charge[:, :, None])[:, :, 0]  # (F, F dx, F dy), shape (n, 3)
+        force, force_times_shift = np.split(estimates, [1], axis=1)
         max_shift = 4.0 * self.radius / (GRID_POINTS - 1)  # the linear map is valid up to the next grid points
         shift = np.clip(force_times_shift / np.maximum(force, MIN_DIVISOR), -max_shift, max_shift)
-        return np.column_stack([self.position_[rows] + shift, np.maximum(force, MIN_FORCE)])
+        return np.column_stack([self.position_[grid_rows] + shift, np.maximum(force, MIN_FORCE)])
 
     def _terms(self, position: Array) -> Array:
         """Evaluate the products of Chebyshev polynomials up to the total degree.
@@ -170,35 +187,49 @@ class AffineTable(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         self.neighbours = neighbours
 
     def fit(self, values: Array, target: Array) -> "AffineTable":
-        """Compute the entries and their affine maps; rows with the same target form one entry.
+        """Compute the entries of the table and their affine maps.
+
+        Presses with the same target form one entry, whose features are the mean of their features. The affine map of an
+        entry is fitted to the presses with the most similar features.
 
         Args:
             values: Features of presses, shape (n, n_feature).
             target: Contacts in any coordinates, shape (n, n_target).
-        """
-        _, entry, count = np.unique(target, axis=0, return_inverse=True, return_counts=True)
-        sums = np.zeros((count.size, values.shape[1]))
-        np.add.at(sums, entry.ravel(), values)
-        entries = sums / count[:, None]
 
-        presses = cKDTree(values)
+        Returns:
+            This estimator.
+        """
+        _, entry_of_press, presses_per_entry = np.unique(target, axis=0, return_inverse=True, return_counts=True)
+        feature_sums = np.zeros((presses_per_entry.size, values.shape[1]))
+        np.add.at(feature_sums, entry_of_press.ravel(), values)
+        entries = feature_sums / presses_per_entry[:, None]
+
+        press_tree = cKDTree(values)
         neighbour_ranks = range(1, min(self.neighbours, len(values)) + 1)
-        chunk = max(1, CHUNK // self.neighbours)
+        entries_per_chunk = max(1, CHUNK // self.neighbours)
         maps = []
-        for centres in np.array_split(entries, len(entries) // chunk + 1):
-            _, rows = presses.query(centres, neighbour_ranks)
-            maps.append(affine_maps(values[rows] - centres[:, None], target[rows]))
+        for centres in np.array_split(entries, len(entries) // entries_per_chunk + 1):
+            _, neighbours = press_tree.query(centres, neighbour_ranks)
+            maps.append(affine_maps(values[neighbours] - centres[:, None], target[neighbours]))
         self.tree_ = cKDTree(entries)
         self.maps_ = np.concatenate(maps)
         return self
 
     def predict(self, values: Array) -> Array:
-        """Apply the affine map of the nearest entry to features of shape (n, n_feature)."""
-        _, rows = self.tree_.query(values)
+        """Estimate contacts by the affine map of the nearest entry.
+
+        Args:
+            values: Features, shape (n, n_feature).
+
+        Returns:
+            Contacts in the coordinates of the fit, shape (n, n_target).
+        """
+        _, nearest_entry = self.tree_.query(values)
         n_feature = values.shape[1]
-        slope, constant = np.split(self.maps_[rows], [n_feature], axis=1)
-        linear = np.einsum("ne,nek->nk", values - self.tree_.data[rows], slope)
-        return np.asarray(linear + constant[:, 0])
+        slope, constant = np.split(self.maps_[nearest_entry], [n_feature], axis=1)
+        difference = values - self.tree_.data[nearest_entry]
+        linear_part = (difference[:, None, :] @ slope)[:, 0]
+        return np.asarray(linear_part + constant[:, 0])
 
 
 def affine_maps(offset: Array, target: Array) -> Array:

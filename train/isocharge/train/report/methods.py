@@ -124,6 +124,10 @@ def _single_press_call(method: ComparedMethod, test: LabelledPresses) -> Callabl
     """Return a function that predicts one press, and the next press at each call.
 
     ONNX networks are called as `Predictor` calls them, with arrays that are bound once.
+
+    Args:
+        method: Fitted method.
+        test: Presses that are predicted one after the other.
     """
     inputs = _test_inputs(method, test)[:SINGLE_PRESSES]
     regressor = method.regressor
@@ -162,7 +166,17 @@ def _batch_contender(method: ComparedMethod, test: LabelledPresses, batch_size: 
 def _method_record(
     fitted: FittedMethod, truth: Array, posterior_mean: Array | None, single_timing: Timing, batch_timing: Timing
 ) -> MethodRecord:
-    """Return the record of a method. A method that is given the true force has no force error."""
+    """Return the record of a method, with its errors, times and memory.
+
+    A method that is given the true force has no force error.
+
+    Args:
+        fitted: Fitted method and its estimates of the contacts.
+        truth: True contacts, shape (n, 3), mm and N.
+        posterior_mean: Posterior means of the contacts, shape (n, 3), mm and N; None if they are not computed.
+        single_timing: Time of the prediction of one press.
+        batch_timing: Time of the prediction of many presses.
+    """
     errors = ContactErrors.of(fitted.estimate, truth)
     if fitted.method.given_force:
         errors = replace(errors, force_rms_percent=None, force_median_percent=None)

@@ -83,7 +83,13 @@ def cost_plot(records: Sequence[MethodRecord], cost: Cost, limits: Mapping[str, 
 
 
 def _draw_methods(axes: Axes, records: Sequence[MethodRecord], cost: Cost) -> None:
-    """Draw one point for each method; points of methods that are not comparable are hollow."""
+    """Draw one point for each method. Points of methods that are not comparable are hollow.
+
+    Args:
+        axes: Axes of matplotlib.
+        records: Results of the methods.
+        cost: Cost on the horizontal axis.
+    """
     markers = {kind: cycle(MARKERS) for kind in KIND_COLOURS}
     for record in records:
         colour = KIND_COLOURS[record.method.kind]
@@ -109,11 +115,17 @@ def _draw_pareto_front(axes: Axes, records: Sequence[MethodRecord], cost: Cost) 
 
 
 def _set_logarithmic_axes(axes: Axes, x_label: str, y_label: str) -> None:
-    """Set both axes to logarithmic scales with plain numbers."""
+    """Set both axes to logarithmic scales with plain numbers.
+
+    Args:
+        axes: Axes of matplotlib.
+        x_label: Label of the horizontal axis.
+        y_label: Label of the vertical axis.
+    """
     axes.set(xscale="log", yscale="log", xlabel=x_label, ylabel=y_label)
     for axis in (axes.xaxis, axes.yaxis):
         lower, upper = axis.get_view_interval()
-        is_short = upper < 1e3 * lower
+        is_short = upper < 1e3 * lower  # a short axis has labels between the powers of ten, too
         multiples = (1.0, 2.0, 5.0) if is_short else (1.0,)
         axis.set_major_locator(LogLocator(subs=multiples))
         axis.set_major_formatter("{x:g}")
@@ -194,14 +206,17 @@ def mismatch_plot(results: Sequence[Mapping[str, Any]], nominal_error_mm: float 
     Args:
         results: Results of `studies.measure_mismatch`.
         nominal_error_mm: Position error of the released model without a mismatch, mm; None if it is unknown.
+
+    Returns:
+        Figure with the errors on the left and the alarms on the right.
     """
-    drawn = [result for result in results if result["group"] != "noise"]
-    labels = [f"{result['group']}: {result['case']}" for result in drawn]
-    figure = new_figure(11.5, 1.9 + 0.36 * len(drawn))
+    shown_results = [result for result in results if result["group"] != "noise"]
+    labels = [f"{result['group']}: {result['case']}" for result in shown_results]
+    figure = new_figure(11.5, 1.9 + 0.36 * len(shown_results))
     error_axes, alarm_axes = figure.subplots(1, 2, sharey=True, width_ratios=(1.5, 1.0))
 
     for name in results[0]["errors"]:
-        errors_mm = [result["errors"][name]["position_rms_mm"] for result in drawn]
+        errors_mm = [result["errors"][name]["position_rms_mm"] for result in shown_results]
         style = _line_style(name) | {"ls": ""}
         error_axes.plot(errors_mm, labels, **style, label=name)
     error_axes.axvline(nominal_error_mm or np.nan, color=FELT, lw=0.9, ls="--", label="without mismatch")
@@ -210,7 +225,7 @@ def mismatch_plot(results: Sequence[Mapping[str, Any]], nominal_error_mm: float 
     error_axes.xaxis.set_major_formatter("{x:g}")
     error_axes.grid(alpha=0.25, lw=0.5)
 
-    alarms_percent = [result["alarms_percent"] for result in drawn]
+    alarms_percent = [result["alarms_percent"] for result in shown_results]
     bars = alarm_axes.barh(labels, alarms_percent, color=FELT, alpha=0.8, height=0.6)
     alarm_axes.bar_label(bars, fmt="{:g}", padding=3, fontsize=8)
     alarm_axes.axvline(100.0 * FALSE_ALARM_RATE, color=INK, lw=0.9, ls="--")

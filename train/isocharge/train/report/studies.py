@@ -201,7 +201,15 @@ def mismatches(
 def _solved_mismatch(
     group: str, name: str, other_case: EvaluationCase, accuracy: float, executor: Executor | None
 ) -> Mismatch:
-    """Return presses that are simulated with the sensor and the probes of another case."""
+    """Return presses that are simulated with the sensor and the probes of another case.
+
+    Args:
+        group: Group of the mismatch, such as "film".
+        name: Name of the mismatch within the group.
+        other_case: Case whose sensor and probes differ.
+        accuracy: Relative accuracy of the charges.
+        executor: Executor of the simulations; None for this process.
+    """
     forward_maps = other_case.forward_maps(accuracy=accuracy, executor=executor)
     presses = simulate_presses(forward_maps, other_case.test_sweep())
     charge = presses.noisy(other_case.noise, other_case.seed + MISMATCH_NOISE_SEED)
@@ -214,6 +222,12 @@ def _gain_mismatches(
     """Yield presses with random errors of all gains, and then presses with one wrong gain for each electrode.
 
     The random errors are drawn anew for each press.
+
+    Args:
+        case: Case that contains the sensor.
+        truth: Contacts, shape (n, 3), mm and N.
+        noisy_charge: Charges with noise, shape (n, n_electrode), pC.
+        rng: Random number generator.
     """
     gains = 1.0 + GAIN_STD * rng.standard_normal(noisy_charge.shape)
     yield Mismatch("gain", f"each off by {100 * GAIN_STD:g} % rms", truth, gains * noisy_charge)
@@ -226,7 +240,14 @@ def _gain_mismatches(
 def _dead_electrodes(
     case: EvaluationCase, truth: Array, noisy_charge: Array, rng: np.random.Generator
 ) -> Iterator[Mismatch]:
-    """Yield, for each electrode, presses in which this electrode measures only the white noise."""
+    """Yield, for each electrode, presses in which this electrode measures only the white noise.
+
+    Args:
+        case: Case that contains the sensor and the noise.
+        truth: Contacts, shape (n, 3), mm and N.
+        noisy_charge: Charges with noise, shape (n, n_electrode), pC.
+        rng: Random number generator.
+    """
     noise_charge = case.noise.white * rng.standard_normal(noisy_charge.shape)
     for electrode, name in enumerate(case.sensor.electrode_names):
         charge = noisy_charge.copy()
