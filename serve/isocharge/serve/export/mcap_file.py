@@ -123,10 +123,10 @@ class McapFile:
         """
         values = record.json_values
         time_ns = time_of(values)
-        line = record.to_json()
+        json_text = record.to_json()
         is_json = self._encoding is RecordEncoding.json
         messages = {
-            RECORD_TOPIC: line.encode() if is_json else string_message(line),
+            RECORD_TOPIC: json_text.encode() if is_json else string_message(json_text),
             WRENCH_TOPIC: wrench_stamped(values, time_ns),
             POSE_TOPIC: pose_stamped(values, time_ns),
         }
@@ -134,7 +134,13 @@ class McapFile:
             self._add(messages, time_ns)
 
     def _add(self, messages: dict[str, bytes | None], time_ns: int) -> None:
-        sequence = self.records & MAX_SEQUENCE_NUMBER
+        """Add the messages of one record, and write the file to the disk from time to time.
+
+        Args:
+            messages: Message for each topic; None if the record has no message for the topic.
+            time_ns: Time of the record, ns.
+        """
+        sequence = self.records & MAX_SEQUENCE_NUMBER  # the number has 32 bits and wraps
         for topic, data in messages.items():
             if data is not None:
                 self._writer.add_message(self._channels[topic], time_ns, data, publish_time=time_ns, sequence=sequence)

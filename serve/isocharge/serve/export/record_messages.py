@@ -115,6 +115,7 @@ def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
         return None
     x_m = 1e-3 * (contact["x_mm"] or 0.0)
     y_m = 1e-3 * (contact["y_mm"] or 0.0)
+    # The press acts along -z at (x, y, 0). The subtractions from 0.0 avoid negative zeros.
     force = (0.0, 0.0, 0.0 - force_N)
     torque = (0.0 - y_m * force_N, x_m * force_N, 0.0)
     return _stamped(contact["frame_id"], time_ns, (*force, *torque))
@@ -134,12 +135,17 @@ def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
     if None in (x_mm, y_mm, x_std_mm, y_std_mm):
         return None
     xy_correlation = contact.get("xy_correlation") or 0.0  # a record of an earlier version has none
-    variances = ((1e-3 * x_std_mm) ** 2, (1e-3 * y_std_mm) ** 2, DEFLECTION_STD_m**2, *[ROTATION_VARIANCE_rad2] * 3)
-    xy_covariance = 1e-6 * x_std_mm * y_std_mm * xy_correlation
-    covariance = [0.0] * 36  # row by row: x, y, z, and the rotations about these axes
-    covariance[::7] = variances
-    covariance[1] = xy_covariance
-    covariance[6] = xy_covariance
+    x_std_m = 1e-3 * x_std_mm
+    y_std_m = 1e-3 * y_std_mm
+    rotation_variances = [ROTATION_VARIANCE_rad2] * 3
+    # The matrix has 6 rows and 6 columns for x, y, z and the rotations about these axes. It is stored row by row.
+    covariance = [0.0] * 36
+    diagonal = slice(0, 36, 7)
+    x_with_y = 1
+    y_with_x = 6
+    covariance[diagonal] = [x_std_m**2, y_std_m**2, DEFLECTION_STD_m**2, *rotation_variances]
+    covariance[x_with_y] = x_std_m * y_std_m * xy_correlation
+    covariance[y_with_x] = covariance[x_with_y]
     position = (1e-3 * x_mm, 1e-3 * y_mm, 0.0)
     orientation = (0.0, 0.0, 0.0, 1.0)
     return _stamped(contact["frame_id"], time_ns, (*position, *orientation, *covariance))

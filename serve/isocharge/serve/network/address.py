@@ -47,7 +47,7 @@ class Address:
         return self.uds is not None or self.host == "localhost" or (address is not None and address.is_loopback)
 
     def listen(self, backlog: int) -> socket.socket:
-        """Open a listening socket.
+        """Open a socket that listens on this address, and return it.
 
         Args:
             backlog: Largest number of connections that wait to be accepted.
@@ -56,7 +56,7 @@ class Address:
             ListenError: If the address is in use or cannot be used. The message states what to do.
         """
         try:
-            if self.uds:
+            if self.uds is not None:
                 return _listen_unix(self.uds, backlog)
             # create_server sets SO_REUSEADDR, so that a port can be used again right after a server was killed.
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
@@ -64,7 +64,9 @@ class Address:
         except ListenError:
             raise
         except (OSError, UnicodeError) as error:
-            reason = LISTEN_ERRORS.get(getattr(error, "errno", None) or 0, str(error))
+            reason = str(error)
+            if isinstance(error, OSError) and error.errno in LISTEN_ERRORS:
+                reason = LISTEN_ERRORS[error.errno]
             place = self.uds or f"{self.host}:{self.port}"
             raise ListenError(f"cannot listen on {place}: {reason}") from error
 
@@ -108,9 +110,14 @@ def check_exposure(address: Address, *, has_token: bool) -> None:
 
 
 def _listen_unix(path: Path, backlog: int) -> socket.socket:
-    """Open a Unix socket that only the owner can use."""
+    """Open a listening Unix socket that only its owner can use, and return it.
+
+    Args:
+        path: Path of the socket. A file that an earlier server left there is removed first.
+        backlog: Largest number of connections that wait to be accepted.
+    """
     _remove_stale(path)
-    previous_mask = os.umask(0o177)
+    previous_mask = os.umask(0o177)  # only the owner may read and write the new file
     listening = socket.socket(socket.AF_UNIX)
     try:
         listening.bind(str(path))
@@ -133,9 +140,10 @@ def _remove_stale(path: Path) -> None:
         return
     if not stat.S_ISSOCK(path.stat().st_mode):
         raise ListenError(f"{path}: expected nothing or a left-over socket, found a file; choose another path")
-    with socket.socket(socket.AF_UNIX) as probe:
-        if probe.connect_ex(str(path)) != errno.ECONNREFUSED:
-            raise ListenError(f"{path}: another server listens there; stop it or choose another path")
+    with socket.socket(socket.AF_UNIX) as client:
+        connect_error = client.connect_ex(str(path))
+    if connect_error != errno.ECONNREFUSED:  # a connection is refused only if no server listens
+        raise ListenError(f"{path}: another server listens there; stop it or choose another path")
     path.unlink(missing_ok=True)
 
 
@@ -189,7 +197,9 @@ class Token:
         Raises:
             InputError: If the token is empty, or has characters that are not possible in a header or in a URL.
         """
-        if not token or not token.isascii() or not token.isprintable() or token != token.strip() or "%" in token:
+        is_printable_ascii = token.isascii() and token.isprintable()
+        has_outer_blanks = token != token.strip()
+        if not token or not is_printable_ascii or has_outer_blanks or "%" in token:
             raise InputError(
                 "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
                 "meaning in the address of a page; choose another one"
@@ -207,8 +217,10 @@ class Token:
             TokenError: If the header does not contain the token.
         """
         scheme, _, token = authorization.partition(b" ")
-        given = b"Bearer " + token.lstrip(b" ") if scheme.lower() == b"bearer" else authorization
-        if not hmac.compare_digest(given, self._expected):
+        normalised = authorization
+        if scheme.lower() == b"bearer":
+            normalised = b"Bearer " + token.lstrip(b" ")
+        if not hmac.compare_digest(normalised, self._expected):
             received = "a wrong one" if authorization else "none"
             raise TokenError(
                 f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {received}"

@@ -76,7 +76,16 @@ class BrowserCheck:
         fetch_mode: bytes | None,
         fetch_dest: bytes | None,
     ) -> str | None:
-        """Return what is wrong with the headers of a request; None if it is to be answered."""
+        """Return the reason for which a request is refused; None if the request is accepted.
+
+        Args:
+            method: Method in capitals.
+            host: Value of the header `Host`; empty if the request has none.
+            origin: Value of `Origin`; None if the request has none, as for the following headers.
+            fetch_site: Value of `Sec-Fetch-Site`.
+            fetch_mode: Value of `Sec-Fetch-Mode`.
+            fetch_dest: Value of `Sec-Fetch-Dest`.
+        """
         if not (self._any_host or self._is_served(host)):
             return (
                 f"Host: expected an IP address or one of {self._served_names()}, got {_shown(host)}; use the server's "
@@ -91,6 +100,7 @@ class BrowserCheck:
             )
         if fetch_site is None or fetch_site.lower() in TRUSTED_FETCH_SITES:
             return None
+        # A link on a page of another site may open this page, because that site cannot read the answer.
         is_link = method in ("GET", "HEAD") and fetch_mode == b"navigate" and fetch_dest == b"document"
         if is_link:
             return None
@@ -107,35 +117,46 @@ class BrowserCheck:
         return ip_address(name) is not None or name in self._host_names
 
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
-        """Return whether an `Origin` is the server itself, or an allowed name whose proxy replaced the `Host`.
+        """Return whether a request was sent by a page of this server.
 
-        A page on another port of the requested host belongs to another server.
+        The page belongs to this server if its origin is the requested host, or an allowed name whose proxy has replaced
+        the `Host`. A page on another port of the requested host belongs to another server.
+
+        Args:
+            origin: Value of the header `Origin`, for example b"http://localhost:8000".
+            host: Value of the header `Host`, for example b"localhost:8000".
         """
-        scheme, _, authority = origin.decode("latin-1").lower().partition("://")
+        scheme, _, page_host = origin.decode("latin-1").lower().partition("://")
         if scheme not in ("http", "https"):
             return False
-        requested = host.decode("latin-1").lower()
-        if authority == requested:
+        requested_host = host.decode("latin-1").lower()
+        if page_host == requested_host:
             return True
-        page_name = _name_in(f"//{authority}")
-        return page_name in self._allowed_names and page_name != _name_in(f"//{requested}")
+        page_name = _name_in(f"//{page_host}")
+        requested_name = _name_in(f"//{requested_host}")
+        return page_name in self._allowed_names and page_name != requested_name
 
     def _served_names(self) -> str:
+        """Return the names by which this server is reached, separated by commas."""
         return ", ".join(sorted(self._host_names))
 
 
 def host_name(text: str) -> str:
-    """Return a host name in lower case.
+    """Check the value of the option --allow-host, and return the host name in lower case.
+
+    Args:
+        text: A host name, or an IP address. An IPv6 address may be in square brackets.
 
     Raises:
         InputError: If the text is not a plain host name or address; a scheme, a port or a path is refused.
     """
     name = text.strip().lower()
-    is_plain = name.isascii() and name.isprintable() and not set(name) & set("/@?#%* ,\\")
+    has_only_plain_characters = name.isascii() and name.isprintable() and not set(name) & set("/@?#%* ,\\")
     is_bracketed = name.startswith("[") and name.endswith("]")
     if is_bracketed:
         name = name[1:-1]
-    if not name or not is_plain or (":" in name and ip_address(name) is None):
+    has_port = ":" in name and ip_address(name) is None
+    if not name or not has_only_plain_characters or has_port:
         raise InputError(f"--allow-host: expected a host name without scheme, port and path, got {text!r:.100}")
     return name.removesuffix(".")
 

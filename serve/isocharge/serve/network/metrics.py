@@ -66,7 +66,7 @@ class Metrics(Collector):
 
 
 def _model_families(store: ModelStore) -> Iterable[Metric]:
-    """Return the loaded versions with their checksums, and the state of all versions."""
+    """Return one metric with the checksum of each loaded version, and one with the state of every version."""
     info = InfoMetricFamily("isocharge_model", "Loaded versions of the models.", labels=VERSION_LABELS)
     for loaded in store.loaded_versions():
         properties = {"sensor": loaded.metadata.frame_id, "sha256": loaded.model.golden.sha256}
@@ -80,7 +80,7 @@ def _model_families(store: ModelStore) -> Iterable[Metric]:
 
 
 def _traffic_families(traffic: Traffic) -> Iterable[Metric]:
-    """Return the numbers of requests, open connections and lost log lines."""
+    """Return the metrics for requests, open connections and lost log lines."""
     requests = CounterMetricFamily(
         "isocharge_requests", "Requests that were answered or refused.", labels=("transport", "route", "status")
     )
@@ -92,27 +92,36 @@ def _traffic_families(traffic: Traffic) -> Iterable[Metric]:
     for transport, count_open in traffic.open.items():
         opened.add_metric((transport,), count_open())
     lost_lines = CounterMetricFamily("isocharge_log_lines_lost", "Lines of the log that could not be written.")
-    lost_lines.add_metric((), traffic.lost_lines() if traffic.lost_lines else 0)
+    lost_line_count = 0 if traffic.lost_lines is None else traffic.lost_lines()
+    lost_lines.add_metric((), lost_line_count)
     return requests, opened, lost_lines
 
 
 def _inference_families(counters: _Counters) -> Iterable[Metric]:
-    """Yield the numbers of presses and of refused requests for each version of a model."""
-    families = {
+    """Yield the numbers of presses and of refused requests for each version of a model.
+
+    Args:
+        counters: Counters of each version, by the name and the version of the model.
+    """
+    metrics_of_attribute = {
         "presses": ("isocharge_presses", "Presses that were answered."),
         "checked": ("isocharge_misfit_checked", "Presses whose misfit was computed."),
         "alarms": ("isocharge_misfit_alarms", "Presses whose misfit is above the limit of the model."),
         "refused": ("isocharge_inferences_refused", "Requests for an inference that were refused."),
     }
-    for attribute, (name, text) in families.items():
-        family = CounterMetricFamily(name, text, labels=VERSION_LABELS)
-        for labels, statistics in counters.items():
-            family.add_metric(labels, getattr(statistics, attribute))
+    for attribute, (metric_name, description) in metrics_of_attribute.items():
+        family = CounterMetricFamily(metric_name, description, labels=VERSION_LABELS)
+        for name_and_version, statistics in counters.items():
+            family.add_metric(name_and_version, getattr(statistics, attribute))
         yield family
 
 
 def _latency_families(counters: _Counters) -> Iterable[Metric]:
-    """Return the latency histogram and the time of each stage for each version of a model."""
+    """Return the latency histogram and the time of each stage for each version of a model.
+
+    Args:
+        counters: Counters of each version, by the name and the version of the model.
+    """
     latency = HistogramMetricFamily(
         "isocharge_inference_seconds",
         "Time to read, compute and write an inference, without the network.",
@@ -123,9 +132,11 @@ def _latency_families(counters: _Counters) -> Iterable[Metric]:
         "Time of each stage of an inference, under the names of Triton.",
         labels=(*VERSION_LABELS, "stage"),
     )
-    for labels, statistics in counters.items():
-        buckets = list(zip(BUCKET_BOUNDS, accumulate(statistics.latency), strict=True))
-        latency.add_metric(labels, buckets, sum(statistics.stages_ns) / 1e9)
-        for stage, ns in zip(STAGES, statistics.stages_ns, strict=True):
-            stages.add_metric((*labels, stage), ns / 1e9)
+    for name_and_version, statistics in counters.items():
+        cumulative_counts = accumulate(statistics.latency)  # a bucket of Prometheus includes all lower buckets
+        buckets = list(zip(BUCKET_BOUNDS, cumulative_counts, strict=True))
+        total_s = sum(statistics.stages_ns) / 1e9
+        latency.add_metric(name_and_version, buckets, total_s)
+        for stage, stage_ns in zip(STAGES, statistics.stages_ns, strict=True):
+            stages.add_metric((*name_and_version, stage), stage_ns / 1e9)
     return latency, stages

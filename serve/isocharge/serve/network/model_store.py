@@ -114,15 +114,21 @@ class ModelStore:
         return loaded
 
     def _not_found_message(self, name: str, version: str) -> str:
+        """Return the message for a model that is not loaded, with the loaded versions and the reasons for refusals.
+
+        Args:
+            name: Name of the model.
+            version: Version; empty for any version.
+        """
         label = f"{name}/{version}" if version else name
-        available = ", ".join(sorted(loaded.metadata.label for loaded in self.loaded_versions())) or "no model"
-        reasons = [
-            reason
-            for (refused_name, refused_version), reason in sorted(self._refused.items())
-            if refused_name == name and version in ("", str(refused_version))
-        ]
-        parts = [f"model {label!r:.200} is not found", f"serving: {available}", *dict.fromkeys(reasons)]
-        return "; ".join(parts)
+        loaded_labels = sorted(loaded.metadata.label for loaded in self.loaded_versions())
+        available = ", ".join(loaded_labels) or "no model"
+        reasons: list[str] = []
+        for (refused_name, refused_version), reason in sorted(self._refused.items()):
+            is_requested = refused_name == name and version in ("", str(refused_version))
+            if is_requested and reason not in reasons:
+                reasons.append(reason)
+        return "; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *reasons])
 
     def label(self, name: str, version: str = "") -> str | None:
         """Return the label `name/version` of a version; None if it is not loaded.
@@ -169,16 +175,17 @@ class ModelStore:
 
     def version_states(self) -> list[dict[str, str]]:
         """Return the name, version, state and reason of every version that is loaded or was refused."""
-        refused = self._refused
-        loaded = {(version.metadata.name, version.metadata.version) for version in self.loaded_versions()}
+        reasons = self._refused
+        loaded_keys = {(loaded.metadata.name, loaded.metadata.version) for loaded in self.loaded_versions()}
+        all_keys = loaded_keys | set(reasons)
         return [
             {
                 "name": name,
                 "version": str(version),
-                "state": "READY" if (name, version) in loaded else "UNAVAILABLE",
-                "reason": refused.get((name, version), ""),
+                "state": "READY" if (name, version) in loaded_keys else "UNAVAILABLE",
+                "reason": reasons.get((name, version), ""),
             }
-            for name, version in sorted(loaded | set(refused))
+            for name, version in sorted(all_keys)
         ]
 
     def index(self) -> list[dict[str, str]]:
@@ -230,23 +237,30 @@ class ModelStore:
             self._replace(name, [], reasons)
 
     def _load(self, name: str, folder: Path) -> dict[tuple[str, int], str]:
-        """Load every version of a model.
+        """Load every version of a model, and replace the versions that were loaded before.
+
+        If a version is refused, or no version is found, the other versions that were loaded before stay loaded.
+
+        Args:
+            name: Name of the model.
+            folder: Folder of the model.
 
         Returns:
             Reasons why versions were refused, by name and version.
         """
         loaded: dict[int, LoadedVersion] = {}
         refused: dict[tuple[str, int], str] = {}
-        for version, path in version_folders(folder).items():
+        for version, version_folder in version_folders(folder).items():
             # The counters continue when files are loaded again, because a Prometheus counter must never decrease.
             statistics = self._statistics.setdefault((name, version), Statistics())
             try:
-                loaded[version] = _load_version(name, version, path, statistics)
+                loaded[version] = _load_version(name, version, version_folder, statistics)
             except Exception as error:  # A folder may be broken in any way, and must not affect other models.
-                refused[name, version] = _refusal_reason(path, error)
+                refused[name, version] = _refusal_reason(version_folder, error)
         if refused or not loaded:
             loaded = self._loaded_by_version(name) | loaded
-        self._replace(name, [loaded[version] for version in sorted(loaded)], refused)
+        ascending_versions = [loaded[version] for version in sorted(loaded)]
+        self._replace(name, ascending_versions, refused)
         return refused
 
     def _loaded_by_version(self, name: str) -> dict[int, LoadedVersion]:
@@ -254,12 +268,23 @@ class ModelStore:
         return {loaded.metadata.version: loaded for loaded in self.loaded_versions() if loaded.metadata.name == name}
 
     def _replace(self, name: str, versions: list[LoadedVersion], refused: dict[tuple[str, int], str]) -> None:
-        """Replace the versions of a model, in ascending order, by one assignment, so that readers need no lock."""
+        """Replace the versions of a model, and the reasons why versions were refused.
+
+        Each dictionary is replaced by one assignment, so that readers need no lock.
+
+        Args:
+            name: Name of the model.
+            versions: New versions of the model, in ascending order.
+            refused: Reasons why versions were refused, by name and version.
+        """
         loaded = {key: version for key, version in self._loaded.items() if key[0] != name}
-        loaded |= {(name, version.version): version for version in versions}
+        for new_version in versions:
+            loaded[name, new_version.version] = new_version
         if versions:
-            loaded[name, ""] = versions[-1]
-        self._refused = {key: reason for key, reason in self._refused.items() if key[0] != name} | refused
+            loaded[name, ""] = versions[-1]  # the highest version
+
+        other_refused = {key: reason for key, reason in self._refused.items() if key[0] != name}
+        self._refused = other_refused | refused
         self._loaded = loaded
 
 
@@ -299,7 +324,17 @@ def _refusal_reason(folder: Path, error: Exception) -> str:
 
 
 def _load_version(name: str, version: int, folder: Path, statistics: Statistics) -> LoadedVersion:
-    """Load and check one version; raise ModelError if its metadata name another model or version than its folders."""
+    """Load one version of a model, check it, and return it.
+
+    Args:
+        name: Name of the model, which is the name of the parent folder.
+        version: Version, which is the name of the folder.
+        folder: Folder of the version.
+        statistics: Counters of the version.
+
+    Raises:
+        ModelError: If a check fails, or the metadata name another model than the folders.
+    """
     model = load_checked_model(folder)
     if model.metadata.name != name:
         raise ModelError(

@@ -70,9 +70,10 @@ class RequestLog(logging.Handler):
     def exchange(self, exchange: Exchange) -> None:
         """Write a line about a request."""
         transport, route, status, model, error, ns, bytes_in, bytes_out, client = exchange
+        is_internal_error = status in (500, "INTERNAL")
         line = {
             "time": datetime.now(UTC),
-            "level": "error" if status in (500, "INTERNAL") else "info",
+            "level": "error" if is_internal_error else "info",
             "event": "request",
             "transport": transport,
             "route": route,
@@ -101,14 +102,17 @@ class RequestLog(logging.Handler):
         self._write(orjson.dumps({"time": datetime.now(UTC), "level": level} | fields).decode())
 
     def _clean(self, text: str) -> str:
-        """Return a text as valid UTF-8, without the secret, and shortened to the largest number of characters."""
-        text = text.encode("utf-8", "replace").decode()
+        """Return a text as valid UTF-8 without the secret.
+
+        Of a text with more than `MAX_TEXT_CHARACTERS` characters, the middle is replaced by " [...] ".
+        """
+        cleaned = text.encode("utf-8", "replace").decode()
         if self._secret:
-            text = text.replace(self._secret, "[secret]")
-        if len(text) <= MAX_TEXT_CHARACTERS:
-            return text
+            cleaned = cleaned.replace(self._secret, "[secret]")
+        if len(cleaned) <= MAX_TEXT_CHARACTERS:
+            return cleaned
         half = MAX_TEXT_CHARACTERS // 2
-        return f"{text[:half]} [...] {text[-half:]}"
+        return f"{cleaned[:half]} [...] {cleaned[-half:]}"
 
 
 class Traffic:
@@ -202,17 +206,17 @@ class Statistics:
             alarms: Number of presses whose misfit is above the limit.
         """
         read_ns, run_ns, write_ns = stages_ns
-        totals_ns = self.stages_ns
+        bucket = bisect_left(LATENCY_BOUNDS_NS, read_ns + run_ns + write_ns)
         with self._lock:
             self.presses += presses
             self.unchecked += unchecked
             self.alarms += alarms
             self.answered += 1
-            self.latency[bisect_left(LATENCY_BOUNDS_NS, read_ns + run_ns + write_ns)] += 1
+            self.latency[bucket] += 1
             # Three statements take half a microsecond less than a loop.
-            totals_ns[0] += read_ns
-            totals_ns[1] += run_ns
-            totals_ns[2] += write_ns
+            self.stages_ns[0] += read_ns
+            self.stages_ns[1] += run_ns
+            self.stages_ns[2] += write_ns
             self.last_ms = time.time_ns() // 1_000_000
 
     def failed(self, ns: int) -> None:
@@ -234,10 +238,10 @@ class Statistics:
     def to_json(self) -> dict[str, Any]:
         """Return the counters under Triton's names. The time in the queue is 0, because no request waits in a queue."""
         counters = self.snapshot()
-        totals_ns = dict(zip(STAGES, counters.stages_ns, strict=True))
-        totals_ns["queue"] = 0
-        totals_ns["success"] = sum(counters.stages_ns)
-        inference_stats = {name: {"count": counters.answered, "ns": ns} for name, ns in totals_ns.items()}
+        durations_ns = dict(zip(STAGES, counters.stages_ns, strict=True))
+        durations_ns["queue"] = 0
+        durations_ns["success"] = sum(counters.stages_ns)
+        inference_stats = {name: {"count": counters.answered, "ns": ns} for name, ns in durations_ns.items()}
         inference_stats["fail"] = {"count": counters.refused, "ns": counters.refused_ns}
         return {
             "last_inference": counters.last_ms,

@@ -59,11 +59,12 @@ class McapOutput:
     def discard(self) -> None:
         """Close the file without an index; in a replay it is removed."""
         self._file.is_abandoned = True
-        stopped = OutputError(f"{self._path}: incomplete")
+        # The contexts are left with an error, so that they remove an incomplete file. The error itself is suppressed.
+        incomplete = OutputError(f"{self._path}: incomplete")
         try:
-            self._stack.__exit__(OutputError, stopped, None)
+            self._stack.__exit__(OutputError, incomplete, None)
         except OutputError as error:
-            if error is not stopped:
+            if error is not incomplete:
                 raise
 
 

@@ -66,7 +66,11 @@ class QueuedOutput:
             self._handle(error)
 
     def _handle(self, error: Exception) -> None:
-        """Raise an error that ends the stream, or write the first error of the output to the log."""
+        """Raise an error that ends the stream, or write the first error of the output to the log.
+
+        Raises:
+            Exception: The error, if the errors of this output end the stream.
+        """
         is_first = not self.has_failed
         self.has_failed = True
         if self._ends_stream:

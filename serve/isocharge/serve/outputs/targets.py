@@ -36,23 +36,33 @@ def target_forms() -> str:
 def kind_of(target: str) -> OutputKind:
     """Return the kind of output that a target names.
 
+    The built-in kinds are asked first, and then the kinds that installed packages add by entry points.
+
+    Args:
+        target: Target of an output, such as `json` or `touch.csv`.
+
     Raises:
-        InputError: If no kind accepts the target, or the package that should is broken.
+        InputError: If no kind accepts the target, or a package that adds a kind cannot be loaded.
     """
     for kind in OUTPUT_KINDS:
         if kind.accepts(target):
             return kind
-    names = []
+    added_forms = []
     for entry_point in entry_points(group=ENTRY_POINTS):
-        kind = _loaded(entry_point)
-        if kind.accepts(target):
-            return kind
-        names.append(kind.form)
-    forms = ", ".join([target_forms(), *names])
+        added_kind = _load_kind(entry_point)
+        if added_kind.accepts(target):
+            return added_kind
+        added_forms.append(added_kind.form)
+    forms = ", ".join([target_forms(), *added_forms])
     raise InputError(f"output {shown(target)}: expected one of the forms {forms}")
 
 
-def _loaded(entry_point: EntryPoint) -> OutputKind:
+def _load_kind(entry_point: EntryPoint) -> OutputKind:
+    """Return the kind of output that a package adds.
+
+    Raises:
+        InputError: If the package cannot be loaded, or its entry point is not an OutputKind.
+    """
     try:
         kind = entry_point.load()
     except Exception as error:
@@ -92,13 +102,15 @@ class Outputs:
             InputError: If a target has none of the forms, or two targets write to standard output.
         """
         kinds = [(target, kind_of(target)) for target in targets]
-        standard = [target for target, kind in kinds if kind.is_standard_output]
-        if len(standard) > 1:
-            raise InputError(f"outputs {shown(standard)}: expected at most one on standard output; remove one of them")
+        standard_targets = [target for target, kind in kinds if kind.is_standard_output]
+        if len(standard_targets) > 1:
+            raise InputError(
+                f"outputs {shown(standard_targets)}: expected at most one on standard output; remove one of them"
+            )
         if len(set(targets)) < len(targets):
             raise InputError(f"outputs {shown(list(targets))}: expected targets that differ; remove one of them")
-        # Standard output comes last: if its reader goes away, the other outputs have the record.
-        self._kinds = sorted(kinds, key=lambda pair: pair[1].is_standard_output)
+        # Standard output is written last, so that the other outputs have the record if its reader has gone away.
+        self._kinds = sorted(kinds, key=lambda target_and_kind: target_and_kind[1].is_standard_output)
         self._context = context
         self._outputs: dict[str, Output] = {}
         self.not_written: dict[str, int | None] = {}
@@ -107,7 +119,7 @@ class Outputs:
         """Open the outputs.
 
         Raises:
-            IsochargeError: If an output cannot be opened. Those that were opened before are discarded.
+            IsochargeError: If an output cannot be opened. The outputs that were opened before are discarded.
         """
         for target, kind in self._kinds:
             try:
@@ -118,6 +130,7 @@ class Outputs:
             except Exception as error:
                 self._discard()
                 raise _failure(target, error) from error
+            # A live stream must not wait for a slow consumer, so its records are written by another thread.
             if self._context.is_live and kind.may_block:
                 is_ready = self._context.stdout_is_ready if kind.is_standard_output else lambda: True
                 output = QueuedOutput(output, target, is_ready=is_ready, ends_stream=kind.is_standard_output)
@@ -151,18 +164,21 @@ class Outputs:
                 raise _failure(target, error) from error
 
     def close(self) -> None:
-        """Close the outputs, once, and count the records that are missing in each."""
+        """Close the outputs, once, and count the records that are missing in each output.
+
+        Raises:
+            OSError, IsochargeError: The first error of an output. The other outputs are closed as well.
+        """
         errors: list[BaseException] = []
         for target, output in self._taken():
             try:
                 output.close()
             except (OSError, IsochargeError) as error:
                 errors.append(error)
-            if isinstance(output, QueuedOutput):
-                if output.has_failed:
-                    self.not_written[target] = None
-                elif output.lost:
-                    self.not_written[target] = output.lost
+            if isinstance(output, QueuedOutput) and output.has_failed:
+                self.not_written[target] = None
+            elif isinstance(output, QueuedOutput) and output.lost:
+                self.not_written[target] = output.lost
         if errors:
             raise errors[0]
 

@@ -77,11 +77,12 @@ class TextFile:
 
     def discard(self) -> None:
         """Close the file; in a replay it is removed."""
-        stopped = OutputError(f"{self._path}: incomplete")
+        # The contexts are left with an error, so that they remove an incomplete file. The error itself is suppressed.
+        incomplete = OutputError(f"{self._path}: incomplete")
         try:
-            self._stack.__exit__(OutputError, stopped, None)
+            self._stack.__exit__(OutputError, incomplete, None)
         except OutputError as error:
-            if error is not stopped:
+            if error is not incomplete:
                 raise
 
     def _write_line(self, line: str) -> None:

@@ -32,12 +32,13 @@ class UdpOutput:
         try:
             if not 0 < int(port) <= MAX_PORT:
                 raise ValueError(f"a port is a number from 1 to {MAX_PORT}")
-            family, _, _, _, socket_address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        except (OSError, ValueError) as error:  # ValueError: a part of the name is too long
+            first_address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        except (OSError, ValueError) as error:  # getaddrinfo raises ValueError if a part of the name is too long
             example = f"{SCHEME}127.0.0.1:9870"
             raise InputError(
                 f"output {shown(SCHEME + address)}: expected {SCHEME}HOST:PORT, as in {example} ({error})"
             ) from error
+        family, _, _, _, socket_address = first_address
         self._address = socket_address
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)

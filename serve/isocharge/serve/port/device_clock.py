@@ -78,25 +78,33 @@ class DeviceClock:
             arrived_s: Arrival of the chunk that held the reading, unix seconds.
         """
         if t_us is None:
-            step_s = 0.0 if self._last_arrival_s is None else max(0.0, arrived_s - self._last_arrival_s)
+            step_s = 0.0
+            if self._last_arrival_s is not None:
+                step_s = max(0.0, arrived_s - self._last_arrival_s)
             self._last_arrival_s = arrived_s
             return ReadingTime(arrived_s, None, step_s)
 
         step_us = self._unwrap(t_us, modulus)
-        # The chunks of a file all arrive at the same time, which says nothing about the clock.
-        is_new_arrival = self._chunk_arrival_s not in (None, arrived_s)
-        if self._fitted_us is not None and is_new_arrival:
-            lead_s = self._predict(self._device_us) - arrived_s
-            if lead_s > MAX_DEVIATION_s:
-                self.restarts += 1
-                self._fitted_us = None
-                step_us = 0
+        if self._is_ahead_of(arrived_s):
+            self.restarts += 1
+            self._fitted_us = None  # the fit starts again from this reading
+            step_us = 0
         if self._fitted_us is None:
             self._fitted_us = self._device_us
             self._fitted_host_s = max(arrived_s, self._latest_host_s)
             self._is_first_fit = True
         self._latest_host_s = max(self._latest_host_s, self._predict(self._device_us))
         return ReadingTime(self._latest_host_s, self._device_us, step_us * 1e-6)
+
+    def _is_ahead_of(self, arrived_s: float) -> bool:
+        """Return whether the fitted clock is so far ahead of an arrival, unix seconds, that the clock was set.
+
+        The chunks of a file all arrive at the same time. Such an arrival contains no information about the clock.
+        """
+        is_new_arrival = self._chunk_arrival_s not in (None, arrived_s)
+        if self._fitted_us is None or not is_new_arrival:
+            return False
+        return self._predict(self._device_us) - arrived_s > MAX_DEVIATION_s
 
     def arrived(self, arrival_s: float) -> None:
         """Fit the clock to the arrival of a chunk, whose last reading must be the latest reading.
@@ -123,13 +131,15 @@ class DeviceClock:
                 self._latest_host_s = -math.inf
             return
 
+        # One step of the delay-locked loop (Adriaensen 2005): the delay corrects the time with the gain sqrt(2) * w,
+        # and the rate of the clock with the gain w^2.
         step_s = (self._device_us - self._fitted_us) * 1e-6
         self._fit_age_s += step_s
         bandwidth_Hz = max(BANDWIDTH_Hz, FIRST_BANDWIDTH_Hz / (1.0 + self._fit_age_s))
-        gain = min(MAX_LOOP_GAIN, 2.0 * math.pi * bandwidth_Hz * step_s)
-        self._fitted_host_s = self._predict(self._device_us) + math.sqrt(2.0) * gain * delay_s
+        loop_gain = min(MAX_LOOP_GAIN, 2.0 * math.pi * bandwidth_Hz * step_s)
+        self._fitted_host_s = self._predict(self._device_us) + math.sqrt(2.0) * loop_gain * delay_s
         if step_s > 0.0:
-            self.rate += gain * gain * delay_s / step_s
+            self.rate += loop_gain**2 * delay_s / step_s
         self._fitted_us = self._device_us
 
     def _predict(self, device_us: int) -> float:
@@ -137,7 +147,15 @@ class DeviceClock:
         return self._fitted_host_s + self.rate * (device_us - (self._fitted_us or 0)) * 1e-6
 
     def _unwrap(self, t_us: int, modulus: int) -> int:
-        """Return the step since the reading before, us; 0 where the clock jumped back, or ahead by half its range."""
+        """Return the time since the previous reading, us, and add it to the clock without wraps.
+
+        The result is 0 for the first reading. If the clock jumped back, or ahead by more than half of its range, the
+        device has restarted; then the clock starts again, and the result is 0, too.
+
+        Args:
+            t_us: Clock of the device as it was sent, us.
+            modulus: Time at which the clock wraps to 0, us.
+        """
         last_us = self._raw_us
         self._raw_us = t_us
         if last_us is not None:

@@ -39,7 +39,15 @@ def refuse_foreign_file(name: str, head: bytes) -> None:
 
 
 def _kind_and_command(name: str, head: bytes) -> tuple[str, str] | None:
-    """Return the kind of a file and what to do with the file; None for bytes of a board."""
+    """Return the kind of a file that does not come from a board, and advice what to do with this file.
+
+    Args:
+        name: Name of the file.
+        head: First bytes of the file.
+
+    Returns:
+        Kind and advice, as parts of a sentence; None if the bytes may come from a board.
+    """
     file = shlex.quote(name)
     first_line = head.removeprefix(b"\xef\xbb\xbf").lstrip().partition(b"\n")[0]
     if first_line.startswith(RECORDING_START):

@@ -113,11 +113,16 @@ class Recorder:
         """Write a chunk and the lines of its records.
 
         After an interruption the same chunk may be passed again. It is written once.
+
+        Args:
+            chunk: The chunk.
+            records: Records of the frames in the chunk, each a line of JSON.
         """
-        if chunk is self._last_chunk and self._file.tell() > self._size_before_last:
+        is_written = chunk is self._last_chunk and self._file.tell() > self._size_before_last
+        if is_written:
             return
-        data = base64.b64encode(chunk.data).decode()
-        chunk_line = json.dumps({"chunk": [chunk.timestamp, chunk.clock_ns, chunk.outage_s, data]})
+        base64_data = base64.b64encode(chunk.data).decode()
+        chunk_line = json.dumps({"chunk": [chunk.timestamp, chunk.clock_ns, chunk.outage_s, base64_data]})
         self._last_chunk = chunk
         self._size_before_last = self._file.tell()
         self._write("\n".join([chunk_line, *records]))
@@ -214,6 +219,7 @@ class Recording:
         Raises:
             RecordingError: If a line other than the last one is damaged.
         """
+        # A chunk is followed by its records, so it is yielded when the next chunk or the end of the file is reached.
         chunk: Chunk | None = None
         latencies_us: list[float] = []
         for entry in self._lines(_Entry):
@@ -241,23 +247,34 @@ class Recording:
         return self._lines(kind, beginning='{"timestamp"')
 
     def _lines(self, kind: type[Line], beginning: str = "") -> Iterator[Line]:
-        """Yield the lines after the first one, decoded; only lines with the given beginning, if there is one."""
-        number = 1
-        characters = 0
-        size = self._path.stat().st_size
+        """Yield the content of the lines after the first line, and report the progress.
+
+        Args:
+            kind: Struct as which each line is parsed.
+            beginning: First characters of the lines to parse; empty for all lines. Damaged lines, which do not begin
+                with a brace, are always parsed and cause the error.
+
+        Raises:
+            RecordingError: If a line other than the last one is damaged.
+        """
+        line_number = 1
+        read_characters = 0
+        file_bytes = self._path.stat().st_size
         try:
             with self._path.open(encoding="utf-8", errors="replace") as file:
                 for line in bounded_lines(file, LONGEST_ENTRY):
-                    if not line.endswith("\n"):
+                    is_complete = line.endswith("\n")
+                    if not is_complete:
                         return  # the power failed while the line was written
-                    if number > 1 and (line.startswith(beginning) or not line.startswith("{")):
+                    is_selected = line.startswith(beginning) or not line.startswith("{")
+                    if line_number > 1 and is_selected:
                         yield parse_json(line, "", RecordingError, kind)
-                    number += 1
-                    characters += len(line)
-                    if number % 1000 == 0:
-                        report("reading", min(characters, size), size)
+                    line_number += 1
+                    read_characters += len(line)
+                    if line_number % 1000 == 0:
+                        report("reading", min(read_characters, file_bytes), file_bytes)
         except (OSError, ValueError) as error:
-            raise RecordingError(f"{self._path}, line {number}: damaged ({cut(str(error))})") from error
+            raise RecordingError(f"{self._path}, line {line_number}: damaged ({cut(str(error))})") from error
 
 
 class _Header(Struct):

@@ -71,13 +71,17 @@ class Requester:
         self._expected_echo = b""
 
     def wait_s(self) -> float:
-        """Return the time until the next request is due, s; 0 if it is due now."""
+        """Return the time until the next request is due, s; 0 if it is due now.
+
+        An unanswered request is repeated later than an answered one, and no request is sent while the line is busy.
+        """
         now_s = self._now_s()
         due_s = self._requested_s + 1.0 / self._request.rate_Hz
         is_unanswered = self._received_s < self._requested_s
         if is_unanswered:
             due_s = max(due_s, self._requested_s + REPEAT_TIME_s)
-        return max(0.0, due_s - now_s, self._received_s + QUIET_TIME_s - now_s)
+        quiet_s = self._received_s + QUIET_TIME_s
+        return max(0.0, due_s - now_s, quiet_s - now_s)
 
     def next_request(self) -> bytes:
         """Return the bytes to send now, and note that they are sent."""
@@ -87,18 +91,26 @@ class Requester:
         return self._request.data
 
     def remove_echo(self, received: bytes) -> bytes:
-        """Return the received bytes without the echo of the request."""
+        """Return the received bytes without the echo of the request.
+
+        The echo may arrive in several parts. Complete echoes are counted also if the request states that the line has
+        none; then the bytes are returned unchanged.
+        """
         if not received:
             return b""
         self._received_s = self._now_s()
         echo_length = min(len(received), len(self._expected_echo))
-        if not echo_length or received[:echo_length] != self._expected_echo[:echo_length]:
+        is_echo = received[:echo_length] == self._expected_echo[:echo_length]
+        if echo_length == 0 or not is_echo:
             self._expected_echo = b""
             return received
+
         self._expected_echo = self._expected_echo[echo_length:]
         if not self._expected_echo:
             self._echoes += 1
-        return received[echo_length:] if self._request.echo else received
+        if not self._request.echo:
+            return received
+        return received[echo_length:]
 
 
 MAX_READ_BYTES = 65536
@@ -185,6 +197,7 @@ class SerialLine:
         return data
 
     def _receive_by_pyserial(self, timeout_s: float) -> bytes:
+        """Wait for a byte, s, and return all bytes that have arrived, for a line without a file descriptor."""
         if timeout_s != self._serial.timeout:  # Setting the timeout costs a system call.
             self._serial.timeout = timeout_s
         data: bytes = self._serial.read(1)
@@ -214,9 +227,10 @@ class UdpSocket:
         parts = urlsplit(url)
         if parts.port is None or parts.path or parts.query:
             raise ValueError(f"expected {UDP_SCHEME}HOST:PORT, got {url!r}")
-        family, kind, protocol, _, address = socket.getaddrinfo(
+        addresses = socket.getaddrinfo(
             parts.hostname or "", parts.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
-        )[0]
+        )
+        family, kind, protocol, _, address = addresses[0]
         self._socket = socket.socket(family, kind, protocol)
         try:
             self._socket.bind(address)
@@ -254,10 +268,11 @@ class UdpSocket:
         return bool(readable)
 
     def _end_line(self, data: bytes) -> bytes:
-        """Add an end of line to a datagram of text, unless the board sends ends of lines itself."""
+        """Return a datagram with an end of line if it is text, unless the board sends ends of lines itself."""
         if data.endswith(b"\n"):
             self._board_ends_lines = True
-        if self._board_ends_lines or _CONTROL_CHARACTER.search(data):
+        has_control_characters = _CONTROL_CHARACTER.search(data) is not None
+        if self._board_ends_lines or has_control_characters:
             return data
         is_utf8 = data.decode("utf-8", "replace").encode() == data
         return data + b"\n" if is_utf8 else data

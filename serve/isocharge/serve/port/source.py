@@ -117,6 +117,12 @@ class Port:
                 time.sleep(FIRST_RETRY_PAUSE_s)
 
     def _open(self) -> None:
+        """Open the line, drop the bytes that it has buffered, and make a request due.
+
+        Raises:
+            PortError: If the line cannot be opened.
+            InputError: If the port is a file.
+        """
         is_path = "://" not in self.url
         if is_path and HAS_POSIX_PORTS and not Path(self.url).exists():
             raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
@@ -165,13 +171,13 @@ class Port:
             PortError: If the port is not open.
         """
         while True:
-            started_s = time.monotonic()
+            wait_start_s = time.monotonic()
             outage_s = 0.0
             try:
                 data = self._read()
             except PortLost as error:
                 data = self._read_after_reconnecting(error)
-                outage_s = time.monotonic() - started_s
+                outage_s = time.monotonic() - wait_start_s
                 self.outages += 1
             yield Chunk(data, time.time(), time.perf_counter_ns(), outage_s)
 
@@ -188,7 +194,14 @@ class Port:
         return Chunk(data, time.time(), time.perf_counter_ns())
 
     def _read_after_reconnecting(self, reason: PortLost) -> bytes:
-        """Open the port repeatedly until bytes arrive, and return these bytes."""
+        """Open the port repeatedly until bytes arrive, and return these bytes.
+
+        Args:
+            reason: Error that states why the port was lost.
+
+        Raises:
+            PortLost: The error `reason`, if the port must not be opened again.
+        """
         if not self._reconnect:
             raise reason
         log.warning("%s; trying again until it is back", reason)
@@ -211,14 +224,20 @@ class Port:
         """
         data = self._receive(self._silence_s)
         if not data:
-            speed = f", and that {self._baud} baud is its speed" if has_speed(self.url) else ""
+            speed_advice = f", and that {self._baud} baud is its speed" if has_speed(self.url) else ""
             raise PortLost(
-                f"{self.url}: no data for {self._silence_s:g} s; check that the board is powered and sends{speed}"
+                f"{self.url}: no data for {self._silence_s:g} s; check that the board is powered and sends"
+                f"{speed_advice}"
             )
         return data
 
     def _receive(self, timeout_s: float) -> bytes:
-        """Return the bytes that arrive within a time, s; empty if there are none."""
+        """Return the bytes that arrive within `timeout_s`, s; empty if there are none.
+
+        Raises:
+            PortError: If the port is not open.
+            PortLost: If the port disappears.
+        """
         if self._line is None:
             raise PortError(f"{self.url}: the port is not open; use `with Port(...) as port`")
         try:
@@ -231,7 +250,16 @@ class Port:
             ) from error
 
     def _receive_answer(self, line: SerialLine | UdpSocket, requester: Requester, timeout_s: float) -> bytes:
-        """Send requests when they are due, until an answer arrives or the time is over."""
+        """Send requests when they are due, until an answer arrives, and return the answer.
+
+        Args:
+            line: The open line.
+            requester: Computes when a request is due, and removes the echo of the requests.
+            timeout_s: Longest time to wait, s.
+
+        Returns:
+            The answer; empty if none arrives in time.
+        """
         deadline_s = time.monotonic() + timeout_s
         while True:
             remaining_s = deadline_s - time.monotonic()
@@ -286,11 +314,11 @@ class FileSource:
         """
         opened_s = time.time()
         is_on_disk = stat.S_ISREG(os.fstat(self._descriptor).st_mode)
-        is_start = True
+        is_first_chunk = True
         while data := os.read(self._descriptor, CHUNK_BYTES):
-            if is_start:
+            if is_first_chunk:
                 refuse_foreign_file(self._name, data)
-            is_start = False
+            is_first_chunk = False
             arrival_s = opened_s if is_on_disk else time.time()
             yield Chunk(data, arrival_s, time.perf_counter_ns())
 
@@ -304,7 +332,7 @@ def open_source(
     request: Request | None = None,
     wait: float = 0.0,
 ) -> Chunks:
-    """Return the source with a name, as a context manager.
+    """Return the source of chunks that a URL or a path names, as a context manager.
 
     Args:
         url: A device path or URL, the path of a file or a named pipe, or - for the standard input.
@@ -349,6 +377,11 @@ def _is_file_or_pipe(path: Path) -> bool:
 
 @contextlib.contextmanager
 def _open_file(path: Path) -> Iterator[FileSource]:
+    """Open a file or a named pipe as a source while the block runs.
+
+    Raises:
+        InputError: If the file cannot be read, or does not come from a board.
+    """
     try:
         file = path.open("rb", buffering=0)
     except OSError as error:

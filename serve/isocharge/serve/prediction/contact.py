@@ -50,7 +50,9 @@ class Contact(NamedTuple):
     yF_correlation: float = math.nan
 
     def widened(self, shift: tuple[float, float, float]) -> "Contact":
-        """Return the contact with the uncertainty of an additional, independent error.
+        """Return the contact with larger standard deviations, which include an additional, independent error.
+
+        The error moves x, y and the force together, so its covariances are added, too.
 
         Args:
             shift: Changes of x and y, mm, and of the force, N, that one standard deviation of the error causes.
@@ -62,17 +64,13 @@ class Contact(NamedTuple):
         xy_covariance = self.xy_correlation * self.x_std_mm * self.y_std_mm + x_shift * y_shift
         xF_covariance = self.xF_correlation * self.x_std_mm * self.force_std_N + x_shift * force_shift
         yF_covariance = self.yF_correlation * self.y_std_mm * self.force_std_N + y_shift * force_shift
-        return Contact(
-            self.x_mm,
-            self.y_mm,
-            self.force_N,
-            x_std_mm,
-            y_std_mm,
-            force_std_N,
-            self.misfit,
-            xy_covariance / (x_std_mm * y_std_mm),
-            xF_covariance / (x_std_mm * force_std_N),
-            yF_covariance / (y_std_mm * force_std_N),
+        return self._replace(
+            x_std_mm=x_std_mm,
+            y_std_mm=y_std_mm,
+            force_std_N=force_std_N,
+            xy_correlation=xy_covariance / (x_std_mm * y_std_mm),
+            xF_correlation=xF_covariance / (x_std_mm * force_std_N),
+            yF_correlation=yF_covariance / (y_std_mm * force_std_N),
         )
 
     def fields(self) -> dict[str, Any]:
@@ -88,13 +86,18 @@ class Contact(NamedTuple):
         return f"Contact({numbers}, misfit={self.misfit:.2g})"
 
     def _rounded(self) -> Iterator[tuple[str, str, str]]:
-        """Yield the name, the rounded value and the rounded standard deviation of x, y and the force."""
+        """Yield the name, the rounded value and the rounded standard deviation of x, y and the force.
+
+        Both numbers have as many decimals as are needed for two significant digits of the standard deviation.
+        """
         stds = {"x_mm": self.x_std_mm, "y_mm": self.y_std_mm, "force_N": self.force_std_N}
         for name, std in stds.items():
             decimals = MAX_DECIMALS
             if math.isfinite(std) and std > 0.0:
-                decimals = min(max(1 - math.floor(math.log10(std)), 0), MAX_DECIMALS)
-            yield name, f"{getattr(self, name):.{decimals}f}", f"{std:.{decimals}f}"
+                decimals_of_two_digits = 1 - math.floor(math.log10(std))
+                decimals = min(max(decimals_of_two_digits, 0), MAX_DECIMALS)
+            value = getattr(self, name)
+            yield name, f"{value:.{decimals}f}", f"{std:.{decimals}f}"
 
 
 NO_CORRELATION = dict.fromkeys(Contact._fields[N_WITHOUT_CORRELATION:])
@@ -134,12 +137,12 @@ class Sensitivity:
             Changes of x and y, mm, and of the force, N.
         """
         if not self._is_reusable(contact):
-            neighbour = other()
+            contact_after_unit = other()
             self._reference = contact
             self._unit_shift = (
-                neighbour.x_mm - contact.x_mm,
-                neighbour.y_mm - contact.y_mm,
-                neighbour.force_N - contact.force_N,
+                contact_after_unit.x_mm - contact.x_mm,
+                contact_after_unit.y_mm - contact.y_mm,
+                contact_after_unit.force_N - contact.force_N,
             )
         x_shift, y_shift, force_shift = self._unit_shift
         factor = size / self._unit
@@ -287,12 +290,15 @@ class Validity:
         zero = np.zeros(1)
         if not inside_polygon(zero, zero, self.corners_mm)[0]:
             return 0.0
-        start = self.corners_mm
+        # The nearest point of each edge is the projection of the origin onto the edge, limited to the ends of the edge.
+        start = self.corners_mm  # shape (edges, 2)
         edge = np.roll(start, -1, axis=0) - start
-        edge_length_squared = np.maximum((edge * edge).sum(axis=1), 1e-30)
-        fraction = np.clip(-(start * edge).sum(axis=1) / edge_length_squared, 0.0, 1.0)
+        edge_length_squared = np.maximum((edge * edge).sum(axis=1), 1e-30)  # the last corner may repeat the first one
+        projection = -(start * edge).sum(axis=1) / edge_length_squared  # as a fraction of the edge, shape (edges,)
+        fraction = np.clip(projection, 0.0, 1.0)
         nearest_point = start + fraction[:, np.newaxis] * edge
-        return float((nearest_point**2).sum(axis=1).min())
+        distance_squared_mm2 = (nearest_point**2).sum(axis=1)
+        return float(distance_squared_mm2.min())
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the flags of one contact.
@@ -308,9 +314,12 @@ class Validity:
         )
 
     def _is_outside(self, contact: Contact) -> bool:
-        """Return whether a contact is outside the working area or the range of forces."""
-        low_N, high_N = self.force_range_N
-        if contact.force_N < low_N or contact.force_N > high_N:
+        """Return whether a contact is outside the working area or the range of forces.
+
+        Only a contact between the inscribed and the circumscribed circle of the area is compared with the polygon.
+        """
+        min_force_N, max_force_N = self.force_range_N
+        if contact.force_N < min_force_N or contact.force_N > max_force_N:
             return True
         distance_squared_mm2 = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm
         if distance_squared_mm2 < self.inscribed_radius_squared_mm2:
@@ -320,10 +329,18 @@ class Validity:
         return True
 
     def batch_flags(self, contacts: Contacts) -> list[tuple[str, ...]]:
-        """Return the flags of each of n contacts."""
-        low_N, high_N = self.force_range_N
-        is_outside = ~inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm)
-        is_outside |= (contacts.force_N < low_N) | (contacts.force_N > high_N)
+        """Return the flags of each contact.
+
+        Args:
+            contacts: Contacts of n presses.
+
+        Returns:
+            For each press, the flags that `flags` returns for a single contact.
+        """
+        min_force_N, max_force_N = self.force_range_N
+        is_outside_area = ~inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm)
+        is_outside_forces = (contacts.force_N < min_force_N) | (contacts.force_N > max_force_N)
+        is_outside = is_outside_area | is_outside_forces
         has_misfit = contacts.misfit > self.misfit_limit
         yields = contacts.force_N > self.yield_force_N
         # An implausible contact is outside, too, so that `is_beyond` need not be tested here.
@@ -336,10 +353,18 @@ class Validity:
             distance_squared_mm2 = (contacts.x_mm - centre_x_mm) ** 2 + (contacts.y_mm - centre_y_mm) ** 2
         is_beyond = (distance_squared_mm2 > limit_mm2) | (contacts.force_N > limit_N)
         columns = (is_outside.tolist(), is_beyond.tolist(), has_misfit.tolist(), yields.tolist())
-        return [_flag_words(*row) for row in zip(*columns, strict=True)]
+        return [_flag_words(*conditions) for conditions in zip(*columns, strict=True)]
 
 
 def _flag_words(is_outside: bool, is_beyond: bool, has_misfit: bool, yields: bool) -> tuple[str, ...]:
+    """Return the flag of each condition that is true.
+
+    Args:
+        is_outside: Whether the contact is outside the working area or the range of forces.
+        is_beyond: Whether the contact is so far outside that it cannot be a measurement.
+        has_misfit: Whether the misfit is above the limit of the model.
+        yields: Whether the force is above the force at which the film yields.
+    """
     flags = []
     if is_outside:
         flags.append(OUTSIDE)
@@ -353,7 +378,9 @@ def _flag_words(is_outside: bool, is_beyond: bool, has_misfit: bool, yields: boo
 
 
 def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
-    """Return whether points lie inside a polygon. The function counts the edges to the right of each point.
+    """Return whether points lie inside a polygon.
+
+    A point is inside if a horizontal ray from the point to the right crosses an odd number of edges.
 
     Args:
         x: First coordinates of the points, shape (n,), in the unit of the corners.
@@ -363,10 +390,13 @@ def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
     Returns:
         Shape (n,). The result for points on an edge is undefined.
     """
-    x0, y0 = corners.T[..., np.newaxis]
-    x1, y1 = np.roll(corners, -1, axis=0).T[..., np.newaxis]
-    crosses_height = (y0 > y) != (y1 > y)
+    edge_ends = np.roll(corners, -1, axis=0)
+    # Coordinates of shape (m, 1), so that the arrays below have the shape (m edges, n points).
+    x_start, y_start = corners.T[..., np.newaxis]
+    x_end, y_end = edge_ends.T[..., np.newaxis]
+    crosses_height = (y_start > y) != (y_end > y)
     with np.errstate(divide="ignore", invalid="ignore"):  # horizontal edges have no crossing
-        crossing_x = x0 + (y - y0) * (x1 - x0) / (y1 - y0)
-    crossings_to_the_right = np.count_nonzero(crosses_height & (x < crossing_x), axis=0)
-    return np.asarray(crossings_to_the_right % 2 == 1)
+        crossing_x = x_start + (y - y_start) * (x_end - x_start) / (y_end - y_start)
+    is_to_the_right = x < crossing_x
+    crossing_count = np.count_nonzero(crosses_height & is_to_the_right, axis=0)
+    return np.asarray(crossing_count % 2 == 1)

@@ -112,7 +112,8 @@ class Predictor:
         contact = Contact(*self._press.read())
         x_mm = contact.x_mm - self._centre_x_mm
         y_mm = contact.y_mm - self._centre_y_mm
-        if contact.force_N > self._limit_N or x_mm * x_mm + y_mm * y_mm > self._limit_mm2:
+        is_implausible = contact.force_N > self._limit_N or x_mm * x_mm + y_mm * y_mm > self._limit_mm2
+        if is_implausible:
             self._warn_once(charge_pC, contact)
         return contact
 
@@ -159,11 +160,13 @@ class Predictor:
         Raises:
             ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
         """
-        columns = self._press.columns
-        outputs = run(self._session, as_batch(charge_pC, self.metadata.electrodes), tuple(columns))
-        contacts = np.full((len(outputs["misfit"]), len(Contact._fields)), np.nan, np.float32)
-        for name, part in columns.items():
-            contacts[:, part] = outputs[name]
+        columns_of_output = self._press.columns
+        charges = as_batch(charge_pC, self.metadata.electrodes)
+        outputs = run(self._session, charges, tuple(columns_of_output))
+        # One row for each press and one column for each attribute of Contact. Missing correlations are NaN.
+        contacts = np.full((len(charges), len(Contact._fields)), np.nan, np.float32)
+        for name, columns in columns_of_output.items():
+            contacts[:, columns] = outputs[name]
         return Contacts(*contacts.T)
 
     def __repr__(self) -> str:
@@ -202,6 +205,10 @@ def _describe(value: object) -> str:
 def _check_bound_memory(press: BoundPress, model: Model) -> None:
     """Check that this version of onnxruntime computes in the bound memory and not in copies of it.
 
+    Args:
+        press: Bound memory for one press of the model.
+        model: The model, of which the first golden press is computed.
+
     Raises:
         ModelError: If the bound press and `session.run` give different results.
     """
@@ -210,8 +217,9 @@ def _check_bound_memory(press: BoundPress, model: Model) -> None:
     press.run()
     outputs = run(model.session, charges, tuple(press.columns))
     expected = np.concatenate([rows[0] for rows in outputs.values()])
-    if not np.allclose(press.read(), expected, rtol=1e-4, atol=1e-4):
+    actual = press.read()
+    if not np.allclose(actual, expected, rtol=1e-4, atol=1e-4):
         raise ModelError(
-            f"{model.folder}: onnxruntime {ort.__version__} computes {press.read()} in bound memory and "
+            f"{model.folder}: onnxruntime {ort.__version__} computes {actual} in bound memory and "
             f"{tuple(expected.tolist())} without it; report this with the version and the machine"
         )

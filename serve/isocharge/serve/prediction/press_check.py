@@ -135,7 +135,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     force = _force_summary(errors, rows)
     misfit_text = _frequent_misfits(errors, rows, metadata)
 
-    fits = None
+    fits = None  # too few presses
     if count >= MIN_PRESSES:
         fits = agreement.acceptable and not misfit_text
     notes: list[str] = []
@@ -165,29 +165,38 @@ def _bad_presses(errors: PressErrors) -> Booleans:
     No press is bad if all presses agree with the model, or if too many presses would have to be excluded.
     """
     is_compared = errors.is_compared
-    count = int(is_compared.sum())
-    nothing = np.zeros_like(is_compared)
+    no_bad_press = np.zeros_like(is_compared)
     if Agreement.of(errors, is_compared).acceptable:
-        return nothing
+        return no_bad_press
+
     is_improbable = _improbable_presses(errors, is_compared)
+    compared_count = int(is_compared.sum())
     bad_count = int(is_improbable.sum())
-    max_bad_count = max(1.0, MAX_BAD_FRACTION * count)
-    if not 0 < bad_count <= max_bad_count or count - bad_count < MIN_PRESSES:
-        return nothing
-    if not Agreement.of(errors, is_compared & ~is_improbable).acceptable:
-        return nothing
-    return is_improbable
+    max_bad_count = max(1.0, MAX_BAD_FRACTION * compared_count)
+    has_few_bad_presses = 0 < bad_count <= max_bad_count
+    has_enough_good_presses = compared_count - bad_count >= MIN_PRESSES
+    if not (has_few_bad_presses and has_enough_good_presses):
+        return no_bad_press
+
+    good_presses_agree = Agreement.of(errors, is_compared & ~is_improbable).acceptable
+    return is_improbable if good_presses_agree else no_bad_press
 
 
 def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
-    """Return which of the compared presses have errors that noise and rig hardly cause, shape (n,)."""
+    """Return which of the compared presses have errors that noise and rig hardly cause, shape (n,).
+
+    The limit of the probability is divided by the number of presses (Bonferroni), so that all presses together exceed
+    it by chance with the probability `BAD_PRESS_PROBABILITY`.
+    """
     max_probability = BAD_PRESS_PROBABILITY / max(1, int(is_compared.sum()))
-    squared_ratio = errors.squared_ratio
+    squared_ratio = errors.squared_ratio  # of x, y and the force, shape (n, 3), NaN if unknown
     is_candidate = is_compared & (np.nansum(squared_ratio, axis=1) > BAD_PRESS_MIN_CHI_SQUARED)
     is_improbable = np.zeros_like(is_compared)
     for press in np.flatnonzero(is_candidate):
-        known = squared_ratio[press][~np.isnan(squared_ratio[press])]
-        is_improbable[press] = chi_squared_survival(float(known.sum()), known.size) < max_probability
+        press_ratio = squared_ratio[press]
+        known_ratio = press_ratio[~np.isnan(press_ratio)]
+        probability = chi_squared_survival(float(known_ratio.sum()), known_ratio.size)
+        is_improbable[press] = probability < max_probability
     return is_improbable
 
 
@@ -237,6 +246,15 @@ def _probability_of_fewer(misfit_count: int, count: int) -> float:
 def _verdict(
     fits: bool | None, count: int, position: ErrorSummary | None, force: ErrorSummary | None, misfit_text: str
 ) -> str:
+    """Return the result of the comparison in words.
+
+    Args:
+        fits: Whether noise and rig explain the errors; None if there are too few presses.
+        count: Number of compared presses.
+        position: Errors of the positions; None if no position is known.
+        force: Errors of the forces; None if no force is known.
+        misfit_text: Statement about too many misfits; empty if there are not too many.
+    """
     if fits is None:
         return f"too few presses to say: {count} can be compared, {MIN_PRESSES} are needed"
     if fits:
@@ -286,14 +304,15 @@ def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[s
 
 
 def _explain_exclusion(reason: str, metadata: ModelMetadata) -> str:
+    """Return the reason for an exclusion as a part of a sentence, with the limits of the model if it exceeds them."""
     if reason != NOT_TRAINED:
         return reason
-    low_N, high_N = metadata.force_range_N
+    min_force_N, max_force_N = metadata.force_range_N
     validity = Validity.of(metadata)
     area = f"{validity.area_text} from the centre" if validity.is_centred else validity.area_text
     return (
-        f"outside the model's working area ({area}) or forces ({low_N:.3g} to {high_N:.3g} N); if these are most, look "
-        "at the units"
+        f"outside the model's working area ({area}) or forces ({min_force_N:.3g} to {max_force_N:.3g} N); if these "
+        "are most, look at the units"
     )
 
 
@@ -316,17 +335,19 @@ def _misfit_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]
 
 
 def _common_notes(agreement: Agreement) -> Iterator[str]:
-    """Yield notes about the common shift and the common scale, if they are significant."""
-    x = agreement.shift_x
-    y = agreement.shift_y
-    force = agreement.force
-    if max(abs(x.significance), abs(y.significance)) > MIN_COMMON_SIGNIFICANCE:
+    """Yield notes about the common shift of the positions and the common scale of the forces, if significant."""
+    shift_x = agreement.shift_x
+    shift_y = agreement.shift_y
+    relative_force = agreement.force
+    if max(abs(shift_x.significance), abs(shift_y.significance)) > MIN_COMMON_SIGNIFICANCE:
+        shift_std_mm = max(shift_x.std, shift_y.std)
         yield (
-            f"positions are off by ({x.mean:.2g}, {y.mean:.2g}) +- {max(x.std, y.std):.2g} mm on the average: "
+            f"positions are off by ({shift_x.mean:.2g}, {shift_y.mean:.2g}) +- {shift_std_mm:.2g} mm on the average: "
             "electrodes or rig are shifted"
         )
-    if abs(force.significance) > MIN_COMMON_SIGNIFICANCE:
+    if abs(relative_force.significance) > MIN_COMMON_SIGNIFICANCE:
+        force_scale = 1.0 + relative_force.mean
         yield (
-            f"forces are {1.0 + force.mean:.4g} +- {force.std:.2g} times the measured ones on the average, as after a "
-            "change of pretension, d31 or gains"
+            f"forces are {force_scale:.4g} +- {relative_force.std:.2g} times the measured ones on the average, as "
+            "after a change of pretension, d31 or gains"
         )

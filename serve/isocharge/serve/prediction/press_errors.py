@@ -29,6 +29,9 @@ Y = 1
 FORCE = 2
 """Columns of the errors and standard deviations of `PressErrors`."""
 
+VALUE_COLUMNS = slice(0, 3)
+"""Columns of a `Contact` with x, y and the force."""
+
 STD_COLUMNS = slice(3, 6)
 """Columns of a `Contact` with the standard deviations of x, y and the force."""
 
@@ -104,29 +107,35 @@ class PressErrors:
 
 
 def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
-    """Predict measured presses and compute the errors.
+    """Predict the contacts of measured presses from their charges, and return the errors of these contacts.
+
+    Args:
+        predictor: The model.
+        presses: The presses, with at least the electrodes of the model.
 
     Raises:
         PressError: If the charges of one of the model's electrodes are missing.
     """
     metadata = predictor.metadata
-    presses = presses.of_electrodes(metadata.electrodes, metadata.label)
-    measured = presses.contact
-    predicted = _predicted_contacts(predictor, presses.charge_pC)
+    model_presses = presses.of_electrodes(metadata.electrodes, metadata.label)
+    measured = model_presses.contact  # x, y and force, shape (n, 3)
+    predicted = _predicted_contacts(predictor, model_presses.charge_pC)
 
-    scale = np.ones((len(presses), 3))  # the error of the force is relative to the force
+    # Errors of the position are in mm, errors of the force are relative to the measured force.
+    scale = np.ones((len(model_presses), 3))
     scale[:, FORCE] = measured[:, FORCE]
-    rig_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
+    position_std_mm = model_presses.position_std_mm
+    rig_std = np.column_stack([position_std_mm, position_std_mm, model_presses.force_std])
     is_unknown = np.isnan(measured)
     return PressErrors(
-        lines=presses.lines,
-        row_noun=presses.row_noun,
+        lines=model_presses.lines,
+        row_noun=model_presses.row_noun,
         predicted=predicted,
-        error=(predicted[:, :3] - measured) / scale,
+        error=(predicted[:, VALUE_COLUMNS] - measured) / scale,
         noise_std=np.where(is_unknown, np.nan, predicted[:, STD_COLUMNS] / scale),
         rig_std=np.where(is_unknown, np.nan, rig_std),
         flags=_flags(metadata, predicted),
-        exclusion_reasons=_exclusion_reasons(metadata, presses),
+        exclusion_reasons=_exclusion_reasons(metadata, model_presses),
     )
 
 
@@ -144,36 +153,46 @@ def _predicted_contacts(predictor: Predictor, charge_pC: Array) -> Array:
 
 
 def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], ...]:
-    """Return the flags `outside` and `misfit` of predicted contacts, shape (n, 10)."""
-    batch_flags = Validity.of(metadata).batch_flags(Contacts(*predicted.astype(np.float32).T))
+    """Return the flags `outside` and `misfit` of predicted contacts.
+
+    Args:
+        metadata: Metadata of the model.
+        predicted: Values of a `Contact`, shape (n, 10); NaN where a charge is unknown.
+
+    Returns:
+        The flags of each press.
+    """
+    contacts = Contacts(*predicted.astype(np.float32).T)
+    batch_flags = Validity.of(metadata).batch_flags(contacts)
     is_complete = np.asarray(~np.isnan(predicted).all(axis=1))
     has_misfit = np.asarray(predicted[:, MISFIT_COLUMN] > misfit_limit(metadata))
     all_flags = []
-    for row, words in enumerate(batch_flags):
+    for press, validity_flags in enumerate(batch_flags):
         flags = []
-        if OUTSIDE in words and is_complete[row]:
+        if OUTSIDE in validity_flags and is_complete[press]:
             flags.append(OUTSIDE)
-        if has_misfit[row]:
+        if has_misfit[press]:
             flags.append(MISFIT)
         all_flags.append(tuple(flags))
     return tuple(all_flags)
 
 
 def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tuple[str, ...]:
-    """Return why each press is excluded; empty if it is compared.
+    """Return the reason why each press is excluded; empty if the press is compared.
 
     Whether a press lies in the domain of the model is decided by the measured position and force, not by the predicted
-    ones.
+    position and force.
     """
     x_mm, y_mm, force_N = presses.contact.T
-    low_N, high_N = metadata.force_range_N
-    is_outside = ~np.isnan(x_mm) & ~inside_polygon(x_mm, y_mm, np.array(metadata.working_area_mm))
-    is_outside |= (force_N < low_N) | (force_N > high_N)
+    min_force_N, max_force_N = metadata.force_range_N
+    corners_mm = np.array(metadata.working_area_mm)
+    is_outside_area = ~np.isnan(x_mm) & ~inside_polygon(x_mm, y_mm, corners_mm)
+    is_outside_forces = (force_N < min_force_N) | (force_N > max_force_N)
     is_contact_unknown = np.isnan(presses.contact).all(axis=1)
     is_charge_unknown = np.isnan(presses.charge_pC).any(axis=1)
-    reasons = np.select(
-        [is_charge_unknown, is_contact_unknown, is_outside], [CHARGE_UNKNOWN, CONTACT_UNKNOWN, NOT_TRAINED], default=""
-    )
+    # The first condition that is true gives the reason.
+    conditions = [is_charge_unknown, is_contact_unknown, is_outside_area | is_outside_forces]
+    reasons = np.select(conditions, [CHARGE_UNKNOWN, CONTACT_UNKNOWN, NOT_TRAINED], default="")
     return tuple(reasons.tolist())
 
 
@@ -227,17 +246,19 @@ class ErrorSummary:
         if not size.size:
             return None
         mean_square = float(np.mean(size**2))
-        noise = float(np.mean(noise_variance))
-        rig = float(np.mean(rig_variance))
+        mean_noise_variance = float(np.mean(noise_variance))
+        mean_rig_variance = float(np.mean(rig_variance))
+        explained_variance = mean_noise_variance + mean_rig_variance
+        unexplained_variance = max(mean_square - mean_noise_variance - mean_rig_variance, 0.0)
         return cls(
             presses=size.size,
             rms=math.sqrt(mean_square),
             median=float(np.median(size)),
             max=float(size.max()),
-            noise=math.sqrt(noise),
-            rig=math.sqrt(rig),
-            explained=math.sqrt(noise + rig),
-            beyond=math.sqrt(max(mean_square - noise - rig, 0.0)),
+            noise=math.sqrt(mean_noise_variance),
+            rig=math.sqrt(mean_rig_variance),
+            explained=math.sqrt(explained_variance),
+            beyond=math.sqrt(unexplained_variance),
         )
 
 
@@ -257,20 +278,29 @@ class CommonError:
 
     @classmethod
     def of(cls, error: Array, variance: Array) -> "CommonError":
-        """Estimate the common error from errors and their expected variances, shape (n,), NaN where unknown."""
+        """Estimate the error that all presses have in common, by the mean weighted with the inverse variances.
+
+        Args:
+            error: Errors, shape (n,); NaN where unknown.
+            variance: Expected variances of the errors, shape (n,); NaN where unknown.
+        """
         is_known = ~np.isnan(error)
         count = int(np.count_nonzero(is_known))
-        if not count:
+        if count == 0:
             return cls(np.nan, np.nan, 0.0)
         known_error = error[is_known]
         weight = 1.0 / variance[is_known]
-        mean = float(weight @ known_error / weight.sum())
-        mean_variance = 1.0 / float(weight.sum())
-        chi_squared_per_degree = float(weight @ (known_error - mean) ** 2) / max(count - 1, 1)
+        total_weight = float(weight.sum())
+        mean = float(weight @ known_error) / total_weight
+        mean_variance = 1.0 / total_weight
+
+        # If the errors scatter more than their variances state, the standard error of the mean is larger, too.
+        chi_squared = float(weight @ (known_error - mean) ** 2)
+        chi_squared_per_degree = chi_squared / max(count - 1, 1)
         std = math.sqrt(mean_variance * max(chi_squared_per_degree, 1.0))
         # A constant error of the rig does not become smaller by averaging over the presses.
         std_with_rig = math.sqrt(mean_variance * (1.0 + COMMON_RATIO**2 * count))
-        return cls(mean, std, mean / std_with_rig)
+        return cls(mean, std, significance=mean / std_with_rig)
 
 
 @dataclass(frozen=True)
@@ -297,7 +327,12 @@ class Agreement:
 
     @classmethod
     def of(cls, errors: PressErrors, rows: Booleans) -> "Agreement":
-        """Test the presses of a mask of shape (n,)."""
+        """Test whether noise and rig explain the errors of the selected presses.
+
+        Args:
+            errors: Errors of all presses.
+            rows: Which presses are selected, shape (n,).
+        """
         error = errors.error[rows]
         variance = errors.variance[rows]
         chi_squared = float(np.nansum(errors.squared_ratio[rows]))
@@ -305,7 +340,8 @@ class Agreement:
         shift_x = CommonError.of(error[:, X], variance[:, X])
         shift_y = CommonError.of(error[:, Y], variance[:, Y])
         force = CommonError.of(error[:, FORCE], variance[:, FORCE])
-        significances = [part.significance for part in (shift_x, shift_y, force) if not math.isnan(part.mean)]
+        known_errors = [common for common in (shift_x, shift_y, force) if not math.isnan(common.mean)]
+        squared_significance = sum(common.significance**2 for common in known_errors)
         return cls(
             chi_squared=chi_squared,
             degrees=degrees,
@@ -313,7 +349,7 @@ class Agreement:
             shift_x=shift_x,
             shift_y=shift_y,
             force=force,
-            common_p_value=_p_value(sum(value**2 for value in significances), len(significances)),
+            common_p_value=_p_value(squared_significance, len(known_errors)),
         )
 
     @property
@@ -355,9 +391,10 @@ def chi_squared_survival(statistic: float, degrees: int) -> float:
         smallest_log_term += 0.5 * math.log(4.0 * x / math.pi)
 
     # Each term is the previous term times x / s. Logarithms are added, because the factors overflow.
-    count = degrees // 2
-    s = smallest_s + np.arange(1, count)
-    log_terms = smallest_log_term + np.concatenate([[0.0], np.cumsum(np.log(x / s))])[:count]
+    term_count = degrees // 2
+    s = smallest_s + np.arange(1, term_count)
+    log_ratio_to_smallest = np.concatenate([[0.0], np.cumsum(np.log(x / s))])
+    log_terms = smallest_log_term + log_ratio_to_smallest[:term_count]
     probability = float(np.exp(log_terms).sum())
     if is_odd:
         probability += math.erfc(math.sqrt(x))

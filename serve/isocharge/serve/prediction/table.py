@@ -78,24 +78,32 @@ def _expected_header(electrodes: tuple[str, ...]) -> str:
 
 
 def _charges(table: NumberTable, electrodes: tuple[str, ...], warn: Callable[[str], None]) -> Array:
-    """Read the charges of a table, shape (n, electrodes), pC."""
+    """Read the charges of a table, and return them in the order of the electrodes, shape (n, electrodes), pC.
+
+    Args:
+        table: The table, whose columns have the names of the electrodes.
+        electrodes: Names of the electrodes.
+        warn: Function that is called with a message about columns that are ignored.
+    """
     rule = replace(CHARGE_RULE, may_be_empty=False)
-    chosen = table.choose_columns(dict.fromkeys(electrodes, rule))
-    ignored = [name for name in table.header if name not in electrodes]
-    if ignored:
-        warn(ignored_words(table.where, ignored))
-    columns = table.read(chosen, MAX_CHARGE_ROWS)
-    return np.column_stack([columns.values[name] for name in electrodes])
+    charge_columns = table.choose_columns(dict.fromkeys(electrodes, rule))
+    ignored_names = [name for name in table.header if name not in electrodes]
+    if ignored_names:
+        warn(ignored_words(table.where, ignored_names))
+    content = table.read(charge_columns, MAX_CHARGE_ROWS)
+    return np.column_stack([content.values[name] for name in electrodes])
 
 
 def write_contacts(
     contacts: Contacts, out: TextIO, validity: Validity | None = None, charge_pC: Array | None = None
 ) -> None:
-    """Write contacts as CSV, a row for each press, columns as in `Contact` up to the misfit, numbers to six decimals.
+    """Write contacts as CSV with one row for each press.
+
+    The columns are the attributes of `Contact` up to the misfit. Numbers have six decimals.
 
     Args:
         contacts: The contacts of n presses.
-        out: Receives the text.
+        out: Text file to which the rows are written.
         validity: Limits of the model's validity. If given, a column `flags` is added: words separated by blanks.
         charge_pC: The charges of the presses, shape (n, electrodes), pC. If given together with `validity`, a row
             whose charges do not exceed the noise gets a force of 0 and otherwise empty cells.
@@ -114,12 +122,10 @@ def write_contacts(
         is_touch = touches[start : start + BLOCK_ROWS]
         values = block[:, :N_WITHOUT_CORRELATION].tolist()
         flags = [()] * len(block) if validity is None else validity.batch_flags(Contacts(*block.T))
-        for numbers, row_touches, words in zip(values, is_touch.tolist(), flags, strict=True):
-            cells = tuple(map("{:.6f}".format, numbers)) if row_touches else no_contact
-            if validity is None:
-                writer.writerow(cells)
-            else:
-                writer.writerow((*cells, " ".join(words) if row_touches else ""))
+        for numbers, has_contact, words in zip(values, is_touch.tolist(), flags, strict=True):
+            cells = tuple(map("{:.6f}".format, numbers)) if has_contact else no_contact
+            flag_text = " ".join(words) if has_contact else ""
+            writer.writerow(cells if validity is None else (*cells, flag_text))
 
 
 def blocks(rows: Array) -> Iterator[Array]:
@@ -129,9 +135,13 @@ def blocks(rows: Array) -> Iterator[Array]:
 
 
 def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
-    """Yield a record for each row of charges, shape (n, electrodes), pC; what a table does not have is None.
+    """Yield a record for each row of charges. Times, counters and raw charges, which a table does not have, are None.
 
     A row whose charges do not exceed the noise of the model is out of contact: its force is 0, and it has no position.
+
+    Args:
+        charge_pC: Charges, shape (n, electrodes), pC.
+        predictor: The model.
 
     Raises:
         ChargeError: If the charges do not fit the model.

@@ -10,7 +10,13 @@ from isocharge.serve.record.record import DECIMALS, PredictionRecord, selected_f
 
 
 def csv_header(electrodes: Sequence[str], *, with_tracking: bool = False, with_film: bool = False) -> str:
-    """Return the header of the rows of `csv_row`, for a sensor with these electrodes."""
+    """Return the header of the rows that `csv_row` returns.
+
+    Args:
+        electrodes: Names of the electrodes.
+        with_tracking: Whether the records have the fields of the tracking.
+        with_film: Whether the records have the fields of the film follower.
+    """
     columns: list[str] = []
     for field in selected_fields(with_tracking=with_tracking, with_film=with_film):
         parts = _part_names(field, electrodes)
@@ -22,7 +28,14 @@ def csv_header(electrodes: Sequence[str], *, with_tracking: bool = False, with_f
 
 
 def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
-    """Return a record as a row, numbers with six decimals and flags separated by blanks; unknown values are empty."""
+    """Return a record as a row of a CSV file.
+
+    Numbers have six decimals, flags are separated by blanks, and the cells of unknown values are empty.
+
+    Args:
+        record: The record.
+        electrodes: Names of the electrodes, in the order of the header.
+    """
     fields = selected_fields(with_tracking=record.tracking is not None, with_film=record.film is not None)
     cells: list[str] = []
     for field in fields:
@@ -56,6 +69,7 @@ def _line(cells: Iterable[str]) -> str:
 
 
 def _cell(value: Any) -> str:
+    """Return the text of one cell."""
     if value is None:
         return ""
     if isinstance(value, tuple):

@@ -55,10 +55,11 @@ def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
 
 
 def _fields(struct: type[Struct]) -> Iterator[Field]:
+    """Yield the fields of a struct. The fields of a nested struct with `is_flattened` take the place of the struct."""
     hints = get_type_hints(struct, include_extras=True)
     for name in struct.__struct_fields__:
-        declared, meaning = _split(hints[name], f"{struct.__name__}.{name}")
-        value_type, may_be_null = _without_none(declared)
+        declared_type, meaning = _type_and_meaning(hints[name], f"{struct.__name__}.{name}")
+        value_type, may_be_null = _without_none(declared_type)
         if meaning.is_flattened:
             for field in _fields(value_type):
                 yield field._replace(group=name)
@@ -68,13 +69,21 @@ def _fields(struct: type[Struct]) -> Iterator[Field]:
             yield Field(name, _kind(value_type), meaning, may_be_null)
 
 
-def _split(hint: Any, where: str) -> tuple[Any, Meaning]:
-    """Return the type and the meaning of an annotation."""
-    if get_origin(hint) is Annotated:
-        declared, *notes = get_args(hint)
-        for note in notes:
-            if isinstance(note, Meaning):
-                return declared, note
+def _type_and_meaning(annotation: Any, where: str) -> tuple[Any, Meaning]:
+    """Return the type and the meaning in an annotation of the form `Annotated[type, Meaning(...)]`.
+
+    Args:
+        annotation: Annotation of a field.
+        where: Name of the field, for the error message.
+
+    Raises:
+        TypeError: If the annotation has another form.
+    """
+    if get_origin(annotation) is Annotated:
+        declared_type, *metadata = get_args(annotation)
+        for item in metadata:
+            if isinstance(item, Meaning):
+                return declared_type, item
     raise TypeError(f"{where}: expected Annotated[type, Meaning(...)]")
 
 
@@ -87,6 +96,7 @@ def _without_none(declared: Any) -> tuple[Any, bool]:
 
 
 def _kind(value_type: Any) -> Kind:
+    """Return the kind of values of a type; raise TypeError for a type that no field of a record has."""
     if value_type in KINDS:
         return KINDS[value_type]
     if get_origin(value_type) is dict:

@@ -214,13 +214,18 @@ NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
 
 
 def selected_fields(*, with_tracking: bool, with_film: bool) -> tuple[Field, ...]:
-    """Return the fields of records with or without tracking and the following of the film."""
-    groups = {""}
+    """Return the fields that every record has, and the fields of the optional groups that are selected.
+
+    Args:
+        with_tracking: Whether to include the fields of the tracking.
+        with_film: Whether to include the fields of the film follower.
+    """
+    selected_groups = {""}  # the fields that every record has belong to no group
     if with_tracking:
-        groups.add("tracking")
+        selected_groups.add("tracking")
     if with_film:
-        groups.add("film")
-    return tuple(field for field in RECORD_FIELDS if field.group in groups)
+        selected_groups.add("film")
+    return tuple(field for field in RECORD_FIELDS if field.group in selected_groups)
 
 
 _NAMES = {
@@ -244,15 +249,18 @@ _ENCODE = json.JSONEncoder(allow_nan=False).encode
 
 
 def _json_value(value: Any) -> Any:
-    """Return a value as JSON shows it.
+    """Return the value of a field in the form in which it is written as JSON: numbers are rounded to six decimals.
 
     The class is compared by identity, because the function is called 20 times for each record.
+
+    Args:
+        value: A number, a value that JSON has too, the charges by electrode, or a struct.
     """
-    kind = value.__class__
-    if kind is float:
+    value_class = value.__class__
+    if value_class is float:
         return round(value, DECIMALS)
-    if kind in _UNCHANGED:
+    if value_class in _UNCHANGED:
         return value
-    if kind is dict:
+    if value_class is dict:
         return {name: charge if charge is None else round(charge, DECIMALS) for name, charge in value.items()}
     return {name: _json_value(getattr(value, name)) for name in value.__struct_fields__}

@@ -30,6 +30,13 @@ def record_table() -> str:
 
 
 def _rows(fields: Iterable[Field], prefix: str = "", group: str = "") -> Iterator[str]:
+    """Yield a row of the table for each field, and after it the rows of the fields that it contains.
+
+    Args:
+        fields: The fields.
+        prefix: Text before the names of the fields: the name of the object that contains the fields, and a point.
+        group: Group of the object that contains the fields.
+    """
     for field in fields:
         present = GROUPS.get(field.group or group, "always")
         value_type = TYPES[field.kind]

@@ -1,9 +1,10 @@
 """JSON Schema of the records of a sensor.
 
-Foxglove and Lichtblick read the fields of a topic from `properties` and expect one `type` for each field, so a number
-that may be null has to be a plain "number" there. Validators of draft 7 ignore everything beside a `$ref` and check
-`definitions/record`, which allows null wherever a record may have it. Viewers therefore list all fields, and all
-records are valid.
+The schema describes the fields twice. The viewers Foxglove and Lichtblick read the top-level key `properties` and
+expect a single `type` for each field, so a number that may be null is declared as "number" there. Validators of draft 7
+of JSON Schema follow the top-level `$ref` to `definitions/record` and ignore all other top-level keys. In this
+definition, null is allowed for every field that may be null. Viewers therefore list all fields, and validators accept
+all records.
 """
 
 from collections.abc import Sequence
@@ -41,25 +42,38 @@ def record_schema(electrodes: Sequence[str]) -> dict[str, Any]:
 
 
 def _object(electrodes: Sequence[str], *, allows_null: bool) -> dict[str, Any]:
-    """Return the schema of the record; the fields that every record has are required."""
+    """Return the schema of the record; the fields that every record has are required.
+
+    Args:
+        electrodes: Names of the electrodes.
+        allows_null: Whether fields that may be unknown may be null.
+    """
     properties = {field.name: _property(field, electrodes, allows_null=allows_null) for field in RECORD_FIELDS}
     required = sorted(field.name for field in RECORD_FIELDS if not field.group)
     return {"type": "object", "properties": properties, "required": required}
 
 
 def _property(field: Field, electrodes: Sequence[str], *, allows_null: bool) -> dict[str, Any]:
+    """Return the schema of one field.
+
+    Args:
+        field: The field.
+        electrodes: Names of the electrodes.
+        allows_null: Whether the field may be null if it may be unknown, and whether numbers in objects may be null.
+    """
     json_type: str | list[str] = JSON_TYPES[field.kind]
-    number: dict[str, Any] = {"type": "number"}
+    number_in_object: dict[str, Any] = {"type": "number"}
     if allows_null:
-        number = {"type": ["number", "null"]}
+        number_in_object = {"type": ["number", "null"]}
         if field.may_be_null:
             json_type = [JSON_TYPES[field.kind], "null"]
-    described: dict[str, Any] = {"type": json_type}
+    schema: dict[str, Any] = {"type": json_type}
     if field.kind == "words":
-        described["items"] = {"type": "string"}
+        schema["items"] = {"type": "string"}
     if field.kind == "charges":
-        described["properties"] = dict.fromkeys(electrodes, number)
+        schema["properties"] = dict.fromkeys(electrodes, number_in_object)
     if field.kind == "object":
-        described["properties"] = dict.fromkeys([part.name for part in field.parts], number)
-    described["description"] = field.meaning.text
-    return described
+        part_names = [part.name for part in field.parts]
+        schema["properties"] = dict.fromkeys(part_names, number_in_object)
+    schema["description"] = field.meaning.text
+    return schema

@@ -67,7 +67,9 @@ CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
 
 
 def read_request(message: Any, loaded: LoadedVersion, batch: int) -> InferRequest:
-    """Read a ModelInferRequest. If the input is raw, the outputs are requested as raw contents, too.
+    """Parse a ModelInferRequest, and return the charges and the requested outputs.
+
+    If the charges are raw contents, the outputs are sent as raw contents, too.
 
     Args:
         message: The message.
@@ -79,25 +81,31 @@ def read_request(message: Any, loaded: LoadedVersion, batch: int) -> InferReques
         ChargeError: If a charge is not finite.
         TooLarge: If there are more presses than `batch`.
     """
-    raw = message.raw_input_contents
-    if len(raw) > 1:
-        raise RequestError(f"expected one input tensor, got {len(raw)} raw contents")
+    raw_contents = message.raw_input_contents
+    if len(raw_contents) > 1:
+        raise RequestError(f"expected one input tensor, got {len(raw_contents)} raw contents")
+    raw = raw_contents[0] if raw_contents else None
     content = {
         "id": message.id,
         "inputs": [_input_object(tensor, raw) for tensor in message.inputs],
         "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
-        "parameters": {"binary_data_output": bool(raw)},
+        "parameters": {"binary_data_output": raw is not None},
     }
-    return parse_request(content, raw[0] if raw else b"", loaded, batch)
+    return parse_request(content, raw or b"", loaded, batch)
 
 
-def _input_object(tensor: Any, raw: Any) -> dict[str, Any]:
-    """Return an input tensor as the JSON object of the HTTP protocol."""
+def _input_object(tensor: Any, raw: bytes | None) -> dict[str, Any]:
+    """Return an input tensor as the JSON object of the HTTP protocol.
+
+    Args:
+        tensor: Message with the name, the number type and the shape of the tensor, and possibly its numbers.
+        raw: Raw content of the message, which follows the JSON text in the HTTP protocol; None if there is none.
+    """
     parameters: dict[str, Any] = _unsupported_parameters(tensor)
     content = {"name": tensor.name, "datatype": tensor.datatype, "shape": list(tensor.shape), "parameters": parameters}
-    if raw:
-        parameters["binary_data_size"] = len(raw[0])
-    if tensor.HasField("contents") or not raw:
+    if raw is not None:
+        parameters["binary_data_size"] = len(raw)
+    if tensor.HasField("contents") or raw is None:
         field = CONTENT_FIELDS.get(tensor.datatype, "fp32_contents")
         content["data"] = list(getattr(tensor.contents, field))
     return content
@@ -116,10 +124,11 @@ def write_response(answer: InferAnswer) -> Any:
     message.model_version = answer.version
     message.id = answer.id
     for name, rows in answer.outputs.items():
-        tensor = message.outputs.add(name=name, datatype="BYTES" if name == FLAGS else "FP32", shape=rows.shape)
+        is_text = name == FLAGS
+        tensor = message.outputs.add(name=name, datatype="BYTES" if is_text else "FP32", shape=rows.shape)
         if name in answer.binary:
             message.raw_output_contents.append(binary_tensor(rows))
-        elif name == FLAGS:
+        elif is_text:
             tensor.contents.bytes_contents.extend(text.encode() for text in rows[:, 0].tolist())
         else:
             tensor.contents.fp32_contents.extend(rows.ravel().tolist())
@@ -187,10 +196,19 @@ class Service:
         return grpc.method_handlers_generic_handler(SERVICE, methods)
 
     async def _handle(self, name: str, _: object, context: grpc.aio.ServicerContext) -> Any:
-        """Answer a call, and count it with its status and its error."""
+        """Answer a call, and count it with its status and its error.
+
+        Args:
+            name: Name of the method.
+            context: Context of the call, from which messages are read.
+
+        Returns:
+            The response; None for the method `STREAM`, whose responses have been sent. If an error occurs, the call is
+            ended with the status and the message of the error.
+        """
         call = _Call()
         start_ns = time.perf_counter_ns()
-        status = "CANCELLED"  # if the client disconnects
+        status = "CANCELLED"  # stays if the client disconnects
         error_type = None
         try:
             result = await self._answer_call(name, context, call)
@@ -235,7 +253,12 @@ class Service:
             return await self._answer_message(name, context, call)
 
     async def _answer_message(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes:
-        """Return the response to the only message of a call."""
+        """Return the serialized response to the only message of a call.
+
+        Raises:
+            RequestError: If the call ends without a message, or the message is not valid.
+            TimeoutError: If the message does not arrive in time.
+        """
         data = await self._next_message(context, self._limits.header_seconds)
         if data is grpc.aio.EOF:
             raise RequestError(f"{name}: expected a message, got none")
@@ -252,7 +275,13 @@ class Service:
             timeout_s = self._limits.idle_seconds
 
     def _answer(self, name: str, data: bytes, call: _Call) -> bytes:
-        """Return the serialized response to a serialized message."""
+        """Return the serialized response to a serialized message.
+
+        Args:
+            name: Name of the method.
+            data: The serialized request.
+            call: Properties of the call, to which the model and the sizes of request and response are added.
+        """
         request_type, response_type = METHODS[name]
         call.bytes_in += len(data)
         try:
@@ -260,28 +289,34 @@ class Service:
         except DecodeError as error:
             expected = request_type.DESCRIPTOR.name
             raise RequestError(f"expected a {expected}, got {len(data)} bytes of another kind") from error
-        call.model = self._store.label(
-            getattr(request, "model_name", "") or getattr(request, "name", ""),
-            getattr(request, "model_version", "") or getattr(request, "version", ""),
-        )
-        fields = self._answers[name](request)
-        answer = fields if isinstance(fields, Message) else ParseDict(fields or {}, response_type())
-        message: bytes = answer.SerializeToString()
-        call.bytes_out += len(message)
-        return message
+        # The messages of the protocol have different names for the fields with the model and its version.
+        model_name = getattr(request, "model_name", "") or getattr(request, "name", "")
+        model_version = getattr(request, "model_version", "") or getattr(request, "version", "")
+        call.model = self._store.label(model_name, model_version)
+
+        answer = self._answers[name](request)
+        response = answer if isinstance(answer, Message) else ParseDict(answer or {}, response_type())
+        response_data: bytes = response.SerializeToString()
+        call.bytes_out += len(response_data)
+        return response_data
 
     def _load(self, request: Any) -> None:
+        """Read the files of a model again; raise RequestError if the request has parameters."""
         if request.parameters:
             raise RequestError(describe.NO_LOAD_PARAMETERS)
         self._store.load(request.model_name)
 
     def _infer(self, request: Any) -> Any:
+        """Return the ModelInferResponse to a ModelInferRequest."""
         loaded = self._store.get(request.model_name, request.model_version)
         read = partial(read_request, request, loaded, self._limits.batch)
         return answer_inference(loaded, read, write_response)
 
     def _infer_in_stream(self, request: Any) -> Any:
-        """Return the response to one request of a stream. An error is sent as a response, and the stream continues."""
+        """Return the response to one request of a stream.
+
+        If an error occurs, its message is returned as a response, so that the stream continues.
+        """
         _, response_type = METHODS[STREAM]
         try:
             response = response_type(infer_response=self._infer(request))
@@ -326,7 +361,7 @@ class Service:
 
 
 def _authorization(context: grpc.aio.ServicerContext) -> bytes:
-    """Return the value of the metadata `authorization`; empty if there is none."""
+    """Return the value of the metadata field `authorization`; empty if the client did not send this field."""
     value = dict(context.invocation_metadata() or ()).get("authorization", "")
     return value.encode() if isinstance(value, str) else bytes(value)
 
@@ -360,6 +395,7 @@ def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) 
     with _event_loop() as loop:
 
         def run(coroutine: Coroutine[Any, Any, Any]) -> Any:
+            """Run a coroutine in the event loop of the server, and return its result."""
             return asyncio.run_coroutine_threadsafe(coroutine, loop).result()
 
         url_host = f"[{host}]" if ":" in host else host
@@ -397,6 +433,7 @@ async def _start(handler: Handler, address: str, tls: Tls | None) -> tuple[grpc.
 
 
 def _options(limits: ServerLimits) -> list[tuple[str, int]]:
+    """Return the options of grpcio that apply the limits of a server."""
     return [
         ("grpc.max_receive_message_length", limits.body_bytes),
         ("grpc.max_metadata_size", limits.header_bytes),
@@ -410,11 +447,22 @@ def _options(limits: ServerLimits) -> list[tuple[str, int]]:
 
 
 def _listen(server: grpc.aio.Server, address: str, tls: Tls | None) -> int:
-    """Let a server listen on `host:port`, and return the port."""
+    """Let a server listen on `host:port`, and return the port on which it listens.
+
+    Args:
+        server: The server, which has not been started.
+        address: `host:port`; the port 0 selects a free port.
+        tls: Certificate and key; None for no TLS.
+
+    Raises:
+        ListenError: If the address is in use or cannot be used.
+        InputError: If a TLS file cannot be used.
+    """
     try:
         if tls is None:
             return int(server.add_insecure_port(address))
-        return int(server.add_secure_port(address, grpc.ssl_server_credentials([tls.key_and_certificate()])))
+        credentials = grpc.ssl_server_credentials([tls.key_and_certificate()])
+        return int(server.add_secure_port(address, credentials))
     except RuntimeError as error:
         raise ListenError(
             f"cannot listen on {address} for gRPC: {error}; choose another --grpc-port or --host"

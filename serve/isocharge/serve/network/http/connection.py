@@ -106,16 +106,16 @@ class Connection(asyncio.Protocol):
 
         # The data that are being parsed.
         self._piece_bytes = 0
-        self._request_bytes = 0  # since the request began, or since the latest part of its body
-        self._starts_in_piece = True  # whether the present piece of data begins with a request
-        self._has_answered = False  # whether a request of the present piece was answered
+        self._unchecked_bytes = 0  # bytes since the request began, or since the latest part of its body
+        self._piece_begins_with_request = True
+        self._piece_was_answered = False  # whether a request of the present piece of data was answered
         self._unparsed = bytearray()
         self._turn: asyncio.Handle | None = None
 
         # The latest complete request. If it came in one piece, its text and size are stored to recognise a repetition.
         self._head: Head | None = None
-        self._repeated_head = b""
-        self._repeated_bytes = 0
+        self._remembered_head = b""
+        self._remembered_bytes = 0
 
         # The answer that is computed in another thread, and the complete requests that wait for it, with their bodies.
         self._answering: asyncio.Task[None] | None = None
@@ -137,11 +137,15 @@ class Connection(asyncio.Protocol):
             self._refuse(refusal(503, f"all {self._limits.connections} connections are taken; try again later"))
 
     def _make_room(self) -> bool:
-        """End the oldest connection that has not sent a complete request; return False if there is none."""
-        silent = [other for other in self._connections if other is not self and not other.has_completed_request]
-        if not silent:
+        """End the oldest connection that has not sent a complete request.
+
+        Returns:
+            Whether there was such a connection.
+        """
+        candidates = [other for other in self._connections if other is not self and not other.has_completed_request]
+        if not candidates:
             return False
-        oldest = min(silent, key=lambda other: other.deadline)
+        oldest = min(candidates, key=lambda connection: connection.deadline)
         self._connections.discard(oldest)
         oldest._transport.abort()
         return True
@@ -153,23 +157,32 @@ class Connection(asyncio.Protocol):
         self._waiting.clear()
 
     def data_received(self, data: bytes) -> None:
-        """Parse short data at once, and long or postponed data in slices, in turns with other connections."""
+        """Parse short data at once, and long or postponed data in slices, in turns with other connections.
+
+        A request with the same head as the latest request is answered without parsing the head again.
+        """
         if self._is_refused or self._transport.is_closing():
             return
-        if self._unparsed or self._answering or self._is_blocked or len(data) > SLICE_BYTES:
+        must_wait = self._unparsed or self._answering or self._is_blocked
+        if must_wait or len(data) > SLICE_BYTES:
             self._unparsed += data
             if self._turn is None:
                 self._take_turn()
-        elif len(data) == self._repeated_bytes and data.startswith(self._repeated_head) and self._head is not None:
-            self._answer(self._head, data[len(self._repeated_head) :])
-        else:
-            begins_request = self._phase is Phase.IDLE
-            self._parse(data)
-            if begins_request and self._has_answered:
-                self._remember(data)
+            return
+
+        repeats_head = len(data) == self._remembered_bytes and data.startswith(self._remembered_head)
+        if repeats_head and self._head is not None:
+            body = data[len(self._remembered_head) :]
+            self._answer(self._head, body)
+            return
+
+        begins_request = self._phase is Phase.IDLE
+        self._parse(data)
+        if begins_request and self._piece_was_answered:
+            self._remember(data)
 
     def eof_received(self) -> bool:
-        """Handle the end of the client's data. Return whether the connection stays open for outstanding responses."""
+        """Handle the end of the client's data, and return whether the connection stays open for further responses."""
         self._is_half_closed = bool(self._unparsed or self._answering)
         return self._is_half_closed and self._transport.can_write_eof()
 
@@ -187,11 +200,15 @@ class Connection(asyncio.Protocol):
             self._take_turn()
 
     def shutdown(self) -> None:
-        """Close the connection, because the server stops. A request that has begun is still answered."""
+        """Close the connection, because the server stops.
+
+        If a request is incomplete, or its answer is being computed, the connection is closed after the response.
+        """
         self._is_stopping = True
+        has_open_request = self._phase is not Phase.IDLE or self._answering is not None
         if self._is_refused:
             self._transport.abort()
-        elif self._phase is Phase.IDLE and not self._answering:
+        elif not has_open_request:
             self._transport.close()
 
     def end_overdue(self) -> None:
@@ -232,22 +249,27 @@ class Connection(asyncio.Protocol):
                 self._transport.close()
 
     def _new_parser(self) -> httptools.HttpRequestParser:
+        """Return a parser of requests that calls the methods `on_...` of this connection."""
         parser = httptools.HttpRequestParser(self)
         # Data after the last request are ignored instead of being an error.
         parser.set_dangerous_leniencies(lenient_data_after_close=True)
         return parser
 
     def _parse(self, data: bytes) -> None:
-        """Parse a piece of data, and check the size of a request that is still incomplete."""
+        """Parse a piece of data, and check the size of a request that is still incomplete.
+
+        The parser calls the methods `on_...`, which answer each complete request.
+        """
         self._piece_bytes = len(data)
-        self._request_bytes += self._piece_bytes
-        self._starts_in_piece = self._phase is Phase.IDLE
-        self._has_answered = False
-        self._repeated_bytes = 0
+        self._unchecked_bytes += self._piece_bytes
+        self._piece_begins_with_request = self._phase is Phase.IDLE
+        self._piece_was_answered = False
+        self._remembered_bytes = 0
         try:
             self._parser.feed_data(data)
         except httptools.HttpParserUpgrade as upgrade:
-            self._parse_without_upgrade(data[upgrade.args[0] :])
+            headers_end = upgrade.args[0]  # position in the piece at which the parser has stopped
+            self._parse_without_upgrade(data[headers_end:])
         except httptools.HttpParserError:
             self._refuse(refusal(400, "Invalid HTTP request received."))
         if self._phase is not Phase.IDLE and not self._is_refused:
@@ -255,14 +277,16 @@ class Connection(asyncio.Protocol):
 
     def _check_incomplete_request(self) -> None:
         """Check the size of the headers, trailers and chunk extensions, and set the deadline of a new phase."""
-        if self._request_bytes > self._limits.header_bytes:
+        if self._unchecked_bytes > self._limits.header_bytes:
             self._refuse_headers()
         elif self._timed_phase is not self._phase:
             self._timed_phase = self._phase
-            is_head = self._phase is Phase.HEADERS
-            self._set_deadline(self._limits.header_seconds if is_head else self._limits.body_seconds)
+            if self._phase is Phase.HEADERS:
+                self._set_deadline(self._limits.header_seconds)
+            else:
+                self._set_deadline(self._limits.body_seconds)
 
-    def _parse_without_upgrade(self, rest: bytes) -> None:
+    def _parse_without_upgrade(self, data_after_headers: bytes) -> None:
         """Parse a request again without its `Upgrade` header, which HTTP allows a server to ignore.
 
         A new parser is needed, because the old parser treats everything after the headers as another protocol.
@@ -274,14 +298,19 @@ class Connection(asyncio.Protocol):
             return
         self._parser = self._new_parser()
         self._phase = Phase.IDLE
-        lines = [b"%s: %s" % header for header in self._headers if header[0] != b"upgrade"]
-        self._parse(b"\r\n".join([b"%s %s HTTP/1.1" % (method, self._url), *lines, b"", rest]))
+        request_line = b"%s %s HTTP/1.1" % (method, self._url)
+        header_lines = [b"%s: %s" % (name, value) for name, value in self._headers if name != b"upgrade"]
+        self._parse(b"\r\n".join([request_line, *header_lines, b"", data_after_headers]))
 
     def on_message_begin(self) -> None:
-        """Begin a request. The parser calls this method, and does not report where in the piece the request begins."""
+        """Begin a request. The parser calls this method before it has read the request line.
+
+        The parser does not report where in the present piece of data the request begins. The bytes of the piece are
+        therefore counted only for the request with which the piece begins.
+        """
         self._phase = Phase.HEADERS
-        self._request_bytes = self._piece_bytes if self._starts_in_piece else 0
-        self._starts_in_piece = False
+        self._unchecked_bytes = self._piece_bytes if self._piece_begins_with_request else 0
+        self._piece_begins_with_request = False
         self._expects_continue = False
         self._url = b""
         self._headers = []
@@ -292,30 +321,35 @@ class Connection(asyncio.Protocol):
         self._url += url
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Append a header. Trailers are ignored."""
+        """Append a header. Trailers, which follow the body, are ignored."""
         if self._phase is Phase.BODY:
             return
-        name = name.lower()
-        if name == b"expect":
+        lower_name = name.lower()
+        if lower_name == b"expect":
             self._expects_continue = value.lower() == b"100-continue"
-        self._headers.append((name, value))
+        self._headers.append((lower_name, value))
 
     def on_headers_complete(self) -> None:
         """Check the size of the complete headers, and send `100 Continue` if the client waits for it."""
-        # The piece in which the request began is not counted if it began with another request.
-        max_possible_bytes = self._request_bytes + SLICE_BYTES
+        # If the request began in the middle of a piece, up to SLICE_BYTES of its headers have not been counted. The
+        # exact size is computed only if the headers may be too long.
+        max_possible_bytes = self._unchecked_bytes + SLICE_BYTES
+        may_be_too_long = max_possible_bytes > self._limits.header_bytes
         self._phase = Phase.BODY
-        self._request_bytes = 0
-        if max_possible_bytes > self._limits.header_bytes and self._header_bytes() > self._limits.header_bytes:
+        self._unchecked_bytes = 0
+        if may_be_too_long and self._header_bytes() > self._limits.header_bytes:
             self._refuse_headers()
-        elif self._expects_continue and not self._is_refused and not self._parser.should_upgrade():
+            return
+
+        is_parsed_again = self._parser.should_upgrade()
+        if self._expects_continue and not self._is_refused and not is_parsed_again:
             self._transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
     def on_body(self, body: bytes) -> None:
         """Append a part of the body, and check the size of the body."""
         if self._is_refused:
             return
-        self._request_bytes = 0
+        self._unchecked_bytes = 0  # the body has its own limit, which is checked here
         self._body += body
         try:
             self._limits.check_body(len(self._body))
@@ -329,37 +363,45 @@ class Connection(asyncio.Protocol):
         self._phase = Phase.IDLE
         self.has_completed_request = True
         method = self._parser.get_method().decode("latin-1")
-        head = Head(method, _path(self._url), self._headers, not self._parser.should_keep_alive())
+        is_last = not self._parser.should_keep_alive()
+        head = Head(method, _path(self._url), self._headers, is_last)
+        body = bytes(self._body)
         self._head = head
         if self._answering:
-            self._waiting.append((head, bytes(self._body)))
+            self._waiting.append((head, body))
         elif self._handler.may_block(head.path):
-            self._answer_in_thread(head, bytes(self._body))
+            self._answer_in_thread(head, body)
         else:
-            self._has_answered = True
-            self._answer(head, bytes(self._body))
+            self._piece_was_answered = True
+            self._answer(head, body)
 
     def _answer(self, head: Head, body: bytes) -> None:
-        self._write(self._handler.answer(head.method, head.path, head.headers, body, self._client), head)
+        """Answer a request, and send the response."""
+        response = self._handler.answer(head.method, head.path, head.headers, body, self._client)
+        self._write(response, head)
 
     def _answer_in_thread(self, head: Head, body: bytes) -> None:
+        """Begin to answer a request in another thread. The connection has no deadline until the response is sent."""
         self._answering = self._loop.create_task(self._answer_later(head, body))
         self._timed_phase = Phase.IDLE
         self.deadline = math.inf
 
     async def _answer_later(self, head: Head, body: bytes) -> None:
-        """Answer a request in another thread, and then the requests that arrived later, in their order."""
+        """Answer a request in another thread, and then the requests that arrived later, in their order.
+
+        If one of the later requests needs another thread as well, the requests after it wait again.
+        """
         response = await asyncio.to_thread(
             self._handler.answer, head.method, head.path, head.headers, body, self._client
         )
         self._answering = None
         self._write(response, head)
         while self._waiting and self._answering is None:
-            head, body = self._waiting.popleft()
-            if self._handler.may_block(head.path):
-                self._answer_in_thread(head, body)
+            next_head, next_body = self._waiting.popleft()
+            if self._handler.may_block(next_head.path):
+                self._answer_in_thread(next_head, next_body)
             else:
-                self._answer(head, body)
+                self._answer(next_head, next_body)
         self._take_turn()
 
     def _remember(self, data: bytes) -> None:
@@ -368,13 +410,18 @@ class Connection(asyncio.Protocol):
         Clients send the same head again and again. If the bytes of the head and the size of the body are equal, the
         parser would give the same result again.
         """
-        head, end, body = data.partition(b"\r\n\r\n")
+        head, blank_line, body = data.partition(b"\r\n\r\n")
         if body == self._body and self._phase is Phase.IDLE:
-            self._repeated_head = head + end
-            self._repeated_bytes = len(data)
+            self._remembered_head = head + blank_line
+            self._remembered_bytes = len(data)
 
     def _write(self, response: Response, head: Head) -> None:
-        """Send a response in one piece, and set the deadline of the next request."""
+        """Send a response in one piece, and set the deadline of the next request.
+
+        Args:
+            response: The response.
+            head: Head of the request, which states whether the connection is closed after the response.
+        """
         if self._is_refused or self._transport.is_closing():
             return
         is_last = self._is_stopping or head.is_last
@@ -392,9 +439,11 @@ class Connection(asyncio.Protocol):
             self.deadline = self._loop.time() + seconds
 
     def _header_bytes(self) -> int:
+        """Return the size of the target and the headers, bytes. Each header has a colon, a blank and a line end."""
         return len(self._url) + sum(len(name) + len(value) + 4 for name, value in self._headers)
 
     def _refuse_headers(self) -> None:
+        """Refuse a request whose request line and headers are too long."""
         limit = self._limits.header_bytes
         self._refuse(refusal(431, f"the request line and headers are longer than {limit} bytes"))
 
@@ -417,7 +466,13 @@ class Connection(asyncio.Protocol):
 
 
 def _response_bytes(response: Response, *, is_last: bool, with_body: bool = True) -> bytes:
-    """Return a response as the bytes that are sent. The last response states that the connection is closed."""
+    """Return a response as the bytes that are sent.
+
+    Args:
+        response: The response.
+        is_last: Whether the connection is closed after the response, which the headers then state.
+        with_body: Whether the body is sent. The response to a HEAD request has none.
+    """
     parts = [STATUS_LINES[response.status]]
     for name, value in response.headers:
         parts += (name, b": ", value, b"\r\n")

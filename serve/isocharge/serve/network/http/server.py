@@ -70,14 +70,17 @@ class HttpServer:
         self._address.release()
 
     async def _serve(self) -> None:
+        """Accept connections and answer requests until the server is stopped, and then finish the open requests."""
         loop = asyncio.get_running_loop()
-        signals = SIGNALS if threading.current_thread() is threading.main_thread() else ()
+        is_main_thread = threading.current_thread() is threading.main_thread()
+        signals = SIGNALS if is_main_thread else ()  # other threads cannot handle signals
         for number in signals:
             loop.add_signal_handler(number, self.stop)
         accepting = loop.create_task(self._accept(loop))
         while not self._is_stopped:
             await asyncio.sleep(TICK_SECONDS)
             close_overdue(self._connections, loop.time())
+
         for number in signals:
             loop.remove_signal_handler(number)  # a second Ctrl-C does not wait
         for task in (accepting, *self._handshakes):
@@ -98,7 +101,7 @@ class HttpServer:
             connection.abort()
 
     async def _accept(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Accept connections.
+        """Accept connections until the task is cancelled.
 
         Unfinished TLS handshakes count as connections. If there are too many, the oldest handshake is cancelled.
         """
@@ -111,7 +114,8 @@ class HttpServer:
                 continue
             is_full = len(self._connections) + len(self._handshakes) >= self._limits.connections
             if is_full and self._tls is not None and self._handshakes:
-                next(iter(self._handshakes)).cancel()
+                oldest_handshake = next(iter(self._handshakes))
+                oldest_handshake.cancel()
             handshake = loop.create_task(self._connect(accepted, loop))
             self._handshakes[handshake] = None
             handshake.add_done_callback(self._handshakes.pop)

@@ -41,6 +41,7 @@ def model_metadata(loaded: LoadedVersion, store: ModelStore) -> dict[str, Any]:
 
 
 def _tensor(name: str, width: int) -> dict[str, Any]:
+    """Return the description of a tensor with any number of rows and `width` columns."""
     return {"name": name, "datatype": "FP32", "shape": [-1, width]}
 
 

@@ -117,22 +117,29 @@ class Handler:
             client: Address of the client, for the log.
 
         Returns:
-            The answer. An error becomes an answer with the body {"error": "..."}, so nothing is raised.
+            The response. No error is raised: an error becomes a response with the body {"error": "..."}.
         """
-        began_ns = time.perf_counter_ns()
+        start_ns = time.perf_counter_ns()
         match = match_path(path)
         try:
             response = self._answer(method, path, match, dict(headers), body)
         except Exception as error:  # the one place where an error becomes an answer
             response = error_response(error)
-        status = response.status
-        self.traffic.count("http", match.label, status)
+        self.traffic.count("http", match.label, response.status)
         log = self.traffic.log
         if log is not None:
-            model = self.store.label(match.model, match.version)
-            elapsed_ns = time.perf_counter_ns() - began_ns
-            sizes = len(body), len(response.body)
-            log.exchange(Exchange("http", match.label, status, model, response.error, elapsed_ns, *sizes, client))
+            exchange = Exchange(
+                transport="http",
+                route=match.label,
+                status=response.status,
+                model=self.store.label(match.model, match.version),
+                error=response.error,
+                ns=time.perf_counter_ns() - start_ns,
+                bytes_in=len(body),
+                bytes_out=len(response.body),
+                client=client,
+            )
+            log.exchange(exchange)
         return response
 
     def refused(self, response: Response, client: Client = None) -> None:
@@ -141,16 +148,29 @@ class Handler:
         self.traffic.note(Exchange("http", "none", response.status, None, response.error, 0, 0, size, client))
 
     def _answer(self, method: str, path: str, match: Match, fields: dict[bytes, bytes], body: bytes) -> Response:
-        """Check a request and answer it; raise an error if it is refused."""
+        """Check a request, answer it, and return the response.
+
+        Args:
+            method: Method in capitals.
+            path: Path without the query, for error messages.
+            match: Route of the path.
+            fields: Values of the headers by their names in lower case.
+            body: Body of the request, which may be compressed.
+
+        Raises:
+            IsochargeError: If the request is refused.
+        """
         self._browser_check.check(method, fields)
         route = match.route
+        # The token is checked before the path, so that a client without a token does not learn which paths exist.
         if self.token is not None and (route is None or route.needs_token):
             self.token.check(fields.get(b"authorization", b""))
         if route is None:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
-        if method != route.method and (method, route.method) != ("HEAD", "GET"):
+        is_head_of_get = method == "HEAD" and route.method == "GET"
+        if method != route.method and not is_head_of_get:
             raise WrongMethod(f"{path}: expected the method {route.method}, got {method[:20]}", route.method)
         self.limits.check_body(len(body))
-        if b"content-encoding" in fields:
-            body = decompress(body, fields[b"content-encoding"].lower(), self.limits.body_bytes)
-        return route.respond(Request(self._service, fields, body, match.model, match.version))
+        encoding = fields.get(b"content-encoding", b"").lower()
+        plain_body = decompress(body, encoding, self.limits.body_bytes)
+        return route.respond(Request(self._service, fields, plain_body, match.model, match.version))

@@ -142,8 +142,9 @@ def read_infer(body: bytes, header_length: bytes | None, loaded: LoadedVersion, 
     """
     if header_length is None:
         return parse_request(read_object(body), b"", loaded, batch)
-    # isdigit is tested first, because int() accepts signs, blanks and underscores, and is slow for a long text.
-    if not header_length.isdigit() or len(header_length) > 12 or int(header_length) > len(body):
+    # The digits are tested first, because int() accepts signs, blanks and underscores, and is slow for a long text.
+    is_short_number = header_length.isdigit() and len(header_length) <= 12
+    if not is_short_number or int(header_length) > len(body):
         raise RequestError(
             f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
             f"got {header_length.decode('latin-1')!r:.50}"
@@ -182,25 +183,48 @@ def parse_request(
 def _requested_outputs(
     outputs: list[OutputTensor], loaded: LoadedVersion, *, default_is_binary: bool
 ) -> tuple[tuple[str, ...], frozenset[str]]:
-    """Return the names of the requested outputs, and the names of those that are sent as binary tensors."""
-    is_binary = {output.name: output.parameters.binary_data for output in outputs}
-    if len(is_binary) < len(outputs):
+    """Return the names of the requested outputs, and the names of the outputs that are sent as binary tensors.
+
+    Args:
+        outputs: Outputs that the request names.
+        loaded: The model.
+        default_is_binary: Whether an output is sent as a binary tensor if the request does not state it.
+
+    Raises:
+        RequestError: If an output is named twice, or the model does not have it.
+    """
+    names = tuple(output.name for output in outputs)
+    if len(set(names)) < len(names):
         raise RequestError("outputs: expected each name once")
-    if CORRELATION in is_binary and CORRELATION not in loaded.outputs:
+    if CORRELATION in names and CORRELATION not in loaded.outputs:
         raise RequestError(
             f"outputs: expected one of {', '.join(loaded.outputs)}, got {CORRELATION!r}, which "
             f"{loaded.metadata.label} does not have"
         )
-    binary_names = frozenset(
-        name for name, choice in is_binary.items() if choice or (choice is None and default_is_binary)
-    )
-    return tuple(is_binary), binary_names
+    binary_names: list[str] = []
+    for output in outputs:
+        stated_choice = output.parameters.binary_data
+        is_binary = default_is_binary if stated_choice is None else stated_choice
+        if is_binary:
+            binary_names.append(output.name)
+    return names, frozenset(binary_names)
 
 
 def _charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[str, ...], batch: int) -> Singles:
     """Return the charges of an input tensor, shape (n, electrodes), pC.
 
     The shape is checked before any memory of that size is used.
+
+    Args:
+        tensor: The input tensor.
+        binary: Bytes that follow the JSON text; empty if there are none.
+        electrodes: Electrodes of the model.
+        batch: Largest number of presses in one request.
+
+    Raises:
+        RequestError: If the shape or the data are not valid.
+        ChargeError: If a charge is not finite.
+        TooLarge: If there are more presses than `batch`.
     """
     shape = tensor.shape
     if len(shape) != 2 or shape[0] < 1 or shape[1] != len(electrodes):
@@ -208,31 +232,50 @@ def _charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[
             f"input {INPUT!r}: expected the shape [n, {len(electrodes)}] with n > 0, "
             f"a column for each of {electrodes}, got {shape!r:.100}"
         )
-    if shape[0] > batch:
-        raise TooLarge(f"input {INPUT!r}: expected at most {batch} presses in one request, got {shape[0]}")
-    binary_size = tensor.parameters.binary_data_size
-    if binary_size is None and not binary:
+    press_count, electrode_count = shape
+    if press_count > batch:
+        raise TooLarge(f"input {INPUT!r}: expected at most {batch} presses in one request, got {press_count}")
+    stated_size = tensor.parameters.binary_data_size
+    if stated_size is None and not binary:
         return _from_values(tensor.data, shape, electrodes)
+
     dtype = DATATYPES[tensor.datatype]
-    expected_size = shape[0] * shape[1] * dtype.itemsize
-    if not binary_size == len(binary) == expected_size or tensor.data is not None:
+    expected_size = press_count * electrode_count * dtype.itemsize
+    has_expected_size = stated_size == len(binary) == expected_size
+    if not has_expected_size or tensor.data is not None:
         raise RequestError(
             f"expected either `data` or {expected_size} bytes after the JSON, announced by `binary_data_size` of the "
-            f"input and Inference-Header-Content-Length, got binary_data_size {binary_size!r:.50} and {len(binary)} "
+            f"input and Inference-Header-Content-Length, got binary_data_size {stated_size!r:.50} and {len(binary)} "
             "bytes"
         )
     # The copy is aligned. The bytes after a JSON text may begin at any address.
-    return as_float32(np.frombuffer(binary, dtype).reshape(shape).copy(), electrodes)
+    charges = np.frombuffer(binary, dtype).reshape(shape).copy()
+    return as_float32(charges, electrodes)
 
 
 def _from_values(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
-    """Return the charges from a flat list of numbers, or from a list of rows."""
-    rows, columns = shape
+    """Return the charges from a flat list of numbers, or from a list of rows.
+
+    Args:
+        values: Content of the key `data` of the request. Nothing has been checked yet.
+        shape: Number of presses and number of electrodes.
+        electrodes: Names of the electrodes, for error messages.
+
+    Returns:
+        Charges, shape (n, electrodes), pC.
+
+    Raises:
+        RequestError: If the values are no numbers, or do not have this shape.
+        ChargeError: If a charge is not finite.
+    """
+    press_count, electrode_count = shape
+    is_flat_list = type(values) is list and len(values) == press_count * electrode_count
     # For a few numbers, struct is several times faster than creating and testing arrays. It converts True to 1.0, so
     # that a list with a number that equals True or False is converted by `_from_array`.
-    if type(values) is list and len(values) == rows * columns and not (True in values or False in values):
+    if is_flat_list and not (True in values or False in values):
         charges = np.empty(shape, np.float32)
-        if write_finite(partial(_packer(len(values)), charges.data, 0), values):
+        write_into_charges = partial(_packer(len(values)), charges.data, 0)
+        if write_finite(write_into_charges, values):
             return charges
     return _from_array(values, shape, electrodes)
 
@@ -246,7 +289,10 @@ def _packer(count: int) -> Callable[..., None]:
 def _from_array(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
     """Return the charges from values of any kind; raise RequestError or ChargeError if they are not valid."""
     numbers = _as_array(values)
-    if numbers.dtype.kind not in "fiu" or list(numbers.shape) not in (shape, [shape[0] * shape[1]]):
+    press_count, electrode_count = shape
+    is_numeric = numbers.dtype.kind in "fiu"  # floating-point numbers, and integers with and without sign
+    has_shape = list(numbers.shape) in (shape, [press_count * electrode_count])
+    if not (is_numeric and has_shape):
         raise RequestError(
             f"input {INPUT!r}: expected `data`, numbers for the shape {shape}, flat or in rows, "
             f"got {numbers.dtype} of shape {list(numbers.shape)}"
@@ -270,16 +316,21 @@ def _as_array(values: Any) -> np.ndarray[Any, Any]:
 
 
 def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
-    """Return the body of a response, and the length of its JSON if binary tensors follow, otherwise None."""
+    """Return the body of the response to an inference.
+
+    Returns:
+        The body: JSON, which may be followed by binary tensors; and the length of the JSON in bytes if binary tensors
+        follow, otherwise None.
+    """
     content: dict[str, Any] = {"model_name": answer.name, "model_version": answer.version}
     if answer.id:
         content["id"] = answer.id
-    tensors = {name: binary_tensor(rows) for name, rows in answer.outputs.items() if name in answer.binary}
-    content["outputs"] = [_json_tensor(name, rows, tensors.get(name)) for name, rows in answer.outputs.items()]
-    text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
-    if not tensors:
-        return text, None
-    return b"".join([text, *tensors.values()]), len(text)
+    binary_tensors = {name: binary_tensor(rows) for name, rows in answer.outputs.items() if name in answer.binary}
+    content["outputs"] = [_json_tensor(name, rows, binary_tensors.get(name)) for name, rows in answer.outputs.items()]
+    json_text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
+    if not binary_tensors:
+        return json_text, None
+    return b"".join([json_text, *binary_tensors.values()]), len(json_text)
 
 
 def binary_tensor(rows: Rows) -> bytes:
@@ -290,12 +341,19 @@ def binary_tensor(rows: Rows) -> bytes:
 
 
 def _json_tensor(name: str, rows: Rows, binary: bytes | None) -> dict[str, Any]:
-    """Return an output as a JSON object with its values row by row, or with the size of the binary tensor."""
+    """Return an output as a JSON object with its values, or with the size of the binary tensor that has the values.
+
+    Args:
+        name: Name of the output.
+        rows: Values of the output, shape (n, width). They are written row by row.
+        binary: The binary tensor; None if the values are written as JSON.
+    """
     is_text = name == FLAGS
     tensor = {"name": name, "datatype": "BYTES" if is_text else "FP32", "shape": rows.shape}
     if binary is not None:
         return tensor | {"parameters": {"binary_data_size": len(binary)}}
-    return tensor | {"data": rows.ravel().tolist() if is_text else rows.ravel()}
+    values = rows.ravel()
+    return tensor | {"data": values.tolist() if is_text else values}  # orjson writes arrays of numbers, not of texts
 
 
 ResponseType = TypeVar("ResponseType")
@@ -337,22 +395,29 @@ def _infer_single_press(
 ) -> tuple[dict[str, Rows], int, int]:
     """Run the model for one press in bound memory, which is faster than `session.run`; see `infer`."""
     press = loaded.press()
-    row = np.empty((1, press.size), np.float32)
+    row = np.empty((1, press.size), np.float32)  # all outputs of the press, one after the other
     try:
         press.run_into(charge_pC, row[0])
     except Exception as error:  # onnxruntime's exceptions have no common base class of their own
         raise run_error(error) from error
     columns = press.columns
+    outputs = {name: row[:, columns[name]] for name in names}
     misfit = row[:, columns["misfit"]].item()
     is_alarm = not misfit <= loaded.validity.misfit_limit  # also true for NaN
-    return {name: row[:, columns[name]] for name in names}, 0, int(is_alarm)
+    return outputs, 0, int(is_alarm)
 
 
 def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
-    """Return the flags of presses, separated by commas, shape (n, 1)."""
+    """Return the flags of presses, separated by commas, shape (n, 1).
+
+    Args:
+        loaded: The model.
+        outputs: Outputs of the model for these presses, each of shape (n, width).
+    """
     correlations = np.zeros_like(outputs["contact"])  # they do not influence the flags
     parts = [outputs["contact"], outputs["contact_std"], outputs["misfit"], correlations]
-    contacts = Contacts(*np.concatenate(parts, axis=1).T)
+    columns = np.concatenate(parts, axis=1).T  # one row for each attribute of Contacts
+    contacts = Contacts(*columns)
     texts = [",".join(flags) for flags in loaded.validity.batch_flags(contacts)]
     return np.array(texts, dtype=object)[:, np.newaxis]
 

@@ -34,7 +34,9 @@ def openapi_document(routes: Iterable[Route], store: ModelStore) -> Json:
         "components": {
             "parameters": {"model": _path_parameter("model", models), "version": _path_parameter("version", versions)},
             "schemas": _schemas(listed),
-            "responses": {"error": {"description": "Why not", "content": _content(ERROR, "application/json")}},
+            "responses": {
+                "error": {"description": "Reason for the refusal", "content": _content(ERROR, "application/json")}
+            },
             "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
         },
         "security": [{}, {"token": []}],
@@ -42,6 +44,12 @@ def openapi_document(routes: Iterable[Route], store: ModelStore) -> Json:
 
 
 def _path_item(path: str, route: Route) -> Json:
+    """Return the description of a path: its parameters, and its method with the request body and the responses.
+
+    Args:
+        path: Template of the path.
+        route: Route of the path.
+    """
     operation: Json = {
         "summary": route.summary,
         "responses": {
@@ -56,15 +64,18 @@ def _path_item(path: str, route: Route) -> Json:
         operation["requestBody"] = {"content": content}
         if route.body.is_required:
             operation["requestBody"]["required"] = True
-    parameters = [{"$ref": f"#/components/parameters/{name}"} for name in ("model", "version") if f"{{{name}}}" in path]
+    parameter_names = [name for name in ("model", "version") if f"{{{name}}}" in path]
+    parameters = [{"$ref": f"#/components/parameters/{name}"} for name in parameter_names]
     return {"parameters": parameters, route.method.lower(): operation}
 
 
 def _content(schema: Schema, media_type: str) -> Json:
+    """Return the description of a body of this media type, with a reference to its schema."""
     return {media_type: {"schema": {"$ref": REFERENCE.format(name=schema.name)}}}
 
 
 def _path_parameter(name: str, values: set[str]) -> Json:
+    """Return the description of a parameter in a path, with its possible values."""
     schema = {"type": "string", "enum": sorted(values) or ["none"]}
     return {"name": name, "in": "path", "required": True, "schema": schema}
 

@@ -1,7 +1,7 @@
 """The start page of the HTTP server, for people.
 
-Names, cards and reasons come from files. They are escaped, and the headers of the page forbid a browser to run or load
-anything, in case one of them was not.
+Names of models, model cards and reasons for refusals come from files and are escaped. In addition, the headers of the
+page forbid a browser to run scripts and to load anything.
 """
 
 import base64
@@ -71,7 +71,7 @@ def page(store: ModelStore) -> str:
 
 
 def _first_request(served: list[LoadedVersion]) -> str:
-    """Return how to send a press, and what the answer means."""
+    """Return the section of the page that shows how to send a press, as HTML; empty if no model is loaded."""
     if not served:
         return ""
     loaded = served[0]
@@ -90,12 +90,13 @@ without load.</p>
 
 
 def _article(loaded: LoadedVersion) -> str:
+    """Return the section of the page about one version of a model, as HTML."""
     metadata = loaded.metadata
-    low, high = metadata.force_range_N
+    min_force_N, max_force_N = metadata.force_range_N
     facts = {
         "sensor": metadata.frame_id,
         "charges": f"{', '.join(metadata.electrodes)}, pC, in this order",
-        "forces": f"{low:g} to {high:g} N",
+        "forces": f"{min_force_N:g} to {max_force_N:g} N",
         "probes": ", ".join(metadata.probes),
     }
     rows = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts.items())
@@ -108,15 +109,22 @@ def _article(loaded: LoadedVersion) -> str:
 
 
 def _example(loaded: LoadedVersion, path: str) -> str:
-    press = ", ".join(f"{charge:.1f}" for charge in loaded.model.golden.charge_pC[0].tolist())
+    """Return shell commands that send the first golden press of a model with curl.
+
+    Args:
+        loaded: The model.
+        path: Path of the model on the server, without the first slash.
+    """
+    charges = ", ".join(f"{charge:.1f}" for charge in loaded.model.golden.charge_pC[0].tolist())
     tensor = f'"name": "charge_pC", "datatype": "FP32", "shape": [1, {len(loaded.metadata.electrodes)}]'
-    body = f'{{"inputs": [{{{tensor}, "data": [{press}]}}]}}'
+    body = f'{{"inputs": [{{{tensor}, "data": [{charges}]}}]}}'
     return f"SERVER=...  # the address of this page\ncurl $SERVER/{path}/infer -d '{body}'"
 
 
 def _card(model: Model) -> str:
-    """Return the card in the folder of a model as preformatted text."""
+    """Return the card in the folder of a model as preformatted HTML."""
     try:
-        return f"<pre>{escape(read_whole(model.folder / 'card.md', MAX_CARD_BYTES).decode('utf-8'))}</pre>"
+        text = read_whole(model.folder / "card.md", MAX_CARD_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError):
         return "<p>This model has no card that can be shown.</p>"
+    return f"<pre>{escape(text)}</pre>"

@@ -144,10 +144,11 @@ def compress(body: bytes, accepted: bytes) -> tuple[bytes, bytes]:
 
 
 def _accepted_encodings(header: bytes) -> set[bytes]:
-    """Return the names in an Accept-Encoding whose weight is not zero."""
+    """Return the names of the encodings in an Accept-Encoding header, except names with the weight 0."""
     names = set()
     for part in header.split(b","):
-        name, _, weight = part.replace(b" ", b"").lower().partition(b";q=")
+        normalised = part.replace(b" ", b"").lower()
+        name, _, weight = normalised.partition(b";q=")
         is_zero = weight != b"" and weight.strip(b"0.") == b""
         if not is_zero:
             names.add(name)

@@ -180,6 +180,7 @@ EXAMPLE = {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3],
 
 
 def _show_page(request: Request) -> Response:
+    """Return the start page of the server."""
     response = response_of(200, b"text/html; charset=utf-8", page(request.service.store).encode())
     response.headers.extend(PAGE_HEADERS)
     return response
@@ -211,6 +212,7 @@ def _show_statistics(request: Request) -> Response:
 
 
 def _show_index(request: Request) -> Response:
+    """Return the versions in the repository, or, if the body has `ready: true`, the versions that are loaded."""
     ready = read_object(request.body).get("ready", False)
     if not isinstance(ready, bool):
         raise RequestError(f"ready: expected true or false, got {ready!r:.100}")
@@ -218,6 +220,7 @@ def _show_index(request: Request) -> Response:
 
 
 def _load(request: Request) -> Response:
+    """Read the files of a model again."""
     if read_object(request.body).get("parameters", {}) != {}:
         raise RequestError(describe.NO_LOAD_PARAMETERS)
     request.service.store.load(request.model)
@@ -243,20 +246,19 @@ def _show_config(request: Request) -> Response:
 
 
 def _infer(request: Request) -> Response:
-    """Compute an inference.
+    """Compute the contacts of the presses in a request.
 
-    Only this answer is compressed, because the asyncio client of Triton decompresses no other.
+    Of all responses only this one is compressed, because the asyncio client of Triton decompresses no other response.
     """
     loaded = request.loaded
-    headers = request.headers
-    length = headers.get(b"inference-header-content-length")
-    read = partial(read_infer, request.body, length, loaded, request.service.limits.batch)
-    body, json_length = answer_inference(loaded, read, write_answer)
-    accepted = headers.get(b"accept-encoding")
-    encoding = b""
-    if accepted:
-        body, encoding = compress(body, accepted)
-    response = response_of(200, b"application/json" if json_length is None else b"application/octet-stream", body)
+    header_length = request.headers.get(b"inference-header-content-length")
+    read = partial(read_infer, request.body, header_length, loaded, request.service.limits.batch)
+    plain_body, json_length = answer_inference(loaded, read, write_answer)
+    accepted_encodings = request.headers.get(b"accept-encoding", b"")
+    body, encoding = compress(plain_body, accepted_encodings)
+
+    content_type = b"application/json" if json_length is None else b"application/octet-stream"
+    response = response_of(200, content_type, body)
     if json_length is not None:
         response.headers.append((b"inference-header-content-length", b"%d" % json_length))
     if encoding:
@@ -264,9 +266,9 @@ def _infer(request: Request) -> Response:
     return response
 
 
-def of_model(tail: str = "") -> tuple[str, str]:
+def model_paths(ending: str = "") -> tuple[str, str]:
     """Return the paths of a route that belongs to a model: with its name, and with its name and version."""
-    return f"/v2/models/{{model}}{tail}", f"/v2/models/{{model}}/versions/{{version}}{tail}"
+    return f"/v2/models/{{model}}{ending}", f"/v2/models/{{model}}/versions/{{version}}{ending}"
 
 
 ROUTES: tuple[Route, ...] = (
@@ -322,7 +324,7 @@ ROUTES: tuple[Route, ...] = (
         method="POST",
         paths=("/v2/repository/models/{model}/load",),
         respond=_load,
-        summary="Read a model's files again and swap it in",
+        summary="Read the files of a model again and replace its loaded versions",
         answer=ANY,
         body=Body(LOAD_BODY),
         may_block=True,
@@ -331,40 +333,44 @@ ROUTES: tuple[Route, ...] = (
         method="POST",
         paths=("/v2/repository/models/{model}/unload",),
         respond=_unload,
-        summary="Take a model off",
+        summary="Remove a model from the server",
         answer=ANY,
         body=Body(UNLOAD_BODY),
         may_block=True,
     ),
     Route(
         method="GET",
-        paths=of_model(),
+        paths=model_paths(),
         respond=_show_model,
-        summary="Tensors of a model and what its file says about itself",
+        summary="Tensors and metadata of a model",
         answer=MODEL,
     ),
     Route(
-        method="GET", paths=of_model("/ready"), respond=_is_model_ready, summary="Whether a model serves", answer=ANY
-    ),
-    Route(
         method="GET",
-        paths=of_model("/config"),
-        respond=_show_config,
-        summary="A model's configuration, as Triton words it",
+        paths=model_paths("/ready"),
+        respond=_is_model_ready,
+        summary="Whether a model is loaded",
         answer=ANY,
     ),
     Route(
         method="GET",
-        paths=of_model("/stats"),
+        paths=model_paths("/config"),
+        respond=_show_config,
+        summary="Configuration of a model in the form of Triton",
+        answer=ANY,
+    ),
+    Route(
+        method="GET",
+        paths=model_paths("/stats"),
         respond=_show_statistics,
-        summary="A model's counters",
+        summary="Counters of a model",
         answer=STATISTICS,
     ),
     Route(
         method="POST",
-        paths=of_model("/infer"),
+        paths=model_paths("/infer"),
         respond=_infer,
-        summary="Charges to contacts",
+        summary="Compute contacts from charges",
         answer=INFERENCE,
         body=Body(INFER_BODY, is_required=True, example=EXAMPLE),
     ),
