@@ -1,101 +1,69 @@
-"""Charges of presses on any film of a prior, with their derivatives by the contact and by the unknowns of the film.
+"""Charges of presses on any film of a prior, and their derivatives with respect to the contact and the film.
 
-A film is given by the parameters of `FilmPrior`, after which the coefficients of what it has besides may stand: modes
-of its imperfections in units of their standard deviations, traces, and the terms of its discrepancy. `UnknownLayout`
-gives the places of all of them.
+A film is described by a vector of unknowns. The parameters of `FilmPrior` come first. Coefficients may follow: those of
+the modes of imperfections (in units of their standard deviations), those of traces that the sensor file does not
+describe, and those of the terms of the discrepancy. `UnknownLayout` defines their order.
 """
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.simulate import Circle, Film, ForwardMap, Probe, Sensor
+from isocharge.simulate import Circle, Film, ForwardMap, Probe
 from isocharge.simulate.forward.charge_map import Domain, FunctionMap, differences
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.forward.film_modes import MODES, ModeMap
-from isocharge.simulate.forward.forward_map import EVEN_FIELD
-from isocharge.simulate.forward.readout import ReadoutPoints
 from isocharge.simulate.numerics.disk import onto_disk
-from isocharge.simulate.numerics.polygon import area_of
 from isocharge.simulate.sensor.film_prior import PARAMETERS, SHARED, FilmPrior
-from isocharge.train.calibration.discrepancy import TRACE_ANGLES, term_count, terms
+from isocharge.train.calibration.discrepancy import term_count, terms
+from isocharge.train.calibration.imperfections import (
+    ModeCharges,
+    log_unevenness,
+    tension_unevenness,
+    trace_charges,
+    trace_lines,
+    trace_widths,
+)
 from isocharge.train.calibration.unknowns import UnknownLayout
 
 STEP = 0.005
-"""Step of the differences by a parameter, in standard deviations of its prior: the map is smooth on that scale."""
+"""Step of the finite differences with respect to a parameter, in standard deviations of its prior."""
 
 LOAD_PARAMETERS = ("pretension", "young", "thickness")
-"""Parameters by which the stress of the film depends on the load; the others move electrodes or scale charges."""
+"""Parameters that change the stress of the film under a load. The others move electrodes or scale charges."""
 
 STEPPED = tuple(parameter.name for parameter in PARAMETERS if parameter.derivative == "difference")
 """Parameters whose derivatives are differences."""
 
 CONTACT_STEPS = (5e-3, 5e-3, 1e-3)
-"""Steps of the differences in x and y (mm) and in ln F: small, so that they cost little of the films' domain."""
+"""Steps of the finite differences in x and y (mm) and in ln F. They are small, because the domain is reduced by a
+step."""
 
 CACHED_MAPS = 8
 """Number of forward maps that are cached."""
 
-TRACE_STD_MM = 0.5
-"""Standard deviation of the width of a trace that is not described, mm."""
-
-TRACE_END = 0.93
-"""Distance from the centre at which such traces end, over the film's radius: four millimetres matter little."""
-
-LARGEST_UNEVENNESS = 0.9
-"""Largest square of the uneven tension over that of the mean tension.
-
-Modes with `is_uneven_tension` act on all charges alike to second order: a membrane with tensions T +- e along two axes
-sags as one of sqrt(T^2 - e^2) all round, the less the more the press itself stretches it: ln Q grows by
-(1 - sqrt(1 - (e / T)^2)) x (1 - (1 - x / 2)^SLACKENING), x = -d ln Q / d ln T."""
-
-SLACKENING = 1.75
-"""Fitted to full solves of 0.6 to 2 MPa, 0.05 to 1.6 N, two places, which it meets to 5 % where x is above 0.1."""
-
 NEGLIGIBLE = 1e-3
-"""Largest coefficient of the modes that counts as none: it changes charges by some 3e-5, and they take long."""
+"""Coefficient of the modes and traces below which they are not computed. The charges change by less than 1e-4."""
 
 LARGEST_LOCAL_COEFFICIENT = 0.1
-"""Largest coefficient of modes and traces whose effect is taken for the same on neighbouring films."""
+"""Largest coefficient of modes and traces whose factor is assumed to be the same on neighbouring films."""
 
-LEAST_TENSION = 1e-3
-"""Least pretension over which the uneven part is taken, MPa."""
-
-LEAST_FACTOR = 0.05
-"""Least factor of the modes: first order ends before charges change their sign."""
+MIN_FACTOR = 0.05
+"""Lower bound for the factor of modes and traces. The first-order expansion is not valid for smaller factors."""
 
 EDGE = 1.0 - 1e-6
-"""Share of the family's radius and forces within which presses are evaluated: differences stay inside."""
-
-
-class _ModeCharges(NamedTuple):
-    """Charges of the modes of a film under the last presses.
-
-    Attributes:
-        modes: The modes of the film; None in a family without modes.
-        sensor: The sensor that they belong to.
-        contact: The presses.
-        by_mode: Derivatives of the charges by the coefficients of the modes, shape (n, n_electrode, n_mode), pC.
-        by_unevenness: What an uneven tension adds to ln Q, for each unit of its share; see `_unevenness`.
-    """
-
-    modes: ModeMap | None
-    sensor: Sensor
-    contact: Array
-    by_mode: Array
-    by_unevenness: Array
+"""Share of the radius and of the forces of the family within which presses are evaluated."""
 
 
 @dataclass(frozen=True)
 class FilmCharges:
-    """The forward map of every film of a prior.
+    """Forward maps of all films of a prior.
 
     Attributes:
-        prior: What the parameters are.
-        family: The solved films.
+        prior: Distribution of the films, which declares the parameters.
+        family: Solved films, between which the forward maps are interpolated.
     """
 
     prior: FilmPrior
@@ -103,17 +71,22 @@ class FilmCharges:
 
     @cached_property
     def domain(self) -> Domain:
-        """Contacts for which every film of the prior has charges, including those a step of the differences away."""
+        """Contacts for which every film of the prior has charges, with a margin for the finite differences."""
         film = self.prior.sensor.film
         young = self.prior.index("young")
         thickness = self.prior.index("thickness")
-        load = film.young * film.thickness * film.radius
-        softest, stiffest = (load * np.exp(bound[young] + bound[thickness]) for bound in self.prior.bounds)
-        smallest_load, largest_load = self.family.limits["load"]
-        return Domain(
-            EDGE * self.family.limits["distance"][1] * film.radius - CONTACT_STEPS[0],
-            (float(smallest_load * stiffest) * (2.0 - EDGE) * 1.01, float(largest_load * softest) * EDGE / 1.01),
+        stiffness = film.young * film.thickness * film.radius
+        min_stiffness, max_stiffness = (
+            stiffness * np.exp(bound[young] + bound[thickness]) for bound in self.prior.bounds
         )
+
+        # The family is limited in the distance over the radius, and in the load F / (E h a).
+        _, max_distance = self.family.limits["distance"]
+        min_load, max_load = self.family.limits["load"]
+        radius = EDGE * max_distance * film.radius - CONTACT_STEPS[0]
+        min_force = float(min_load * max_stiffness) * (2.0 - EDGE) * 1.01
+        max_force = float(max_load * min_stiffness) * EDGE / 1.01
+        return Domain(radius, (min_force, max_force))
 
     @cached_property
     def modes(self) -> tuple[str, ...]:
@@ -142,45 +115,32 @@ class FilmCharges:
 
     @cached_property
     def _trace_lines(self) -> Array:
-        """Ends of the lines along which traces may lie, shape (n_electrode, n_line, 2, 2), mm."""
-        electrodes = self.prior.sensor.electrodes
-        end_radius = TRACE_END * self.prior.sensor.film.radius
-        centre = np.array([complex(*electrode.centre) for electrode in electrodes])[:, None]
-        areas = [area_of(np.array(electrode.corners)) for electrode in electrodes]
-        pad_radius = np.sqrt(np.array(areas) / np.pi)[:, None]
-        direction = np.exp(1j * (np.angle(centre) + np.deg2rad(TRACE_ANGLES)))
-        along = (centre.conj() * direction).real
-        to_rim = np.sqrt(along**2 + end_radius**2 - np.abs(centre) ** 2) - along
-        ends = centre[:, :, None] + np.stack([pad_radius * direction, to_rim * direction], axis=2)
-        return np.stack([ends.real, ends.imag], axis=3)
-
-    def _trace_charges(self, forward_map: ForwardMap, contact: Array) -> Array:
-        """Return the charges of the lines, `TRACE_STD_MM` wide, shape (n, n_electrode, n_electrode * n_line), pC."""
-        n = len(contact)
-        electrode_count = len(self.prior.sensor.electrodes)
-        points = ReadoutPoints.along(forward_map.sensor, self._trace_lines)
-        charge_per_mm = forward_map.field_charges(contact, EVEN_FIELD, points).reshape(n, electrode_count, 1, -1)
-        own_electrode = np.eye(electrode_count)[:, :, None]
-        return np.asarray((TRACE_STD_MM * charge_per_mm * own_electrode).reshape(n, electrode_count, -1))
+        """Ends of the lines along which traces may lie; see `trace_lines`."""
+        return trace_lines(self.prior.sensor)
 
     def trace_widths(self, unknowns: Array, covariance: Array) -> dict[str, tuple[float, float]]:
-        """Return the width of each electrode's trace beyond the described one, and its standard deviation, mm.
+        """Return the total width of the traces of each electrode that the sensor file does not describe.
 
         Args:
-            unknowns: Unknowns of a film, shape (n_parameter + n_coefficient,).
-            covariance: Their covariance, parameters over their prior standard deviations.
+            unknowns: Parameters and coefficients of a film, shape (n_parameter + n_coefficient,).
+            covariance: Covariance of the unknowns, with parameters in units of their prior standard deviations.
+
+        Returns:
+            Width and its standard deviation by the name of the electrode, mm.
         """
-        names = self.prior.sensor.electrode_names
         traces = self.layout.traces
-        width_of_lines = TRACE_STD_MM * np.eye(len(names)).repeat(len(TRACE_ANGLES), axis=1)
-        widths = width_of_lines @ unknowns[traces]
-        stds = np.sqrt(np.diag(width_of_lines @ covariance[traces, traces] @ width_of_lines.T))
+        widths, stds = trace_widths(unknowns[traces], covariance[traces, traces])
+        names = self.prior.sensor.electrode_names
         return {name: (float(width), float(std)) for name, width, std in zip(names, widths, stds, strict=True)}
 
     def forward_map(self, parameters: Array) -> ForwardMap:
-        """Return the forward map of one film without a discrepancy, parameters of shape (n_parameter,).
+        """Return the forward map of one film without modes, traces and discrepancy.
 
-        Films that differ in coefficients, gains and electrodes only share their stresses; the last few are cached.
+        Films that differ only in piezoelectric coefficients, gains and electrodes have the same stresses. The last few
+        stresses are cached.
+
+        Args:
+            parameters: Parameters of the film, shape (n_parameter,).
         """
         sensor, probe = self.prior.film(parameters)
         key = (sensor.film, probe)
@@ -195,22 +155,32 @@ class FilmCharges:
         return {}
 
     def film(self, unknowns: Array) -> FunctionMap:
-        """Return the charges of one film, shape (n_parameter,), or (n_parameter + n_coefficient,) with coefficients."""
+        """Return the charges of one film as a function of the contact.
+
+        Args:
+            unknowns: Parameters of the film, shape (n_parameter,), or parameters and coefficients, shape
+                (n_parameter + n_coefficient,).
+        """
         forward_map = self.forward_map(unknowns[self.layout.parameters])
 
         def charges(contact: Array) -> Array:
+            """Return the charges of contacts (x, y, F), shape (n, n_electrode), pC."""
             charge = forward_map.charges(contact)
             return charge * self.factor(unknowns, contact, charge)
 
         return FunctionMap(charges, forward_map.electrodes, self.domain)
 
     def factor(self, unknowns: Array, contact: Array, charge: Array | None = None) -> Array:
-        """Return the factors of modes, traces and discrepancy on a film's charges, shape (n, n_electrode).
+        """Compute the factors by which modes, traces and discrepancy change the charges of a film.
 
         Args:
-            unknowns: As `film` takes them.
-            contact: (x, y, F), shape (n, 3), mm and N.
-            charge: Charges without the coefficients; computed if absent.
+            unknowns: Parameters and coefficients, as in `film`.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges without modes, traces and discrepancy, shape (n, n_electrode), pC. They are computed if
+                absent.
+
+        Returns:
+            Factors, shape (n, n_electrode), dimensionless.
         """
         layout = self.layout
         parameters = unknowns[layout.parameters]
@@ -222,13 +192,13 @@ class FilmCharges:
             forward_map = self.forward_map(parameters)
             charge = forward_map.charges(contact) if charge is None else charge
             if np.abs(trace_coefficients).max() > NEGLIGIBLE:
-                factor += self._trace_charges(forward_map, contact) @ trace_coefficients / charge
+                factor += trace_charges(forward_map, self._trace_lines, contact) @ trace_coefficients / charge
             if np.abs(mode_coefficients).max(initial=0.0) > NEGLIGIBLE:
                 modes = self._mode_charges(parameters, contact, charge)
                 unevenness, _ = self._unevenness(self._pretension(parameters), mode_coefficients)
-                factor += modes.by_mode @ mode_coefficients / charge
-                factor *= np.exp(unevenness * modes.by_unevenness)
-            factor = np.maximum(factor, LEAST_FACTOR)
+                factor += modes.mode_jacobian @ mode_coefficients / charge
+                factor *= np.exp(unevenness * modes.log_unevenness)
+            factor = np.maximum(factor, MIN_FACTOR)
         if term_coefficients.any():
             log_factor = terms(contact, self.domain) @ term_coefficients.reshape(term_count(), -1)
             factor = factor * np.exp(log_factor)
@@ -238,116 +208,165 @@ class FilmCharges:
         """Return the pretension of a film, MPa."""
         return float(unknowns[self.layout.parameter("pretension")])
 
-    def _mode_charges(self, parameters: Array, contact: Array, charge: Array) -> _ModeCharges:
-        """Return what the modes do to presses with these charges."""
+    def _mode_charges(self, parameters: Array, contact: Array, charge: Array) -> ModeCharges:
+        """Return the effects of the modes on the charges of presses, from a cache if possible.
+
+        Args:
+            parameters: Parameters of the film, shape (n_parameter,).
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges of these contacts without modes, shape (n, n_electrode), pC.
+        """
         forward_map = self.forward_map(parameters)
         sensor = forward_map.sensor
-        family = self.family.imperfections
-        if family is None:
-            zeros = np.zeros_like(charge)
-            return _ModeCharges(None, sensor, contact, by_mode=np.zeros((*charge.shape, 0)), by_unevenness=zeros)
+        if self.family.imperfections is None:
+            no_modes = np.zeros((*charge.shape, 0))
+            return ModeCharges(None, sensor, contact, mode_jacobian=no_modes, log_unevenness=np.zeros_like(charge))
+
         key = (sensor.film, forward_map.probe)
         cached = self._cached_modes.get(key)
         if cached is not None and cached.sensor == sensor and np.array_equal(cached.contact, contact):
             return cached
         modes = cached.modes if cached is not None else None
         if modes is None:
-            modes = family.mode_map(forward_map, self.modes)
-        fields = replace(modes.fields, sensor=sensor) if modes.fields is not None else None
-        by_mode = replace(modes, film=forward_map, fields=fields).mode_jacobian(contact)
-        by_pretension = self._difference("pretension", parameters, contact, charge)
-        fall = -self._pretension(parameters) * by_pretension / charge
-        by_unevenness = fall * (1.0 - np.clip(1.0 - 0.5 * fall, 0.0, 1.0) ** SLACKENING)
-        computed = _ModeCharges(modes, sensor, contact, by_mode * self._mode_stds, by_unevenness)
+            modes = self.family.imperfections.mode_map(forward_map, self.modes)
+        computed = self._computed_mode_charges(modes, forward_map, parameters, contact, charge)
         if key not in self._cached_modes and len(self._cached_modes) > 1:
-            del self._cached_modes[next(iter(self._cached_modes))]
+            oldest_key = next(iter(self._cached_modes))
+            del self._cached_modes[oldest_key]
         self._cached_modes[key] = computed
         return computed
 
+    def _computed_mode_charges(
+        self, modes: ModeMap, forward_map: ForwardMap, parameters: Array, contact: Array, charge: Array
+    ) -> ModeCharges:
+        """Compute the effects of the modes on the charges of presses; the arguments are those of `_mode_charges`."""
+        sensor = forward_map.sensor
+        fields = replace(modes.fields, sensor=sensor) if modes.fields is not None else None
+        mode_jacobian = replace(modes, film=forward_map, fields=fields).mode_jacobian(contact)
+
+        pretension_derivative = self._difference("pretension", parameters, contact, charge)
+        log_tension_derivative = self._pretension(parameters) * pretension_derivative / charge
+        return ModeCharges(
+            modes, sensor, contact, mode_jacobian * self._mode_stds, log_unevenness(log_tension_derivative)
+        )
+
     @cached_property
-    def _cached_modes(self) -> dict[tuple[Film, Probe], _ModeCharges]:
+    def _cached_modes(self) -> dict[tuple[Film, Probe], ModeCharges]:
         return {}
 
     def _unevenness(self, pretension: float, mode_coefficients: Array) -> tuple[float, Array]:
-        """Return the share by which an uneven tension acts as a lower one, and its derivatives by the coefficients."""
+        """Return the unevenness of the tension and its derivatives; see `tension_unevenness`."""
         tension_stds = np.where(self._is_uneven_tension, self._mode_stds, 0.0)
-        relative_stds = tension_stds / max(pretension, LEAST_TENSION)
-        square = float(((relative_stds * mode_coefficients) ** 2).sum())
-        root = np.sqrt(1.0 - min(square, LARGEST_UNEVENNESS))
-        if square >= LARGEST_UNEVENNESS:
-            return 1.0 - root, np.zeros_like(mode_coefficients)
-        return 1.0 - root, relative_stds**2 * mode_coefficients / root
+        return tension_unevenness(pretension, tension_stds, mode_coefficients)
 
     def charges(self, unknowns: Array, contact: Array) -> Array:
-        """Return the charges of contacts (x, y, F), shape (n, 3), mm and N, on one film: (n, n_electrode), pC."""
+        """Compute the charges of contacts on one film.
+
+        Args:
+            unknowns: Parameters and coefficients of the film, as in `film`.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Charges, shape (n, n_electrode), pC.
+        """
         return self.film(unknowns).charges(contact)
 
     def by_contact(self, unknowns: Array, contact: Array) -> Array:
-        """Return the derivatives by (x, y, ln F) on one film, shape (n, n_electrode, 3), pC/mm, pC/mm and pC."""
+        """Compute the derivatives of the charges of one film with respect to (x, y, ln F).
+
+        Args:
+            unknowns: Parameters and coefficients of the film, as in `film`.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
+        """
         return differences(self.film(unknowns).charges, contact, CONTACT_STEPS)
 
     def into_domain(self, contact: Array) -> Array:
-        """Return contacts moved to the nearest contact of the domain, shape (n, 3)."""
-        place = onto_disk(contact[:, :2], self.domain.radius)
-        return np.column_stack([place, np.clip(contact[:, 2], *self.domain.force_range)])
-
-    def by_parameter(self, unknowns: Array, contact: Array, by_contact: Array) -> Array:
-        """Return the derivatives by the parameters over their prior standard deviations, and by given coefficients.
-
-        What scales is exact: charges are E q(F / (E h a), T / E, h / a) with T the pretension, and linear in d31 and
-        d32. The others are differences of small steps. The modes are taken for the same share of the charges where
-        electrodes, coefficients and probe differ a little.
+        """Return the nearest contacts of the domain.
 
         Args:
-            unknowns: The film, shape (n_parameter,) or (n_parameter + n_coefficient,).
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            by_contact: Derivatives by the contacts, as `by_contact` gives them.
+        """
+        position = onto_disk(contact[:, :2], self.domain.radius)
+        force = np.clip(contact[:, 2], *self.domain.force_range)
+        return np.column_stack([position, force])
+
+    def by_parameter(self, unknowns: Array, contact: Array, by_contact: Array) -> Array:
+        """Compute the derivatives of the charges with respect to the parameters and, if given, the coefficients.
+
+        The charges are E q(F / (E h a), T / E, h / a) with the pretension T, and linear in d31 and d32. The derivatives
+        with respect to the scales are therefore exact, and the others are finite differences. Small changes of
+        electrodes, coefficients and probe are assumed not to change the factor of the modes.
+
+        Args:
+            unknowns: Parameters of the film, shape (n_parameter,), or parameters and coefficients, shape
+                (n_parameter + n_coefficient,).
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            by_contact: Derivatives with respect to the contacts, as the method `by_contact` returns them.
 
         Returns:
-            Shape (n, n_electrode, n_parameter) or (n, n_electrode, n_parameter + n_coefficient), pC.
+            Derivatives with respect to the parameters over their prior standard deviations, shape (n, n_electrode,
+            n_parameter), or with respect to parameters and coefficients, shape (n, n_electrode, n_parameter +
+            n_coefficient), pC.
         """
         layout = self.layout
         parameters = unknowns[layout.parameters]
         coefficients = unknowns[layout.coefficients]
         film = self.forward_map(parameters)
         charge = film.charges(contact)
-        by_force = by_contact[:, :, 2]
-        if coefficients.any():  # the derivative of the charges without them
-            force_factor = np.array([1.0, 1.0, np.exp(CONTACT_STEPS[2])])
-            harder = film.charges(contact * force_factor)
-            softer = film.charges(contact / force_factor)
-            by_force = (harder - softer) / (2.0 * CONTACT_STEPS[2])
-        film_jacobian = self._parameter_jacobian(film, parameters, contact, charge, by_force) * self.prior.std
+        force_derivative = by_contact[:, :, 2]
+        if coefficients.any():
+            force_derivative = _force_derivative(film, contact)
+        film_jacobian = self._parameter_jacobian(film, parameters, contact, charge, force_derivative) * self.prior.std
         if not coefficients.size:
             return np.asarray(film_jacobian)
+
+        # Product rule: the charge is that of the film without coefficients times the factor of the coefficients.
         factor = self.factor(unknowns, contact, charge)[:, :, None]
-        for name, slope in self._load_slopes(unknowns, contact).items():
-            number = layout.parameter(name)
-            film_jacobian[:, :, number] += charge * slope * self.prior.std[number]
+        for name, log_derivative in self._load_slopes(unknowns, contact).items():
+            index = layout.parameter(name)
+            film_jacobian[:, :, index] += charge * log_derivative * self.prior.std[index]
         if np.abs(unknowns[layout.traces]).max() > LARGEST_LOCAL_COEFFICIENT:
-            for name, slope in self._trace_slopes(unknowns, contact).items():
-                film_jacobian[:, :, layout.parameter(name)] += charge * slope
+            for name, log_derivative in self._trace_slopes(unknowns, contact).items():
+                film_jacobian[:, :, layout.parameter(name)] += charge * log_derivative
         film_jacobian *= factor
+
         modes = self._mode_charges(parameters, contact, charge)
-        trace_jacobian = self._trace_charges(film, contact)
         _, unevenness_slopes = self._unevenness(self._pretension(parameters), unknowns[layout.modes])
-        mode_jacobian = modes.by_mode + factor * (charge * modes.by_unevenness)[:, :, None] * unevenness_slopes
-        tension_coefficients = unknowns[layout.modes] * self._is_uneven_tension  # as the pretension, they count over E
+        log_unevenness_charge = (charge * modes.log_unevenness)[:, :, None]
+        mode_jacobian = modes.mode_jacobian + factor * log_unevenness_charge * unevenness_slopes
+        # Uneven tensions are relative to E, as the pretension is, so that they contribute to the derivative of ln E.
+        tension_coefficients = unknowns[layout.modes] * self._is_uneven_tension
         young = layout.parameter("young")
         film_jacobian[:, :, young] -= mode_jacobian @ tension_coefficients * self.prior.std[young]
-        own_charge = charge[:, :, None] * np.eye(charge.shape[1])
-        term_jacobian = (factor * own_charge)[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
-        return np.concatenate(
-            [film_jacobian, mode_jacobian, trace_jacobian, term_jacobian.reshape(*charge.shape, -1)], axis=2
-        )
+
+        trace_jacobian = trace_charges(film, self._trace_lines, contact)
+        own_charge = factor * charge[:, :, None] * np.eye(charge.shape[1])  # shape (n, n_electrode, n_electrode)
+        term_jacobian = own_charge[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
+        term_jacobian = term_jacobian.reshape(*charge.shape, -1)
+        return np.concatenate([film_jacobian, mode_jacobian, trace_jacobian, term_jacobian], axis=2)
 
     def _parameter_jacobian(
-        self, film: ForwardMap, parameters: Array, contact: Array, charge: Array, by_force: Array
+        self, film: ForwardMap, parameters: Array, contact: Array, charge: Array, force_derivative: Array
     ) -> Array:
-        """Return the derivatives of the charges by the parameters, without coefficients."""
+        """Compute the derivatives of the charges without coefficients with respect to the parameters.
+
+        Args:
+            film: Forward map of the film.
+            parameters: Parameters of the film, shape (n_parameter,).
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges of these contacts, shape (n, n_electrode), pC.
+            force_derivative: Derivatives of the charges with respect to ln F, shape (n, n_electrode), pC.
+
+        Returns:
+            Shape (n, n_electrode, n_parameter), pC per unit of the parameter.
+        """
         columns = {name: self._difference(name, parameters, contact, charge) for name in STEPPED}
-        columns["young"] = charge - by_force - self._pretension(parameters) * columns["pretension"]
-        columns["thickness"] = columns["thickness"] - by_force
+        # Chain rule for Q = E q(F / (E h a), T / E, h / a), with respect to ln E and ln h
+        columns["young"] = charge - force_derivative - self._pretension(parameters) * columns["pretension"]
+        columns["thickness"] = columns["thickness"] - force_derivative
         piezo = film.sensor.piezo
         columns["d32"] = np.zeros_like(charge)
         if piezo.d32 != 0.0:
@@ -359,66 +378,118 @@ class FilmCharges:
         return np.concatenate([shared, gain_jacobian], axis=2)
 
     def _without_terms(self, unknowns: Array) -> Array:
-        """Return a film without the terms of its discrepancy."""
+        """Return parameters and coefficients of a film, with the terms of the discrepancy set to zero."""
         film = unknowns.copy()
         film[self.layout.terms] = 0.0
         return film
 
     def _stepped(self, unknowns: Array, name: str) -> tuple[Array, float]:
-        """Return a film with a small step of one parameter towards its mean, and the step in standard deviations."""
-        number = self.layout.parameter(name)
-        step = -STEP if unknowns[number] > self.prior.mean[number] else STEP
+        """Change one parameter by a small step towards its prior mean, so that it remains within its bounds.
+
+        Args:
+            unknowns: Parameters and coefficients of a film.
+            name: Name of the parameter.
+
+        Returns:
+            Changed parameters and coefficients, and the step in prior standard deviations.
+        """
+        index = self.layout.parameter(name)
+        step = -STEP if unknowns[index] > self.prior.mean[index] else STEP
         stepped = unknowns.copy()
-        stepped[number] += step * self.prior.std[number]
+        stepped[index] += step * self.prior.std[index]
         return stepped, step
 
     def _load_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
-        """Return the derivatives of ln Q of modes and traces by pretension, ln E and ln h, each (n, n_electrode).
+        """Compute the derivatives of ln(factor of modes and traces) with respect to pretension, ln E and ln h.
 
-        Modes and traces are functions of F / (E h a) and T / E, as the charges are.
+        The factor depends on F / (E h a) and T / E only, as the charges do, so that two finite differences determine
+        all three derivatives.
+
+        Args:
+            unknowns: Parameters and coefficients of the film.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Derivatives by the name of the parameter, each of shape (n, n_electrode). There are none if the
+            coefficients are small.
         """
         film = self._without_terms(unknowns)
         if np.abs(film[self.layout.imperfections]).max() < LARGEST_LOCAL_COEFFICIENT:
             return {}
-        tauter, step = self._stepped(film, "pretension")
-        tension_change = step * self.prior.std[self.layout.parameter("pretension")]
         factor = self.factor(film, contact)
-        harder = self.factor(film, contact * [1.0, 1.0, np.exp(CONTACT_STEPS[2])])
-        by_force = (harder - factor) / CONTACT_STEPS[2]
-        by_tension = (self.factor(tauter, contact) - factor) / tension_change
-        slopes = {
-            "pretension": by_tension,
-            "young": -by_force - self._pretension(film) * by_tension,
-            "thickness": -by_force,
+        log_force_step = CONTACT_STEPS[2]
+        factor_with_force = self.factor(film, contact * [1.0, 1.0, np.exp(log_force_step)])
+        force_derivative = (factor_with_force - factor) / log_force_step
+
+        film_with_tension, step = self._stepped(film, "pretension")
+        tension_step = step * self.prior.std[self.layout.parameter("pretension")]
+        tension_derivative = (self.factor(film_with_tension, contact) - factor) / tension_step
+        derivatives = {
+            "pretension": tension_derivative,
+            "young": -force_derivative - self._pretension(film) * tension_derivative,
+            "thickness": -force_derivative,
         }
-        return {name: slope / np.maximum(factor, LEAST_FACTOR) for name, slope in slopes.items()}
+        return {name: derivative / np.maximum(factor, MIN_FACTOR) for name, derivative in derivatives.items()}
 
     def _trace_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
-        """Return the derivatives of ln Q of traces by coefficients, place and probe over their prior's deviations.
+        """Compute the derivatives of ln(factor of traces) with respect to the parameters that are not in the load.
 
-        Each has the shape (n, n_electrode). A trace is not where its electrode is, so it answers otherwise.
+        These are the piezoelectric coefficients, the place of the electrodes and the radius of the probe. A trace lies
+        at another place than its electrode, so that its charge changes by another share than that of the electrode.
+
+        Args:
+            unknowns: Parameters and coefficients of the film.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Derivatives with respect to each parameter over its prior standard deviation, by the name of the parameter,
+            each of shape (n, n_electrode).
         """
         film = self._without_terms(unknowns)
         film[self.layout.modes] = 0.0
         factor = self.factor(film, contact)
-        slopes = {}
+        log_derivatives = {}
         for name in SHARED:
             if name in LOAD_PARAMETERS:
                 continue
-            stepped, step = self._stepped(film, name)
-            slopes[name] = (self.factor(stepped, contact) - factor) / step / np.maximum(factor, LEAST_FACTOR)
-        return slopes
+            stepped_film, step = self._stepped(film, name)
+            derivative = (self.factor(stepped_film, contact) - factor) / step
+            log_derivatives[name] = derivative / np.maximum(factor, MIN_FACTOR)
+        return log_derivatives
 
     def _difference(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
-        """Return the derivative by one parameter, by a small step.
+        """Compute the derivative of the charges with respect to one parameter by a finite difference.
 
-        The derivative by the thickness is at one load F / (E h a), which is the part of bending alone.
+        The derivative with respect to ln h is computed at a constant load F / (E h a), so that it contains only the
+        effect of bending.
+
+        Args:
+            name: Name of the parameter.
+            parameters: Parameters of the film, shape (n_parameter,).
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges of these contacts, shape (n, n_electrode), pC.
+
+        Returns:
+            Shape (n, n_electrode), pC per unit of the parameter.
         """
-        number = self.prior.index(name)
+        index = self.prior.index(name)
         _, upper_bounds = self.prior.bounds
-        step = STEP * self.prior.std[number]
+        step = STEP * self.prior.std[index]
+        if parameters[index] + step > upper_bounds[index]:
+            step = -step
         stepped = parameters.copy()
-        stepped[number] += step if parameters[number] + step <= upper_bounds[number] else -step
-        change = stepped[number] - parameters[number]
-        at = contact * [1.0, 1.0, np.exp(change)] if name == "thickness" else contact
-        return np.asarray((self.forward_map(stepped).charges(at) - charge) / change)
+        stepped[index] += step
+        change = stepped[index] - parameters[index]
+        stepped_contact = contact
+        if name == "thickness":
+            stepped_contact = contact * [1.0, 1.0, np.exp(change)]  # keeps F / h constant
+        return np.asarray((self.forward_map(stepped).charges(stepped_contact) - charge) / change)
+
+
+def _force_derivative(film: ForwardMap, contact: Array) -> Array:
+    """Compute the derivatives of the charges of a forward map with respect to ln F, shape (n, n_electrode), pC."""
+    log_force_step = CONTACT_STEPS[2]
+    force_factor = np.array([1.0, 1.0, np.exp(log_force_step)])
+    charge_above = film.charges(contact * force_factor)
+    charge_below = film.charges(contact / force_factor)
+    return np.asarray((charge_above - charge_below) / (2.0 * log_force_step))

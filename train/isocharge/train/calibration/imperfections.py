@@ -1,0 +1,152 @@
+"""Effects of traces and of an uneven tension on the charges of a film.
+
+A trace that the sensor file does not describe collects charge beyond the pad of its electrode. It is modelled by lines
+from the edge of the pad to the rim of the film, whose widths are unknown. An uneven tension acts like a smaller tension
+to second order.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.simulate import ForwardMap, Sensor
+from isocharge.simulate.forward.film_modes import ModeMap
+from isocharge.simulate.forward.forward_map import EVEN_FIELD
+from isocharge.simulate.forward.readout import ReadoutPoints
+from isocharge.simulate.numerics.polygon import area_of
+from isocharge.train.calibration.discrepancy import TRACE_ANGLES
+
+TRACE_STD_MM = 0.5
+"""Prior standard deviation of the width of a trace that is not described, mm."""
+
+TRACE_END = 0.93
+"""Distance from the centre at which such traces end, relative to the film's radius. The last millimetres before the rim
+contribute little charge."""
+
+LARGEST_SQUARED_RATIO = 0.9
+"""Largest squared ratio of the uneven part of the tension to the mean tension."""
+
+SLACKENING = 1.75
+"""Exponent in `log_unevenness`, fitted to full simulations."""
+
+MIN_TENSION = 1e-3
+"""Lower bound for the pretension to which the uneven part is related, MPa."""
+
+
+class ModeCharges(NamedTuple):
+    """Effects of the modes of a film on the charges of presses.
+
+    Attributes:
+        modes: The modes of the film; None in a family without modes.
+        sensor: The sensor to which the charges belong.
+        contact: Contacts of the presses, shape (n, 3), mm and N.
+        mode_jacobian: Derivatives of the charges with respect to the coefficients of the modes, shape (n, n_electrode,
+            n_mode), pC.
+        log_unevenness: Derivative of ln Q with respect to the unevenness of the tension, shape (n, n_electrode); see
+            `tension_unevenness`.
+    """
+
+    modes: ModeMap | None
+    sensor: Sensor
+    contact: Array
+    mode_jacobian: Array
+    log_unevenness: Array
+
+
+def trace_lines(sensor: Sensor) -> Array:
+    """Return both ends of the lines along which traces may lie.
+
+    A line begins at the edge of a pad, which is treated as a circle of the same area, and ends near the rim.
+
+    Args:
+        sensor: Sensor with the pads.
+
+    Returns:
+        Points (x, y), shape (n_electrode, n_line, 2, 2), mm.
+    """
+    end_radius = TRACE_END * sensor.film.radius
+    centre = np.array([complex(*electrode.centre) for electrode in sensor.electrodes])[:, None]
+    areas = [area_of(np.array(electrode.corners)) for electrode in sensor.electrodes]
+    pad_radius = np.sqrt(np.array(areas) / np.pi)[:, None]
+    direction = np.exp(1j * (np.angle(centre) + np.deg2rad(TRACE_ANGLES)))
+
+    # Distance from the centre of the pad to the circle with `end_radius`, along the direction of the line
+    projection = (centre.conj() * direction).real
+    distance_to_end = np.sqrt(projection**2 + end_radius**2 - np.abs(centre) ** 2) - projection
+    ends = centre[:, :, None] + np.stack([pad_radius * direction, distance_to_end * direction], axis=2)
+    return np.stack([ends.real, ends.imag], axis=3)
+
+
+def trace_charges(forward_map: ForwardMap, lines: Array, contact: Array) -> Array:
+    """Compute the charges that traces of the width `TRACE_STD_MM` collect, for each line.
+
+    Args:
+        forward_map: Forward map of the film.
+        lines: Ends of the lines, as `trace_lines` returns them.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Shape (n, n_electrode, n_electrode * n_line), pC. A line adds charge to its own electrode only.
+    """
+    n_electrode = len(lines)
+    points = ReadoutPoints.along(forward_map.sensor, lines)
+    charge_per_mm = forward_map.field_charges(contact, EVEN_FIELD, points)
+    line_charge = TRACE_STD_MM * charge_per_mm.reshape(len(contact), n_electrode, 1, -1)
+    is_own_electrode = np.eye(n_electrode)[:, :, None]
+    return np.asarray((line_charge * is_own_electrode).reshape(len(contact), n_electrode, -1))
+
+
+def trace_widths(coefficients: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return the total width of the traces of each electrode, and its standard deviation.
+
+    Args:
+        coefficients: Coefficients of the lines, shape (n_electrode * n_line,).
+        covariance: Covariance of the coefficients.
+
+    Returns:
+        Widths and standard deviations, each of shape (n_electrode,), mm.
+    """
+    n_electrode = coefficients.size // len(TRACE_ANGLES)
+    # The matrix adds the widths of all lines of an electrode.
+    width_matrix = TRACE_STD_MM * np.eye(n_electrode).repeat(len(TRACE_ANGLES), axis=1)
+    width_covariance = width_matrix @ covariance @ width_matrix.T
+    return width_matrix @ coefficients, np.sqrt(np.diag(width_covariance))
+
+
+def tension_unevenness(pretension: float, tension_stds: Array, coefficients: Array) -> tuple[float, Array]:
+    """Compute the unevenness 1 - sqrt(1 - (e / T)^2) of the tension.
+
+    A membrane with the tensions T + e and T - e along two axes deflects like a membrane with the uniform tension
+    sqrt(T^2 - e^2).
+
+    Args:
+        pretension: Mean pretension T, MPa.
+        tension_stds: Standard deviation of the uneven tension of each mode, shape (n_mode,), MPa; zero for other modes.
+        coefficients: Coefficients of the modes, in standard deviations, shape (n_mode,).
+
+    Returns:
+        Unevenness, dimensionless, and its derivatives with respect to the coefficients, shape (n_mode,).
+    """
+    relative_stds = tension_stds / max(pretension, MIN_TENSION)
+    squared_ratio = float(((relative_stds * coefficients) ** 2).sum())  # (e / T)^2
+    root = np.sqrt(1.0 - min(squared_ratio, LARGEST_SQUARED_RATIO))
+    if squared_ratio >= LARGEST_SQUARED_RATIO:
+        return 1.0 - root, np.zeros_like(coefficients)
+    return 1.0 - root, relative_stds**2 * coefficients / root
+
+
+def log_unevenness(log_tension_derivative: Array) -> Array:
+    """Compute the derivative of ln Q with respect to the unevenness of the tension.
+
+    It is x (1 - (1 - x / 2)^SLACKENING) with x = -d ln Q / d ln T. The effect of the tension is smaller if the press
+    itself stretches the film.
+
+    Args:
+        log_tension_derivative: d ln Q / d ln T, shape (n, n_electrode).
+
+    Returns:
+        Shape (n, n_electrode), dimensionless.
+    """
+    x = -log_tension_derivative
+    return np.asarray(x * (1.0 - np.clip(1.0 - 0.5 * x, 0.0, 1.0) ** SLACKENING))
