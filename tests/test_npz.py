@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 
-from isocharge.common.npz import DAMAGED, MAX_ENTRIES, finite_array, finite_number, npz_arrays, text_item
+from isocharge.common.npz import DAMAGED_FILE_ERRORS, MAX_ENTRIES, finite_array, finite_number, npz_arrays, text_item
 
 MEBIBYTE = 1 << 20
 
@@ -70,7 +70,7 @@ def test_entry_longer_than_the_archive_declares_is_refused():
     data = entry(content)
     size = struct.pack("<I", len(content))
     assert data.count(size) == 2
-    with pytest.raises(DAMAGED):
+    with pytest.raises(DAMAGED_FILE_ERRORS):
         npz_arrays(bytes(data.replace(size, struct.pack("<I", 200))))
 
 
@@ -103,7 +103,7 @@ def with_header(text):
     ids=["too long", "negative shape", "objects", "code", "pickle", "other content", "empty"],
 )
 def test_entry_that_is_no_array_of_numbers_is_refused(content, reason):
-    with pytest.raises(DAMAGED, match=reason):
+    with pytest.raises(DAMAGED_FILE_ERRORS, match=reason):
         npz_arrays(bytes(entry(content)))
 
 

@@ -38,7 +38,7 @@ COMPRESSION_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZM
 _LOCAL_HEADER = struct.Struct("<26xHH")
 _LZMA_PROPERTIES = struct.Struct("<HHBI")
 
-DAMAGED = (
+DAMAGED_FILE_ERRORS = (
     OSError,
     ValueError,
     KeyError,
@@ -65,7 +65,7 @@ def npz_arrays(data: bytes, names: Iterable[str] | None = None) -> dict[str, np.
 
     Raises:
         ValueError: If the file is too large when it is unpacked, or an entry is not an array of numbers or text.
-        Exception: One of `DAMAGED`, if the data are damaged.
+        Exception: One of `DAMAGED_FILE_ERRORS`, if the data are damaged.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = _checked_entries(archive)

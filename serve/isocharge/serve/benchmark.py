@@ -90,10 +90,11 @@ def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = t
     """
     turn_ns = round(seconds * 1e9 / (ROUNDS * max(len(contenders), 1)))
     durations: list[list[int]] = [[] for _ in contenders]
-    for number in track(range(ROUNDS), "measuring", ROUNDS):
+    for round_number in track(range(ROUNDS), "measuring", ROUNDS):
+        is_warm_up = round_number == 0
         for contender, contender_durations in zip(contenders, durations, strict=True):
             turn_durations = _turn(contender.call, turn_ns, clock)
-            if number > 0:
+            if not is_warm_up:
                 contender_durations += turn_durations
     return [
         Timing.of(contender.name, contender.presses, np.array(contender_durations, float))
@@ -103,13 +104,13 @@ def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = t
 
 def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
     """Call a function for the length of a turn, and return the durations of the calls, ns."""
-    durations: list[int] = []
-    end = clock() + turn_ns
-    while len(durations) < MIN_CALLS or clock() < end:
-        begin = clock()
+    durations_ns: list[int] = []
+    turn_end_ns = clock() + turn_ns
+    while len(durations_ns) < MIN_CALLS or clock() < turn_end_ns:
+        call_start_ns = clock()
         call()
-        durations.append(clock() - begin)
-    return durations
+        durations_ns.append(clock() - call_start_ns)
+    return durations_ns
 
 
 def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Singles:
@@ -137,18 +138,18 @@ def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Cont
         charge_pC: Charges of presses, shape (n, electrodes), pC. Each call for one press uses the next row. Batches of
             more than n presses are left out.
     """
-    rows = cycle(charge_pC)
-    lists = cycle(charge_pC.tolist())
+    next_array = partial(next, cycle(charge_pC))
+    next_list = partial(next, cycle(charge_pC.tolist()))
     out = np.zeros(N_WITHOUT_CORRELATION, np.float32)
     contenders = [
-        Contender("predict_into, float32 array", 1, lambda: predictor.predict_into(next(rows), out)),
-        Contender("predict, list of numbers", 1, lambda: predictor.predict(next(lists))),
+        Contender("predict_into, float32 array", 1, lambda: predictor.predict_into(next_array(), out)),
+        Contender("predict, list of numbers", 1, lambda: predictor.predict(next_list())),
     ]
-    return contenders + [
-        Contender(f"predict_batch, {n}", n, partial(predictor.predict_batch, charge_pC[:n]))
-        for n in BATCH_SIZES
-        if n <= len(charge_pC)
-    ]
+    for size in BATCH_SIZES:
+        if size <= len(charge_pC):
+            batch = charge_pC[:size]
+            contenders.append(Contender(f"predict_batch, {size}", size, partial(predictor.predict_batch, batch)))
+    return contenders
 
 
 def machine(packages: Sequence[str] = ("numpy", "onnxruntime")) -> dict[str, str]:

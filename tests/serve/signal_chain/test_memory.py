@@ -10,7 +10,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Contact, Frame, TouchStream, device_from_table, encode_frame
 from isocharge.serve.prediction.contact import Sensitivity
 from isocharge.serve.signal_chain.chain import SignalChain
-from isocharge.serve.signal_chain.memory import DECADES_S, LEARN_S, UNLIKE, WANDER_PC
+from isocharge.serve.signal_chain.memory import CREEP_LAW_DEVIATION, DECADES_S, LEARN_S, WARMTH_CHANGE_PC
 from isocharge.train.export_c.folder import device_header
 
 RATE_HZ, CREEP, STEP, WARMTH_S = 200.0, 0.08, 0.06, 2.5
@@ -100,7 +100,7 @@ def bayes(wrong, after_s):
     rest_s = np.arange(0.5, LEARN_S, 1.0 / RATE_HZ)
     scales = np.array([CREEP, STEP]) * wrong
     left_pC = np.linalg.norm(SHAPE) * scales * less(rest_s, 60.0)
-    noise_pC2 = SHAPE.size * WANDER_PC**2 * (60.0 + rest_s) + (UNLIKE * left_pC.sum(axis=1)) ** 2
+    noise_pC2 = SHAPE.size * WARMTH_CHANGE_PC**2 * (60.0 + rest_s) + (CREEP_LAW_DEVIATION * left_pC.sum(axis=1)) ** 2
     told = np.einsum("ni,nj,n->ij", left_pC, left_pC, 1.0 / noise_pC2) / (RATE_HZ * LEARN_S)
     covariance = np.linalg.inv(np.eye(2) / 0.2**2 + told)
     scales = scales * (1.0 + covariance @ told @ (1.0 / wrong - 1.0))

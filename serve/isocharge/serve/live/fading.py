@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.signal_chain.memory import MOST_CREEP, MemoryRule
+from isocharge.serve.signal_chain.memory import MAX_CREEP, MemoryRule
 
 MIN_RESIDUAL_RATIO = 9.0
 """Ratio of the squared residuals of two laws from which the better law is reported. The variations of the force of a
@@ -53,7 +53,7 @@ class Fading(NamedTuple):
     @property
     def memory(self) -> dict[str, float] | None:
         """Settings of the section `[memory]` that correct the decrease; None if no settings correct it."""
-        if self.creep is None or not self.creep < MOST_CREEP:
+        if self.creep is None or not self.creep < MAX_CREEP:
             return None
         settings = {"creep": float(f"{self.creep:.2g}")}
         if self.thermoelastic:

@@ -23,7 +23,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.chebyshev_series import Series
 from isocharge.common.errors import ModelError, cut
-from isocharge.common.npz import DAMAGED, finite_array, finite_number, npz_arrays
+from isocharge.common.npz import DAMAGED_FILE_ERRORS, finite_array, finite_number, npz_arrays
 from isocharge.serve.model.companion_files import read_companion_file
 
 FILE = "charges.npz"
@@ -84,18 +84,21 @@ class ChargeSeries:
             The charges, shape (n, n_electrode), pC, and their derivatives with respect to x, y (pC/mm) and ln F (pC),
             shape (n, n_electrode, 3).
         """
-        log_low, log_high = np.log(self.force_N)
-        centre = np.array([0.0, 0.0, 0.5 * (log_low + log_high)])
-        scale = np.array([self.radius_mm, self.radius_mm, 0.5 * (log_high - log_low)])
-        unit = (contact - centre) / scale
-        values = self.series.values(unit)
+        # The series is a function of coordinates between -1 and 1.
+        min_log_force, max_log_force = np.log(self.force_N)
+        centre = np.array([0.0, 0.0, 0.5 * (min_log_force + max_log_force)])
+        scale = np.array([self.radius_mm, self.radius_mm, 0.5 * (max_log_force - min_log_force)])
+        unit_contact = (contact - centre) / scale
+        # ln Q and its derivatives with respect to the three coordinates, shape (n, 4, n_electrode).
+        values = self.series.values(unit_contact)
         log_charge = values[:, 0]
         log_slopes = values[:, 1:]
         log_force_slope = values[:, 3]
 
-        unit_force = unit[:, 2:]
-        excess = unit_force - np.clip(unit_force, -1.0, 1.0)
-        charge = np.exp(log_charge + excess * log_force_slope)
+        unit_force = unit_contact[:, 2:]
+        distance_from_range = unit_force - np.clip(unit_force, -1.0, 1.0)  # 0 within the range of forces
+        charge = np.exp(log_charge + distance_from_range * log_force_slope)
+        # d Q = Q d(ln Q)
         slopes = charge[:, :, None] * log_slopes.swapaxes(1, 2) / scale
         return charge, slopes
 
@@ -124,43 +127,61 @@ def read_charges(version_folder: Path, n_electrode: int) -> ChargeSeries | None:
     data = read_companion_file(version_folder, FILE, ADVICE)
     try:
         return _charge_series(npz_arrays(data), n_electrode)
-    except DAMAGED as error:
+    except DAMAGED_FILE_ERRORS as error:
         raise ModelError(f"{path}: {cut(str(error))}; {ADVICE}") from error
 
 
 def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> ChargeSeries:
-    """Return the series that the arrays of a file describe; raise ValueError if the arrays describe no valid series."""
+    """Return the series of the charges that the arrays of a file contain.
+
+    Args:
+        arrays: Arrays of the file by name.
+        n_electrode: Number of electrodes of the model.
+
+    Raises:
+        ValueError: If an array is missing or not valid.
+    """
     coefficients = finite_array(arrays, "series", (None, None, None, n_electrode))
-    degree, y_degree, force_degree, _ = (length - 1 for length in coefficients.shape)
-    if degree != y_degree or not (1 <= degree <= MAX_DEGREE and 1 <= force_degree <= MAX_DEGREE):
+    x_count, y_count, force_count, _ = coefficients.shape
+    x_degree = x_count - 1
+    y_degree = y_count - 1
+    force_degree = force_count - 1
+    has_valid_degrees = 1 <= x_degree <= MAX_DEGREE and 1 <= force_degree <= MAX_DEGREE
+    if x_degree != y_degree or not has_valid_degrees:
         raise ValueError(
-            f"series: expected equal degrees in x and y and degrees from 1 to {MAX_DEGREE}, got {degree}, {y_degree} "
-            f"and {force_degree} in the force"
+            f"series: expected equal degrees in x and y and degrees from 1 to {MAX_DEGREE}, got {x_degree}, "
+            f"{y_degree} and {force_degree} in the force"
         )
     radius_mm = finite_number(arrays, "radius_mm")
     if not 0.0 < radius_mm <= MAX_RADIUS_mm:
         raise ValueError(f"radius_mm: expected a radius up to {MAX_RADIUS_mm:g} mm, got {radius_mm:g}")
-    low_N, high_N = finite_array(arrays, "force_N", (2,)).tolist()
-    if not (low_N > 0.0 and high_N >= MIN_FORCE_RATIO * low_N):
+    min_force_N, max_force_N = finite_array(arrays, "force_N", (2,)).tolist()
+    if not (min_force_N > 0.0 and max_force_N >= MIN_FORCE_RATIO * min_force_N):
         raise ValueError(
             f"force_N: expected a smallest force above 0 and a largest force of at least {MIN_FORCE_RATIO:g} times the "
-            f"smallest, got {low_N:g} and {high_N:g} N"
+            f"smallest, got {min_force_N:g} and {max_force_N:g} N"
         )
-    charges = ChargeSeries(Series(coefficients), radius_mm, (low_N, high_N))
+    charges = ChargeSeries(Series(coefficients), radius_mm, (min_force_N, max_force_N))
     _check_charges(charges)
     return charges
 
 
 def _check_charges(charges: ChargeSeries) -> None:
-    """Raise ValueError if the charges of a series overflow, or do not depend on the position or on the force."""
+    """Check the charges of contacts on a circle with half of the radius, at several forces.
+
+    Raises:
+        ValueError: If the charges overflow, or do not depend on the position or on the force.
+    """
     angle = np.linspace(0.0, 2.0 * np.pi, N_CHECKED_DIRECTIONS, endpoint=False)
     log_forces = np.log(np.geomspace(*charges.force_N, N_CHECKED_FORCES))
-    circle = 0.5 * charges.radius_mm * np.column_stack([np.cos(angle), np.sin(angle)])
-    contacts = np.array([[x_mm, y_mm, log_force] for x_mm, y_mm in circle for log_force in log_forces])
+    positions_mm = 0.5 * charges.radius_mm * np.column_stack([np.cos(angle), np.sin(angle)])
+    contacts = np.array([[x_mm, y_mm, log_force] for x_mm, y_mm in positions_mm for log_force in log_forces])
     with np.errstate(over="ignore", invalid="ignore"):
         charge_pC, derivative = charges.linearised(contacts)
-    if not (np.isfinite(charge_pC).all() and np.isfinite(derivative).all() and (charge_pC > 0.0).all()):
+
+    is_finite = np.isfinite(charge_pC).all() and np.isfinite(derivative).all()
+    if not (is_finite and (charge_pC > 0.0).all()):
         raise ValueError("series: expected charges that are finite and positive for every contact")
-    changes = np.abs(derivative).max(axis=(0, 1))
-    if not (changes > 0.0).all():
+    largest_slopes = np.abs(derivative).max(axis=(0, 1))  # with respect to x, y and ln F, shape (3,)
+    if not (largest_slopes > 0.0).all():
         raise ValueError("series: expected charges that change with x, y and the force")

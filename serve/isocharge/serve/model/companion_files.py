@@ -36,11 +36,12 @@ def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
     if checksums is None:
         log.warning("%s: golden.json holds no checksum of this file; whether it fits model.onnx is not verified", path)
         return data
-    expected = checksums.get(name, "no such file")
-    actual = sha256_of(data)
-    if actual != expected:
+    expected_sha256 = checksums.get(name, "no such file")
+    actual_sha256 = sha256_of(data)
+    if actual_sha256 != expected_sha256:
         raise ModelError(
-            f"{path}: expected sha256 {expected:.12} (golden.json), got {actual:.12}; the file is damaged or belongs "
+            f"{path}: expected sha256 {expected_sha256:.12} (golden.json), got {actual_sha256:.12}; the file is "
+            "damaged or belongs "
             f"to another model: copy the whole folder of the model again, or {advice}"
         )
     return data

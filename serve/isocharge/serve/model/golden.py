@@ -45,8 +45,9 @@ REFERENCE_FORCE_N = 2.0
 def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
     """Return the floors of x and y, mm, and of the force, N, for the outputs `contact` and `contact_std` of a model.
 
-    The floors of the position grow with the working area and with the position error of the model, the floor of the
-    force grows with the largest force.
+    The tolerance of an output is relative to the larger of its absolute value and its floor. The floors of the position
+    grow with the working area and with the position error of the model, the floor of the force grows with the largest
+    force.
     """
     x_floor_mm, y_floor_mm, force_floor_N = FLOORS["contact"]
     radius_mm = max(math.hypot(x_mm, y_mm) for x_mm, y_mm in metadata.working_area_mm)
@@ -139,13 +140,13 @@ def read_golden(path: Path) -> Golden:
         file = read_json(path, "golden vectors", ModelError, _File)
     except ModelError as error:
         raise ModelError(f"{error}; the file is damaged: copy or export the model again") from error
-    names = [name for name in OUTPUTS if getattr(file.outputs, name) is not None]
+    present_outputs = [name for name in OUTPUTS if getattr(file.outputs, name) is not None]
     return Golden(
         sha256=file.sha256,
         charge_pC=_float32_array(file.inputs.charge_pC),
-        outputs={name: _float32_array(getattr(file.outputs, name)) for name in names},
+        outputs={name: _float32_array(getattr(file.outputs, name)) for name in present_outputs},
         relative=file.tolerance.relative,
-        floors={name: getattr(file.tolerance.floor, name) for name in names},
+        floors={name: getattr(file.tolerance.floor, name) for name in present_outputs},
         companion_sha256=file.files,
     )
 
@@ -226,12 +227,12 @@ def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> No
         actual = outputs[name].astype(np.float64)
         tolerance = golden.relative * np.maximum(np.abs(expected), golden.floors[name])
         with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 with a tolerance of 0 is reported as a difference
-            excess = np.abs(actual - expected) / tolerance
-        if (excess <= 1.0).all():
+            ratio = np.abs(actual - expected) / tolerance  # shape (n, width)
+        if (ratio <= 1.0).all():
             continue
 
-        comparable_excess = np.where(np.isnan(excess), np.inf, excess)
-        row, column = np.unravel_index(np.argmax(comparable_excess), excess.shape)
+        ratio[np.isnan(ratio)] = np.inf  # a value that is not a number is the largest difference
+        row, column = np.unravel_index(np.argmax(ratio), ratio.shape)
         raise ModelError(
             f"{where}: {name}[{row}, {column}]: expected {expected[row, column]:.9g} +- {tolerance[row, column]:.1g} "
             f"(golden.json), got {actual[row, column]:.9g}; copy or export the model again"

@@ -91,6 +91,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
     yield_force_N: Positive | None = None
 
     def __post_init__(self) -> None:
+        """Check the keys that must fit each other; raise WrongKey for the first key that does not."""
         if "name" not in self.sensor:
             raise WrongKey("sensor.name")
         sensor_name = self.sensor["name"]
@@ -102,10 +103,11 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         for key, texts in displayed.items():
             if not all(is_printable(text) for text in texts):
                 raise WrongKey(key, "printable characters", texts)
-        low_N, high_N = self.force_range_N
-        if low_N > high_N:
-            raise WrongKey("force_range_N", "a smaller and a larger number", [low_N, high_N])
-        for key, level in (("white_pC", self.noise.white_pC), ("gain", self.noise.gain)):
+        min_force_N, max_force_N = self.force_range_N
+        if min_force_N > max_force_N:
+            raise WrongKey("force_range_N", "a smaller and a larger number", [min_force_N, max_force_N])
+        noise_levels = {"white_pC": self.noise.white_pC, "gain": self.noise.gain}
+        for key, level in noise_levels.items():
             if isinstance(level, tuple) and len(level) != len(self.electrodes):
                 raise WrongKey(f"noise.{key}", f"one number for each of {len(self.electrodes)} electrodes", level)
 
@@ -139,17 +141,17 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         Raises:
             ModelError: If the format version is not supported, or a key is missing or wrong.
         """
-        where = f"{where}: metadata"
+        place = f"{where}: metadata"
         try:
             names = [name for name in cls.__struct_fields__ if name in props]
-            values = {name: parse_json(props[name], f"{where}: {name}", ModelError, object) for name in names}
-            version = convert(values, _Version, where, ModelError).format_version
+            values = {name: parse_json(props[name], f"{place}: {name}", ModelError, object) for name in names}
+            version = convert(values, _Version, place, ModelError).format_version
             if version == FORMAT_VERSION:
-                return convert(values, cls, where, ModelError)
+                return convert(values, cls, place, ModelError)
         except ModelError as error:
             raise ModelError(f"{error}; export the model again") from error
         raise ModelError(
-            f"{where} format {version} is not supported (this version reads {FORMAT_VERSION}); export it again or "
+            f"{place} format {version} is not supported (this version reads {FORMAT_VERSION}); export it again or "
             "upgrade isocharge"
         )
 

@@ -57,9 +57,10 @@ def find_model(model: str | Path, models: Path | None = None) -> Path:
     """
     roots = repositories(models)
     is_path = isinstance(model, Path) or model.startswith((".", "/")) or model.endswith(".onnx")
-    candidates = [Path(model)]
+    candidates: list[Path] = []
     if not is_path:
-        candidates = [root / model for root in roots] + candidates
+        candidates += [root / model for root in roots]
+    candidates.append(Path(model))
     for candidate in candidates:
         folder = _version_folder(candidate)
         if folder is not None:
@@ -160,6 +161,13 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def _not_found_message(model: str | Path, roots: list[Path], is_path: bool) -> str:
+    """Return the message for a model that is not found.
+
+    Args:
+        model: Name or path of the model.
+        roots: Repositories that were searched for the name.
+        is_path: Whether the model was given as a path, so that no repository was searched.
+    """
     if is_path:
         return (
             f"{model}: no model; expected a model folder with numbered versions, a version folder with "
@@ -296,8 +304,9 @@ def write_model(
     session = open_session(onnx_model, where)
     check_interface(session, len(metadata.electrodes), where)
     charges = as_batch(golden_charge_pC, metadata.electrodes)
-    golden = make_golden(session, onnx_model, charges, contact_floors(metadata))
-    golden = replace(golden, companion_sha256={name: sha256_of(content) for name, content in companion_files.items()})
+    golden_of_model = make_golden(session, onnx_model, charges, contact_floors(metadata))
+    companion_sha256 = {name: sha256_of(content) for name, content in companion_files.items()}
+    golden = replace(golden_of_model, companion_sha256=companion_sha256)
     with new_folder(target) as draft:
         write_whole(draft / "model.onnx", onnx_model)
         write_whole(draft / "golden.json", golden.to_json().encode())
@@ -349,11 +358,16 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
 
 
 def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> None:
-    """Raise ModelError if `config.pbtxt` exists and describes another model."""
+    """Check that an existing `config.pbtxt` describes a model with this name and these electrodes.
+
+    Raises:
+        ModelError: If the file exists and describes another model.
+    """
     if not path.exists():
         return
     text = path.read_text(encoding="utf-8")
-    if text in [triton_config(name, len(electrodes), correlation=correlation) for correlation in (False, True)]:
+    valid_texts = [triton_config(name, len(electrodes), correlation=correlation) for correlation in (False, True)]
+    if text in valid_texts:
         return
     match = re.match('name: "(.*)"', text)
     if match and match[1] != name:
@@ -367,7 +381,15 @@ def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> 
 
 
 def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
-    """Read a new version as a user reads it, and compare its metadata with the expected metadata."""
+    """Load a new version like a user, check it, and compare its metadata with the expected metadata.
+
+    Args:
+        draft: Folder with the files of the new version.
+        metadata: The expected metadata.
+
+    Raises:
+        ModelError: If a reader would refuse the model, or the metadata differ.
+    """
     model = load_model(draft)
     actual = model.metadata.to_props()
     expected = metadata.to_props()

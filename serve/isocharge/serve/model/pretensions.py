@@ -23,7 +23,7 @@ from isocharge.common.activations import ACTIVATIONS, TANH
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.charge_features import ChargeFeatures
 from isocharge.common.errors import ModelError, cut
-from isocharge.common.npz import DAMAGED, finite_array, npz_arrays, text_item
+from isocharge.common.npz import DAMAGED_FILE_ERRORS, finite_array, npz_arrays, text_item
 from isocharge.common.perceptron import Layer, Perceptron, evaluate
 from isocharge.common.structs import NotNegative, Positive, Text, parse_json
 from isocharge.serve.model.companion_files import read_companion_file
@@ -45,6 +45,12 @@ MAX_PRETENSION_MPa = 50.0
 
 MAX_WEIGHT = 1e6
 """Largest absolute value of a weight; those of trained networks are below 100."""
+
+CALIBRATION_ADVICE = (
+    "a film is followed from a model that `isocharge train calibrate` made of presses on it, with four electrodes "
+    "or more: calibrate it, or again with this version"
+)
+"""Advice to the user if the file cannot be read."""
 
 CHECKED_PRETENSIONS = 50
 """Number of pretensions at which the misfits of a file are checked to be finite."""
@@ -89,11 +95,12 @@ class Pretensions:
     activation: str = TANH.name
 
     def to_bytes(self) -> bytes:
-        """Return the content of the file."""
+        """Return the content of the file `pretensions.npz`."""
         numbers = {name: getattr(self, name) for name in _NUMBERS}
-        about = json.dumps({"format_version": FORMAT, "constants": [*self.weights], **numbers}, allow_nan=False)
-        file = io.BytesIO()
+        constant_names = list(self.weights)
+        about = json.dumps({"format_version": FORMAT, "constants": constant_names, **numbers}, allow_nan=False)
         arrays: dict[str, Any] = {"node_MPa": self.node_MPa, "typical_pC": self.typical_pC, **self.weights}
+        file = io.BytesIO()
         np.savez_compressed(file, about=np.array(about), **arrays)
         return file.getvalue()
 
@@ -119,19 +126,21 @@ class Pretensions:
         return Perceptron(tuple(hidden), Layer(weight, bias[:, None]), skip, ACTIVATIONS[self.activation])
 
     def interpolation_weights(self, pretension_MPa: Array) -> Array:
-        """Evaluate the Lagrange polynomials of the k pretensions.
+        """Return the weights with which the values at the k pretensions `node_MPa` are interpolated.
+
+        The weights are the Lagrange polynomials: the product of (p - p_j) / (p_i - p_j) over all j other than i.
 
         Args:
-            pretension_MPa: Shape (n,).
+            pretension_MPa: Pretensions p, shape (n,), MPa.
 
         Returns:
-            Shape (n, k). Each row sums to 1.
+            Weights, shape (n, k), dimensionless. Each row sums to 1.
         """
-        is_other = ~np.eye(self.node_MPa.size, dtype=bool)
-        node_distance = self.node_MPa[:, None] - self.node_MPa
-        distance = pretension_MPa[:, None, None] - self.node_MPa
-        factors = distance / np.where(is_other, node_distance, 1.0)
-        return np.asarray(np.prod(factors, axis=2, where=is_other))
+        is_other_node = ~np.eye(self.node_MPa.size, dtype=bool)  # shape (k, k), False where i equals j
+        node_difference_MPa = self.node_MPa[:, None] - self.node_MPa  # shape (k, k)
+        difference_MPa = pretension_MPa[:, None, None] - self.node_MPa  # shape (n, 1, k)
+        factors = difference_MPa / np.where(is_other_node, node_difference_MPa, 1.0)  # shape (n, k, k)
+        return np.asarray(np.prod(factors, axis=2, where=is_other_node))
 
     def at(self, node_MPa: Array) -> "Pretensions":
         """Return the same network with its weights given at other pretensions of the range, shape (k,)."""
@@ -164,19 +173,26 @@ class Pretensions:
         each other; `at` provides that.
 
         Args:
-            charge_pC: Shape (m, n_electrode), pC.
-            pretension_MPa: Shape (n,).
+            charge_pC: Charges of m presses, shape (m, n_electrode), pC.
+            pretension_MPa: Pretensions, shape (n,), MPa.
 
         Returns:
-            Shape (m, n, n_electrode), in standard deviations of the noise.
+            Misfit vectors, shape (m, n, n_electrode), in standard deviations of the noise.
         """
         inputs = self.features.evaluate(charge_pC).astype(np.float32)
-        _, misfit_vectors = np.split(evaluate(self.perceptron, inputs), [-inputs.shape[1]], axis=-1)
+        # The last outputs of the network are the misfit vectors, shape (k pretensions, m presses, n_electrode).
+        outputs = evaluate(self.perceptron, inputs)
+        n_electrode = inputs.shape[1]
+        node_vectors = outputs[..., -n_electrode:]
+
+        # The two neighbouring pretensions of `node_MPa`, and the position between them from 0 to 1.
         upper = np.clip(np.searchsorted(self.node_MPa, pretension_MPa), 1, self.node_MPa.size - 1)
         lower = upper - 1
         gap_MPa = self.node_MPa[upper] - self.node_MPa[lower]
         fraction = np.clip((pretension_MPa - self.node_MPa[lower]) / gap_MPa, 0.0, 1.0)[:, None, None]
-        interpolated = (1.0 - fraction) * misfit_vectors[lower] + fraction * misfit_vectors[upper]
+        interpolated = (1.0 - fraction) * node_vectors[lower] + fraction * node_vectors[upper]
+
+        # The misfit is misfit_unit * sinh(length); the direction of the vector stays the same.
         length = np.maximum(np.linalg.norm(interpolated, axis=2, keepdims=True), MIN_LENGTH)
         vectors = interpolated * (self.misfit_unit * np.sinh(length) / length)
         return np.asarray(vectors.swapaxes(0, 1))
@@ -207,21 +223,24 @@ def read_pretensions(version_folder: Path) -> Pretensions:
         ModelError: If the file is missing, damaged, of another format, or belongs to another model.
     """
     path = version_folder / FILE
-    data = read_companion_file(
-        version_folder,
-        FILE,
-        "a film is followed from a model that `isocharge train calibrate` made of presses on it, with four electrodes "
-        "or more: calibrate it, or again with this version",
-    )
+    data = read_companion_file(version_folder, FILE, CALIBRATION_ADVICE)
     try:
         return _pretensions(npz_arrays(data))
-    except (ModelError, *DAMAGED) as error:
+    except (ModelError, *DAMAGED_FILE_ERRORS) as error:
         advice = "copy the model's folder again, or calibrate again"
         raise ModelError(f"{path}: {cut(str(error))}; {advice}") from error
 
 
 def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
-    """Return what the arrays of a file describe; raise ValueError or ModelError if they do not fit together."""
+    """Return the network that the arrays of a file contain, and check it.
+
+    Args:
+        arrays: Arrays of the file by name.
+
+    Raises:
+        ValueError: If an array is missing or not valid, or the arrays do not fit together.
+        ModelError: If the JSON object `about` is not valid.
+    """
     about = parse_json(text_item(arrays, "about"), "about", ModelError, _About)
     if about.format_version != FORMAT:
         raise ValueError(f"format {about.format_version} is not supported (this version reads {FORMAT})")
@@ -237,20 +256,34 @@ def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
             f"{low_pC:g} to {high_pC:g} pC"
         )
     numbers = {name: getattr(about, name) for name in _NUMBERS}
+    weight_names = _checked_weights(arrays, about, node_MPa.size)
     with np.errstate(over="ignore"):
-        weights = {name: arrays[name].astype(np.float32) for name in _checked_weights(arrays, about, node_MPa.size)}
+        weights = {name: arrays[name].astype(np.float32) for name in weight_names}
     pretensions = Pretensions(node_MPa=node_MPa, typical_pC=typical_pC, weights=weights, **numbers)
-    between_MPa = np.linspace(*pretensions.range_MPa, CHECKED_PRETENSIONS)
-    with np.errstate(over="ignore", invalid="ignore"):
-        charges_pC = np.outer([0.5, 1.0, 2.0], typical_pC)
-        misfits = pretensions.at(between_MPa).vectors(charges_pC, between_MPa)
-    if not np.isfinite(misfits).all():
-        raise ValueError("the weights give misfits that are not finite")
+    _check_misfits(pretensions)
     return pretensions
 
 
+def _check_misfits(pretensions: Pretensions) -> None:
+    """Raise ValueError if the network computes misfits that are not finite, for pretensions between the given ones."""
+    checked_MPa = np.linspace(*pretensions.range_MPa, CHECKED_PRETENSIONS)
+    with np.errstate(over="ignore", invalid="ignore"):
+        charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)
+        misfits = pretensions.at(checked_MPa).vectors(charges_pC, checked_MPa)
+    if not np.isfinite(misfits).all():
+        raise ValueError("the weights give misfits that are not finite")
+
+
 def _check_nodes(node_MPa: Array, calibrated_MPa: float) -> None:
-    """Refuse pretensions between which weights cannot be interpolated."""
+    """Check the pretensions at which the weights are given.
+
+    Args:
+        node_MPa: The pretensions, shape (k,), MPa.
+        calibrated_MPa: Pretension of the calibration, MPa.
+
+    Raises:
+        ValueError: If the weights cannot be interpolated between them, or the calibration is not one of them.
+    """
     is_rising = node_MPa.size >= 2 and bool((np.diff(node_MPa) >= MIN_NODE_DISTANCE_MPa).all())
     in_range = node_MPa.size <= MAX_NODES and bool((np.abs(node_MPa) <= MAX_PRETENSION_MPa).all())
     if not (is_rising and in_range and calibrated_MPa in node_MPa):
@@ -261,25 +294,33 @@ def _check_nodes(node_MPa: Array, calibrated_MPa: float) -> None:
 
 
 def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: int) -> list[str]:
-    """Return the names of the weights in the order of the layers, after a check of their shapes.
+    """Check the shapes of the weights, and return their names in the order of the layers.
 
-    The hidden layers are pairs of a matrix and a vector; then follow the matrix that bypasses them, the vector and the
-    matrix of the last layer.
+    The names of the hidden layers are pairs: the weight and the bias of each layer. They are followed by the names of
+    the skip layer, which connects the inputs with the outputs, and of the bias and the weight of the output layer.
+
+    Args:
+        arrays: Arrays of the file by name.
+        about: Description in the file, with the names of the weights.
+        n_node: Number of pretensions at which the weights are given.
+
+    Raises:
+        ValueError: If an array is missing, or the shapes do not fit together.
     """
-    *hidden, skip, bias, last = about.constants
-    if len(hidden) % 2 or len(set(about.constants)) < len(about.constants):
+    *hidden_names, skip_weight, output_bias, output_weight = about.constants
+    if len(hidden_names) % 2 or len(set(about.constants)) < len(about.constants):
         raise ValueError(f"constants: expected pairs of names that differ, got {cut(str(about.constants))}")
     n_electrode = finite_array(arrays, "typical_pC", (None,)).size
-    width = n_electrode
-    for matrix, vector in zip(hidden[::2], hidden[1::2], strict=True):
-        next_width = finite_array(arrays, matrix, (n_node, width, None)).shape[2]
-        finite_array(arrays, vector, (n_node, next_width))
-        width = next_width
-    n_output = finite_array(arrays, last, (n_node, width, None)).shape[2]
-    finite_array(arrays, bias, (n_node, n_output))
-    finite_array(arrays, skip, (n_node, n_electrode, n_output))
+    n_input = n_electrode
+    for weight, bias in zip(hidden_names[::2], hidden_names[1::2], strict=True):
+        n_neuron = finite_array(arrays, weight, (n_node, n_input, None)).shape[2]
+        finite_array(arrays, bias, (n_node, n_neuron))
+        n_input = n_neuron
+    n_output = finite_array(arrays, output_weight, (n_node, n_input, None)).shape[2]
+    finite_array(arrays, output_bias, (n_node, n_output))
+    finite_array(arrays, skip_weight, (n_node, n_electrode, n_output))
     if n_output < n_electrode:
-        raise ValueError(f"{last}: expected at least {n_electrode} outputs, got {n_output}")
+        raise ValueError(f"{output_weight}: expected at least {n_electrode} outputs, got {n_output}")
     for name in about.constants:
         largest = np.abs(arrays[name].astype(float)).max()
         if largest > MAX_WEIGHT:

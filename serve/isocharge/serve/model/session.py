@@ -83,6 +83,7 @@ def _decode_texts(session: ort.InferenceSession) -> None:
 
 
 def _single_thread_options() -> ort.SessionOptions:
+    """Return the options of a session that computes in the calling thread, without threads that wait for work."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
@@ -227,7 +228,11 @@ class BoundPress:
 
 
 def _columns(widths: Mapping[str, int]) -> dict[str, slice]:
-    """Return the positions of the outputs among the values of a `Contact`, where the correlations are the last."""
+    """Return the positions of the outputs of a model among the values of a `Contact`.
+
+    Args:
+        widths: Number of values of each output by its name. The correlations, if there are any, are put last.
+    """
     names = [name for name in widths if name != CORRELATION]
     if CORRELATION in widths:
         names.append(CORRELATION)
@@ -244,12 +249,19 @@ def _columns(widths: Mapping[str, int]) -> dict[str, slice]:
 def _bind(
     session: ort.InferenceSession, charges: Singles, outputs: Singles, columns: Mapping[str, slice]
 ) -> ort.IOBinding:
-    """Bind the input, shape (1, electrodes), and the columns of `outputs`, shape (size,), to a session."""
+    """Bind arrays to the input and the outputs of a session, so that it reads and writes them without copies.
+
+    Args:
+        session: Session of the model.
+        charges: Array from which the charges are read, shape (1, electrodes).
+        outputs: Array into which all outputs are written, shape (size,).
+        columns: Position of each output in `outputs` by its name.
+    """
     binding = session.io_binding()
     binding.bind_input(INPUT, "cpu", 0, np.float32, charges.shape, charges.ctypes.data)
-    for name, part in columns.items():
-        width = part.stop - part.start
-        binding.bind_output(name, "cpu", 0, np.float32, (1, width), outputs[part].ctypes.data)
+    for name, position in columns.items():
+        width = position.stop - position.start
+        binding.bind_output(name, "cpu", 0, np.float32, (1, width), outputs[position].ctypes.data)
     return binding
 
 
@@ -333,7 +345,8 @@ def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...], *, is_single_
     if charges.dtype.kind == "f":
         flat = charges.ravel()
         # A scalar product is faster than a check of each number, and is not finite if one of the charges is not.
-        if np.vdot(flat, flat) <= MAX_FAST_SQUARE_SUM_pC2:
+        square_sum_pC2 = np.vdot(flat, flat)
+        if square_sum_pC2 <= MAX_FAST_SQUARE_SUM_pC2:
             return np.ascontiguousarray(charges, dtype=np.float32)
     return _checked_float32(charges, electrodes, is_single_press)
 
@@ -345,7 +358,8 @@ def _checked_float32(charges: NDArray[np.number], electrodes: tuple[str, ...], i
     rows, columns = np.nonzero(~np.isfinite(converted))
     if not rows.size:
         return converted
-    row = rows[0]
-    refused = [f"{electrodes[column]!r} ({charges[row, column]})" for column in columns[rows == row]]
-    where = "" if is_single_press else f" in row {row} (rows count from 0)"
-    raise ChargeError(f"expected finite charges (pC), got{where} for electrode {', '.join(refused)}")
+    first_row = rows[0]
+    bad_columns = columns[rows == first_row]
+    bad_charges = [f"{electrodes[column]!r} ({charges[first_row, column]})" for column in bad_columns]
+    where = "" if is_single_press else f" in row {first_row} (rows count from 0)"
+    raise ChargeError(f"expected finite charges (pC), got{where} for electrode {', '.join(bad_charges)}")

@@ -155,26 +155,28 @@ class SignalChain:
     def advance(
         self, values: Array, t_s: float, dt_s: float, *, limited: bool = False, flags: tuple[str, ...] = ()
     ) -> Reading:
-        """Take the next frame through all stages.
+        """Process the next frame by all stages, and return the charges of the touch with the flags.
 
         Args:
-            values: Values as they came, in the unit of the device, shape (electrodes,).
+            values: Values as the device sent them, in the unit of the device, shape (electrodes,).
             t_s: Time on the clock of the device, s.
-            dt_s: Time since the frame before, s.
-            limited: Whether the device says that an amplifier is at its limit.
-            flags: Words that the frame has already, to which the chain adds its own.
+            dt_s: Time since the previous frame, s.
+            limited: Whether the device reports that an amplifier is at its limit.
+            flags: Flags that the frame has already, to which the chain adds further flags.
 
         Raises:
             TareError: If the film is not left alone for long enough to tare.
         """
-        if not math.hypot(*values.tolist()) <= self._settings.largest:
+        is_valid = math.hypot(*values.tolist()) <= self._settings.largest  # false for NaN
+        if not is_valid:
             self._invalid_s += dt_s
             with np.errstate(over="ignore"):  # a value may be the largest number that a double holds
                 raw_pC = self._gain.convert(values)
             return Reading(raw_pC, None, None, contact=False, flags=(*flags, INVALID))
-        dt_s += self._invalid_s
+
+        step_s = dt_s + self._invalid_s
         self._invalid_s = 0.0
-        frame = ChainFrame(values, t_s, dt_s, limited, self._touch_stage.is_contact, list(flags))
+        frame = ChainFrame(values, t_s, step_s, limited, self._touch_stage.is_contact, list(flags))
         for stage in self.stages:
             stage.step(frame)
             if frame.is_finished:

@@ -39,14 +39,14 @@ class Touch(NamedTuple):
         last_pC: Total charge of the latest frame, pC.
         base_pC: Smallest total charge since the last release, pC. A touch is a rise above it, so a slow drift is not
             taken for a touch.
-        below: Whether the total charge lies below zero by more than the touch threshold.
+        is_negative: Whether the total charge lies below zero by more than the touch threshold.
     """
 
     contact: bool = False
     peak_pC: float = 0.0
     last_pC: float = 0.0
     base_pC: float = 0.0
-    below: bool = False
+    is_negative: bool = False
 
 
 NO_TOUCH = Touch()
@@ -63,7 +63,7 @@ def update_contact(
 
     Args:
         rule: The thresholds.
-        touch: State after the frame before.
+        touch: State after the previous frame.
         total_pC: Total touch charge of this frame, pC. A press makes it positive.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
         decay: Factor of the base from frame to frame; below 1 if the charge itself decays to zero.
@@ -72,12 +72,16 @@ def update_contact(
     """
     touch_threshold_pC = rule.floor_pC + rule.sigmas * math.sqrt(float(np.dot(noise_pC, noise_pC)))
     if touch.contact:
-        peak_pC = max(touch.peak_pC, min(total_pC, touch.last_pC))
-        remaining_pC = rule.release_share * peak_pC + SCALE_STD_FACTOR * scale_std * total_pC
-        if total_pC < max(remaining_pC, 0.5 * touch_threshold_pC):
+        two_frame_peak_pC = min(total_pC, touch.last_pC)  # a spike of a single frame is not a peak
+        peak_pC = max(touch.peak_pC, two_frame_peak_pC)
+        uncertainty_pC = SCALE_STD_FACTOR * scale_std * total_pC
+        release_threshold_pC = max(rule.release_share * peak_pC + uncertainty_pC, 0.5 * touch_threshold_pC)
+        if total_pC < release_threshold_pC:
             return Touch(last_pC=total_pC, base_pC=total_pC)
-        return Touch(True, peak_pC, total_pC)
+        return Touch(contact=True, peak_pC=peak_pC, last_pC=total_pC)
+
     base_pC = decay * touch.base_pC
     if total_pC > base_pC + touch_threshold_pC:
-        return Touch(True, min(total_pC, touch.last_pC), total_pC)
-    return Touch(last_pC=total_pC, base_pC=min(base_pC, total_pC), below=total_pC < -touch_threshold_pC)
+        return Touch(contact=True, peak_pC=min(total_pC, touch.last_pC), last_pC=total_pC)
+    is_negative = total_pC < -touch_threshold_pC
+    return Touch(last_pC=total_pC, base_pC=min(base_pC, total_pC), is_negative=is_negative)

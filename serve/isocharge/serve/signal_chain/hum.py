@@ -16,7 +16,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes
 from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
-LEAST_TURN = 0.02
+MIN_SQUARED_STEP = 0.02
 """Smallest squared change of the unit phasor between two frames, dimensionless, with which the hum is updated."""
 
 
@@ -58,21 +58,24 @@ def remove_hum(rule: HumRule, hum: Hum, raw_pC: Array, t_s: float, dt_s: float) 
 
     Args:
         rule: Settings of the estimate of hum.
-        hum: State after the frame before.
+        hum: State after the previous frame.
         raw_pC: Charges of the frame, shape (electrodes,), pC.
         t_s: Time on the clock of the device, s.
-        dt_s: Time since the frame before, s.
+        dt_s: Time since the previous frame, s.
 
     Returns:
         The state after this frame, and the charges without hum, shape (electrodes,), pC.
     """
-    turn = cmath.exp(2j * math.pi * rule.frequency_Hz * t_s)
+    turn = cmath.exp(2j * math.pi * rule.frequency_Hz * t_s)  # the hum is the real part of phasor * turn
+    turn_step = turn - hum.turn
+    squared_step = turn_step.real * turn_step.real + turn_step.imag * turn_step.imag
     phasor_pC = hum.phasor_pC
-    step = turn - hum.turn
-    norm = step.real * step.real + step.imag * step.imag
-    if hum.raw_pC is not None and norm > LEAST_TURN:
-        error_pC = raw_pC - hum.raw_pC - (phasor_pC * step).real
-        error_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
+    if hum.raw_pC is not None and squared_step > MIN_SQUARED_STEP:
+        # One step of normalised least mean squares: compare the change of the charges with the change of the hum.
+        expected_change_pC = (phasor_pC * turn_step).real
+        error_pC = raw_pC - hum.raw_pC - expected_change_pC
+        clipped_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
         gain = min(1.0, 2.0 * dt_s / rule.settle_s)
-        phasor_pC = phasor_pC + error_pC * (gain / norm * step.conjugate())
-    return Hum(phasor_pC, turn, raw_pC), raw_pC - (phasor_pC * turn).real
+        phasor_pC = phasor_pC + clipped_pC * (gain / squared_step * turn_step.conjugate())
+    hum_pC = (phasor_pC * turn).real
+    return Hum(phasor_pC, turn, raw_pC), raw_pC - hum_pC

@@ -84,29 +84,33 @@ def undo_leak(
     Args:
         rule: Settings of the estimate of the inflow.
         tau_s: Time constant of each amplifier, shape (electrodes,), s.
-        leak: State after the frame before.
+        leak: State after the previous frame.
         output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
-        dt_s: Time since the frame before, s.
-        contact: Whether something touched in the frame before.
+        dt_s: Time since the previous frame, s.
+        contact: Whether something touched in the previous frame.
     """
-    innovation_pC = output_pC - np.exp(-dt_s / tau_s) * leak.output_pC
+    # The output that would remain without new charge has decayed with the time constant of the amplifier.
+    decayed_output_pC = np.exp(-dt_s / tau_s) * leak.output_pC
+    innovation_pC = output_pC - decayed_output_pC
     surplus_pC = innovation_pC - leak.inflow_pC_per_s * dt_s
     charge_pC = leak.charge_pC + surplus_pC
     if contact:
         return in_touch(leak, charge_pC, output_pC, rule.hold_off_s)
-    decayed_pC = charge_pC * math.exp(-dt_s / rule.relax_s)
-    leak = leak._replace(charge_pC=decayed_pC, output_pC=output_pC)
-    if leak.hold_s > 0.0 or not rule.learn:
-        return leak._replace(hold_s=leak.hold_s - dt_s)
-    return learn_inflow(rule, leak, surplus_pC, noise_pC, dt_s)
+
+    # Out of contact the charge decays to zero, and the inflow is learned after a pause.
+    decayed_charge_pC = charge_pC * math.exp(-dt_s / rule.relax_s)
+    after = leak._replace(charge_pC=decayed_charge_pC, output_pC=output_pC)
+    if after.hold_s > 0.0 or not rule.learn:
+        return after._replace(hold_s=after.hold_s - dt_s)
+    return learn_inflow(rule, after, surplus_pC, noise_pC, dt_s)
 
 
 def in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) -> Leak:
     """Return the state of a frame in contact: the inflow is the trusted one, and its estimate pauses.
 
     Args:
-        leak: State after the frame before.
+        leak: State after the previous frame.
         charge_pC: Touch charge of this frame, shape (electrodes,), pC.
         output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
         hold_off_s: Pause of the estimate after the release, s.
@@ -118,12 +122,14 @@ def in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) 
 def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array, dt_s: float) -> Leak:
     """Return the state with a corrected inflow.
 
+    The inflow follows the mean of the surplus over `settle_s`. Large values are clipped, because they are touches.
+
     Args:
         rule: Settings of the estimate of the inflow.
-        leak: State of this frame with the inflow of the frame before.
+        leak: State of this frame with the inflow of the previous frame.
         surplus_pC: Innovation that the inflow does not explain, shape (electrodes,), pC. It is clipped.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
-        dt_s: Time since the frame before, s.
+        dt_s: Time since the previous frame, s.
 
     Returns:
         The state. Every `look_back_s` the candidate becomes the trusted inflow.
@@ -132,12 +138,21 @@ def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array,
     clipped_pC = np.minimum(np.maximum(surplus_pC, -limit_pC), limit_pC)
     learned_s = leak.learned_s + dt_s
     averaging_s = max(min(rule.settle_s, learned_s), dt_s)  # the correction is at most the whole surplus
-    inflow = leak.inflow_pC_per_s + clipped_pC / averaging_s
-    trusted = leak.trusted_pC_per_s
-    candidate = leak.candidate_pC_per_s
-    age_s = leak.candidate_age_s + dt_s
-    if age_s >= rule.look_back_s:
-        trusted = candidate
-        candidate = inflow
-        age_s = 0.0
-    return Leak(leak.charge_pC, leak.output_pC, inflow, trusted, candidate, age_s, learned_s)
+    inflow_pC_per_s = leak.inflow_pC_per_s + clipped_pC / averaging_s
+
+    trusted_pC_per_s = leak.trusted_pC_per_s
+    candidate_pC_per_s = leak.candidate_pC_per_s
+    candidate_age_s = leak.candidate_age_s + dt_s
+    if candidate_age_s >= rule.look_back_s:
+        trusted_pC_per_s = candidate_pC_per_s
+        candidate_pC_per_s = inflow_pC_per_s
+        candidate_age_s = 0.0
+    return Leak(
+        leak.charge_pC,
+        leak.output_pC,
+        inflow_pC_per_s,
+        trusted_pC_per_s,
+        candidate_pC_per_s,
+        candidate_age_s,
+        learned_s,
+    )

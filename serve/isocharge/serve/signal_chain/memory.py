@@ -62,19 +62,19 @@ SCALE_RESPONSE = np.array(
 LEARN_S = 5.0
 """Time after a release in which the scale factors of the film are updated, s."""
 
-MOST_CREEP = 0.2
+MAX_CREEP = 0.2
 """Upper bound of the creep in a decade. With more, nothing would remain of a charge after some days."""
 
-LINGER_S = 0.1
+RELEASE_S = 0.1
 """Time after a release in which a finger still leaves the film, s. Its last charges are not warmth."""
 
-WANDER_PC = 1.0
+WARMTH_CHANGE_PC = 1.0
 """Standard deviation of the change of the warmth of an electrode in one second, pC."""
 
-UNLIKE = 0.05
+CREEP_LAW_DEVIATION = 0.05
 """Relative deviation of real creep from the logarithmic law."""
 
-OUTLIER = 4.0
+OUTLIER_SIGMAS = 4.0
 """Number of standard deviations from which the charge after a release is not creep, but a hand that warms the film."""
 
 CALM_PC_PER_S = 2.0
@@ -98,7 +98,7 @@ class MemoryRule(Rule, frozen=True, kw_only=True):
         settle_s: Time constant with which warmth is estimated out of contact, s.
     """
 
-    creep: Annotated[float, Meta(ge=0.0, lt=MOST_CREEP)] = 0.0
+    creep: Annotated[float, Meta(ge=0.0, lt=MAX_CREEP)] = 0.0
     thermoelastic: Share = 0.0
     warmth_s: TimeConstant = 2.5
     known: Share = 0.2
@@ -107,15 +107,22 @@ class MemoryRule(Rule, frozen=True, kw_only=True):
 
 @lru_cache(maxsize=8)
 def _relaxation(warmth_s: float) -> tuple[Array, Array]:
-    """Return the time constants of the rows, shape (rows, 1), s, and the propagation over a very long time.
+    """Return the two matrices from which the propagation of the state over any time is computed.
 
-    The propagation has the shape (rows, rows).
+    Args:
+        warmth_s: Time constant with which the film follows the temperature of the air, s.
+
+    Returns:
+        Time constant of each row of the state, shape (rows, 1), s; and the propagation over a very long time, shape
+        (rows, rows). Then the creep terms and the thermoelastic term equal the touch charge, and the slope of the
+        warmth has changed the warmth by `warmth_s` times the slope.
     """
     steady_state = np.zeros_like(INITIAL_PROPAGATION)
     steady_state[:WARMTH_ROW, CHARGE_ROW] = 1.0
     steady_state[WARMTH_ROW, WARMTH_ROW] = 1.0
     steady_state[WARMTH_ROW, SLOPE_ROW] = warmth_s
-    time_constants_s = np.array([*DECADES_S, *[warmth_s] * 4])
+    # The rows after the creep terms (thermoelastic term, warmth, slope and charge) have the time constant of the air.
+    time_constants_s = np.array([*DECADES_S, warmth_s, warmth_s, warmth_s, warmth_s])
     return time_constants_s[:, np.newaxis], steady_state
 
 
@@ -192,7 +199,7 @@ class Memory(NamedTuple):
     learn_s: float = 0.0
 
     @property
-    def lingers(self) -> bool:
+    def is_recently_touched(self) -> bool:
         """Whether something touches, or has just been released."""
         return self.learn_s > LEARN_S
 
@@ -200,10 +207,20 @@ class Memory(NamedTuple):
     def start(cls, rule: MemoryRule, output_pC: Array) -> "Memory":
         """Return the state at the first frame after the tare."""
         rows_pC = np.zeros((len(INITIAL_PROPAGATION), output_pC.size))
-        film = Film.of(rule.creep, rule.thermoelastic, ScaleVariances(rule.known**2, rule.known**2, 0.0))
+        scale_variance = rule.known**2
+        variances = ScaleVariances(creep=scale_variance, step=scale_variance, covariance=0.0)
+        film = Film.of(rule.creep, rule.thermoelastic, variances)
         leak = Leak.start(output_pC)._replace(charge_pC=output_pC / film.step_response)
         warmth_pC = rows_pC[WARMTH_ROWS]
-        return cls(film, leak, output_pC, rows_pC, warmth_pC, warmth_pC, warmth_pC)
+        return cls(
+            film,
+            leak,
+            film_pC=output_pC,
+            rows_pC=rows_pC,
+            trusted_pC=warmth_pC,
+            candidate_pC=warmth_pC,
+            expected_pC=warmth_pC,
+        )
 
 
 def undo_memory(
@@ -224,11 +241,11 @@ def undo_memory(
         leak_rule: Settings of the estimate of the inflow: also the age of the values with which a touch begins, and
             the pause of the estimates after a release.
         tau_s: Time constant of each amplifier, shape (electrodes,), s; None if charges do not leak.
-        memory: State after the frame before.
+        memory: State after the previous frame.
         output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
-        dt_s: Time since the frame before, s.
-        contact: Whether something touched in the frame before.
+        dt_s: Time since the previous frame, s.
+        contact: Whether something touched in the previous frame.
     """
     film = memory.film
     leak = memory.leak
@@ -244,7 +261,7 @@ def undo_memory(
     residual_pC = film_pC - film.response.dot(rows_pC)
     charge_pC = residual_pC / film.step_response
     unseen_s = memory.unseen_s + dt_s
-    if contact or memory.lingers:
+    if contact or memory.is_recently_touched:
         rows_pC[CHARGE_ROW] = charge_pC
         warmth_pC = rows_pC[WARMTH_ROWS]
         return Memory(
@@ -256,7 +273,7 @@ def undo_memory(
             candidate_pC=warmth_pC,
             expected_pC=warmth_pC,
             unseen_s=unseen_s,
-            learn_s=LEARN_S + LINGER_S if contact else memory.learn_s - dt_s,
+            learn_s=LEARN_S + RELEASE_S if contact else memory.learn_s - dt_s,
         )
 
     fading = math.exp(-dt_s / rule.settle_s)
@@ -305,39 +322,52 @@ def undo_memory(
 
 
 def _learn_film(memory: Memory, dt_s: float) -> Memory:
-    """Update the scale factors of creep and step with the charge that remains after a release.
+    """Update the scale factors of creep and thermoelastic step with the charge that remains after a release.
 
-    The remaining charge is projected onto the direction of the predicted creep and step. All frames after one release
-    together count as one measurement.
+    This is a Kalman update of two scale factors with one measurement: the remaining charge, projected onto the
+    predicted charges of creep and step. All frames after one release together count as one measurement, so its
+    variance is increased by the number of frames in `LEARN_S`.
+
+    Args:
+        memory: State of this frame.
+        dt_s: Time since the previous frame, s.
+
+    Returns:
+        The state with the updated film. If the remaining charge cannot be creep, the film is not updated after this
+        release.
     """
     film = memory.film
     rows_pC = memory.rows_pC.copy()
-    responses_pC = SCALE_RESPONSE.dot(rows_pC)
-    creep_pC = film.creep * responses_pC[0]
-    step_pC = film.thermoelastic * responses_pC[1]
+    # Predicted charges, each of shape (electrodes,), and their projection onto the sum of both.
+    unit_creep_pC, unit_step_pC = SCALE_RESPONSE.dot(rows_pC)
+    creep_pC = film.creep * unit_creep_pC
+    step_pC = film.thermoelastic * unit_step_pC
     direction_pC = creep_pC + step_pC
     size_pC = math.sqrt(float(direction_pC @ direction_pC))
     if size_pC < MIN_CREEP_PC:
         return memory
     creep_jacobian = float(creep_pC @ direction_pC) / size_pC
     step_jacobian = float(step_pC @ direction_pC) / size_pC
-    innovation_pC = float((rows_pC[WARMTH_ROW] - memory.expected_pC[0]) @ direction_pC) / size_pC
+    remaining_pC = rows_pC[WARMTH_ROW] - memory.expected_pC[0]
+    innovation_pC = float(remaining_pC @ direction_pC) / size_pC
 
+    # Covariance of each scale factor with the measurement, and variance of the predicted measurement.
     variances = film.variances
-    creep_gain = variances.creep * creep_jacobian + variances.covariance * step_jacobian
-    step_gain = variances.covariance * creep_jacobian + variances.step * step_jacobian
-    prior_pC2 = creep_jacobian * creep_gain + step_jacobian * step_gain
-    noise_pC2 = WANDER_PC**2 * len(direction_pC) * memory.unseen_s + (UNLIKE * size_pC) ** 2
-    if innovation_pC * innovation_pC > OUTLIER**2 * (prior_pC2 + noise_pC2):
+    creep_covariance = variances.creep * creep_jacobian + variances.covariance * step_jacobian
+    step_covariance = variances.covariance * creep_jacobian + variances.step * step_jacobian
+    prior_pC2 = creep_jacobian * creep_covariance + step_jacobian * step_covariance
+    warmth_pC2 = WARMTH_CHANGE_PC**2 * len(direction_pC) * memory.unseen_s
+    noise_pC2 = warmth_pC2 + (CREEP_LAW_DEVIATION * size_pC) ** 2
+    if innovation_pC * innovation_pC > OUTLIER_SIGMAS**2 * (prior_pC2 + noise_pC2):
         return memory._replace(learn_s=0.0)
 
     total_pC2 = prior_pC2 + noise_pC2 * LEARN_S / max(dt_s, MIN_STEP_S)
-    creep_scale = 1.0 + creep_gain / total_pC2 * innovation_pC
-    step_scale = 1.0 + step_gain / total_pC2 * innovation_pC
+    creep_scale = 1.0 + creep_covariance / total_pC2 * innovation_pC
+    step_scale = 1.0 + step_covariance / total_pC2 * innovation_pC
     updated = ScaleVariances(
-        variances.creep - creep_gain**2 / total_pC2,
-        variances.step - step_gain**2 / total_pC2,
-        variances.covariance - creep_gain * step_gain / total_pC2,
+        variances.creep - creep_covariance**2 / total_pC2,
+        variances.step - step_covariance**2 / total_pC2,
+        variances.covariance - creep_covariance * step_covariance / total_pC2,
     )
     rows_pC[WARMTH_ROW] -= (creep_scale - 1.0) * creep_pC + (step_scale - 1.0) * step_pC
     learned = Film.of(film.creep * creep_scale, film.thermoelastic * step_scale, updated)
@@ -345,7 +375,15 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
 
 
 def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
-    """Return the state at the first frame of a touch, with the warmth as predicted from before the touch."""
+    """Return the state at the first frame of a touch.
+
+    The touch may have changed the latest estimate of the warmth before it was detected. The warmth is therefore
+    predicted from its trusted value, which was estimated at least `look_back_s` ago.
+
+    Args:
+        rule: Memory of the film.
+        memory: State of this frame.
+    """
     film = memory.film
     age_s = memory.trusted_s
     rows_pC = memory.rows_pC.copy()
@@ -357,8 +395,8 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
     return memory._replace(
         leak=memory.leak._replace(charge_pC=charge_pC),
         rows_pC=rows_pC,
-        unseen_s=max(memory.unseen_s, age_s) if memory.lingers else age_s,
-        learn_s=LEARN_S + LINGER_S,
+        unseen_s=max(memory.unseen_s, age_s) if memory.is_recently_touched else age_s,
+        learn_s=LEARN_S + RELEASE_S,
     )
 
 
@@ -388,18 +426,19 @@ def add_warmth(
 
 
 def charge_scale_std(memory: Memory) -> float:
-    """Return the relative standard deviation that all touch charges have in common.
+    """Return the relative standard deviation that all touch charges have in common, dimensionless.
 
-    It follows from the variances of the scale factors of creep and step.
+    It follows from the variances of the scale factors of creep and step. Without a touch it is 0.
     """
-    totals_pC = memory.rows_pC.sum(axis=1)
-    touch_pC = float(totals_pC[CHARGE_ROW])
+    film = memory.film
+    total_rows_pC = memory.rows_pC.sum(axis=1)  # summed over the electrodes, shape (rows,)
+    touch_pC = float(total_rows_pC[CHARGE_ROW])
     if touch_pC <= 0.0:
         return 0.0
-    creep_response, step_response = SCALE_RESPONSE.dot(totals_pC).tolist()
-    creep_share = memory.film.creep * creep_response / touch_pC
-    step_share = memory.film.thermoelastic * step_response / touch_pC
-    variances = memory.film.variances
+    unit_creep_pC, unit_step_pC = SCALE_RESPONSE.dot(total_rows_pC).tolist()
+    creep_share = film.creep * unit_creep_pC / touch_pC
+    step_share = film.thermoelastic * unit_step_pC / touch_pC
+    variances = film.variances
     variance = (
         creep_share * creep_share * variances.creep
         + step_share * step_share * variances.step

@@ -17,9 +17,9 @@ class ChainFrame:
     Attributes:
         values: Values as they came, in the unit of the device, shape (electrodes,).
         t_s: Time on the clock of the device, s.
-        dt_s: Time since the frame before, s.
+        dt_s: Time since the previous frame, s.
         is_at_limit: Whether an amplifier is at its limit.
-        was_contact: Whether something touched in the frame before.
+        was_contact: Whether something touched in the previous frame.
         flags: Words of `isocharge.serve.flags`, in their order.
         raw_pC: Charges as the device sent them, shape (electrodes,), pC.
         charge_pC: The same charges after the stages so far, shape (electrodes,), pC.
@@ -68,7 +68,7 @@ class Stage(ABC):
         """Process the next frame in place."""
 
     def reset(self) -> None:  # noqa: B027  # most stages have no state
-        """Forget everything that depends on the tare, because the film is tared again."""
+        """Discard the state that depends on the tare, because the film is tared again."""
 
     def begin_touch(self, frame: ChainFrame) -> None:  # noqa: B027  # most stages do nothing
         """Adapt to a touch that begins with this frame; the touch stage calls it on the stages before it."""

@@ -84,7 +84,12 @@ class TareStage(OffsetStage):
     """Measures the charge at rest on quiet frames, and subtracts it from all later frames."""
 
     def __init__(self, rule: TareRule | None, n_electrode: int) -> None:
-        """Begin without a tare; None as the rule takes zero charges as the tare."""
+        """Begin without a tare.
+
+        Args:
+            rule: Conditions of a tare; None to subtract nothing.
+            n_electrode: Number of electrodes.
+        """
         self._rule = rule
         self._tare: Tare | None = None
         self._waiting_pC = np.empty((0, n_electrode))
@@ -125,12 +130,19 @@ class TareStage(OffsetStage):
         self._tare = self._tare._replace(charge_pC=self._tare.charge_pC + change.charge_pC)
 
     def _search(self, charge_pC: Array) -> None:
-        """Measure the tare on the latest frames if they are enough and quiet; it counts from the next frame on."""
+        """Measure the tare on the latest frames if there are enough of them and they are quiet.
+
+        The tare is subtracted from the next frame on.
+
+        Args:
+            charge_pC: Charges of this frame, shape (electrodes,), pC.
+        """
         if self._rule is None:
-            nothing_pC = np.zeros_like(charge_pC)
-            self._tare = Tare(nothing_pC, nothing_pC, 0)
+            zero_pC = np.zeros_like(charge_pC)
+            self._tare = Tare(charge_pC=zero_pC, noise_pC=zero_pC, frames=0)
             return
-        self._waiting_pC = np.vstack([self._waiting_pC, charge_pC])[-self._rule.frames :]
+        latest_pC = np.vstack([self._waiting_pC, charge_pC])
+        self._waiting_pC = latest_pC[-self._rule.frames :]
         if self._gives_up:
             self._searched_frames += 1
         self._tare = look_for_tare(self._rule, self._waiting_pC, self._searched_frames)
@@ -194,16 +206,16 @@ class MemoryStage(OffsetStage):
     def step(self, frame: ChainFrame) -> None:
         """Replace the output of the amplifiers by the touch charge."""
         output_pC = frame.charge_pC
-        before = self._memory
-        if before is None:
+        previous = self._memory
+        if previous is None:
             self._memory = Memory.start(self._rule, output_pC)
         else:
-            frame.is_base_held = before.lingers
+            frame.is_base_held = previous.is_recently_touched
             self._memory = undo_memory(
                 self._rule,
                 self._leak_rule,
                 self._tau_s,
-                before,
+                previous,
                 output_pC,
                 frame.noise_pC,
                 frame.dt_s,
@@ -254,11 +266,12 @@ class TouchStage(Stage):
         return self._touch.contact
 
     def step(self, frame: ChainFrame) -> None:
-        """Write the touch into a frame, and notify the earlier stages if it begins."""
-        before = self._touch
-        self._touch = self._next(before, frame)
+        """Decide whether something touches in this frame, and notify the earlier stages if a touch begins."""
+        previous_touch = self._touch
+        self._touch = self._next_touch(previous_touch, frame)
         frame.touch = self._touch
-        if self._touch.contact and not before.contact:
+        is_beginning = self._touch.contact and not previous_touch.contact
+        if is_beginning:
             for stage in self._earlier_stages:
                 stage.begin_touch(frame)
 
@@ -266,13 +279,23 @@ class TouchStage(Stage):
         """Forget the touch."""
         self._touch = NO_TOUCH
 
-    def _next(self, before: Touch, frame: ChainFrame) -> Touch:
+    def _next_touch(self, previous_touch: Touch, frame: ChainFrame) -> Touch:
+        """Return the state of the touch detection after a frame. Without a rule, every frame is a touch.
+
+        Args:
+            previous_touch: State after the previous frame.
+            frame: The frame, after the earlier stages.
+        """
         if self._rule is None:
             return Touch(contact=True)
-        relax_s = math.inf if frame.is_base_held and before.base_pC > 0.0 else frame.base_relax_s
-        decay = math.exp(-frame.dt_s / relax_s)
+        # While a finger leaves the film, a positive charge at rest must not decay, because it still belongs to the
+        # finger.
+        base_relax_s = frame.base_relax_s
+        if frame.is_base_held and previous_touch.base_pC > 0.0:
+            base_relax_s = math.inf
+        base_decay = math.exp(-frame.dt_s / base_relax_s)
         total_pC = float(frame.charge_pC.sum())
-        return update_contact(self._rule, before, total_pC, frame.noise_pC, decay, frame.charge_scale_std)
+        return update_contact(self._rule, previous_touch, total_pC, frame.noise_pC, base_decay, frame.charge_scale_std)
 
 
 class PressFlags(Stage):
@@ -284,11 +307,12 @@ class PressFlags(Stage):
 
     def step(self, frame: ChainFrame) -> None:
         """Add the flags to a frame."""
-        self._is_saturated = frame.is_at_limit or (self._is_saturated and frame.touch.contact)
+        was_saturated_in_press = self._is_saturated and frame.touch.contact
+        self._is_saturated = frame.is_at_limit or was_saturated_in_press
         frame.is_saturated = self._is_saturated
         if frame.is_saturated:
             frame.flags.append(SATURATED)
-        if frame.touch.below:
+        if frame.touch.is_negative:
             frame.flags.append(NEGATIVE)
 
     def reset(self) -> None:
@@ -325,25 +349,26 @@ class Warming(Stage):
         self._drift = NO_DRIFT
 
     def step(self, frame: ChainFrame) -> None:
-        """Subtract the warming from a frame in contact, and flag it."""
+        """Estimate the warming of a frame in contact, subtract its change from the charges, and add the flags."""
         if not frame.touch.contact:
             self._drift = NO_DRIFT
             return
         if frame.is_saturated:  # a clipped charge fits no contact, whatever the temperature
             return
-        before = self._drift
-        self._drift = track_thermal_drift(
-            self._rule, before, frame.charge_pC, self._misfit, frame.dt_s, self._ratios, self._warmth_s
+        previous_pC = self._drift.charge_pC
+        drift = track_thermal_drift(
+            self._rule, self._drift, frame.charge_pC, self._misfit, frame.dt_s, self._ratios, self._warmth_s
         )
-        is_large = abs(self._drift.charge_pC) >= self._rule.tell_pC
-        if self._drift.charge_pC != before.charge_pC:
-            change_pC = (self._drift.charge_pC - before.charge_pC) * self._ratios
+        self._drift = drift
+        is_large = abs(drift.charge_pC) >= self._rule.tell_pC
+        if drift.charge_pC != previous_pC:
+            change_pC = (drift.charge_pC - previous_pC) * self._ratios
             frame.charge_pC = frame.charge_pC - change_pC
-            rate_pC_per_s = self._drift.rate_pC_per_s * self._ratios
+            rate_pC_per_s = drift.rate_pC_per_s * self._ratios
             self._offset_stage.add_warming(WarmingChange(change_pC, rate_pC_per_s, is_learned=not is_large))
         if is_large:
             frame.flags.append(THERMAL)
-        if self._drift.blind:
+        if drift.blind:
             frame.flags.append(BLIND)
 
     def reset(self) -> None:

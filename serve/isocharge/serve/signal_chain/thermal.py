@@ -85,37 +85,45 @@ def track_thermal_drift(
 ) -> ThermalDrift:
     """Return the state after the next frame in contact.
 
+    Every `every_s`, the common charge p is estimated as the minimum of the squared misfit, to which a parabola is
+    fitted over several trial values of p. The estimate corrects the prediction by a Kalman filter.
+
     Args:
         rule: Settings of the estimate of warming.
-        state: State after the frame before.
+        state: State after the previous frame.
         charge_pC: Touch charges without the warming so far, shape (electrodes,), pC.
         misfit: Misfit of the model that answers.
-        dt_s: Time since the frame before, s.
+        dt_s: Time since the previous frame, s.
         ratios: Charge of each electrode over p, shape (electrodes,), dimensionless.
         warmth_s: Time constant with which the slope of p decays, s; None if the slope is not predicted.
     """
     waited_s = state.waited_s + dt_s
     if waited_s < rule.every_s:
         return state._replace(waited_s=waited_s, rate_pC_per_s=0.0)
-    predicted_pC2, covariance, rate_variance = _predicted(rule, state, waited_s, warmth_s)
-    tried_pC = charge_pC - TRIED_PC[:, np.newaxis] * ratios
-    _, slope, curvature = (_PARABOLA_FIT @ np.square(misfit(tried_pC), dtype=float)).tolist()
+    predicted_pC2, covariance, rate_variance = _predicted_variances(rule, state, waited_s, warmth_s)
+
+    # squared misfit = constant + slope * p + curvature * p^2, fitted to the charges without each trial value of p
+    trial_charges_pC = charge_pC - TRIED_PC[:, np.newaxis] * ratios  # shape (trials, electrodes)
+    squared_misfits = np.square(misfit(trial_charges_pC), dtype=float)
+    _, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
     estimate_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
     if estimate_pC2 > rule.blind_pC**2:
         return state._replace(waited_s=0.0, blind=True, rate_pC_per_s=0.0)
-    change_pC = min(max(-slope / (2.0 * curvature), float(TRIED_PC[0])), float(TRIED_PC[-1]))
-    gain = predicted_pC2 / (predicted_pC2 + estimate_pC2)
-    turn = covariance / (predicted_pC2 + estimate_pC2)
+
+    minimum_pC = -slope / (2.0 * curvature)
+    change_pC = min(max(minimum_pC, float(TRIED_PC[0])), float(TRIED_PC[-1]))
+    charge_gain = predicted_pC2 / (predicted_pC2 + estimate_pC2)
+    rate_gain = covariance / (predicted_pC2 + estimate_pC2)
     return ThermalDrift(
-        state.charge_pC + gain * change_pC,
-        (1.0 - gain) * predicted_pC2,
-        rate_pC_per_s=turn * change_pC,
-        covariance=(1.0 - gain) * covariance,
-        rate_variance=rate_variance - turn * covariance,
+        charge_pC=state.charge_pC + charge_gain * change_pC,
+        variance_pC2=(1.0 - charge_gain) * predicted_pC2,
+        rate_pC_per_s=rate_gain * change_pC,
+        covariance=(1.0 - charge_gain) * covariance,
+        rate_variance=rate_variance - rate_gain * covariance,
     )
 
 
-def _predicted(
+def _predicted_variances(
     rule: ThermalRule, state: ThermalDrift, waited_s: float, warmth_s: float | None
 ) -> tuple[float, float, float]:
     """Return the predicted variance of p, its covariance with the slope, and the variance of the slope.
@@ -140,4 +148,5 @@ def _predicted(
         + slope_noise * waited_s**2 / 3.0
     )
     predicted_covariance = decay * (covariance + slope_effect_s * rate_variance) + 0.5 * slope_noise * waited_s
-    return variance_pC2, predicted_covariance, decay * decay * rate_variance + slope_noise
+    predicted_rate_variance = decay * decay * rate_variance + slope_noise
+    return variance_pC2, predicted_covariance, predicted_rate_variance

@@ -13,7 +13,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.common.files import new_folder, refuse_existing, write_whole
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.model.model_folder import load_model
-from isocharge.serve.signal_chain.hum import LEAST_TURN
+from isocharge.serve.signal_chain.hum import MIN_SQUARED_STEP
 from isocharge.train.export_c.c_text import c_comment, c_double, c_doubles, source_text
 from isocharge.train.export_c.model_source import model_header, model_source, self_test
 from isocharge.train.model_release.onnx_graph import read_graph
@@ -57,7 +57,7 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
         "GAIN_PC": c_doubles(np.ones(len(electrodes)) if chain.gain_pC is None else chain.gain_pC),
         "LARGEST": c_double(chain.largest),
         "SATURATION": str(int(chain.limit_pC is not None)),
-        "HUM_LEAST_TURN": c_double(LEAST_TURN),
+        "HUM_LEAST_TURN": c_double(MIN_SQUARED_STEP),
     }
     if chain.limit_pC is not None:
         numbers["LIMIT_PC"] = c_double(chain.limit_pC)

@@ -25,7 +25,7 @@ from isocharge.common.activations import ACTIVATIONS, TANH, Activation
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, ModelError
 from isocharge.common.files import sha256_of
-from isocharge.common.npz import DAMAGED, npz_arrays
+from isocharge.common.npz import DAMAGED_FILE_ERRORS, npz_arrays
 from isocharge.serve.model.companion_files import read_companion_file
 from isocharge.simulate import Circle, Domain, NoiseModel
 from isocharge.simulate.forward.film_family import FilmFamily
@@ -104,7 +104,7 @@ def films_from_bytes(data: bytes, where: str) -> FilmsModel:
         return _model(about, arrays, sha256_of(data))
     except ModelError:
         raise
-    except DAMAGED as error:
+    except DAMAGED_FILE_ERRORS as error:
         raise ModelError(f"{where}: damaged ({type(error).__name__}: {error}); {ADVICE}") from error
 
 
