@@ -119,6 +119,7 @@ class FilmFamily:
         """
         domain = Domain(radius, force_range)
         film = prior.sensor.film
+        _check_back(film)
         surface = prior.sensor.surface
         limits = _limits_of(prior, domain)
         grid = FilmGrid.spread(limits, counts)
@@ -269,10 +270,25 @@ class FilmFamily:
             )
         if not film.is_axisymmetric:
             raise SceneError(f"film: expected an axisymmetric film, got {film.asymmetries}; use modes for these")
+        _check_back(film)
         for name, value in groups.items():
             low, high = self.limits[name]
             if not low * (1.0 - LIMIT_TOLERANCE) - 1e-15 <= value <= high * (1.0 + LIMIT_TOLERANCE):
                 raise SceneError(f"film: {name} {value:.4g} is outside the family: expected {low:.4g} to {high:.4g}")
+
+
+def _check_back(film: Film) -> None:
+    """Raise an error if a film has a closed back or a static pressure, which would add axes to the family.
+
+    Raises:
+        SceneError: If a pressure acts on the whole film.
+    """
+    if film.has_back_pressure:
+        raise SceneError(
+            f"film: expected a vented back without static pressure, got back volume {film.back_volume} mm^3 and static "
+            f"pressure {1e6 * film.static_pressure:g} Pa: networks for all films and calibrations do not cover these; "
+            "vent the back, or use `press`, `ForwardMap.build` or `isocharge train fit` for this film"
+        )
 
 
 def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) -> float:

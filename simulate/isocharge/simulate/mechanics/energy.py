@@ -2,8 +2,9 @@
 
     Pi = stretching energy + bending energy
          - load * mean of W over the footprint - side load . mean of (U1, U2) over the footprint
+         + energy of the pressure on the whole film (`mechanics.back_pressure`)
 
-The means are weighted with the pressure.
+The means are weighted with the pressure of the probe.
 
 The energy is a function of the scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3). Lengths are in units
 of the film radius a. With the amplitude A of `isocharge.simulate.mechanics.scaling`, the displacements and the
@@ -24,6 +25,7 @@ from scipy.sparse import diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from isocharge.common.arrays import Array
+from isocharge.simulate.mechanics.back_pressure import BackPressure
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_stress
 from isocharge.simulate.mechanics.stress import strain
 from isocharge.simulate.mesh.placed_mesh import Geometry
@@ -43,6 +45,7 @@ class ElasticFilm:
         groups: Dimensionless groups of the press.
         membrane: Stretching energy.
         bending: Bending energy; None if the theory omits bending.
+        back: Energy of the pressure on the whole film; None if there is none.
     """
 
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
@@ -50,6 +53,7 @@ class ElasticFilm:
         self.groups = groups
         self.membrane = Membrane(geometry, groups)
         self.bending = Bending(geometry, groups.bending) if groups.bending > 0.0 else None
+        self.back = BackPressure(geometry, groups) if groups.has_back_pressure else None
 
     @property
     def components(self) -> int:
@@ -66,6 +70,8 @@ class ElasticFilm:
         elastic = self.membrane.energy(field)
         if self.bending is not None:
             elastic += self.bending.energy(field[:, 2])
+        if self.back is not None:
+            elastic += self.back.energy(field[:, 2])
         work = self.groups.load * float(self.geometry.load @ field[:, 2])
         if self.has_side_load:
             work += float(self.geometry.load @ field[:, :2] @ np.array(self.groups.side_load))
@@ -85,16 +91,33 @@ class ElasticFilm:
             forces[..., 2] += self.bending.forces(field[:, 2])
         residual = np.stack([self.geometry.gather(forces[..., i]) for i in range(3)], axis=1)
         residual[:, 2] -= self.groups.load * self.geometry.load
+        if self.back is not None:
+            residual[:, 2] += self.back.forces(field[:, 2])
         if self.has_side_load:
             residual[:, :2] -= np.outer(self.geometry.load, self.groups.side_load)
         return residual
+
+    @property
+    def load_scale(self) -> float:
+        """Norm of the forces at the nodes by the probe or, without a probe, by the static pressure."""
+        if self.groups.load == 0.0 and self.back is not None:
+            return abs(self.groups.static_pressure) * float(np.linalg.norm(self.back.weights))
+        return self.groups.load * float(np.linalg.norm(self.geometry.load))
+
+    def work(self, field: Array) -> float:
+        """Compute the size of the work of the probe or, without a probe, of the static pressure on a field."""
+        if self.groups.load == 0.0 and self.back is not None:
+            return abs(self.back.static_work(field[:, 2]))
+        return self.groups.load * abs(float(self.geometry.load @ field[:, 2]))
 
     def in_plane_scale(self, field: Array) -> float:
         """Compute the norm of the in-plane forces of the elements, to which the in-plane residual is relative."""
         return float(np.linalg.norm(self.membrane.forces(field)[..., :2]))
 
     def tangent(self, field: Array, guard: float = 0.0) -> Array:
-        """Compute the element matrices of the linear solve.
+        """Compute the element matrices of the linear solve, without the stiffness of trapped air.
+
+        This stiffness couples all nodes; see `solver.tangent_factor`.
 
         Args:
             field: Scaled displacements, shape (n_node, 3).

@@ -25,6 +25,12 @@ MEMBRANE_STIFFNESS = 1.6
 
 The value is 2 pi / ln(a / R) for a probe radius R = 0.02 a."""
 
+AMBIENT_PRESSURE = 0.101325
+"""Pressure of the atmosphere, MPa."""
+
+AIR_SHAPE = 0.6
+"""Square of the volume under the first iterate of Newton's method, over its height, in units of a^2."""
+
 PLATE_STIFFNESS = 16.0 * np.pi
 """Force over deflection of a clamped plate under a central point load, in units of the plate stiffness over a^2."""
 
@@ -57,6 +63,10 @@ class DimensionlessGroups:
         poisson: Poisson's ratio.
         anisotropy: Direction-dependent properties; None if the film is isotropic.
         side_load: Side force (Fx, Fy) over E h a A^2, in axes that are rotated with the press.
+        static_pressure: Static pressure over E h A^3 / a, positive in the direction of the push.
+        ambient_pressure: Pressure of the atmosphere over E h A^3 / a. Zero if the back is vented.
+        compression: Relative compression of the air behind the film, per integral of the scaled deflection W over the
+            film. Zero if the back is vented.
     """
 
     amplitude2: float
@@ -66,6 +76,9 @@ class DimensionlessGroups:
     poisson: float
     anisotropy: Anisotropy | None = None
     side_load: tuple[float, float] = (0.0, 0.0)
+    static_pressure: float = 0.0
+    ambient_pressure: float = 0.0
+    compression: float = 0.0
 
     @classmethod
     def of(
@@ -91,6 +104,10 @@ class DimensionlessGroups:
         along = side_x * np.cos(angle) + side_y * np.sin(angle)
         across = side_y * np.cos(angle) - side_x * np.sin(angle)
         side_unit = side_force_unit(film, amplitude2)
+        pressure_unit = film.young * film.thickness * amplitude2**1.5 / film.radius
+        compression = 0.0
+        if film.back_volume is not None:
+            compression = film.radius**3 * amplitude2**0.5 / film.back_volume
         return cls(
             amplitude2=amplitude2,
             load=force / (film.young * film.thickness * film.radius * amplitude2**1.5),
@@ -99,13 +116,46 @@ class DimensionlessGroups:
             poisson=film.poisson,
             anisotropy=_anisotropy(film, amplitude2, angle) if film.is_anisotropic else None,
             side_load=(float(along / side_unit), float(across / side_unit)) if any(side_force) else (0.0, 0.0),
+            static_pressure=film.static_pressure / pressure_unit,
+            ambient_pressure=AMBIENT_PRESSURE / pressure_unit if compression else 0.0,
+            compression=compression,
         )
 
     @property
+    def has_back_pressure(self) -> bool:
+        """Whether a pressure acts on the whole film."""
+        return self.static_pressure != 0.0 or self.compression != 0.0
+
+    @property
+    def without_probe(self) -> "DimensionlessGroups":
+        """Groups of the same film without the forces of the probe, in the same units."""
+        return replace(self, load=0.0, side_load=(0.0, 0.0))
+
+    @property
+    def total_load(self) -> float:
+        """Force of the probe plus the size of the force of the static pressure, over E h a A^3."""
+        return self.load + np.pi * abs(self.static_pressure)
+
+    @property
     def height(self) -> float:
-        """Approximate deflection of the centre in units of a A, which is one for groups that `of` computes."""
+        """Approximate deflection of the centre in units of a A, which is one for groups of a film with a vented back
+        that `of` computes."""
         linear = MEMBRANE_STIFFNESS * max(self.tension, 0.0) + PLATE_STIFFNESS * self.bending
-        return float(_root(linear, self.load))
+        air = AIR_SHAPE * self.ambient_pressure * self.compression
+        return float(_root(linear + air, self.load))
+
+    @property
+    def static_height(self) -> float:
+        """Approximate deflection of the centre by the static pressure, in units of a A.
+
+        The deflection is (0.662)^3 p of a membrane without pretension (Hencky 1915), p / 4 over the pretension, and
+        p / 64 over the bending stiffness.
+        """
+        air = 0.5 * np.pi * self.ambient_pressure * self.compression
+        linear = 4.0 * max(self.tension, 0.0) + 64.0 * self.bending + air
+        cubic = 1.0 / 0.662**3
+        height = float(_root(linear / cubic, abs(self.static_pressure) / cubic))
+        return float(np.copysign(height, self.static_pressure))
 
     @property
     def induced(self) -> float:

@@ -155,6 +155,8 @@ def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Th
         Theory(stretching=True, bending=False, pretensioned=is_tense),
     )
     for theory in cheapest_first:
+        if film.has_back_pressure and not theory.stretching:  # linear theories have no pressure on the whole film
+            continue
         if modelling_error(film, probe, force, theory) <= 0.5 * accuracy:
             return theory
     return full

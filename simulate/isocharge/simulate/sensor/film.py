@@ -41,6 +41,12 @@ MAX_YOUNG_RATIO = 10.0
 MAX_OVAL = 0.1
 """Largest parameter e of an oval clamp for which the mesh has been tested, dimensionless."""
 
+MIN_BACK_VOLUME = 1.0
+"""Smallest volume behind a film, mm^3. Smaller values are probably in m^3."""
+
+MAX_STATIC_PRESSURE = 0.01
+"""Largest size of a static pressure, MPa. A film of 25 um bulges by several millimetres under such a pressure."""
+
 MAX_COAT_STIFFNESS = 5.0
 """Largest stiffness of a coat over the stiffness of the film. The bending of a stiffer coat cannot be neglected."""
 
@@ -80,6 +86,9 @@ class Film:
         oval: Parameter e of an oval clamp, whose semi-axes are radius * (1 + e) and radius * (1 - e), dimensionless.
         oval_axis: Angle of the longer semi-axis from x, anticlockwise, rad.
         coat: Coat that stiffens parts of the film; None if there is no coat.
+        back_volume: Volume of the closed cavity behind the film, mm^3; None if the back is vented.
+        static_pressure: Pressure on the film without contact, MPa, positive in the direction of the push. With a closed
+            cavity, this is the pressure on the flat film.
     """
 
     radius: float
@@ -94,6 +103,13 @@ class Film:
     oval: float = 0.0
     oval_axis: float = 0.0
     coat: Coat | None = None
+    back_volume: float | None = None
+    static_pressure: float = 0.0
+
+    @property
+    def has_back_pressure(self) -> bool:
+        """Whether a pressure acts on the whole film, with or without contact."""
+        return self.back_volume is not None or self.static_pressure != 0.0
 
     @property
     def is_anisotropic(self) -> bool:
@@ -135,6 +151,16 @@ class Film:
             )
         if not abs(self.oval) <= MAX_OVAL:
             raise SensorError(f"film oval: expected a share up to {MAX_OVAL:g}, got {self.oval}")
+        if self.back_volume is not None and not MIN_BACK_VOLUME <= self.back_volume < math.inf:
+            raise SensorError(
+                f"film back volume: expected at least {MIN_BACK_VOLUME:g} mm^3, got {self.back_volume:.6g} mm^3; leave "
+                "it out if the back is vented"
+            )
+        if not abs(self.static_pressure) <= MAX_STATIC_PRESSURE:
+            raise SensorError(
+                f"film static pressure: expected at most {1e6 * MAX_STATIC_PRESSURE:g} Pa in size, got "
+                f"{1e6 * self.static_pressure:.6g} Pa"
+            )
         if not (math.isfinite(self.axis) and math.isfinite(self.oval_axis)):
             raise SensorError(f"film axis, oval_axis: expected finite angles, got {self.axis}, {self.oval_axis}")
         if self.thickness > 0.1 * self.radius:

@@ -377,6 +377,8 @@ class FilmPrior:
             ("d33 (pC/N)", sensor.piezo.d33, described.piezo.d33),
             ("d12 (pC/N)", sensor.piezo.d12, described.piezo.d12),
             ("crosstalk", sensor.calibration.crosstalk, described.calibration.crosstalk),
+            ("back volume (mm^3)", sensor.film.back_volume, described.film.back_volume),
+            ("static pressure (MPa)", sensor.film.static_pressure, described.film.static_pressure),
             ("asymmetry of the film", sensor.film.asymmetries, described.film.asymmetries),
         ):
             if value != expected:

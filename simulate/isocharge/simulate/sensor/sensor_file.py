@@ -30,6 +30,9 @@ from isocharge.simulate.sensor.size_check import tidy
 MAX_COORDINATE_mm = 1e6
 """Largest absolute value of a coordinate, mm."""
 
+PASCAL_PER_MPA = 1e6
+"""Pascal per megapascal."""
+
 log = logging.getLogger(__name__)
 
 SIDE = "side_mm"
@@ -54,6 +57,8 @@ class FilmTable(Settings, frozen=True):
     axis_deg: Finite = 0.0
     oval: Finite = 0.0
     oval_axis_deg: Finite = 0.0
+    back_volume_mm3: Positive | None = None
+    static_pressure_Pa: Finite = 0.0
 
 
 class PiezoTable(Settings, frozen=True):
@@ -223,11 +228,13 @@ def film_to_dict(film: Film) -> dict[str, Any]:
     tension = [tidy(value) for value in (mean + difference, mean - difference, shear)]
     ratio = np.sqrt(film.young_ratio)
     young_GPa = [tidy(film.young * 1e-3 * ratio), tidy(film.young * 1e-3 / ratio)]
-    asymmetries = {
+    optional = {
         "shear_GPa": None if film.shear is None else tidy(film.shear * 1e-3),
         "axis_deg": tidy(float(np.rad2deg(film.axis))),
         "oval": tidy(film.oval),
         "oval_axis_deg": tidy(float(np.rad2deg(film.oval_axis))),
+        "back_volume_mm3": None if film.back_volume is None else tidy(film.back_volume),
+        "static_pressure_Pa": tidy(film.static_pressure * PASCAL_PER_MPA),
     }
     return {
         "radius_mm": tidy(film.radius),
@@ -235,7 +242,7 @@ def film_to_dict(film: Film) -> dict[str, Any]:
         "young_GPa": tidy(film.young * 1e-3) if film.young_ratio == 1.0 else young_GPa,
         "poisson": film.poisson,
         "pretension_MPa": tension if any(film.deviator) else tidy(mean),
-        **{name: value for name, value in asymmetries.items() if value},
+        **{name: value for name, value in optional.items() if value},
     }
 
 
@@ -350,6 +357,8 @@ def _film(table: FilmTable) -> Film:
         axis=float(np.deg2rad(table.axis_deg)),
         oval=table.oval,
         oval_axis=float(np.deg2rad(table.oval_axis_deg)),
+        back_volume=table.back_volume_mm3,
+        static_pressure=table.static_pressure_Pa / PASCAL_PER_MPA,
     )
 
 

@@ -25,6 +25,7 @@ class Assembly:
 
     Attributes:
         components: Number of unknowns per node.
+        odd: Whether the fields are odd about the line of symmetry.
         free: Whether each unknown is free, shape (n_node, components).
         inner_global: Numbers of the interior unknowns of each element, shape (n_element, n_inner).
         outer_global: Numbers of the unknowns on the sides of each element, shape (n_element, n_outer).
@@ -37,6 +38,7 @@ class Assembly:
         on_edge = (line == line[0]) | (line == line[-1])
         shell = (on_edge[:, None] | on_edge[None, :]).ravel()
         self.components = components
+        self.odd = odd
         self.free = _free(mesh, components, odd)
         within = np.arange(components)[:, None]  # an element's unknowns are numbered component by component
         self._outer, self._inner = ((within * shell.size + np.flatnonzero(part)).ravel() for part in (shell, ~shell))

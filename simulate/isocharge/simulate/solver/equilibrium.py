@@ -48,6 +48,8 @@ class Equilibrium:
         seconds: Process CPU time for meshing and solving, s.
         proven_error: Relative difference of the charges between this mesh and a mesh of one order less; None if only
             one mesh was solved.
+        rest: Equilibrium of the same mesh before the contact, under the static pressure alone; None if there is no
+            static pressure. Its stress is not part of the touch stress.
     """
 
     film: Film
@@ -65,6 +67,7 @@ class Equilibrium:
     residual: float
     seconds: float
     proven_error: float | None = None
+    rest: "Equilibrium | None" = None
 
     def __repr__(self) -> str:
         """Return a summary: the press, the deflection, the largest stress, and a warning if PVDF would yield."""
@@ -80,7 +83,7 @@ class Equilibrium:
 
 
 def deflection(equilibrium: Equilibrium, points: Array) -> Array:
-    """Compute the deflection at points of the film.
+    """Compute the deflection at points of the film, from the flat film. It includes that of a static pressure.
 
     Args:
         equilibrium: The solved press.
@@ -100,7 +103,7 @@ def deflection(equilibrium: Equilibrium, points: Array) -> Array:
 
 
 def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "middle") -> Array:
-    """Compute the second Piola-Kirchhoff stress that the press adds to the pretension.
+    """Compute the second Piola-Kirchhoff stress that the press adds to the stress before the contact.
 
     Args:
         equilibrium: The solved press.
@@ -125,7 +128,10 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
         strained = mesh.coat.film_strain(_rotated(equilibrium, points), strained)
     local = equilibrium.film.young * groups.amplitude2 * scaled_stress(strained, groups)
     local[mirrored, 2] *= -1.0
-    return rotate_stress(local, np.arctan2(equilibrium.at[1], equilibrium.at[0]))
+    total = rotate_stress(local, np.arctan2(equilibrium.at[1], equilibrium.at[0]))
+    if equilibrium.rest is None:
+        return total
+    return np.asarray(total - touch_stress(equilibrium.rest, points, surface))
 
 
 def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array:
@@ -138,6 +144,13 @@ def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array
     Returns:
         (S11, S22, S12) in units of E_young A^2, shape (n_element, n_local, 3).
     """
+    if equilibrium.rest is None:
+        return _induced_stress(equilibrium, surface)
+    return np.asarray(_induced_stress(equilibrium, surface) - _induced_stress(equilibrium.rest, surface))
+
+
+def _induced_stress(equilibrium: Equilibrium, surface: Surface) -> Array:
+    """Compute the scaled stress that all loads add to the pretension; see `nodal_stress`."""
     slope = node_slope(equilibrium)
     strained = strain(slope, equilibrium.groups.amplitude2)
     if surface != "middle":
@@ -156,10 +169,10 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     """
     groups = equilibrium.groups
     deviator = np.zeros(3) if groups.anisotropy is None else groups.anisotropy.tension
-    smallest, largest = principal_stresses(nodal_stress(equilibrium) + deviator)
+    smallest, largest = principal_stresses(_induced_stress(equilibrium, "middle") + deviator)
     if equilibrium.theory.bending:
         for surface in ("top", "bottom"):
-            _, surface_stress = principal_stresses(nodal_stress(equilibrium, surface) + deviator)
+            _, surface_stress = principal_stresses(_induced_stress(equilibrium, surface) + deviator)
             largest = max(largest, surface_stress)
     scale = equilibrium.film.young * groups.amplitude2
     return scale * smallest + equilibrium.film.pretension, scale * largest + equilibrium.film.pretension

@@ -21,6 +21,7 @@ from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import side_force_unit
 from isocharge.simulate.solver.assembly import assembly
 from isocharge.simulate.solver.equilibrium import Equilibrium
+from isocharge.simulate.solver.tangent_factor import factor_tangent
 
 MAX_FRICTION = 1.0
 """Largest coefficient of friction, dimensionless. Steel on PVDF has about 0.2."""
@@ -40,9 +41,10 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
     groups = solved.groups
     components = 3 if groups.bending == 0.0 else 4
     with single_threaded_blas():
-        factor = assembly(mesh.template, components).factor(ElasticFilm(geometry, groups).tangent(solved.field))
+        factor = factor_tangent(ElasticFilm(geometry, groups), assembly(mesh.template, components), solved.field)
         n_direction = 1 if mesh.template.half else 2  # a half template has no displacement across its symmetry line
-        slip = geometry.load @ solved.field[:, :n_direction]
+        before_contact = np.zeros_like(solved.field) if solved.rest is None else solved.rest.field
+        slip = geometry.load @ (solved.field - before_contact)[:, :n_direction]
         compliance = np.empty((n_direction, n_direction))
         for direction in range(n_direction):
             unit_load = np.zeros_like(solved.field)

@@ -208,7 +208,8 @@ class LoadCase:
             side_force: Force (Fx, Fy) of the probe on the film along the film, N.
 
         Raises:
-            SceneError: If the press cannot exist, or a linear theory is requested for a side force.
+            SceneError: If the press cannot exist, or a linear theory is requested for a side force or for a film with a
+                pressure on its back.
         """
         began = process_time()
         check_press(film, probe, at, force)
@@ -222,6 +223,11 @@ class LoadCase:
             raise SceneError(
                 f"theory {theory.name!r}: a side force changes the deflection through the stress that it induces, "
                 "which a linear theory omits; use 'nonlinear membrane', 'nonlinear membrane + bending' or 'auto'"
+            )
+        if film.has_back_pressure and not theory.stretching:
+            raise SceneError(
+                f"theory {theory.name!r}: linear theories have no static pressure and no closed back; use 'nonlinear "
+                "membrane', 'nonlinear membrane + bending' or 'auto'"
             )
         layer = settings.layer
         if layer == "auto":

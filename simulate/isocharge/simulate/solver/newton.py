@@ -16,7 +16,8 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.solver.assembly import Assembly, Factor
+from isocharge.simulate.solver.assembly import Assembly
+from isocharge.simulate.solver.tangent_factor import TangentFactor, factor_tangent
 
 GUARD_TENSION = 0.4
 """Tension that is added to the tangent at a relative residual of one, over the induced tension of a film without
@@ -106,6 +107,22 @@ def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Ar
     return field
 
 
+def parabolic_start(radius: np.ndarray, groups: DimensionlessGroups) -> Array:
+    """Compute the first iterate for a film under static pressure without a probe.
+
+    Args:
+        radius: Distances of the nodes from the centre, shape (n_node,), in film radii.
+        groups: Dimensionless groups of the film.
+
+    Returns:
+        Scaled displacements (U1, U2, W), shape (n_node, 3).
+    """
+    field = np.zeros((radius.size, 3))
+    field[:, 2] = groups.static_height * np.maximum(1.0 - radius**2, 0.0)
+    field[radius > 1.0 - 1e-9] = 0.0
+    return field
+
+
 def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
     """Solve a linear theory: the deflection W under the load, and the in-plane displacement U that W causes.
 
@@ -172,7 +189,7 @@ def solve_newton(
             return iterate.result(True, iteration, f"converged in {iteration} steps")
         if iteration == MAX_ITERATIONS or _stalled(sizes):
             return iterate.result(False, iteration, f"no progress any more after {iteration} steps")
-        factor = assembly.factor(elastic.tangent(iterate.field, _regularisation(elastic, relative)))
+        factor = factor_tangent(elastic, assembly, iterate.field, _regularisation(elastic, relative))
         step = factor.solve(-iterate.residual)
         sizes.append(_energy_norm(elastic, iterate.field, step, iterate.residual))
         if sizes[-1] <= ROUND_OFF:
@@ -215,7 +232,7 @@ class _Iterate:
     def relative(self) -> float:
         """Larger one of the relative transverse residual and the relative in-plane residual."""
         residual = self.residual * self.free
-        load = self.elastic.groups.load * np.linalg.norm(self.elastic.geometry.load)
+        load = self.elastic.load_scale
         in_plane_force = max(self.elastic.in_plane_scale(self.field), 1e-300)
         transverse_residual = np.linalg.norm(residual[:, 2]) / load
         in_plane_residual = np.linalg.norm(residual[:, :2]) / in_plane_force
@@ -237,8 +254,7 @@ def _stalled(sizes: list[float]) -> bool:
 
 def _energy_norm(elastic: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
     """Compute the size of a step: the square root of its energy over the work of the load."""
-    work = elastic.groups.load * abs(float(elastic.geometry.load @ field[:, 2]))
-    return float(np.sqrt(abs(float(np.sum(step * residual))) / max(work, 1e-300)))
+    return float(np.sqrt(abs(float(np.sum(step * residual))) / max(elastic.work(field), 1e-300)))
 
 
 def _regularisation(elastic: ElasticFilm, relative: float) -> float:
@@ -248,7 +264,7 @@ def _regularisation(elastic: ElasticFilm, relative: float) -> float:
     """
     if relative <= GUARD_BELOW:
         return 0.0
-    induced_tension = float(np.cbrt(elastic.groups.load)) ** 2
+    induced_tension = float(np.cbrt(elastic.groups.total_load)) ** 2
     return GUARD_TENSION * induced_tension * min(1.0, relative)
 
 
@@ -264,7 +280,7 @@ def _local_step(iterate: _Iterate, step: Array) -> _Iterate | None:
     return trial if trial.relative < 0.5 * iterate.relative else None
 
 
-def _chord_steps(iterate: _Iterate, factor: Factor, before: float, tolerance: float) -> _Iterate:
+def _chord_steps(iterate: _Iterate, factor: TangentFactor, before: float, tolerance: float) -> _Iterate:
     """Continue with the factorised tangent of the last step as long as it reduces the residual well (chord method).
 
     Such a step costs a seventh of a Newton step. If the last step reduced the residual by the factor s, the next step
@@ -292,12 +308,12 @@ def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
     If the given step is not one, return the step with the smallest added tension in the tangent that makes it one.
     """
     elastic = iterate.elastic
-    tension = FIRST_DESCENT_TENSION * GUARD_TENSION * float(np.cbrt(elastic.groups.load)) ** 2
+    tension = FIRST_DESCENT_TENSION * GUARD_TENSION * float(np.cbrt(elastic.groups.total_load)) ** 2
     for _ in range(MAX_DESCENT_TRIALS):
         is_descent_step = np.isfinite(step).all() and float(np.sum(step * iterate.residual)) < 0.0
         if is_descent_step:
             break
-        step = assembly.factor(elastic.tangent(iterate.field, tension)).solve(-iterate.residual)
+        step = factor_tangent(elastic, assembly, iterate.field, tension).solve(-iterate.residual)
         tension *= 2.0
     return step
 

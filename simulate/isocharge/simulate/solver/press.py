@@ -26,7 +26,14 @@ from isocharge.simulate.solver.load_case import (
     needs_second_mesh,
     too_near_the_rim,
 )
-from isocharge.simulate.solver.newton import GUARD_BELOW, NewtonResult, schwerin_start, solve_linear, solve_newton
+from isocharge.simulate.solver.newton import (
+    GUARD_BELOW,
+    NewtonResult,
+    parabolic_start,
+    schwerin_start,
+    solve_linear,
+    solve_newton,
+)
 
 MAX_EXTRA_ORDERS = 3
 """Largest number of increases of the order after the first mesh."""
@@ -154,7 +161,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
         result = _solve_nonlinear(case, elastic, solver, mesh, start)
     else:
         result = solve_linear(elastic, solver)
-    return Equilibrium(
+    equilibrium = Equilibrium(
         film=case.film,
         probe=case.probe,
         at=case.at,
@@ -170,6 +177,28 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
         residual=result.residual,
         seconds=process_time() - case.began,
     )
+    if case.film.static_pressure == 0.0:
+        return equilibrium
+    return _with_rest(equilibrium, case.tolerance)
+
+
+def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
+    """Solve the film before the contact, under the static pressure alone, and add it to the equilibrium of a press."""
+    mesh = equilibrium.mesh
+    elastic = ElasticFilm(mesh.geometry, equilibrium.groups.without_probe)
+    solver = assembly(mesh.template, elastic.components)
+    result = solve_newton(elastic, solver, _static_start(mesh, elastic.groups), tolerance)
+    rest = replace(equilibrium, groups=elastic.groups, field=result.field, force=0.0, side_force=(0.0, 0.0))
+    equilibrium = replace(equilibrium, rest=rest, iterations=equilibrium.iterations + result.iterations)
+    if result.converged:
+        return equilibrium
+    message = f"under the static pressure without a contact, {result.message}"
+    return replace(equilibrium, status="failed", message=message)
+
+
+def _static_start(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
+    """Return the first iterate of a film under the static pressure, shape (n_node, 3)."""
+    return parabolic_start(np.abs(from_oval(mesh.node_points, mesh.oval)), groups)
 
 
 def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
@@ -197,6 +226,8 @@ def _solve_nonlinear(
     """
     z = mesh.placement.to_template(from_oval(mesh.node_points, mesh.oval))
     schwerin_field = schwerin_start(z, float(mesh.placement.rho), elastic.groups)
+    if elastic.groups.static_pressure != 0.0:
+        schwerin_field += _static_start(mesh, elastic.groups)
     result = solve_newton(elastic, solver, _start_field(start, mesh.template, schwerin_field), case.tolerance)
     if result.converged:
         return result

@@ -25,6 +25,7 @@ from isocharge.simulate.mechanics.stress import stress_rotation
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.solver.assembly import assembly
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
+from isocharge.simulate.solver.tangent_factor import factor_tangent
 
 STEP = 1e-3
 """Step of the central differences, in units of the imperfection."""
@@ -156,8 +157,9 @@ def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface:
     """Compute the change of the scaled stress at the nodes by each field, shape (n_field, n_element, n_local, 3)."""
     with single_threaded_blas():
         components = 3 if solved.groups.bending == 0.0 else 4
-        tangent = ElasticFilm(solved.mesh.geometry, solved.groups).tangent(solved.field)
-        factors = [assembly(solved.mesh.template, components, odd).factor(tangent) for odd in (False, True)]
+        elastic = ElasticFilm(solved.mesh.geometry, solved.groups)
+        assemblies = [assembly(solved.mesh.template, components, odd) for odd in (False, True)]
+        factors = [factor_tangent(elastic, solver, solved.field) for solver in assemblies]
         return np.stack([_stress_change(solved, field, factors[field.odd].solve, surface) for field in fields])
 
 

@@ -1,0 +1,82 @@
+"""Pressure on the whole film: a static pressure, and the pressure of the air that is trapped behind the film.
+
+If the film displaces the volume V of a closed cavity with the volume V0, the pressure of the trapped air rises by
+
+    p0 V0 / (V0 - V) - p0,
+
+where p0 is the pressure of the atmosphere (Boyle's law, at constant temperature). The energy of the air is
+-p0 V0 (ln(1 - V / V0) + V / V0). Both pressures act along the direction of the push on the area of the undeformed film,
+as in the theory of plates. With S = integral(W), the units of `mechanics.scaling` give V / V0 = compression * S.
+"""
+
+from functools import cached_property
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.simulate.mechanics.scaling import DimensionlessGroups
+from isocharge.simulate.mesh.placed_mesh import Geometry
+
+SERIES_BELOW = 1e-3
+"""Compression below which the energy of the air is computed by a series, because the logarithm loses digits."""
+
+
+class BackPressure:
+    """Energy of the static pressure and of the trapped air, for one mesh and one set of dimensionless groups.
+
+    Attributes:
+        geometry: Elements of the mesh.
+        groups: Dimensionless groups of the press.
+    """
+
+    def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
+        self.geometry = geometry
+        self.groups = groups
+        self._copies = 1.0 / float(geometry.load.sum())
+
+    @cached_property
+    def weights(self) -> Array:
+        """Integration weights of the nodes for the volume of the meshed part of the film, shape (n_node,)."""
+        return self.geometry.gather(self.geometry.mass)
+
+    def energy(self, deflection: Array) -> float:
+        """Compute the energy of the meshed part for a deflection W, shape (n_node,); infinite if no air remains."""
+        volume = self._volume(deflection)
+        static_work = self.groups.static_pressure * volume
+        if self.groups.compression == 0.0:
+            return -static_work / self._copies
+        air_energy = self.groups.ambient_pressure / self.groups.compression * self._air_energy(deflection)
+        return (air_energy - static_work) / self._copies
+
+    def forces(self, deflection: Array) -> Array:
+        """Compute the derivatives of the energy with respect to W, shape (n_node,), for W of the same shape."""
+        pressure = -self.groups.static_pressure
+        compression = self.groups.compression * self._volume(deflection)
+        if compression >= 1.0:
+            return np.full_like(deflection, np.inf)
+        if compression != 0.0:
+            pressure += self.groups.ambient_pressure * compression / (1.0 - compression)
+        return pressure * self.weights
+
+    def stiffness(self, deflection: Array) -> float:
+        """Compute the factor c of the second derivatives of the energy, which are c times weights times weights."""
+        compression = self.groups.compression * self._volume(deflection)
+        slope = self.groups.ambient_pressure * self.groups.compression / (1.0 - compression) ** 2
+        return float(self._copies * slope)
+
+    def static_work(self, deflection: Array) -> float:
+        """Compute the work of the static pressure on the meshed part, for W of shape (n_node,)."""
+        return self.groups.static_pressure * self._volume(deflection) / self._copies
+
+    def _volume(self, deflection: Array) -> float:
+        """Compute the integral of W over the whole film."""
+        return self._copies * float(self.weights @ deflection)
+
+    def _air_energy(self, deflection: Array) -> float:
+        """Compute the energy of the air over p0 V0, which is -ln(1 - x) - x for the compression x."""
+        x = self.groups.compression * self._volume(deflection)
+        if x >= 1.0:
+            return np.inf
+        if abs(x) < SERIES_BELOW:
+            return x**2 * (1.0 / 2.0 + x * (1.0 / 3.0 + x * (1.0 / 4.0 + x * (1.0 / 5.0 + x / 6.0))))
+        return float(-np.log1p(-x) - x)

@@ -1,0 +1,70 @@
+"""Factorisation of the tangent of an equilibrium, with the stiffness of trapped air.
+
+The air behind the film resists the volume under the deflection W. Its stiffness c v v' couples all nodes and has the
+rank one, where v are the integration weights of the volume. The system (K + c v v') x = b is solved with the
+factorisation of the sparse matrix K (Sherman and Morrison 1950):
+
+    x = K^-1 b - y c (v . K^-1 b) / (1 + c v . y),   y = K^-1 v.
+
+Fields that are odd about the line of symmetry have no volume, so their matrix is K.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.simulate.mechanics.energy import ElasticFilm
+from isocharge.simulate.solver.assembly import Assembly, Factor
+
+
+class TangentFactor(Protocol):
+    """Factorisation that solves linear systems with the tangent."""
+
+    def solve(self, right: Array) -> Array:
+        """Solve for the displacements (U1, U2, W) at the nodes; both arrays have the shape (n_node, 3)."""
+
+
+@dataclass(frozen=True)
+class _AirFactor:
+    """Factorisation of K + c v v'.
+
+    Attributes:
+        film: Factorisation of K.
+        weights: Integration weights v of the volume, shape (n_node,).
+        response: Displacements y = K^-1 v by a uniform pressure, shape (n_node, 3).
+        share: c / (1 + c v . y).
+    """
+
+    film: Factor
+    weights: Array
+    response: Array
+    share: float
+
+    def solve(self, right: Array) -> Array:
+        """See `TangentFactor`."""
+        field = self.film.solve(right)
+        volume = float(self.weights @ field[:, 2])
+        return np.asarray(field - self.share * volume * self.response)
+
+
+def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, guard: float = 0.0) -> TangentFactor:
+    """Factorise the tangent at a field.
+
+    Args:
+        elastic: The discrete film.
+        assembly: Linear solver for its mesh.
+        field: Scaled displacements, shape (n_node, 3).
+        guard: Additional tension; see `ElasticFilm.tangent`.
+    """
+    factor = assembly.factor(elastic.tangent(field, guard))
+    if elastic.back is None or elastic.groups.compression == 0.0 or assembly.odd:
+        return factor
+    weights = elastic.back.weights
+    uniform_pressure = np.zeros_like(field)
+    uniform_pressure[:, 2] = weights
+    response = factor.solve(uniform_pressure)
+    stiffness = elastic.back.stiffness(field[:, 2])
+    share = stiffness / (1.0 + stiffness * float(weights @ response[:, 2]))
+    return _AirFactor(factor, weights, response, share)
