@@ -232,7 +232,7 @@ def test_a_turned_stage_is_named(problem):
     cos, sin = np.cos(angle), np.sin(angle)
     turned = presses.contact @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     cautions = calibrate(presses_of(problem, turned, presses.charge_pC), problem).cautions
-    assert any(re.search(r"as a film may be: rotation; .* axes of the stage", said) for said in cautions)
+    assert any(re.search(r"difference from the sensor file: rotation; .* axes of the stage", said) for said in cautions)
 
 
 @pytest.mark.parametrize(
@@ -308,14 +308,14 @@ def test_the_error_left_is_near_the_linearised_limit(layout):
     assert max(ratios) < 2.5
 
 
-def test_what_presses_identify_is_said_and_what_not(problem):
+def test_summary_names_identified_and_unidentified_quantities(problem):
     truth, presses = rig(problem, 12, seed=1)
     result = calibrate(presses, problem)
     table = result.quantities
     assert all(table[name].identified for name in ("pretension_MPa", "response_percent", "gain_A_percent"))
     assert not any(table[name].identified for name in ("young_percent", "thickness_percent"))
     _, known, unknown, together = result.summary[:4]
-    assert "Young's modulus by itself" in unknown.partition("cannot tell")[2]
+    assert "Young's modulus alone" in unknown.partition("do not determine")[2]
     assert len(known.split(", ")) < 8
     assert not any(table[f"{name}_percent"].identified for name in together.partition(":")[0].split(", "))
     low, high = table["pretension_MPa"].interval_95
@@ -330,9 +330,9 @@ def test_little_said_is_said(problem):
     far = presses.contact.copy()
     far[2, :2] = [12.0, 0.0]
     for few, caution in (
-        (presses[:1], "only 1 press: a wrong one among so few cannot be seen"),
+        (presses[:1], "only 1 press: a wrong one among so few cannot be recognised"),
         (one_place, "within 0 mm of each other"),
-        (replace(presses, contact=np.full((8, 3), np.nan)), "no place is known"),
+        (replace(presses, contact=np.full((8, 3), np.nan)), "no position is known"),
     ):
         result = calibrate(few, problem)
         assert any(caution in sentence for sentence in result.cautions)
@@ -457,7 +457,7 @@ def test_a_pretension_is_followed_by_little(warmed, count, known, within_mpa):
 def test_three_electrodes_follow_no_touches():
     problem = CalibrationProblem.of(load_sensor("three-25um-biaxial"), Circle(1.0))
     _, presses = rig(problem, 5, seed=1)
-    with pytest.raises(PressError, match="three charges are used up by x, y and force"):
+    with pytest.raises(PressError, match="three charges only determine x, y and the force"):
         calibrate(replace(presses, contact=np.full((5, 3), np.nan)), problem)
 
 

@@ -56,7 +56,7 @@ def test_every_file_is_there_and_reads_back(film, problem):
     np.testing.assert_allclose(parameters, result.posterior.parameters, rtol=0.0, atol=1e-11)
     assert read_presses(folder / "1" / "presses.csv") == result.presses
     card = (folder / "card.md").read_text("utf-8")
-    assert "cannot tell" in card
+    assert "do not determine" in card
     assert "\nisocharge train calibrate ...\n" in card
     assert (folder / "calibration.png").read_bytes()[:4] == b"\x89PNG"
     load_model(folder / "1")
@@ -104,7 +104,7 @@ def test_the_command_says_what_is_known_and_where_to_press(film, command):
     folder = film[-1]
     code, out, err = command(*CALIBRATE, folder.parent / "presses.csv", "--next", 2)
     assert code == 0, err
-    assert "Not knowing the film leaves" in out
+    assert "The uncertainty of the film causes errors of" in out
     assert out.count("\npress ") == 2
     table = json.loads(command(*CALIBRATE, folder.parent / "presses.csv", "--json", "--from", folder)[1])
     assert (table["presses"], table["next"]) == (10, [])

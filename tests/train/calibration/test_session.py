@@ -50,7 +50,7 @@ def test_presses_make_a_film_known_as_well_as_their_plan_says(problem, plan):
         unit @ np.linalg.solve(result.posterior.covariance, unit) < 40.0
     )  # 13 parameters: one film in 4000 is farther
     left = result.error_left
-    assert f"{left.position_mm:.2g} mm and {left.force_percent:.2g} % are left" in session.summary[0]
+    assert f"errors of {left.position_mm:.2g} mm and {left.force_percent:.2g} %;" in session.summary[0]
     assert [presses.lines for presses in bench.saved] == [(1,), (1, 2), (1, 2, 3)]
     assert not session.enough
     again = PressSession(problem, save=bench.saved.append, presses=bench.saved[2], until=10.0)
@@ -101,7 +101,7 @@ def test_a_press_at_another_place_than_said_is_named(problem, plan):
     bench = Bench(problem, plan, 5)
     bench.session.take(bench.charge(np.array([2.0, 3.0, 1.0])), np.array([5.0, 0.0, 1.0]))
     assert bench.session.result.bad_lines == (6,)
-    assert bench.session.summary[1].startswith("Press 6, 1.00 N at (5.0, 0.0) mm, fits no film that the others fit")
+    assert bench.session.summary[1].startswith("Press 6, 1.00 N at (5.0, 0.0) mm, does not agree with the others")
 
 
 @pytest.mark.parametrize(

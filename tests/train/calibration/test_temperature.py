@@ -62,7 +62,7 @@ def test_what_a_kelvin_does_is_learned_and_said(day):
     assert known.MPa_per_K == pytest.approx(-PER_K, abs=2.5 * known.std)
     assert known.std < 0.06
     assert day.posterior.parameters[0] == pytest.approx(1.1, abs=0.2)
-    assert f"A kelvin more changes the pretension by {known.MPa_per_K:.3g}" in " ".join(day.summary)
+    assert f"The pretension changes by {known.MPa_per_K:.3g}" in " ".join(day.summary)
 
 
 def test_the_film_at_another_temperature(day, tmp_path, command):

@@ -26,38 +26,39 @@ from isocharge.train.films.films_model import AddedVariance
 from isocharge.train.training.fitted import Fitted
 
 UNEXPLAINED_PROBABILITY = 1e-6
-"""Probability of residuals as large as these, below which no film explains the presses, if they are also large; see
-`UNEXPLAINED_CHI2`."""
+"""Probability of the residuals for presses of a possible film, below which no film explains the presses, provided that
+the residuals exceed `UNEXPLAINED_CHI2`."""
 
 UNEXPLAINED_CHI2 = 9.0
-"""Mean squared residual above which no film explains the presses: three times the noise."""
+"""Mean squared residual, in units of the noise variance, above which no film explains the presses."""
 
 UNCERTAIN_PROBABILITY = 0.01
-"""Probability of residuals as large as these, below which the errors are scaled up by their ratio."""
+"""Probability of the residuals below which the stated errors are increased by Birge's ratio."""
 
 STRAINED_PROBABILITY = 1e-7
-"""Probability of a film as far from the described one as this, below which presses are taken for wrongly written."""
+"""Probability of a film that differs this much from its description, below which the presses are considered to be
+recorded wrongly."""
 
 ODD_PROBABILITY = 1e-3
-"""Probability of such a film, below which presses are compared with those of common mistakes."""
+"""Probability of such a film below which common mistakes in the records of presses are searched for."""
 
 MISLEADING_MISFIT = 8.0
-"""Misfit of presses as they are written, as `misfit` gives it, above which mistakes are looked for before a fit."""
+"""Misfit of the recorded presses, as `misfit` returns it, above which mistakes are searched for before a fit."""
 
 FEW = 3
-"""Largest number of presses among which a wrong one cannot be seen; the user is told."""
+"""Largest number of presses among which a wrong one cannot be recognised. The user is warned."""
 
 BOUND_DISTANCE = 0.1
-"""Distance from its bound within which a parameter counts as held by the bound, in prior standard deviations."""
+"""Distance from its bound within which a parameter counts as limited by the bound, in prior standard deviations."""
 
 PLANNED_PRESSES = 30
-"""Number of further presses whose benefit is given, where a film has what no parameter describes."""
+"""Number of further presses whose benefit is stated if the film has a discrepancy."""
 
 VISIBLE_TRACE = 2.0
-"""Width of a trace, in its standard deviations, from which on the trace is named."""
+"""Smallest width of a trace, in its standard deviations, for which the trace is named."""
 
 CLOSE_MM = 1.0
-"""Presses that all lie within this distance of each other do not identify places; the user is told."""
+"""Distance within which all presses lie too close to each other to determine the positions of the electrodes, mm."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +115,10 @@ class CalibrationResult:
 
     @property
     def fitted(self) -> Fitted:
-        """The network of this film, for `evaluate` and `release`; its deviations contain the film's uncertainty.
+        """The network of this film, for `evaluate` and `release`.
 
-        With enough presses its errors are those of the presses, as calibrations without them answer them.
+        Its standard deviations include the uncertainty of the film. If there are enough presses, its errors are those
+        of calibrations on presses that they did not use; see `held_out`.
         """
         fitted = self.fitted_film(self.posterior.parameters, release=True)
         if self.held_out is None:
@@ -125,9 +127,10 @@ class CalibrationResult:
 
     @cached_property
     def held_out(self) -> HeldOutAnswers | None:
-        """Answers to the presses by calibrations without them; None if there are too few presses, see `cross_validate`.
+        """Answers to presses from calibrations that did not use them; None if there are too few presses.
 
-        The answers are computed when they are first used, which takes about as long as the calibration.
+        See `cross_validate`. The answers are computed when they are first used, which takes about as long as the
+        calibration.
         """
         if self.moved:
             return None
@@ -154,13 +157,16 @@ class CalibrationResult:
         return self.problem.fitted(film.parameters, self._added_variance(film), factor, release=False)
 
     def _added_variance(self, film: FilmPosterior) -> AddedVariance:
-        """Return the variances of contacts by the uncertainty of a film, linearised at this one."""
+        """Return the variances of contacts that the uncertainty of a film causes, linearised at the calibrated film."""
         contact_covariance = self.sensitivity.contact_covariance(film.joint)
         return AddedVariance(self.sensitivity.contact, np.einsum("nii->ni", contact_covariance))
 
     @cached_property
     def _factor(self) -> Callable[[Array], Array]:
-        """Factor of the film's discrepancy; answers are cached, since the networks of a film ask for the same."""
+        """Function that returns the factor of the discrepancy at contacts.
+
+        Its values are cached, because the networks of a film evaluate it at the same contacts.
+        """
         cache: dict[bytes, Array] = {}
 
         def factor(contact: Array) -> Array:
@@ -175,39 +181,43 @@ class CalibrationResult:
 
     @property
     def reduced_chi2(self) -> float:
-        """Mean squared residual of the fitted presses over what noise and rig explain; about one."""
-        chi2, freedom = self.posterior.total
-        return chi2 / freedom if freedom > 0.0 else np.nan
+        """Mean squared residual of the fitted presses over its expected value, about 1; NaN without any redundancy."""
+        chi2, degrees_of_freedom = self.posterior.total
+        if degrees_of_freedom == 0.0:
+            return np.nan
+        return chi2 / degrees_of_freedom
 
     @property
     def bad_lines(self) -> tuple[int, ...]:
-        """Lines of the presses that were left out because they fit no film that the others fit."""
+        """Lines of the presses that were left out because they do not agree with the others."""
         return self.presses[self.posterior.bad].lines
 
     @cached_property
     def summary(self) -> tuple[str, ...]:
-        """The result in sentences; they are computed once, since they contain a plan of further presses."""
-        left = self.error_left
+        """The result in sentences. They are computed once, because they contain a plan of further presses."""
+        after = self.error_left
         before = self.error_left_before
         noise = self.sensitivity.noise_error
-        when = "it was moved" if self.moved else "these presses"
-        errors = (
-            f"Not knowing the film leaves {left.position_mm:.2g} mm and {left.force_percent:.2g} % of the "
-            f"force (root mean square); before {when} it was {before.position_mm:.2g} mm and "
-            f"{before.force_percent:.2g} %. Noise alone leaves {noise.position_mm:.2g} mm and "
+        event = "it was moved" if self.moved else "these presses"
+        film_errors = (
+            f"The uncertainty of the film causes errors of {after.position_mm:.2g} mm and {after.force_percent:.2g} % "
+            f"of the force (root mean square); before {event} they were {before.position_mm:.2g} mm and "
+            f"{before.force_percent:.2g} %. Noise alone causes {noise.position_mm:.2g} mm and "
             f"{noise.force_percent:.2g} %."
         )
-        film = (f"The film was {self.moved}, without presses.",) if self.moved else summarise(self.quantities)
-        rig = (
-            "Forces are as right as the load cell, and places as the origin and the axes of the stage: an error of "
-            "theirs is in every answer, beside these."
+        film_quantities = summarise(self.quantities)
+        if self.moved:
+            film_quantities = (f"The film was {self.moved}, without presses.",)
+        rig_errors = (
+            "Errors of the load cell, and of the origin and the axes of the stage, affect every answer in addition to "
+            "these errors."
         )
         return (
-            errors,
+            film_errors,
             *self._held_out_sentences(),
-            *film,
+            *film_quantities,
             *self._temperature_sentences(),
-            rig,
+            rig_errors,
             *self._discrepancy_sentences(),
             *self.cautions,
         )
@@ -218,28 +228,29 @@ class CalibrationResult:
             return
         held_out_errors = self.held_out.errors
         yield (
-            f"Calibrations that each leave out a fifth of the places err on the {len(self.held_out.presses)} presses "
-            f"there by {held_out_errors['position_rms_mm']:.2g} mm and {held_out_errors['force_rms_percent']:.2g} % "
-            "(root mean square, with the errors of the measured places and forces)."
+            f"On {len(self.held_out.presses)} presses, calibrations without a fifth of the positions have errors of "
+            f"{held_out_errors['position_rms_mm']:.2g} mm and {held_out_errors['force_rms_percent']:.2g} % at these "
+            "positions (root mean square, including the errors of the measured positions and forces)."
         )
 
     def _temperature_sentences(self) -> Iterator[str]:
-        """Yield what a kelvin does to the film, if the temperatures of the presses are known."""
+        """Yield a sentence on how the pretension changes with the temperature, if temperatures are known."""
         warming = self.posterior.warming
         if warming is None:
             return
         if not warming.identified:
             yield (
-                f"The presses were made at {warming.at_C:.1f} C; over more degrees they would tell what a kelvin does."
+                f"The presses were made at about {warming.at_C:.1f} C; presses over a wider range of temperatures "
+                "would determine how the pretension changes with the temperature."
             )
             return
         yield (
-            f"A kelvin more changes the pretension by {warming.MPa_per_K:.3g} +- {warming.std:.2g} MPa. This is the "
-            f"film at {warming.at_C:.1f} C; --from with --temperature gives it at another."
+            f"The pretension changes by {warming.MPa_per_K:.3g} +- {warming.std:.2g} MPa per kelvin. The result holds "
+            f"at {warming.at_C:.1f} C; --from with --temperature computes the film at another temperature."
         )
 
     def _discrepancy_sentences(self) -> Iterator[str]:
-        """Yield what no parameter describes, and what more presses would do about it."""
+        """Yield sentences on the discrepancy, if there is one, and on the benefit of further presses."""
         if not self.posterior.imperfect:
             return
         factor = self.problem.charges.factor(self.posterior.unknowns, self.sensitivity.contact)
@@ -247,31 +258,32 @@ class CalibrationResult:
         plan = next_presses(self.problem, PLANNED_PRESSES, self.posterior)
         places = ", ".join(f"{press.force_N:.2f} N at ({press.x_mm:g}, {press.y_mm:g}) mm" for press in plan[:3])
         yield (
-            f"Beyond these parameters, the charges of this film differ by {percent:.2g} % (root mean square), "
-            f"smoothly over the film: {self.error_left.position_mm:.2g} mm are left now. {PLANNED_PRESSES} more "
-            f"presses would reach {plan[-1].position_mm:.2g} mm, the first of them {places}; --next lists more."
+            f"The charges of this film differ from those of its parameters by {percent:.2g} % (root mean square), "
+            f"smoothly over the film. The remaining error is {self.error_left.position_mm:.2g} mm. {PLANNED_PRESSES} "
+            f"more presses would reduce it to {plan[-1].position_mm:.2g} mm. The first of them are {places}; --next "
+            "lists more."
         )
         if self.posterior.probability("traces") > PROBABLE:
             widths = self.problem.charges.trace_widths(self.posterior.unknowns, self.posterior.joint)
             visible = [f"{name} {width:.2g} mm" for name, (width, std) in widths.items() if width > VISIBLE_TRACE * std]
             yield (
-                f"Most of it is that electrodes collect beyond their pads, as traces to the rim of this width would: "
-                f"{', '.join(visible)}. Described in the sensor file, they leave less."
+                "Most of this difference is charge that electrodes collect outside their pads, like traces to the rim "
+                f"of this width: {', '.join(visible)}. If the sensor file describes the traces, the error is smaller."
             )
 
 
 def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
-    """Find the film on which presses were made.
+    """Estimate the film on which presses were made.
 
     Args:
-        presses: The presses in the order in which they were made, with place and force, or one of them. Presses without
-            both show how a film has changed since an earlier calibration, if it has more than three electrodes. Their
-            standard deviations count.
-        problem: The films that it may be.
+        presses: The presses in the order in which they were made, with position, force or both, and their standard
+            deviations. Presses without both show how a film has changed since an earlier calibration, if it has more
+            than three electrodes.
+        problem: The possible films.
 
     Raises:
-        PressError: If the presses cannot be as they are written, or no film explains them; the reason is named where it
-            is found.
+        PressError: If the records of the presses are impossible, or no film explains them. The message names the
+            reason if it is found.
     """
     presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
     check_places(presses, problem.prior.sensor.film.radius)
@@ -295,7 +307,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
 
 
 def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tuple[MeasuredPresses, list[str]]:
-    """Return the presses whose places and forces the films have charges for, and a caution about the others.
+    """Return the presses at positions and forces for which the films have charges, and a caution about the others.
 
     Raises:
         PressError: If most presses lie outside.
@@ -311,20 +323,28 @@ def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tup
         f"centre and of {low:.2g} to {high:.2g} N"
     )
     if is_outside.mean() > 0.5:
-        raise explain(presses, problem.charges, np.inf) if len(presses) > 1 else PressError(sentence)
+        if len(presses) == 1:
+            raise PressError(sentence)
+        raise explain(presses, problem.charges, np.inf)
     return presses[~is_outside], [f"{sentence}; left out"]
 
 
 def _scaled_by_scatter(posterior: FilmPosterior) -> tuple[FilmPosterior, list[str]]:
-    """Scale the errors up where the presses scatter more than they should, by Birge's ratio (1932)."""
-    chi2, freedom = posterior.total
-    if freedom == 0.0 or scipy.stats.chi2.sf(chi2, freedom) >= UNCERTAIN_PROBABILITY:
+    """Increase the stated errors if the presses scatter more than expected, by Birge's ratio (1932).
+
+    Returns:
+        The estimate, and a caution if the errors were increased.
+    """
+    chi2, degrees_of_freedom = posterior.total
+    if degrees_of_freedom == 0.0 or scipy.stats.chi2.sf(chi2, degrees_of_freedom) >= UNCERTAIN_PROBABILITY:
         return posterior, []
+    variance_ratio = chi2 / degrees_of_freedom
     caution = (
-        f"the presses scatter {np.sqrt(chi2 / freedom):.2g} times as much as noise and rig are said to; the errors "
-        "are given larger by this factor: are places and forces as certain as assumed?"
+        f"the presses scatter {np.sqrt(variance_ratio):.2g} times as much as the noise and the stated standard "
+        "deviations of the rig explain; the stated errors are increased by this factor: are positions and forces as "
+        "certain as assumed?"
     )
-    return posterior.scaled(chi2 / freedom), [caution]
+    return posterior.scaled(variance_ratio), [caution]
 
 
 def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved: str) -> CalibrationResult:
@@ -333,19 +353,22 @@ def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved:
     Args:
         problem: The calibration.
         film: The estimate.
-        moved: How an earlier calibration was moved to another temperature, for people.
+        moved: Words that describe how an earlier calibration was moved to another temperature.
     """
     layout = problem.charges.layout
     joint = np.zeros((layout.film_count, layout.film_count))
     estimated = slice(0, len(film.unknowns))
     joint[estimated, estimated] = film.unknown_covariance
     has_coefficients = film.coefficients.size > 0
+    warming = film.warming
+    if warming is not None:
+        warming = warming.with_unknowns(layout.film_count)
     posterior = FilmPosterior(
         parameters=film.parameters,
         covariance=film.covariance,
         coefficients=film.coefficients if has_coefficients else np.zeros(layout.coefficient_count),
         joint=joint,
-        warming=film.warming and film.warming.with_unknowns(layout.film_count),
+        warming=warming,
         contact=np.empty((0, 3)),
         chi2=np.empty(0),
         degrees_of_freedom=np.empty(0),
@@ -358,44 +381,53 @@ def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved:
 
 
 def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:
-    """What was measured before the first press."""
-    none = np.empty(0)
-    return MeasuredPresses(np.empty((0, 3)), np.empty((0, len(electrodes))), none, none, electrodes, ())
+    """Return an empty list of presses for electrodes of these names."""
+    no_std = np.empty(0)
+    return MeasuredPresses(np.empty((0, 3)), np.empty((0, len(electrodes))), no_std, no_std, electrodes, ())
 
 
 def _check_enough_measured(presses: MeasuredPresses, problem: CalibrationProblem) -> None:
-    """Refuse presses without place and force where charges alone say nothing about the film."""
+    """Raise PressError if position and force of all presses are unknown and the charges have no redundancy."""
     if np.isnan(presses.contact).all() and len(problem.electrodes) <= 3:
         raise PressError(
-            f"{len(presses)} presses of unknown place and force: three charges are used up by x, y and force, so they "
-            "tell nothing of the film; give the place or the force of a press (four electrodes would have one charge "
-            "to spare)"
+            f"{len(presses)} presses of unknown position and force: three charges only determine x, y and the force, "
+            "so they say nothing about the film; give the position or the force of a press (four electrodes would "
+            "have one redundant charge)"
         )
 
 
 def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> None:
-    """Raise PressError if no film explains the presses, or only a film that hardly exists."""
-    chi2, freedom = posterior.total
+    """Raise PressError if no film explains the presses, or only an improbable film does.
+
+    A few presses with a common mistake may agree with a film that is possible but unusual. The presses are then
+    compared with those of common mistakes.
+    """
+    chi2, degrees_of_freedom = posterior.total
     is_unexplained = (
-        freedom > 0.0
-        and chi2 / freedom > UNEXPLAINED_CHI2
-        and scipy.stats.chi2.sf(chi2, freedom) < UNEXPLAINED_PROBABILITY
+        degrees_of_freedom > 0.0
+        and chi2 / degrees_of_freedom > UNEXPLAINED_CHI2
+        and scipy.stats.chi2.sf(chi2, degrees_of_freedom) < UNEXPLAINED_PROBABILITY
     )
+    # Squared Mahalanobis distance of the film from its description.
     deviation = (posterior.parameters - problem.before.parameters) / problem.prior.std
-    strain = float(deviation @ np.linalg.solve(problem.before.covariance, deviation))
-    probability = scipy.stats.chi2.sf(strain, deviation.size)
-    is_strange = posterior.imperfect or posterior.bad.any() or probability < ODD_PROBABILITY
-    # a few presses with a common mistake may find a film that exists, but is strange
-    is_mistaken = is_strange and bool(find_mistakes(presses, problem.charges))
-    if is_unexplained or probability < STRAINED_PROBABILITY or is_mistaken:
-        worst = max(chi2 / max(freedom, 1.0), strain / deviation.size)
+    squared_distance = float(deviation @ np.linalg.solve(problem.before.covariance, deviation))
+    film_probability = scipy.stats.chi2.sf(squared_distance, deviation.size)
+    is_unusual = posterior.imperfect or posterior.bad.any() or film_probability < ODD_PROBABILITY
+    is_mistaken = is_unusual and bool(find_mistakes(presses, problem.charges))
+    if is_unexplained or film_probability < STRAINED_PROBABILITY or is_mistaken:
+        worst = max(chi2 / max(degrees_of_freedom, 1.0), squared_distance / deviation.size)
         raise explain(presses, problem.charges, float(np.sqrt(worst)))
 
 
 def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> FilmPosterior:
-    """Allow for wrong presses that so few presses cannot show.
+    """Return the estimate with a larger covariance, for wrong presses that cannot be recognised among so few.
 
-    With the probability of such a press, the film is only known as before the presses.
+    If there is such a press, the film is only known as before the presses. The covariance is the mean of both cases,
+    weighted by their probabilities.
+
+    Args:
+        posterior: The estimate after the presses.
+        before: The estimate before the presses.
     """
     good_count = int((~posterior.bad).sum())
     left_out_count = int(posterior.bad.sum())
@@ -408,21 +440,21 @@ def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> Fil
     warming = posterior.warming
     if warming is not None:
         warming = warming._replace(covariance=(1.0 - probability) * warming.covariance)
-    count = len(before.parameters)
-    return replace(posterior, joint=joint, covariance=joint[:count, :count], warming=warming)
+    parameters = slice(0, len(before.parameters))
+    return replace(posterior, joint=joint, covariance=joint[parameters, parameters], warming=warming)
 
 
 def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: FilmPosterior) -> Iterator[str]:
-    """Yield warnings for the user, a sentence each."""
+    """Yield warnings about the presses and the estimate, one sentence each."""
     if posterior.bad.any():
         lines = row_words(presses[posterior.bad].lines, presses.row_noun)
-        yield f"{lines}: left out, since no film fits them and all others; look at them again"
+        yield f"{lines}: left out, because no film explains them together with the others; check them"
     good = presses[~posterior.bad]
     if len(good) <= FEW:
         noun = "presses" if len(good) > 1 else "press"
         yield (
-            f"only {len(good)} {noun}: a wrong one among so few cannot be seen, and the "
-            "errors allow for it; more than three tell far more"
+            f"only {len(good)} {noun}: a wrong one among so few cannot be recognised, and the stated errors include "
+            "this possibility; with more than three presses they become much smaller"
         )
     for nuisance in NUISANCES:
         if posterior.probability(nuisance.name) > PROBABLE:
@@ -433,30 +465,35 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
             "their stated standard deviation: are force and charges read at the same moment, or does charge leak in "
             "between? An effect that lowers charges at random also lowers their mean. The stated errors include it"
         )
-    held = _parameters_at_bounds(problem, posterior)
-    if held:
+    limited = _parameters_at_bounds(problem, posterior)
+    if limited:
         yield (
-            f"as far from their description as a film may be: {', '.join(held)}; the errors may "
-            "be larger than is said. Are the sensor file, and the origin and axes of the stage, those of this film?"
+            f"at the limit of the allowed difference from the sensor file: {', '.join(limited)}; the errors may be "
+            "larger than stated. Do the sensor file, and the origin and axes of the stage, belong to this film?"
         )
-    places = good.contact[np.isfinite(good.contact[:, 0]), :2]
-    if len(places) > 1 and np.ptp(places, axis=0).max() < CLOSE_MM:
+    positions = good.contact[np.isfinite(good.contact[:, 0]), :2]
+    if len(positions) == 0:
         yield (
-            f"all presses lie within {np.ptp(places, axis=0).max():.2g} mm of each other: they cannot tell where the "
-            "electrodes are, nor how the film answers elsewhere; press at places spread over the working area"
+            "no position is known: positions will be correct only up to the shift and the rotation of the electrodes, "
+            "and only if the charges are in the right columns"
         )
-    if not len(places):
-        yield (
-            "no place is known: positions will be right only up to the shift and the turn of the electrodes "
-            "themselves, and if the charges are in the right columns"
-        )
+    elif len(positions) > 1:
+        extent_mm = np.ptp(positions, axis=0).max()
+        if extent_mm < CLOSE_MM:
+            yield (
+                f"all presses lie within {extent_mm:.2g} mm of each other: they determine neither the positions of the "
+                "electrodes nor the response of the film elsewhere; press at positions all over the working area"
+            )
 
 
 def _parameters_at_bounds(problem: CalibrationProblem, posterior: FilmPosterior) -> list[str]:
-    """Return the names of the parameters that their bounds hold; no pretension is no such bound."""
+    """Return the names of the parameters that are limited by their bounds.
+
+    A pretension of zero is a physical limit and does not count.
+    """
     prior = problem.prior
     lower, upper = prior.bounds
     margin = BOUND_DISTANCE * prior.std
     is_low = (posterior.parameters < lower + margin) & (lower < 0.0)
     is_high = posterior.parameters > upper - margin
-    return [name for name, is_held in zip(prior.names, is_low | is_high, strict=True) if is_held]
+    return [name for name, is_limited in zip(prior.names, is_low | is_high, strict=True) if is_limited]

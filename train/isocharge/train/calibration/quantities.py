@@ -1,14 +1,14 @@
-"""Quantities of a film that presses can identify: products and ratios beside single parameters.
+"""Quantities of a film that presses can identify: products and ratios of parameters besides single parameters.
 
-Charges depend on Young's modulus, on the piezoelectric coefficients and on the gains almost only through their product,
-on modulus and thickness through E h. A single parameter may be as uncertain after the calibration as before while the
-product has an error of a thousandth. Combinations are therefore reported, each with its error, and single parameters
-are called unknown where the presses hardly reduced their standard deviation.
+Charges depend on Young's modulus, the piezoelectric coefficients and the gains almost only through their product, and
+on modulus and thickness through E h. A single parameter may therefore be as uncertain after the calibration as before,
+while the product is known to 0.1 %. Such combinations are reported with their standard deviations. A quantity counts as
+not identified if the presses hardly reduced its standard deviation.
 """
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,30 +16,31 @@ from isocharge.common.arrays import Array
 from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.train.calibration.problem import IDENTIFIED, FilmEstimate
 
-PERCENT = ", over the described one"
-"""Words behind quantities that are relative to the described value."""
+RELATIVE = " relative to the sensor file"
+"""Words after the meaning of quantities that are relative to their described values."""
 
-BY_ITSELF = ("young_percent", "thickness_percent", "d31_percent", "d32_percent", "mean_gain_percent")
-"""Quantities that presses identify only in products."""
+SINGLE_PARAMETERS = ("young_percent", "thickness_percent", "d31_percent", "d32_percent", "mean_gain_percent")
+"""Quantities of single parameters, which presses identify only in products with others."""
 
-SHOWN = 5
-"""Quantities in a sentence, the first; the card has a table of all."""
+SHOWN_IN_SENTENCE = 5
+"""Largest number of quantities in a sentence; the model card has a table of all."""
 
 NORMAL_95 = 1.959964
-"""Half width of a 95 % interval in standard deviations."""
+"""Half width of a 95 % interval of the normal distribution, in standard deviations."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """One quantity of the film.
+    """A quantity of the film with its standard deviations before and after the presses.
 
     Attributes:
-        name: What it is, with its unit: "pretension_MPa", "charge_scale".
-        meaning: In words.
+        name: Name with its unit, such as "pretension_MPa".
+        meaning: Description in words.
         value: Best estimate.
-        std: Standard deviation.
+        std: Standard deviation after the presses.
         before_std: Standard deviation before the presses.
-        weights: Its weights of the parameters over their prior standard deviations, shape (n_parameter,).
+        weights: Derivatives of the quantity by the parameters in units of their prior standard deviations, shape
+            (n_parameter,).
     """
 
     name: str
@@ -51,99 +52,138 @@ class Quantity:
 
     @property
     def identified(self) -> bool:
-        """Whether the presses have at least halved its standard deviation."""
+        """Whether the presses have at least halved the standard deviation."""
         return self.std <= IDENTIFIED * self.before_std
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """Ends of the 95 % interval."""
-        half = NORMAL_95 * self.std
-        return self.value - half, self.value + half
+        """Lower and upper end of the 95 % interval."""
+        half_width = NORMAL_95 * self.std
+        return self.value - half_width, self.value + half_width
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the quantity as a table for JSON."""
         table = {key: value for key, value in asdict(self).items() if key not in ("name", "weights")}
         return table | {"interval_95": list(self.interval_95), "identified": self.identified}
 
 
+class _Definition(NamedTuple):
+    """Definition of a quantity as a linear function of the parameters.
+
+    Attributes:
+        meaning: Description in words.
+        weights: Derivatives by the parameters in their own units, shape (n_parameter,).
+        offset: Value at parameters of zero.
+    """
+
+    meaning: str
+    weights: Array
+    offset: float = 0.0
+
+
 def quantities(prior: FilmPrior, film: FilmEstimate) -> dict[str, Quantity]:
-    """Return the quantities of a film by name, beside the standard deviations of the described sensor alone."""
+    """Return the quantities of a film by name.
 
-    def std(row: Array, covariance: Array) -> float:
-        return float(np.sqrt(row @ covariance @ row))
-
-    return {
-        name: Quantity(
+    Args:
+        prior: The films; their standard deviations are those before the presses.
+        film: The estimate of the film.
+    """
+    table = {}
+    for name, definition in _definitions(prior).items():
+        scaled_weights = definition.weights * prior.std
+        table[name] = Quantity(
             name,
-            meaning,
-            value=float(offset + row @ film.parameters),
-            std=std(row * prior.std, film.covariance),
-            before_std=std(row * prior.std, np.eye(row.size)),
-            weights=row * prior.std,
+            definition.meaning,
+            value=float(definition.offset + definition.weights @ film.parameters),
+            std=float(np.sqrt(scaled_weights @ film.covariance @ scaled_weights)),
+            before_std=float(np.sqrt(scaled_weights @ scaled_weights)),
+            weights=scaled_weights,
         )
-        for name, (meaning, offset, row) in _rows(prior).items()
-    }
+    return table
 
 
-def _rows(prior: FilmPrior) -> dict[str, tuple[str, float, Array]]:
-    """Return meaning, value at parameters of zero, and weight of each parameter, by the name of the quantity."""
+def _definitions(prior: FilmPrior) -> dict[str, _Definition]:
+    """Return the definitions of all quantities by name.
+
+    Young's modulus, thickness, piezoelectric coefficients and gains are logarithms among the parameters. The logarithm
+    of a product is the sum of theirs.
+    """
     unit = dict(zip(prior.names, np.eye(len(prior.names)), strict=True))
     gains = {name: unit[f"gain {name}"] for name in prior.sensor.electrode_names}
     mean_gain = sum(gains.values(), np.zeros(len(unit))) / len(gains)
-    response = 0.5 * (unit["d31"] + unit["d32"]) + mean_gain
-    of_slack_film = (unit["young"] - 2.0 * unit["thickness"]) / 3.0 + response
-    placed = prior.sensor.calibration
-    degrees = float(np.rad2deg(1.0))
-
-    def relative(meaning: str, weights: Array) -> tuple[str, float, Array]:
-        return f"{meaning}{PERCENT}, %", 0.0, 100.0 * weights
-
-    return {
-        "pretension_MPa": ("pretension", 0.0, unit["pretension"]),
-        "response_percent": relative(
-            "charge of a press on the slack film, E^(1/3) h^(-2/3) sqrt(d31 d32) gain", of_slack_film
+    piezo_times_gain = 0.5 * (unit["d31"] + unit["d32"]) + mean_gain
+    # Without pretension, the charge of a press is proportional to E^(1/3) h^(-2/3) sqrt(d31 d32).
+    slack_response = (unit["young"] - 2.0 * unit["thickness"]) / 3.0 + piezo_times_gain
+    described = prior.sensor.calibration
+    degrees_per_rad = float(np.rad2deg(1.0))
+    definitions = {
+        "pretension_MPa": _Definition("pretension", unit["pretension"]),
+        "response_percent": _relative(
+            "charge of a press on the slack film, E^(1/3) h^(-2/3) sqrt(d31 d32) gain", slack_response
         ),
-        "charge_scale_percent": relative(
-            "product of Young's modulus, sqrt(d31 d32) and mean gain", unit["young"] + response
+        "charge_scale_percent": _relative(
+            "product of Young's modulus, sqrt(d31 d32) and mean gain", unit["young"] + piezo_times_gain
         ),
-        "stiffness_percent": relative("Young's modulus times thickness", unit["young"] + unit["thickness"]),
-        "anisotropy_percent": relative("ratio of d31 to d32", unit["d31"] - unit["d32"]),
-        "shift_x_mm": ("shift of the electrodes along x", placed.shift[0], unit["shift_x"]),
-        "shift_y_mm": ("shift of the electrodes along y", placed.shift[1], unit["shift_y"]),
-        "rotation_deg": ("turn of the electrodes", degrees * placed.rotation, degrees * unit["rotation"]),
-        "probe_radius_mm": ("radius of the probe", prior.probe.radius, unit["probe_radius"]),
-        **{
-            f"gain_{name}_percent": (f"gain of {name} over the mean of all gains, %", 0.0, 100.0 * (gain - mean_gain))
-            for name, gain in gains.items()
-        },
-        "young_percent": relative("Young's modulus by itself", unit["young"]),
-        "thickness_percent": relative("thickness by itself", unit["thickness"]),
-        "d31_percent": relative("d31 by itself", unit["d31"]),
-        "d32_percent": relative("d32 by itself", unit["d32"]),
-        "mean_gain_percent": relative("mean gain by itself", mean_gain),
+        "stiffness_percent": _relative("Young's modulus times thickness", unit["young"] + unit["thickness"]),
+        "anisotropy_percent": _relative("ratio of d31 to d32", unit["d31"] - unit["d32"]),
+        "shift_x_mm": _Definition("shift of the electrodes along x", unit["shift_x"], described.shift[0]),
+        "shift_y_mm": _Definition("shift of the electrodes along y", unit["shift_y"], described.shift[1]),
+        "rotation_deg": _Definition(
+            "rotation of the electrodes",
+            degrees_per_rad * unit["rotation"],
+            degrees_per_rad * described.rotation,
+        ),
+        "probe_radius_mm": _Definition("radius of the probe", unit["probe_radius"], prior.probe.radius),
     }
+    for name, gain in gains.items():
+        meaning = f"gain of {name} relative to the mean of all gains, %"
+        definitions[f"gain_{name}_percent"] = _Definition(meaning, 100.0 * (gain - mean_gain))
+    definitions["young_percent"] = _relative("Young's modulus alone", unit["young"])
+    definitions["thickness_percent"] = _relative("thickness alone", unit["thickness"])
+    definitions["d31_percent"] = _relative("d31 alone", unit["d31"])
+    definitions["d32_percent"] = _relative("d32 alone", unit["d32"])
+    definitions["mean_gain_percent"] = _relative("mean gain alone", mean_gain)
+    return definitions
+
+
+def _relative(meaning: str, log_weights: Array) -> _Definition:
+    """Return the definition of a quantity in percent of its described value.
+
+    Args:
+        meaning: Description in words.
+        log_weights: Derivatives of the logarithm of the quantity by the parameters, shape (n_parameter,).
+    """
+    return _Definition(f"{meaning}{RELATIVE}, %", 100.0 * log_weights)
 
 
 def summarise(table: Mapping[str, Quantity]) -> tuple[str, ...]:
-    """Return sentences on the quantities that the presses identify, and on those that they do not identify."""
+    """Return sentences about the quantities that the presses identify, and about those that they do not identify.
+
+    Args:
+        table: The quantities by name, as `quantities` returns them.
+    """
     identified = [quantity for quantity in table.values() if quantity.identified]
     unidentified = [quantity for quantity in table.values() if not quantity.identified]
     sentences = []
     if identified:
-        listed = ", ".join(f"{each.name} {each.value:.3g} +- {each.std:.2g}" for each in identified[:SHOWN])
-        more = f" and {len(identified) - SHOWN} more, on the card" if len(identified) > SHOWN else ""
-        sentences.append(f"Known now: {listed}{more}.")
+        shown = identified[:SHOWN_IN_SENTENCE]
+        listed = ", ".join(f"{quantity.name} {quantity.value:.3g} +- {quantity.std:.2g}" for quantity in shown)
+        remaining_count = len(identified) - len(shown)
+        if remaining_count:
+            listed += f" and {remaining_count} more, on the card"
+        sentences.append(f"The presses determine {listed}.")
     if unidentified:
-        meanings = [each.meaning.removesuffix(", %").removesuffix(PERCENT) for each in unidentified]
+        meanings = [quantity.meaning.removesuffix(", %").removesuffix(RELATIVE) for quantity in unidentified]
         sentences.append(
-            f"These presses cannot tell {', '.join(meanings)}; what is given for them is hardly more than what was "
-            "assumed before."
+            f"These presses do not determine {', '.join(meanings)}; their values are hardly more certain than in the "
+            "sensor file."
         )
-    factors = [each.name.removesuffix("_percent") for each in unidentified if each.name in BY_ITSELF]
+    single_parameters = [quantity.name for quantity in unidentified if quantity.name in SINGLE_PARAMETERS]
     response = table["response_percent"]
-    if len(factors) > 1 and response.identified:
+    if len(single_parameters) > 1 and response.identified:
+        names = ", ".join(name.removesuffix("_percent") for name in single_parameters)
         sentences.append(
-            f"{', '.join(factors)}: only what they give together, the "
-            f"charge of a press, is known to {response.std:.2g} %, and that is what contacts need."
+            f"{names}: only their combination, the charge of a press, is known to {response.std:.2g} %, which is what "
+            "contacts need."
         )
     return tuple(sentences)

@@ -130,8 +130,8 @@ class PressSession:
             presses: Presses of an earlier session to continue.
             position_std_mm: Standard deviation of the places of further presses, mm.
             force_std: Standard deviation of the forces of further presses, as a share of the force.
-            until: Position error left by the film, as a share of the error by noise, at which the session is complete;
-                0 for never.
+            until: Ratio of the position error that the uncertainty of the film causes to the error that noise causes,
+                at which the session is complete; 0 for never.
         """
         self.problem = problem
         self._save = save
@@ -164,7 +164,7 @@ class PressSession:
 
     @property
     def enough(self) -> bool:
-        """Whether the position error left by the film is small enough in comparison with that by noise."""
+        """Whether the uncertainty of the film causes a small enough position error in comparison with the noise."""
         if self.result is None or len(self) < FEW:
             return False
         noise_mm = self.result.sensitivity.noise_error.position_mm
@@ -232,15 +232,17 @@ class PressSession:
         return removed_number
 
     def skip(self) -> None:
-        """Propose another place, and never this one again."""
+        """Propose another position from now on, and never the present one again."""
         self._skipped_places.append((self.proposed.x_mm, self.proposed.y_mm))
         self._proposed = None
 
     def _change(self, presses: MeasuredPresses) -> None:
+        """Save a new list of presses, and fit the film."""
         self._save(presses)
         self._fit(presses)
 
     def _fit(self, presses: MeasuredPresses) -> None:
+        """Number the presses from 1, and fit the film to them."""
         self.presses = replace(presses, lines=tuple(range(1, len(presses) + 1)), row_noun="press")
         self.result = None
         self.refusal = ""
@@ -254,20 +256,21 @@ class PressSession:
 
     @property
     def summary(self) -> tuple[str, ...]:
-        """Sentences about the error that the film leaves so far, and about presses that do not fit."""
+        """Sentences about the errors that the film causes, and about presses that disagree with the others."""
         if self.refusal:
             return (f"No film explains these presses: {self.refusal}",)
         if self.result is None or len(self) < MIN_PRESSES:
             return ()
-        left = self.result.error_left
-        noise = self.result.sensitivity.noise_error
+        film_error = self.result.error_left
+        noise_error = self.result.sensitivity.noise_error
         error_sentence = (
-            f"{left.position_mm:.2g} mm and {left.force_percent:.2g} % are left by not knowing the film; "
-            f"noise alone is {noise.position_mm:.2g} mm and {noise.force_percent:.2g} %."
+            f"The uncertainty of the film causes errors of {film_error.position_mm:.2g} mm and "
+            f"{film_error.force_percent:.2g} %; noise alone causes {noise_error.position_mm:.2g} mm and "
+            f"{noise_error.force_percent:.2g} %."
         )
         bad_sentences = [
-            f"Press {number}, {describe_press(self.presses.contact[number - 1])}, fits no film that the others fit, "
-            f"and is left out. Was it made there, and as hard? Type u {number} to remove it."
+            f"Press {number}, {describe_press(self.presses.contact[number - 1])}, does not agree with the others "
+            f"and is left out. Were its position and its force as stated? Type u {number} to remove it."
             for number in self.result.bad_lines
         ]
         return (error_sentence, *bad_sentences)
