@@ -1,11 +1,11 @@
-"""Nuisances of a session: what it has besides the film, such as an offset or a drift of the charges.
+"""Nuisances of a session: unknowns of the fit that are not properties of the film, such as an offset of the charges.
 
-A nuisance is an unknown of the fit that is not a property of the film. `NUISANCES` declares each one once: its name and
-unit, its standard deviation before the presses, and how it acts on the charges or on the pretension. All nuisances act
-linearly, so that their derivatives follow from what they do at a value of one.
+`NUISANCES` declares each nuisance once: its name and unit, its standard deviation before the presses, and its effect on
+the charges or on the pretension. All effects are proportional to the value of the nuisance, so that the derivatives
+follow from the effect of the value 1.
 
-A nuisance ends with its session. Only the change of the pretension with temperature is stored with the film, as
-`problem.Warming`, because the next calibration needs it.
+Nuisances are not stored after the session. The only exception is the change of the pretension with temperature
+(`problem.Warming`), which the next calibration needs.
 """
 
 from collections.abc import Sequence
@@ -27,15 +27,15 @@ class NuisanceEstimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Nuisance:
-    """Declaration of a nuisance; a class for each kind says how it acts.
+    """Declaration of a nuisance. A subclass for each kind defines its effect.
 
     Attributes:
         name: Name of the nuisance.
         unit: Unit of the nuisance.
-        probabilities: Standard deviations before the presses that are weighed as hypotheses, each with its probability;
-            zero alone for a nuisance that is not weighed.
-        std_with_temperatures: Standard deviation before the presses in every session whose temperatures are known; zero
-            for a nuisance that has nothing to do with temperature.
+        probabilities: Considered standard deviations before the presses, each with its prior probability. The presses
+            determine which of them is probable (`hypotheses`). Only zero for a nuisance without such hypotheses.
+        std_with_temperatures: Standard deviation before the presses if the temperatures of the presses are known; zero
+            for a nuisance that does not depend on temperature.
     """
 
     name: str
@@ -44,64 +44,64 @@ class Nuisance:
     std_with_temperatures: float = 0.0
 
     def charge_error(self, data: PressData, value: float) -> Array:
-        """Return what the nuisance adds to the measured charges, shape (n, n_electrode), pC."""
+        """Return the charges that the nuisance adds to the measured ones, shape (n, n_electrode), pC."""
         del value
         return np.zeros_like(data.charge)
 
     def tension_change(self, data: PressData, value: float) -> Array:
-        """Return what the nuisance adds to the pretension under each press, shape (n,), MPa."""
+        """Return the change of the pretension during each press, shape (n,), MPa."""
         del value
         return np.zeros(len(data))
 
     def gain_std(self, estimate: NuisanceEstimate) -> float:
-        """Return the standard deviation, a share, that it adds to every gain when the film is used later."""
+        """Return the relative standard deviation that the nuisance adds to all gains when the film is used later."""
         del estimate
         return 0.0
 
     def caution(self, estimate: NuisanceEstimate) -> str:
-        """Return the sentence for the user if the session probably has this nuisance."""
-        return f"the session has {self.name}: {estimate.value:.2g} +- {estimate.std:.2g} {self.unit}; it is taken off"
+        """Return the warning for the user if the session probably has this nuisance."""
+        return f"the session has {self.name}: {estimate.value:.2g} +- {estimate.std:.2g} {self.unit}; it is subtracted"
 
 
 class PretensionPerKelvin(Nuisance):
-    """Change of the pretension with temperature: the film grows more than its ring."""
+    """Change of the pretension with temperature, because film and ring expand differently."""
 
     def tension_change(self, data: PressData, value: float) -> Array:
-        """Return the change by the warming since the mean of the presses."""
+        """Return the change relative to the mean temperature of the presses."""
         return value * data.warming_K
 
 
 class ChargeOffset(Nuisance):
-    """Common offset of all charges: the tare was wrong."""
+    """Common offset of all charges, as from a wrong tare."""
 
     def charge_error(self, data: PressData, value: float) -> Array:
-        """Return the offset."""
+        """Return the offset for every charge."""
         return np.full_like(data.charge, value)
 
     def caution(self, estimate: NuisanceEstimate) -> str:
-        """Return the sentence about the tare."""
+        """Return the warning about the tare."""
         return (
             f"the charges are {estimate.value:.2g} +- {estimate.std:.2g} pC too large in all presses and electrodes: "
-            "is the tare right? It is taken off"
+            "is the tare right? The offset is subtracted"
         )
 
 
 class ChargeDrift(Nuisance):
-    """Drift of all charges from the first press to the last."""
+    """Proportional drift of all charges from the first press to the last."""
 
     def charge_error(self, data: PressData, value: float) -> Array:
-        """Return a share of each charge, from minus one half of the drift to plus one half."""
+        """Return a share of each charge, from minus half the drift at the first press to plus half at the last."""
         return value * data.session_time[:, None] * data.charge
 
     def gain_std(self, estimate: NuisanceEstimate) -> float:
-        """Return the spread of a drift whose value is unknown when the film is used."""
+        """Return the standard deviation of a uniform distribution over the range of the drift."""
         return float(np.hypot(estimate.value, estimate.std) / np.sqrt(12.0))
 
     def caution(self, estimate: NuisanceEstimate) -> str:
-        """Return the sentence about the drift."""
+        """Return the warning about the drift."""
         return (
             f"the charges are {100.0 * estimate.value:.2g} +- {100.0 * estimate.std:.2g} % larger at the end than at "
-            "the beginning? It is taken off"
+            "the beginning: does an amplifier drift? The drift is subtracted"
         )
 
 
@@ -118,7 +118,7 @@ NUISANCES: tuple[Nuisance, ...] = (
 
 
 def without_nuisances(data: PressData, values: Sequence[float] | Array) -> PressData:
-    """Return the presses as on a film of one temperature, without the errors of the charges.
+    """Return the presses without the charges of the nuisances, and with the pretension during each press.
 
     Args:
         data: The presses as they were measured.

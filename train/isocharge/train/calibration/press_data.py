@@ -1,4 +1,4 @@
-"""Measured presses as least squares takes them."""
+"""Measured presses in the form in which the least-squares fit of a film uses them."""
 
 from dataclasses import dataclass, replace
 
@@ -11,27 +11,27 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 UNKNOWN_FORCE_STD = 1.5
-"""Standard deviation of the logarithm of a force that was not measured, about the middle of the forces."""
+"""Standard deviation of the logarithm of a force that was not measured, about the middle of the force range."""
 
 NODE_DISTANCE_MPa = 0.5
-"""Distance of the pretensions between which charges are interpolated where the film's differs from press to press."""
+"""Largest distance between pretensions at which charges are computed if the pretension differs between presses."""
 
 
 @dataclass(frozen=True)
 class PressData:
-    """Measured presses as least squares takes them.
+    """Measured presses with the weights of their charges and contacts.
 
-    A residual row has one entry for each electrode and then three for the rig: x, y and ln F.
+    The residuals of a press are one for each electrode, followed by three for the rig: x, y and ln F.
 
     Attributes:
         charge: Charges, shape (n, n_electrode), pC, 0 where unknown.
-        weight: One over the standard deviation of each charge, 1/pC, 0 where unknown.
+        weight: Inverse of the standard deviation of each charge, 1/pC, 0 where unknown.
         contact: (x, y, ln F), shape (n, 3); the middle of the domain where unknown.
-        contact_weight: One over the standard deviation of each, shape (n, 3); small where unknown.
+        contact_weight: Inverse of the standard deviation of each coordinate, shape (n, 3); small where unknown.
         measured: Which charges and coordinates were measured, shape (n, n_electrode + 3).
-        session_time: When each press was made, from -1/2, the first, to 1/2, the last, shape (n,).
-        warming_K: How much warmer each press was than their mean, shape (n,).
-        tension_change: Pretension under each press over that of the film, MPa, shape (n,).
+        session_time: Time of each press, from -1/2 for the first press to 1/2 for the last, shape (n,), dimensionless.
+        warming_K: Temperature of each press less the mean temperature, shape (n,), K.
+        tension_change: Pretension during each press less that of the film, shape (n,), MPa.
     """
 
     charge: Array
@@ -50,7 +50,7 @@ class PressData:
         Args:
             presses: The presses.
             noise: Noise of the charges.
-            domain: Contacts that the films have charges for.
+            domain: Contacts for which the films have charges.
         """
         has_charge = ~np.isnan(presses.charge_pC)
         charge = np.where(has_charge, presses.charge_pC, 0.0)
@@ -83,21 +83,26 @@ class PressData:
 
     @property
     def has_place(self) -> Booleans:
-        """Which places were measured, shape (n,)."""
-        place = self.measured[:, self.charge.shape[1] :][:, :2]
-        return np.asarray(place.all(axis=1))
+        """Which positions were measured, shape (n,)."""
+        electrode_count = self.charge.shape[1]
+        position = self.measured[:, electrode_count : electrode_count + 2]
+        return np.asarray(position.all(axis=1))
 
     def with_force_scatter(self, share: float) -> "PressData":
-        """Return the presses with forces that are less certain, by this share, than the rig's standard deviation."""
+        """Return the presses with an additional uncertainty of their forces.
+
+        Args:
+            share: Relative standard deviation that is added to that of the rig.
+        """
         x_weight, y_weight, force_weight = self.contact_weight.T
         scattered_weight = 1.0 / np.hypot(1.0 / force_weight, share)
         return replace(self, contact_weight=np.column_stack([x_weight, y_weight, scattered_weight]))
 
     def force_derivative(self) -> Array:
         """Return the derivative of the residual by the logarithm of the stated force, shape (n, n_electrode + 3)."""
-        by_contact = -self.contact_weight[:, :, None] * np.eye(3)
-        by_force = by_contact[:, :, 2]
-        return np.concatenate([np.zeros_like(self.charge), by_force], axis=1)
+        derivative = np.zeros(self.measured.shape)
+        derivative[:, -1] = -self.contact_weight[:, 2]  # only the residual of the force depends on it
+        return derivative
 
     def pretension_nodes(self, pretension: float, bounds: tuple[float, float]) -> tuple[Array, Array]:
         """Return pretensions between which the charges of the presses are interpolated.
@@ -109,26 +114,27 @@ class PressData:
         Returns:
             Pretensions, shape (k,), MPa, and the weight of each in each press, shape (n, k).
         """
-        pressed = np.clip(pretension + self.tension_change, *bounds)
-        low = float(pressed.min(initial=np.inf))
-        high = float(pressed.max(initial=-np.inf))
+        press_pretensions = np.clip(pretension + self.tension_change, *bounds)
+        low = float(press_pretensions.min(initial=np.inf))
+        high = float(press_pretensions.max(initial=-np.inf))
         if high <= low:
             return np.array([low]), np.ones((len(self), 1))
-        nodes = chebyshev_nodes(2 + int(np.ceil((high - low) / NODE_DISTANCE_MPa)), low, high)
-        return nodes, lagrange_values(nodes, barycentric_weights(nodes), pressed)
+        node_count = 2 + int(np.ceil((high - low) / NODE_DISTANCE_MPa))
+        nodes = chebyshev_nodes(node_count, low, high)
+        return nodes, lagrange_values(nodes, barycentric_weights(nodes), press_pretensions)
 
     def residual(self, charge: Array, contact: Array) -> Array:
-        """Return the residuals of charges and rig over their standard deviations, shape (n, n_electrode + 3).
+        """Return the residuals in units of their standard deviations, shape (n, n_electrode + 3).
 
         Args:
-            charge: Charges of a film, shape (n, n_electrode), pC.
-            contact: (x, y, ln F), shape (n, 3).
+            charge: Charges that a film has under the contacts, shape (n, n_electrode), pC.
+            contact: Contacts (x, y, ln F), shape (n, 3).
         """
         charge_residual = self.weight * (charge - self.charge)
         return np.column_stack([charge_residual, self.contact_weight * (contact - self.contact)])
 
     def residual_slopes(self, charge_slopes: Array) -> Array:
-        """Return the derivatives of the residual by the contact, shape (n, n_electrode + 3, 3).
+        """Return the derivatives of the residuals by the contact (x, y, ln F), shape (n, n_electrode + 3, 3).
 
         Args:
             charge_slopes: Derivatives of the charges by the contact, shape (n, n_electrode, 3).
@@ -138,9 +144,9 @@ class PressData:
 
 
 def temperatures(presses: MeasuredPresses) -> Array:
-    """Return the temperature of every press, shape (n,), degrees Celsius; 0 if none was measured.
+    """Return the temperature of every press, shape (n,), degrees Celsius; 0 if no temperature was measured.
 
-    Temperatures that were not measured are interpolated in the order of the presses.
+    Missing temperatures are interpolated between those of the presses before and after.
     """
     if presses.temperature_C is None or not presses.knows_temperature:
         return np.zeros(len(presses))

@@ -1,8 +1,8 @@
 """Layout of the vector of unknowns of a calibration: a named slice for each kind of unknown.
 
 The unknowns are, in this order: the parameters of the film (`film_prior.PARAMETERS` and the gains), the coefficients of
-what the film has besides (modes of imperfections, traces, terms of the discrepancy), and the nuisances of the session
-(`nuisances.NUISANCES`). Parameters are in units of their standard deviations over films where a fit takes them.
+effects that the parameters do not describe (modes of imperfections, traces, terms of the discrepancy), and the
+nuisances of the session (`nuisances.NUISANCES`). In a fit, parameters are in units of their prior standard deviations.
 """
 
 from dataclasses import dataclass
@@ -63,7 +63,7 @@ class UnknownLayout:
 
     @cached_property
     def film(self) -> slice:
-        """Parameters and coefficients together: all that belongs to the film."""
+        """Parameters and coefficients together: all unknowns of the film."""
         return slice(self.parameters.start, self.terms.stop)
 
     @property
@@ -102,5 +102,5 @@ def _count(places: slice) -> int:
 
 
 def _after(previous: slice, count: int) -> slice:
-    """Return the slice of the next unknowns behind others."""
+    """Return the slice of so many unknowns that follow others."""
     return slice(previous.stop, previous.stop + count)
