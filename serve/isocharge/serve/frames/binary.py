@@ -48,7 +48,10 @@ def encode_frame(frame: Frame) -> bytes:
 
 
 def decode_frame(piece: bytes) -> Frame:
-    """Return the frame that is encoded in `piece`, which has no delimiter.
+    """Decode a frame and check its CRC.
+
+    Args:
+        piece: Bytes of the frame with byte stuffing, without the delimiter.
 
     Raises:
         ChecksumError: If the CRC is wrong.

@@ -47,31 +47,35 @@ class Crc:
         return int(bits[::-1], 2)
 
     def _table_entry(self, byte: int) -> int:
-        """Return the register after one byte, starting from a register of zero."""
+        """Return the register after one byte, starting from a register of zero.
+
+        The register is shifted by one bit at a time. If the bit that leaves the register is 1, the polynomial is
+        subtracted, which is an exclusive or.
+        """
         polynomial = self._in_register_order(self.polynomial)
         if self.reflected:
             register = byte
             for _ in range(8):
-                carry = register & 1
+                leaving_bit = register & 1
                 register >>= 1
-                if carry:
+                if leaving_bit:
                     register ^= polynomial
             return register
 
         highest_bit = 1 << (self.width - 1)
         register = byte << (self.width - 8)
         for _ in range(8):
-            carry = register & highest_bit
+            leaving_bit = register & highest_bit
             register <<= 1
-            if carry:
+            if leaving_bit:
                 register ^= polynomial
         return register & ((1 << self.width) - 1)
 
     def __call__(self, data: bytes) -> int:
-        """Compute the check value of some bytes."""
+        """Compute the check value of some bytes, one byte at a time with a table of 256 registers."""
         table = self.table
         register = self.initial_register
-        if self.reflected:
+        if self.reflected:  # the lowest bit leaves the register first
             for byte in data:
                 register = (register >> 8) ^ table[(register ^ byte) & 0xFF]
             return register ^ self.final
@@ -84,13 +88,16 @@ class Crc:
 
 
 def _fletcher_16(data: bytes) -> int:
-    """Compute Fletcher's checksum (1982): a sum in the low byte, the sum of the sums in the high byte, modulo 255."""
-    low = 0
-    high = 0
+    """Compute Fletcher's checksum (1982).
+
+    The low byte is the sum of the bytes, the high byte is the sum of all intermediate sums, both modulo 255.
+    """
+    byte_sum = 0
+    sum_of_sums = 0
     for byte in data:
-        low = (low + byte) % 255
-        high = (high + low) % 255
-    return high << 8 | low
+        byte_sum = (byte_sum + byte) % 255
+        sum_of_sums = (sum_of_sums + byte_sum) % 255
+    return sum_of_sums << 8 | byte_sum
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,11 @@ class AutoParser(Parser):
         self._candidates: tuple[Parser, ...] = (BinaryParser(), TextParser(columns, meanings))
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that end within `data`."""
+        """Return the frames that end within `data`.
+
+        Until the format is recognised, the data are passed to the parsers of all formats piece by piece. The first
+        parser that finds a frame is used from then on.
+        """
         if len(self._candidates) == 1:
             return self._feed_recognised(self._candidates[0], data)
         for match in _PIECE.finditer(data):
@@ -47,7 +51,10 @@ class AutoParser(Parser):
             candidate.reset()
 
     def _feed_recognised(self, parser: Parser, data: bytes) -> list[Frame]:
-        """Feed the parser that recognised the format, and take over its format and moduli, which it may learn late."""
+        """Return the frames that the parser of the recognised format finds, and copy its format and its moduli.
+
+        The format and the moduli are copied each time, because the parser may learn them only after many frames.
+        """
         frames = parser.feed(data)
         self.format = parser.format
         self.seq_modulus = parser.seq_modulus

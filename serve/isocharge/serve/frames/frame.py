@@ -38,7 +38,7 @@ class SequenceGaps:
 
     Attributes:
         lost: Number of frames that are missing between received frames.
-        repeated: Number of frames with the same counter as the frame before.
+        repeated: Number of frames with the same counter as the previous frame.
         restarts: Number of times that the counter went back, for example after a reset of the device. Frames that were
             lost during a restart are not counted.
     """
@@ -65,14 +65,17 @@ class SequenceGaps:
         """
         if seq is None:
             return ()
-        step = 1 if self._last_seq is None else (seq - self._last_seq) % modulus
+        last_seq = self._last_seq
         self._last_seq = seq
+        if last_seq is None:
+            return ()
+        step = (seq - last_seq) % modulus
         if step == 1:
             return ()
         if step == 0:
             self.repeated += 1
             return (REPEAT,)
-        if step >= modulus // 2:
+        if step >= modulus // 2:  # the counter went back
             self.restarts += 1
             return (RESTART,)
         self.lost += step - 1
@@ -100,13 +103,10 @@ class CounterWrap:
         self._largest_value = 0
 
     def update(self, value: int | None) -> int:
-        """Take the next value of the counter.
+        """Learn from the next value of the counter, and return the modulus as far as it is known.
 
         Args:
-            value: The value; None where a connection ends.
-
-        Returns:
-            The modulus, as far as it is known.
+            value: The value; None if a connection has ended.
         """
         last_value = self._last_value
         self._last_value = value
@@ -120,10 +120,15 @@ class CounterWrap:
         return self._modulus
 
     def _modulus_after_fall(self, step: int) -> int:
-        """Return the smallest usual modulus that explains a negative step, or the present modulus if none does."""
+        """Return the smallest usual modulus that explains a negative step, or the present modulus if none does.
+
+        A modulus explains the step if it is larger than all values, and the step modulo the modulus is about as small
+        as the steps before.
+        """
         max_step = self._max_steps * self._last_step
         for modulus in self._usual_moduli:
-            if self._largest_value < modulus and step % modulus <= min(max_step, modulus // 2):
+            has_plausible_step = step % modulus <= min(max_step, modulus // 2)
+            if self._largest_value < modulus and has_plausible_step:
                 return modulus
         return self._modulus
 
@@ -215,18 +220,20 @@ class Columns:
     """
 
     def __init__(self, names: Sequence[str], scales: Sequence[float], flags: int | None = None) -> None:
-        clocks = [names.index(name) for name in TIMES_US if name in names]
+        """Find the columns of the frame counter, of the clock and of the channels by their names."""
+        clock_columns = [names.index(name) for name in TIMES_US if name in names]
         self.seq = names.index(SEQ) if SEQ in names else None
-        self.time = clocks[0] if clocks else None
+        self.time = clock_columns[0] if clock_columns else None
         self.time_unit_us = 1.0
         if self.time is not None:
-            self.time_unit_us = TIMES_US[names[self.time]] * scales[self.time]
+            clock_name = names[self.time]
+            self.time_unit_us = TIMES_US[clock_name] * scales[self.time]
 
-        not_channels = {self.seq, flags, *clocks}
-        self.channels = [(position, scale) for position, scale in enumerate(scales) if position not in not_channels]
+        other_columns = {self.seq, flags, *clock_columns}
+        self.channels = [(column, scale) for column, scale in enumerate(scales) if column not in other_columns]
         self.names: tuple[str, ...] = ()
         if any(names):
-            self.names = tuple(names[position] for position, _ in self.channels)
+            self.names = tuple(names[column] for column, _ in self.channels)
         self._flags = flags
 
     def frame(self, numbers: Sequence[Any]) -> Frame:
@@ -276,12 +283,12 @@ class Parser(ABC):
         """Decode one frame and count it.
 
         Args:
-            decode: Function that raises ValueError or OverflowError if `raw` is no frame.
-            raw: What it decodes.
+            decode: Function that decodes a frame, and raises ValueError or OverflowError if `raw` is no frame.
+            raw: Argument of `decode`: bytes or numbers.
             size: Number of bytes that are dropped if `raw` is no frame.
 
         Returns:
-            The frame, or an empty list.
+            A list with the frame; an empty list if `raw` is no frame.
         """
         try:
             frame = decode(raw)
@@ -308,19 +315,23 @@ class DelimitedParser(Parser):
         self._is_overlong = False
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that end within `data`. Bytes after the last delimiter are kept for the next call."""
+        """Return the frames that end within `data`.
+
+        Bytes after the last delimiter are stored for the next call. If they are longer than any frame, they are
+        dropped, and so is everything up to the next delimiter.
+        """
         *pieces, tail = (self._tail + data).split(self._delimiter)
         frames = []
         for piece in pieces:
             if self._is_overlong or len(piece) > self._max_length:
                 self._is_overlong = False
-                self.counts.count_rejected(len(piece) + 1)
+                self.counts.count_rejected(len(piece) + 1)  # with the delimiter
             else:
                 frames += self._parse_piece(piece)
         self._tail = tail
         if self._is_overlong or len(tail) > self._max_length:
             self._is_overlong = True
-            super().reset()
+            super().reset()  # drops the tail
         return frames
 
     def reset(self) -> None:

@@ -104,17 +104,18 @@ class Field(Settings, frozen=True):
     value: Hexadecimal | None = None
 
     def __post_init__(self) -> None:
+        """Check the keys of the field; raise WrongKey for the first key that is not valid."""
         if self.scale == 0.0:
             raise WrongKey("scale", "a finite number that is not 0", self.scale)
         if self.kind == PADDING:
             return
         if not self.name:
             raise WrongKey("name")
-        only_padding = f"none, because only the type {PADDING} may have one"
+        expected_none = f"none, because only the type {PADDING} may have one"
         if self.count != 1:
-            raise WrongKey("count", only_padding, self.count)
+            raise WrongKey("count", expected_none, self.count)
         if self.value is not None:
-            raise WrongKey("value", only_padding, self.value)
+            raise WrongKey("value", expected_none, self.value)
 
     @property
     def struct_format(self) -> str:
@@ -143,15 +144,17 @@ class Field(Settings, frozen=True):
         count = value / self.scale
         if self.kind in ("f32", "f64"):
             return count
+
+        whole_count = round(count)
         if self.name in (SEQ, *TIMES_US):
-            count = round(count) % self.modulus
+            whole_count %= self.modulus
         is_signed = self.kind.startswith("i")
         lowest = -self.modulus // 2 if is_signed else 0
         highest = lowest + self.modulus - 1
-        count = min(max(round(count), lowest), highest)
-        if self.size == 3:
-            return count.to_bytes(3, byte_order, signed=is_signed)
-        return count
+        limited_count = min(max(whole_count, lowest), highest)
+        if self.size == 3:  # struct has no format for three bytes
+            return limited_count.to_bytes(3, byte_order, signed=is_signed)
+        return limited_count
 
 
 class CrcParameters(Settings, frozen=True):
@@ -343,9 +346,11 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         Raises:
             struct.error: If a number does not fit its field.
         """
-        values: dict[str, float] = {SEQ: frame.seq or 0, FLAGS: frame.flags}
-        for name, unit_us in TIMES_US.items():
-            values[name] = (frame.t_us or 0) / unit_us
+        seq = 0 if frame.seq is None else frame.seq
+        t_us = 0 if frame.t_us is None else frame.t_us
+        values: dict[str, float] = {SEQ: seq, FLAGS: frame.flags}
+        for clock_name, unit_us in TIMES_US.items():
+            values[clock_name] = t_us / unit_us
         for channel, value in zip(self.channels, frame.values, strict=True):
             values[channel.name] = value
         packed = [field.pack(values[field.name], self.byte_order) for field in self.fields]
@@ -360,11 +365,14 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             return SyncParser(self)
         if self.framing == DATAGRAM:
             return DatagramParser(self)
+
         stuffing = STUFFINGS[self.framing]
-        max_length = 2 * self.length + 2
-        return StuffedParser(
-            stuffing.delimiter, max_length, lambda piece: self.decode(stuffing.decode(piece)), *_parser_arguments(self)
-        )
+        max_length = 2 * self.length + 2  # at worst, stuffing doubles the length
+
+        def decode(piece: bytes) -> Frame:
+            return self.decode(stuffing.decode(piece))
+
+        return StuffedParser(stuffing.delimiter, max_length, decode, *_parser_arguments(self))
 
 
 def _parser_arguments(layout: FrameLayout) -> tuple[str, int, int]:
@@ -381,25 +389,30 @@ class SyncParser(Parser):
         self.layout = layout
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that end within `data`. Bytes of an unfinished frame are kept for the next call."""
+        """Return the frames that end within `data`.
+
+        A frame may begin wherever the sync pattern occurs. If the bytes there are no frame, the search continues one
+        byte later. Bytes of an unfinished frame are stored for the next call.
+        """
         sync = self.layout.sync
         length = self.layout.length
-        data = self._tail + data
+        unparsed = self._tail + data
         frames = []
-        position = 0
-        start = data.find(sync)
-        while 0 <= start <= len(data) - length:
+        position = 0  # all bytes before this position have been parsed
+        start = unparsed.find(sync)
+        while 0 <= start <= len(unparsed) - length:
             if start > position:
                 self.counts.count_dropped(start - position)
-            decoded = self._attempt(self.layout.decode, data[start : start + length], 1)
+            decoded = self._attempt(self.layout.decode, unparsed[start : start + length], 1)
             frames += decoded
             position = start + length if decoded else start + 1
-            start = data.find(sync, position)
+            start = unparsed.find(sync, position)
 
-        # A sync pattern may be cut by the end of the data.
-        unfinished = start if start >= 0 else max(position, len(data) - len(sync) + 1)
-        self.counts.count_dropped(unfinished - position)
-        self._tail = data[unfinished:]
+        tail_start = start
+        if start < 0:  # no sync pattern was found, but the end of the data may contain its beginning
+            tail_start = max(position, len(unparsed) - len(sync) + 1)
+        self.counts.count_dropped(tail_start - position)
+        self._tail = unparsed[tail_start:]
         return frames
 
 

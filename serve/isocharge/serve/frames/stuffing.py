@@ -35,14 +35,23 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
-    """Encode bytes without zeros, and the zero that follows them if there is one."""
+    """Encode bytes without zeros, and the zero that follows them if there is one.
+
+    Each piece of at most `MAX_BLOCK` bytes follows a byte with the distance to the next such byte. A distance of
+    `MAX_BLOCK` + 1 means that no zero follows the piece.
+
+    Args:
+        block: The bytes.
+        ends_in_zero: Whether a zero follows the bytes.
+    """
     encoded = bytearray()
-    while len(block) > MAX_BLOCK or (len(block) == MAX_BLOCK and ends_in_zero):
+    rest = block
+    while len(rest) > MAX_BLOCK or (len(rest) == MAX_BLOCK and ends_in_zero):
         encoded.append(MAX_BLOCK + 1)
-        encoded += block[:MAX_BLOCK]
-        block = block[MAX_BLOCK:]
-    encoded.append(len(block) + 1)
-    return bytes(encoded + block)
+        encoded += rest[:MAX_BLOCK]
+        rest = rest[MAX_BLOCK:]
+    encoded.append(len(rest) + 1)
+    return bytes(encoded + rest)
 
 
 def cobs_decode(data: bytes) -> bytes:
@@ -54,13 +63,14 @@ def cobs_decode(data: bytes) -> bytes:
     decoded = bytearray()
     position = 0
     while position < len(data):
-        distance = data[position]
+        distance = data[position]  # distance to the next such byte, which stands for a zero
         block = data[position + 1 : position + distance]
         if len(block) != distance - 1 or 0 in block:
             raise ValueError(f"byte {position} is {distance}, but {len(data) - position - 1} bytes or a zero follow")
         decoded += block
         position += distance
-        if distance <= MAX_BLOCK and position < len(data):
+        zero_follows = distance <= MAX_BLOCK and position < len(data)
+        if zero_follows:
             decoded.append(0)
     return bytes(decoded)
 

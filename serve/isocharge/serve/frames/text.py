@@ -105,7 +105,8 @@ class TextParser(DelimitedParser):
         self._clock_wrap.update(None)
 
     def _parse_piece(self, piece: bytes) -> list[Frame]:
-        size = len(piece) + 1
+        """Return the frames that a line completes. While the layout is not known, the line is used to recognise it."""
+        size = len(piece) + 1  # with the line feed
         is_first_line = self._is_first_line
         self._is_first_line = False
         try:
@@ -149,7 +150,14 @@ class TextParser(DelimitedParser):
         self._unrecognised = []
 
     def _name_columns(self, header: Line, size: int) -> list[Frame]:
-        """Take the names of the columns from a header. A header also follows a reset of the board."""
+        """Use the names in a header as the names of the columns, unless they have names. Return no frames.
+
+        A header that comes after the layout is known is a reset of the board, or text that is no header.
+
+        Args:
+            header: The header.
+            size: Number of bytes of the line.
+        """
         if self.layout is None:
             if not self._columns:
                 self._columns = header.names
@@ -167,54 +175,77 @@ class TextParser(DelimitedParser):
         self.format = f"text, {layout.notation}: {printable(names)}"
 
     def _recognise(self, line: Line, size: int) -> list[Frame]:
-        """Collect lines until their layout repeats, then read the lines that repeat it."""
+        """Collect lines until their layout repeats, and return the frames in the lines with this layout.
+
+        Args:
+            line: The next line.
+            size: Number of bytes of the line.
+        """
         self._unrecognised.append((line, size))
         period = _period([collected for collected, _ in self._unrecognised])
-        if not period or len(line.values) > MAX_VALUES:
+        is_recognised = period > 0 and len(line.values) <= MAX_VALUES
+        if not is_recognised:
             while len(self._unrecognised) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
                 _, oldest_size = self._unrecognised.pop(0)
                 self._reject(oldest_size)
             return []
 
-        first_repeating = len(self._unrecognised) - RECOGNITION_REPEATS * period
-        repeating = self._unrecognised[first_repeating:]
-        self._unrecognised = self._unrecognised[:first_repeating]
+        first_repeated = len(self._unrecognised) - RECOGNITION_REPEATS * period
+        repeated_lines = self._unrecognised[first_repeated:]
+        self._unrecognised = self._unrecognised[:first_repeated]
         self._reject_unrecognised()
-        layout = self._layout_of([collected for collected, _ in repeating[:period]])
+        first_cycle = [cycle_line for cycle_line, _ in repeated_lines[:period]]
+        layout = self._layout_of(first_cycle)
         self._set_layout(layout)
         frames = []
-        for collected, collected_size in repeating:
-            frames += self._read(layout, collected, collected_size)
+        for repeated_line, repeated_size in repeated_lines:
+            frames += self._read(layout, repeated_line, repeated_size)
         return frames
 
     def _layout_of(self, lines: list[Line]) -> Layout:
-        """Return the layout of a row, or of the lines of one cycle."""
-        first = lines[0]
+        """Return the layout of the lines of one cycle, which is a single line for most boards."""
+        first_line = lines[0]
         if len(lines) > 1:
             names = sorted({name for line in lines for name in line.names}, key=_sort_key)
-            return Layout(first.notation, tuple(names), len(names), len(lines))
-        width = len(first.values)
-        if first.names or len(self._columns) != width:
-            return Layout(first.notation, first.names, width)
-        return Layout(first.notation, self._columns, width)
+            return Layout(first_line.notation, tuple(names), len(names), len(lines))
+        width = len(first_line.values)
+        if first_line.names or len(self._columns) != width:
+            return Layout(first_line.notation, first_line.names, width)
+        return Layout(first_line.notation, self._columns, width)
 
     def _read(self, layout: Layout, line: Line, size: int) -> list[Frame]:
-        """Return the frame that a line completes."""
+        """Return the frame that a line completes, in a list; empty if the line completes no frame or is rejected.
+
+        Args:
+            layout: The layout of the lines.
+            line: The line.
+            size: Number of bytes of the line.
+        """
         if line.notation is not layout.notation:
             return self._reject(size)
         if layout.lines > 1:
             return self._read_cycle_line(layout, line, size)
-        if len(line.values) != layout.width or (line.names and line.names != layout.names):
+        has_other_names = bool(line.names) and line.names != layout.names
+        if len(line.values) != layout.width or has_other_names:
             return self._reject(size)
         return self._frame(layout, line.values, size)
 
     def _read_cycle_line(self, layout: Layout, line: Line, size: int) -> list[Frame]:
-        """Take a line of a cycle. The last line completes a frame. A clock may accompany every value of a cycle."""
+        """Store the values of a line of a cycle, and return the frame if the cycle is complete.
+
+        A clock may accompany every value of a cycle.
+
+        Args:
+            layout: The layout of the lines.
+            line: The line.
+            size: Number of bytes of the line.
+        """
         names = [name for name in line.names if name not in TIMES_US]
         if not names or not set(line.names) <= set(layout.names):
             return self._reject(size)
         first_name = next(name for name in layout.names if name not in TIMES_US)
-        if names[0] == first_name or names[0] in self._cycle_values:
+        begins_cycle = names[0] == first_name or names[0] in self._cycle_values
+        if begins_cycle:
             self._drop_cycle()
         self._cycle_values |= dict(zip(line.names, line.values, strict=True))
         self._cycle_bytes += size
@@ -237,7 +268,13 @@ class TextParser(DelimitedParser):
         self._cycle_bytes = 0
 
     def _frame(self, layout: Layout, values: Sequence[float], size: int) -> list[Frame]:
-        """Return the frame with some values, and learn where its counter and its clock wrap."""
+        """Return the frame with some values, in a list, and learn where its counter and its clock wrap.
+
+        Args:
+            layout: The layout of the lines.
+            values: Value of each column.
+            size: Number of bytes that are dropped if the values are no frame.
+        """
         frames = self._attempt(layout.columns.frame, values, size)
         for frame in frames:
             self.seq_modulus = self._seq_wrap.update(frame.seq)
@@ -270,16 +307,19 @@ def _period(lines: list[Line]) -> int:
     """Return the number of lines in the cycle that has just occurred three times in a row, or 0 if there is none.
 
     Only lines with names form cycles of several lines.
+
+    Args:
+        lines: The latest lines.
     """
     signatures = [(line.notation, line.names, len(line.values)) for line in lines]
-    last = signatures[-1]
-    earlier = signatures[-2::-1]
-    if last not in earlier:
+    last_signature = signatures[-1]
+    earlier_signatures = signatures[-2::-1]  # from the latest to the earliest
+    if last_signature not in earlier_signatures:
         return 0
-    period = earlier.index(last) + 1
-    if period > 1 and last[0] not in (Notation.pairs, Notation.teleplot):
+    period = earlier_signatures.index(last_signature) + 1
+    has_names = lines[-1].notation in (Notation.pairs, Notation.teleplot)
+    if period > 1 and not has_names:
         return 0
-    recent = signatures[-RECOGNITION_REPEATS * period :]
-    if recent != recent[:period] * RECOGNITION_REPEATS:
-        return 0
-    return period
+    recent_signatures = signatures[-RECOGNITION_REPEATS * period :]
+    is_repeated = recent_signatures == recent_signatures[:period] * RECOGNITION_REPEATS
+    return period if is_repeated else 0

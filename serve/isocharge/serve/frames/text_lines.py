@@ -66,10 +66,13 @@ NO_READING = Line(Notation.nothing)
 
 
 def parse_line(data: bytes) -> Line:
-    """Read a line, without the characters that end it.
+    """Parse a line of text in any of the notations, which the first characters distinguish.
+
+    Args:
+        data: The line without the characters that end it.
 
     Raises:
-        ValueError: If the line has no notation that is known.
+        ValueError: If the line has no known notation.
     """
     text = data.decode("utf-8").strip()
     if not text or text[0] == "#":
@@ -86,25 +89,28 @@ def parse_line(data: bytes) -> Line:
 
 
 def _csv(text: str) -> Line:
-    """Read numbers between separators, or the header of such columns."""
+    """Parse numbers between separators, or a header with the names of such columns."""
     cells = _SEPARATOR.split(text.rstrip(",; \t"))
     try:
         return Line(Notation.csv, (), tuple(map(parse_number, cells)))
     except ValueError:
         are_names = all(map(_NAME.fullmatch, cells))
-        if are_names and len(set(cells)) == len(cells):
+        are_different = len(set(cells)) == len(cells)
+        if are_names and are_different:
             return Line(Notation.header, tuple(cells))
         raise
 
 
 def _sentence(text: str) -> Line:
-    """Read the numbers of a sentence, which follow a word that says what they are.
+    """Parse the numbers of a sentence such as `$FILM,1.5,2.5*3A`, which follow a word that names the sentence.
 
     The sentence may end in `*` and a checksum, the exclusive or of all bytes between `$` and `*`.
     """
     content, star, checksum = text[1:].partition("*")
-    if star and (len(checksum) != 2 or int(checksum, 16) != reduce(xor, content.encode(), 0)):
-        raise ValueError(f"expected the checksum of the sentence, got {text[-100:]!r}")
+    if star:
+        expected_checksum = reduce(xor, content.encode(), 0)
+        if len(checksum) != 2 or int(checksum, 16) != expected_checksum:
+            raise ValueError(f"expected the checksum of the sentence, got {text[-100:]!r}")
     _, *cells = _SEPARATOR.split(content.rstrip(",; \t"))
     if not cells:
         raise ValueError(f"expected numbers after the first word, got {text[:100]!r}")
@@ -112,40 +118,46 @@ def _sentence(text: str) -> Line:
 
 
 def _pairs(text: str) -> Line:
-    """Read one or several name:value."""
+    """Parse a line of one or several pairs `name:value` or `name=value`."""
     pairs: dict[str, float] = {}
     position = 0
     while position < len(text):
         match = _PAIR.match(text, position)
         if match is None or match[1] in pairs:
             raise ValueError(f"expected name:value, got {text[position:]!r}")
-        pairs[match[1]] = parse_number(match[2])
+        name, value = match.groups()
+        pairs[name] = parse_number(value)
         position = match.end()
     return Line(Notation.pairs, tuple(pairs), tuple(pairs.values()))
 
 
 def _teleplot(text: str) -> Line:
-    """Read the latest value of a Teleplot line. Lines with texts or points of x-y plots are no readings."""
+    """Parse the latest value of a Teleplot line, `>name:time:value;time:value§unit|flags`.
+
+    The time, the unit and the flags may be missing. Lines with texts (flag `t`) or with points of x-y plots (flag `xy`)
+    are no readings.
+    """
     content, _, flags = text[1:].partition("|")
     name, _, values = content.partition(":")
     if not name.strip() or not values:
         raise ValueError(f"expected >name:value, got {text!r}")
     if "t" in flags or "xy" in flags:
         return NO_READING
-    _, _, latest = values.rstrip("; ").rpartition(";")
-    reading, _, _unit = latest.partition("§")
-    *time, value = reading.split(":")
-    if len(time) > 1:
+
+    _, _, latest_value = values.rstrip("; ").rpartition(";")
+    reading, _, _unit = latest_value.partition("§")
+    *times, value = reading.split(":")
+    if len(times) > 1:
         raise ValueError(f"expected >name:time:value, got {text!r}")
     pairs = {}
-    if time:
-        pairs[TELEPLOT_TIME] = parse_number(time[0])
+    if times:
+        pairs[TELEPLOT_TIME] = parse_number(times[0])
     pairs[name.strip()] = parse_number(value)
     return Line(Notation.teleplot, tuple(pairs), tuple(pairs.values()))
 
 
 def _json(text: str) -> Line:
-    """Read a JSON object, or a list of numbers."""
+    """Parse a JSON object with numbers at any level, or a JSON list of numbers."""
     try:
         # As floats, integers with hundreds of digits become infinite, as they do in the other notations.
         content = json.loads(text, parse_int=float)

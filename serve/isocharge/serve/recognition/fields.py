@@ -42,14 +42,17 @@ TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "f32", "f64")
 def steady_step(step: Array) -> float:
     """Return the mean of the regular steps of a counter or clock; 0 if the steps are not regular.
 
+    A step is regular if it is close to the median. Lost frames cause other steps.
+
     Args:
         step: Differences of the values of consecutive frames, shape (n,).
     """
-    median = np.median(step)
-    regular = step[np.abs(step - median) <= STEADY_SPREAD * median]
-    if len(regular) < COUNTING_SHARE * len(step):
+    median_step = np.median(step)
+    is_regular = np.abs(step - median_step) <= STEADY_SPREAD * median_step
+    regular_steps = step[is_regular]
+    if len(regular_steps) < COUNTING_SHARE * len(step):
         return 0.0
-    return float(regular.mean())
+    return float(regular_steps.mean())
 
 
 def clock_of(step: Array, rate_Hz: float) -> tuple[str, float] | None:
@@ -114,7 +117,9 @@ class Part(NamedTuple):
 
 @np.errstate(all="ignore")
 def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) -> list[list[Part]]:
-    """Return the possible parts that begin at each byte of a frame; the first is a single byte without a meaning.
+    """Return the possible parts that begin at each byte of a frame.
+
+    The first possible part at each byte is a single byte without a meaning.
 
     Args:
         rows: Bytes of the frames, each followed by the next frame, shape (n, 2 * length). Where a frame begins need not
@@ -123,25 +128,23 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
         rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
         weights: Contributions to the score.
     """
-    usual, constant = usual_bytes(rows)
-    is_zero = constant & (usual == 0)
+    usual, is_constant = usual_bytes(rows)
+    is_zero = is_constant & (usual == 0)
     length = rows.shape[1] // 2
-    byte_step = 1 if order == "little" else -1
+    lowest_byte_first = slice(None) if order == "little" else slice(None, None, -1)
     parts_at: list[list[Part]] = []
     for position in range(length):
-        pad_score = weights.constant if constant[position] else weights.noise
-        parts_at.append([Part("pad", "pad", 1, pad_score)])
-        for kind in TYPES:
-            span = slice(position, position + int(kind[1:]) // 8)
+        pad_score = weights.constant if is_constant[position] else weights.noise
+        parts = [Part("pad", "pad", 1, pad_score)]
+        for kind in TYPES:  # such as "u16": the number is the size in bits
+            size = int(kind[1:]) // 8
+            span = slice(position, position + size)
             if span.stop <= 2 * length:
-                parts_at[position] += _numbers(
-                    rows[:, span][:, ::byte_step],
-                    constant[span][::byte_step],
-                    is_zero[span][::byte_step],
-                    kind,
-                    rate_Hz,
-                    weights,
-                )
+                number_bytes = rows[:, span][:, lowest_byte_first]
+                number_is_constant = is_constant[span][lowest_byte_first]
+                number_is_zero = is_zero[span][lowest_byte_first]
+                parts += _numbers(number_bytes, number_is_constant, number_is_zero, kind, rate_Hz, weights)
+        parts_at.append(parts)
     return parts_at
 
 
@@ -164,27 +167,33 @@ def _numbers(
         return
     is_float = kind[0] == "f"
     is_unsigned = kind[0] == "u"
+    is_signed = kind[0] == "i"
     values = _values(cut, kind)
     step = np.diff(values)
     counter_step = step
     magnitude = float(np.median(np.abs(values)))
-    unit = 1.0
+    unit = 1.0  # smallest step that the number can represent
     if is_float:
-        unit = magnitude * 256.0 ** (np.argmin(is_zero) - weights.fraction * size)
-        if not PLAUSIBLE_MAGNITUDES[0] < magnitude < PLAUSIBLE_MAGNITUDES[1]:
+        min_magnitude, max_magnitude = PLAUSIBLE_MAGNITUDES
+        if not min_magnitude < magnitude < max_magnitude:
             return
+        zero_byte_count = np.argmin(is_zero)  # low bytes that are always 0 carry no digits
+        unit = magnitude * 256.0 ** (zero_byte_count - weights.fraction * size)
     if is_unsigned:
         half_range = 1 << (8 * size - 1)
         counter_step = (step + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
         magnitude = float(np.median(np.abs(values - half_range)))
-    if is_unsigned and size != 3 and steady_step(counter_step) == 1.0:
+
+    can_be_counter = is_unsigned and size != 3
+    can_be_clock = not is_signed and size not in (1, 3)
+    if can_be_counter and steady_step(counter_step) == 1.0:
         yield Part("seq", kind, size, 0.0, name="seq")
-    elif kind[0] != "i" and size not in (1, 3):
+    elif can_be_clock:
         clock = clock_of(counter_step, rate_Hz)
         if clock is not None:
             name, scale = clock
-            score = _bits(counter_step - np.median(counter_step), unit, size)
-            yield Part("clock", kind, size, score, name=name, scale=scale)
+            clock_score = _bits(counter_step - np.median(counter_step), unit, size)
+            yield Part("clock", kind, size, clock_score, name=name, scale=scale)
     channel_score = weights.channel + _bits(np.append(step, magnitude), unit, size)
     yield Part("channel", kind, size, channel_score, row=kind)
 
@@ -192,7 +201,9 @@ def _numbers(
 def split_frame(
     parts_at: Sequence[Sequence[Part]], syncs: Iterable[int], weights: Weights
 ) -> tuple[float, int, tuple[Part, ...]]:
-    """Divide a frame into parts with the lowest score.
+    """Divide a frame into parts so that the sum of their scores is as low as possible.
+
+    The division is found by dynamic programming, from the last byte to the first.
 
     Args:
         parts_at: Possible parts that begin at each byte before the checksum.
@@ -205,32 +216,42 @@ def split_frame(
 
     @cache
     def lowest(position: int, row: str) -> tuple[float, tuple[Part, ...]]:
-        """Return the lowest score of the bytes from a position on, and their parts, after a channel of type `row`."""
+        """Return the lowest score of all bytes from a position to the end, and the parts with this score.
+
+        Args:
+            position: Position of the first byte.
+            row: Type of the channel before this byte; empty if the part before it is no channel. A channel of the same
+                type continues a row of channels; any other channel begins a row, which adds to the score.
+        """
         if position == len(parts_at):
             return 0.0, ()
-        if position > len(parts_at):
+        if position > len(parts_at):  # the part before this position is too long
             return np.inf, ()
-        best: tuple[float, tuple[Part, ...]] = (np.inf, ())
+        best_score = np.inf
+        best_parts: tuple[Part, ...] = ()
         for part in parts_at[position]:
-            begins_row = part.row not in ("", row)
+            is_channel = part.row != ""
+            begins_row = is_channel and part.row != row
             if begins_row and part.is_constant:
                 continue
             rest_score, rest_parts = lowest(position + part.size, part.row)
             score = part.score + rest_score
             if begins_row:
                 score = part.score + weights.row + rest_score
-            if score < best[0]:
-                best = (score, (part, *rest_parts))
-        return best
+            if score < best_score:
+                best_score = score
+                best_parts = (part, *rest_parts)
+        return best_score, best_parts
 
-    scored = []
-    for sync in syncs:
-        score, _ = lowest(sync, "")
-        if sync == 1:  # a sync of a single byte is rare
+    scored_syncs = []
+    for sync_length in syncs:
+        score, _ = lowest(sync_length, "")
+        if sync_length == 1:  # a sync of a single byte is rare
             score += weights.constant
-        scored.append((score, sync))
-    score, sync = min(scored)
-    return score, sync, lowest(sync, "")[1]
+        scored_syncs.append((score, sync_length))
+    lowest_score, best_sync_length = min(scored_syncs)
+    _, best_parts = lowest(best_sync_length, "")
+    return lowest_score, best_sync_length, best_parts
 
 
 def _values(cut: Bytes, kind: str) -> Array:
@@ -238,16 +259,19 @@ def _values(cut: Bytes, kind: str) -> Array:
 
     Args:
         cut: Bytes of the number, the lowest first, shape (n, size).
-        kind: Type of the number.
+        kind: Type of the number: "f" for floating-point, "u" for unsigned or "i" for signed, and the size in bits.
     """
     size = cut.shape[1]
     if kind[0] == "f":
         return np.ascontiguousarray(cut).view(f"<f{size}")[:, 0].astype(float)
-    values: Array = cut @ 256.0 ** np.arange(size)
-    if kind[0] == "i":
-        is_negative = values >= 256.0**size / 2
-        values = values - 256.0**size * is_negative
-    return values
+    byte_weights = 256.0 ** np.arange(size)
+    unsigned: Array = cut @ byte_weights
+    if kind[0] == "u":
+        return unsigned
+    value_count = 256.0**size
+    is_negative = unsigned >= value_count / 2  # two's complement
+    signed: Array = unsigned - value_count * is_negative
+    return signed
 
 
 def _bits(step: Array, unit: float, size: int) -> float:

@@ -43,8 +43,8 @@ STUFFED_SHARE = 0.9
 COVERED_SHARE = 0.4
 """Smallest share of a stream that frames of one length must cover, dimensionless."""
 
-SINGLE_SHARE = 0.05
-"""Share of a stream by which a single byte must cover more than a pair, which rarely repeats by chance."""
+SINGLE_BYTE_PENALTY = 0.05
+"""Share of a stream by which a single byte must cover more than a pair of bytes, which rarely repeats by chance."""
 
 MAX_FRAME_LENGTHS = 3
 """Number of frame lengths that are tried."""
@@ -84,13 +84,18 @@ def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
 
 
 def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Windows]:
-    """Yield every possible division of a stream into frames, the most certain first."""
+    """Yield every possible division of a stream into frames, the most certain first.
+
+    Args:
+        chunks: The bytes of the stream.
+        are_datagrams: Whether each chunk is a datagram, which contains one or several whole frames.
+    """
     data = b"".join(chunks)[:MAX_EXAMINED_BYTES]
     if are_datagrams:
-        common = gcd(*map(len, chunks))
-        candidates = range(MIN_FRAME_BYTES, min(common, MAX_FRAME_BYTES) + 1)
-        lengths = [length for length in candidates if common % length == 0]
-        yield from (_side_by_side(DATAGRAM, data, length) for length in lengths)
+        common_divisor = gcd(*map(len, chunks))
+        for length in range(MIN_FRAME_BYTES, min(common_divisor, MAX_FRAME_BYTES) + 1):
+            if common_divisor % length == 0:
+                yield _side_by_side(DATAGRAM, data, length)
     for name, stuffing in STUFFINGS.items():
         yield from _stuffed(name, stuffing, data)
     yield from _synchronised(np.frombuffer(data, np.uint8))
@@ -101,17 +106,29 @@ def _side_by_side(framing: str, data: bytes, length: int) -> Windows:
 
 
 def _stuffed(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
-    pieces = [piece for piece in data.split(stuffing.delimiter)[1:-1] if piece]
-    decoded = []
+    """Yield the division of a stream at the delimiters of a byte stuffing, if the pieces are frames of one length.
+
+    Args:
+        name: Name of the stuffing.
+        stuffing: The stuffing.
+        data: Bytes of the stream.
+    """
+    whole_pieces = data.split(stuffing.delimiter)[1:-1]  # the first and the last piece may be incomplete
+    pieces = [piece for piece in whole_pieces if piece]
+    decoded_pieces = []
     for piece in pieces:
         with suppress(ValueError):
-            decoded.append(stuffing.decode(piece))
-    length, count = _most_common_length(decoded)
-    if count < STUFFED_SHARE * len(pieces) or not MIN_FRAME_BYTES <= length <= MAX_FRAME_BYTES:
+            decoded_pieces.append(stuffing.decode(piece))
+    length, count = _most_common_length(decoded_pieces)
+    has_frame_length = MIN_FRAME_BYTES <= length <= MAX_FRAME_BYTES
+    if count < STUFFED_SHARE * len(pieces) or not has_frame_length:
         return
+
     # If decoding makes the lengths no more regular, every frame only happens to begin with the delimiter.
-    if name == "cobs" or count > _most_common_length(pieces)[1]:
-        yield _side_by_side(name, b"".join(piece for piece in decoded if len(piece) == length), length)
+    _, count_without_decoding = _most_common_length(pieces)
+    if name == "cobs" or count > count_without_decoding:
+        frames = [piece for piece in decoded_pieces if len(piece) == length]
+        yield _side_by_side(name, b"".join(frames), length)
 
 
 def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
@@ -122,23 +139,32 @@ def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
 
 
 def _synchronised(stream: Bytes) -> Iterator[Windows]:
-    """Yield the divisions of a stream at bytes that repeat after the length of a frame."""
+    """Yield the divisions of a stream at bytes that repeat after the length of a frame.
+
+    For each length, the pair of bytes or the single byte is chosen whose repetitions cover the largest share of the
+    stream. The lengths with the largest shares are yielded; of about equal shares, the shorter length comes first.
+
+    Args:
+        stream: Bytes of the stream, shape (n,).
+    """
     single_bytes = stream.astype(np.int64)
     byte_pairs = 256 * single_bytes[:-1] + single_bytes[1:]
-    best: dict[int, tuple[float, NDArray[np.int64]]] = {}  # by length: covered share, and positions
-    for codes, penalty in ((byte_pairs, 0.0), (single_bytes, SINGLE_SHARE)):
+    best_coverage: dict[int, float] = {}  # by the length of the frame
+    best_starts: dict[int, NDArray[np.int64]] = {}
+    for codes, penalty in ((byte_pairs, 0.0), (single_bytes, SINGLE_BYTE_PENALTY)):
         for length, starts in _repeats(codes):
             coverage = len(starts) * length / len(stream) - penalty
-            if coverage > best.get(length, (COVERED_SHARE - penalty,))[0]:
-                best[length] = coverage, starts
+            required_coverage = best_coverage.get(length, COVERED_SHARE - penalty)
+            if coverage > required_coverage:
+                best_coverage[length] = coverage
+                best_starts[length] = starts
 
-    def by_coverage(length: int) -> tuple[float, int]:
-        coverage, _ = best[length]
-        return -round(coverage, 1), length
+    def order_of(length: int) -> tuple[float, int]:
+        """Return a key that sorts by falling coverage, in steps of 10 %, and then by rising length."""
+        return -round(best_coverage[length], 1), length
 
-    for length in sorted(best, key=by_coverage)[:MAX_FRAME_LENGTHS]:
-        _, starts = best[length]
-        yield Windows(SYNC, stream, starts, length)
+    for length in sorted(best_coverage, key=order_of)[:MAX_FRAME_LENGTHS]:
+        yield Windows(SYNC, stream, best_starts[length], length)
 
 
 def _repeats(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
@@ -147,17 +173,22 @@ def _repeats(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]
     Args:
         codes: Bytes, or pairs of bytes as numbers, at each position of the stream, shape (n,).
     """
-    order = np.argsort(codes, kind="stable")
-    gaps = np.diff(order)
-    firsts = order[:-1]
-    repeats = (np.diff(codes[order]) == 0) & (gaps >= MIN_FRAME_BYTES) & (gaps <= MAX_FRAME_BYTES)
-    gaps = gaps[repeats]
-    firsts = firsts[repeats]
-    keys = codes[firsts] * (MAX_FRAME_BYTES + 1) + gaps  # one number for each pair of code and distance
+    # A stable sort puts equal codes side by side, in the order of their positions.
+    sorted_positions = np.argsort(codes, kind="stable")
+    all_positions = sorted_positions[:-1]
+    all_distances = np.diff(sorted_positions)
+    has_equal_code = np.diff(codes[sorted_positions]) == 0
+    has_frame_length = (all_distances >= MIN_FRAME_BYTES) & (all_distances <= MAX_FRAME_BYTES)
+    positions = all_positions[has_equal_code & has_frame_length]
+    distances = all_distances[has_equal_code & has_frame_length]
+
+    # Count the pairs of code and distance. Each pair is encoded as one number.
+    distance_count = MAX_FRAME_BYTES + 1
+    keys = codes[positions] * distance_count + distances
     for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
-        length = int(key) % (MAX_FRAME_BYTES + 1)
-        if count * length >= COVERED_SHARE * len(codes):
-            yield length, firsts[keys == key]
+        distance = int(key) % distance_count
+        if count * distance >= COVERED_SHARE * len(codes):
+            yield distance, positions[keys == key]
 
 
 UNNAMED_CRCS = {
@@ -208,31 +239,41 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     Args:
         rows: Bytes of the frames, shape (n, length).
     """
-    rows = np.unique(rows, axis=0)
-    shuffled = np.random.default_rng(0).permutation(len(rows))  # sorted neighbours differ in a few bits only
-    rows = rows[shuffled[:MAX_CHECKED_FRAMES]]
-    if len(rows) < MIN_CHECKED_FRAMES:
+    different_rows = np.unique(rows, axis=0)
+    # The frames are drawn at random, because neighbours in the sorted array differ in a few bits only.
+    drawn = np.random.default_rng(0).permutation(len(different_rows))[:MAX_CHECKED_FRAMES]
+    checked_rows = different_rows[drawn]
+    if len(checked_rows) < MIN_CHECKED_FRAMES:
         return
-    _, constant = usual_bytes(rows)
-    frames = [row.tobytes() for row in rows]
-    n_leading_constant = int(np.argmin([*constant[:MAX_FIRST_COVERED_BYTE], False]))
+    _, is_constant = usual_bytes(checked_rows)
+    length = len(is_constant)
+    frames = [row.tobytes() for row in checked_rows]
+    leading_constant_count = int(np.argmin([*is_constant[:MAX_FIRST_COVERED_BYTE], False]))
     for size in UNNAMED_CRCS:
-        if size + 2 > len(constant) or constant[-size:].all():
+        if size + 2 > length or is_constant[-size:].all():
             continue
-        last_begin = min(n_leading_constant, len(constant) - size - 1)
-        for order in ORDERS[:size]:
-            named = _named(frames, size, order, range(last_begin + 1))
-            yield from islice(chain(named, _unnamed(frames, size, order)), 1)
+        last_begin = min(leading_constant_count, length - size - 1)
+        for order in ORDERS[:size]:  # a single byte has no byte order
+            named_checks = _named(frames, size, order, range(last_begin + 1))
+            all_checks = chain(named_checks, _unnamed(frames, size, order))
+            yield from islice(all_checks, 1)  # the first check that fits
 
 
 def _named(frames: list[bytes], size: int, order: ByteOrder, begins: range) -> Iterator[Check]:
-    """Yield the named checksums that fit, with the position of the first byte that they cover."""
+    """Yield the named checksums that fit, with the position of the first byte that they cover.
+
+    Args:
+        frames: The frames, which are of one length.
+        size: Number of bytes of the checksum.
+        order: Byte order of the checksum.
+        begins: Positions of the first covered byte that are tried.
+    """
     names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
     for begin in begins:
         for name in names:
             if _fits(CHECKSUMS[name].compute, frames, begin, size, order):
                 keys: dict[str, Any] = {"checksum": name}
-                if begin:
+                if begin > 0:
                     keys["checksum_from"] = begin
                 yield Check(size, order, keys)
 
@@ -250,10 +291,24 @@ def _fits(compute: Callable[[bytes], int], frames: list[bytes], begin: int, size
 
 
 def _unnamed(frames: list[bytes], size: int, order: ByteOrder) -> Iterator[Check]:
-    """Yield the cyclic redundancy checks that fit, by their parameters. The constant part is their final value."""
+    """Yield the cyclic redundancy checks that fit, described by their parameters.
+
+    With the right polynomial, the computed and the sent value differ by the same constant in all frames. The constant
+    is stored as the final value of the check.
+
+    Args:
+        frames: The frames, which are of one length.
+        size: Number of bytes of the checksum.
+        order: Byte order of the checksum.
+    """
     for crc in UNNAMED_CRCS[size]:
-        finals = Counter(crc(frame[:-size]) ^ int.from_bytes(frame[-size:], order) for frame in frames)
-        final, count = finals.most_common(1)[0]
+        differences = Counter(crc(frame[:-size]) ^ int.from_bytes(frame[-size:], order) for frame in frames)
+        final, count = differences.most_common(1)[0]
         if count >= FITTING_SHARE * len(frames):
-            numbers = {"polynomial": f"{crc.polynomial:0{2 * size}X}", "final": f"{final:0{2 * size}X}"}
-            yield Check(size, order, {"checksum": {"width": crc.width, "reflected": crc.reflected} | numbers})
+            parameters = {
+                "width": crc.width,
+                "reflected": crc.reflected,
+                "polynomial": f"{crc.polynomial:0{2 * size}X}",
+                "final": f"{final:0{2 * size}X}",
+            }
+            yield Check(size, order, {"checksum": parameters})

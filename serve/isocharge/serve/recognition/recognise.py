@@ -47,11 +47,17 @@ def described_frames(
         are_datagrams: Whether each chunk is a datagram.
         weights: Contributions to the score.
     """
-    seconds *= min(1.0, MAX_EXAMINED_BYTES / max(1, sum(map(len, chunks))))
-    for _, group in groupby(framings(chunks, are_datagrams=are_datagrams), key=lambda windows: windows.framing):
-        tables = [scored for windows in group for scored in _scored_tables(windows, seconds, weights)]
-        if tables:
-            return min(tables, key=lambda scored: scored[0])[1]
+    byte_count = sum(map(len, chunks))
+    examined_share = min(1.0, MAX_EXAMINED_BYTES / max(1, byte_count))
+    examined_seconds = seconds * examined_share
+    all_windows = framings(chunks, are_datagrams=are_datagrams)
+    for _, windows_of_framing in groupby(all_windows, key=lambda windows: windows.framing):
+        scored_tables: list[tuple[float, dict[str, Any]]] = []
+        for windows in windows_of_framing:
+            scored_tables += _scored_tables(windows, examined_seconds, weights)
+        if scored_tables:
+            _, best_table = min(scored_tables, key=lambda score_and_table: score_and_table[0])
+            return best_table
     return None
 
 
@@ -60,35 +66,51 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
 
     Descriptions without a checksum are tried only if no checksum fits. The score is in bits for each byte of the
     stream, including the bytes outside of all frames, so that frames of different lengths can be compared.
+
+    Args:
+        windows: Frames of one length in the stream.
+        seconds: Time in which the stream arrived, s.
+        weights: Contributions to the score.
     """
     length = windows.length
     rows = windows.rows()[:MAX_EXAMINED_FRAMES]
     if len(rows) < MIN_FRAMES - 1:
         return
     has_sync = windows.framing == SYNC
-    usual, constant = usual_bytes(rows[:, :length])
-    may_be_sync = constant & (usual != 0)  # zeros are mostly the high bytes of numbers
+    usual, is_constant = usual_bytes(rows[:, :length])
+    may_be_sync = is_constant & (usual != 0)  # zeros are mostly the high bytes of numbers
     starts = np.flatnonzero(may_be_sync)[:MAX_FRAME_STARTS].tolist() if has_sync else [0]
     checks = [(start, check) for start in starts for check in find_checks(rows[:, start : start + length])]
-    covered = min(1.0, len(windows.starts) * length / len(windows.stream))
+    covered_share = min(1.0, len(windows.starts) * length / len(windows.stream))
     rate_Hz = len(windows.stream) / length / seconds
     for order in ORDERS:
         parts_at = parts_of(rows, order, rate_Hz, weights)
-        for start, check in checks or [(start, Check(0, order, {})) for start in starts]:
-            frame_parts = (parts_at[start:] + parts_at[:start])[: length - check.size]
-            syncs: Sequence[int] = [0]
+        starts_without_check = [(start, Check(0, order, {})) for start in starts]
+        for start, check in checks or starts_without_check:
+            frame_parts = parts_at[start:] + parts_at[:start]  # from the first byte of the frame
+            checked_parts = frame_parts[: length - check.size]
+            sync_lengths: Sequence[int] = [0]
             if has_sync:
-                longest = int(np.argmin([*np.roll(may_be_sync, -start)[:MAX_SYNC_BYTES], False]))
-                syncs = range(1, longest + 1)
-            score, sync, parts = split_frame(frame_parts, syncs, weights)
+                may_be_sync_from_start = np.roll(may_be_sync, -start)[:MAX_SYNC_BYTES]
+                longest_sync = int(np.argmin([*may_be_sync_from_start, False]))
+                sync_lengths = range(1, longest_sync + 1)
+            score, sync_length, parts = split_frame(checked_parts, sync_lengths, weights)
             if any(part.role == "channel" for part in parts):
-                sync_bytes = np.roll(usual, -start)[:sync].tobytes()
-                bits = covered * score / length + (1.0 - covered) * weights.noise
-                yield bits, _table(windows, sync_bytes, check, order, parts)
+                sync = np.roll(usual, -start)[:sync_length].tobytes()
+                bits_per_byte = covered_share * score / length + (1.0 - covered_share) * weights.noise
+                yield bits_per_byte, _table(windows, sync, check, order, parts)
 
 
 def _table(windows: Windows, sync: bytes, check: Check, order: ByteOrder, parts: Sequence[Part]) -> dict[str, Any]:
-    """Return the section `[frames]` of a device file."""
+    """Return the section `[frames]` of a device file for a description of the frames.
+
+    Args:
+        windows: Frames of one length in the stream.
+        sync: The sync pattern; empty if there is none.
+        check: The checksum, whose size is 0 if there is none.
+        order: Byte order of the numbers.
+        parts: Parts of a frame between sync and checksum.
+    """
     table: dict[str, Any] = {"format": "described"}
     if windows.framing == SYNC:
         table["sync"] = sync.hex(" ").upper()
@@ -104,7 +126,10 @@ def _table(windows: Windows, sync: bytes, check: Check, order: ByteOrder, parts:
 
 
 def _fields(parts: Sequence[Part]) -> list[dict[str, Any]]:
-    """Return the fields of a device file. A second counter or clock becomes padding, and adjacent padding is joined."""
+    """Return the list `fields` of a device file for the parts of a frame.
+
+    A second counter or clock becomes padding, and adjacent padding is joined.
+    """
     fields: list[dict[str, Any]] = []
     roles: list[str] = []
     for part in parts:
@@ -139,18 +164,20 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
         seconds: Time in which they arrived, s.
         are_datagrams: Whether each chunk is a datagram.
     """
-    frames, share = _read(BinaryParser(), chunks)
-    if len(frames) >= MIN_FRAMES and share > CLEAR_SHARE:
+    binary_frames, binary_share = _read(BinaryParser(), chunks)
+    if len(binary_frames) >= MIN_FRAMES and binary_share > CLEAR_SHARE:
         return {"format": "binary"}
-    text = None
-    parser = TextParser()
-    frames, share = _read(parser, chunks)
-    frames = [frame for frame in frames if len(frame.values) == len(frames[-1].values)]
-    if parser.layout is not None and len(frames) >= MIN_FRAMES:
-        text = {"format": "text"} | _text_keys(parser.layout, frames, len(frames) / seconds)
-        if share >= CLEAR_SHARE:
-            return text
-    return described_frames(chunks, seconds, are_datagrams=are_datagrams) or text
+
+    text_table = None
+    text_parser = TextParser()
+    all_text_frames, text_share = _read(text_parser, chunks)
+    text_frames = [frame for frame in all_text_frames if len(frame.values) == len(all_text_frames[-1].values)]
+    if text_parser.layout is not None and len(text_frames) >= MIN_FRAMES:
+        rate_Hz = len(text_frames) / seconds
+        text_table = {"format": "text"} | _text_keys(text_parser.layout, text_frames, rate_Hz)
+        if text_share >= CLEAR_SHARE:
+            return text_table
+    return described_frames(chunks, seconds, are_datagrams=are_datagrams) or text_table
 
 
 def _read(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], float]:
@@ -165,31 +192,41 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[
     Columns without names get names if one of them has a meaning. The header of a CSV stream becomes part of the device
     file, because a program that starts later does not receive it.
     """
-    last = frames[-1]
+    last_frame = frames[-1]
     meanings = _meanings(frames, rate_Hz)
     if layout.notation is Notation.csv and layout.names:
         columns = list(layout.names)
         for position, meaning in meanings.items():
-            columns[layout.columns.channels[position][0]] = meaning
+            column, _ = layout.columns.channels[position]
+            columns[column] = meaning
         return {"columns": columns}
-    if last.names or not meanings:
-        return {meaning: last.names[position] for position, meaning in meanings.items()}
-    channels = map("ch{}".format, count(1))
-    return {"columns": [meanings.get(position) or next(channels) for position in range(len(last.values))]}
+    if last_frame.names or not meanings:
+        return {meaning: last_frame.names[position] for position, meaning in meanings.items()}
+    channel_names = map("ch{}".format, count(1))
+    return {"columns": [meanings.get(position) or next(channel_names) for position in range(len(last_frame.values))]}
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def _meanings(frames: Sequence[Frame], rate_Hz: float) -> dict[int, str]:
-    """Return `seq`, `t_us`, `t_ms` or `t_s` by the position of the columns that count frames or time."""
+    """Find the columns that count frames or time, and return their names by their positions.
+
+    Args:
+        frames: Frames with the same number of values.
+        rate_Hz: Number of frames per second, Hz.
+
+    Returns:
+        `seq`, `t_us`, `t_ms` or `t_s` for each position of such a column.
+    """
     meanings: dict[int, str] = {}
     has_counter = frames[-1].seq is not None
     has_clock = frames[-1].t_us is not None
-    for position, step in enumerate(np.diff([frame.values for frame in frames], axis=0).T):
-        name, scale = clock_of(step, rate_Hz) or ("", 0.0)
-        if not has_counter and steady_step(step) == 1.0:
+    steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, columns)
+    for position, column_steps in enumerate(steps.T):
+        clock_name, clock_scale = clock_of(column_steps, rate_Hz) or ("", 0.0)
+        if not has_counter and steady_step(column_steps) == 1.0:
             meanings[position] = SEQ
             has_counter = True
-        elif not has_clock and scale == 1.0:  # lines of text have no scale
-            meanings[position] = name
+        elif not has_clock and clock_scale == 1.0:  # a device file for lines of text cannot state another scale
+            meanings[position] = clock_name
             has_clock = True
     return meanings

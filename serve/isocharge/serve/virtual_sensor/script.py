@@ -188,8 +188,10 @@ def wander(
     Raises:
         SceneError: If an argument is outside its range.
     """
-    low_N, high_N = force_range_N
-    if not (0.0 < low_N <= high_N and radius_mm > 0.0 and rate_Hz > 0.0 and seconds * rate_Hz >= 1.0):
+    min_force_N, max_force_N = force_range_N
+    has_valid_forces = 0.0 < min_force_N <= max_force_N
+    has_frames = rate_Hz > 0.0 and seconds * rate_Hz >= 1.0
+    if not (has_valid_forces and radius_mm > 0.0 and has_frames):
         raise SceneError(
             "wander: expected 0 < smallest <= largest force, a positive radius and at least one frame, got "
             f"{force_range_N} N, {radius_mm} mm, {seconds} s at {rate_Hz} Hz"
@@ -204,7 +206,8 @@ def wander(
         is_press = (t_s >= start_s) & (t_s < end_s)
         press_s = t_s[is_press] - start_s
         position_mm[is_press] = radius_mm * _random_path(rng, press_s)
-        force_N[is_press] = low_N * (high_N / low_N) ** _force_level(rng, press_s, end_s - start_s)
+        force_level = _force_level(rng, press_s, end_s - start_s)
+        force_N[is_press] = min_force_N * (max_force_N / min_force_N) ** force_level
         start_s = end_s + rng.uniform(*PAUSE_DURATION_S)
     return Script(position_mm.real, position_mm.imag, force_N, rate_Hz)
 
@@ -219,6 +222,7 @@ def _random_path(rng: np.random.Generator, t_s: Array) -> Complexes:
     Returns:
         Points x + i y, shape (n,).
     """
+    # The path is a random point plus three circles of random speed and direction, all of which begin at 0.
     start = np.sqrt(rng.uniform()) * np.exp(2j * np.pi * rng.uniform())
     turns_per_s = rng.uniform(-0.5, 0.5, size=(3, 1))
     circles = 0.25 * (np.exp(2j * np.pi * turns_per_s * t_s) - 1.0)
@@ -236,6 +240,7 @@ def _force_level(rng: np.random.Generator, t_s: Array, duration_s: float) -> Arr
         t_s: Times since the start of the press, shape (n,), s.
         duration_s: Duration of the press, s.
     """
+    # A slow sine around a random level, with a smooth ramp at the beginning and at the end of the press.
     mean_level = rng.uniform()
     frequency_Hz = rng.uniform(0.3, 1.0)
     phase_turns = rng.uniform()
@@ -246,7 +251,9 @@ def _force_level(rng: np.random.Generator, t_s: Array, duration_s: float) -> Arr
 
 
 def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
-    """Damage a fraction of the bytes. A damaged byte has one flipped bit, is dropped, or is followed by a random byte.
+    """Return bytes of which a fraction is damaged.
+
+    A damaged byte has one flipped bit, is dropped, or is followed by a random byte, each with the same probability.
 
     Args:
         data: The bytes.
@@ -259,7 +266,8 @@ def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
         damage = int(rng.integers(3))
         random_byte = int(rng.integers(256))
         if damage == 0:
-            pieces[position] = bytes([byte ^ 1 << random_byte % BITS_PER_BYTE])
+            flipped_bit = 1 << (random_byte % BITS_PER_BYTE)
+            pieces[position] = bytes([byte ^ flipped_bit])
         elif damage == 1:
             pieces[position] = b""
         else:

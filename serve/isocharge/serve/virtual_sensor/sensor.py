@@ -227,30 +227,42 @@ class VirtualSensor:
         self._next_script = (script, _clean_charges(charges, script))
 
     def frames(self) -> Iterator[bytes]:
-        """Yield the bytes of each frame without waiting for its time; empty bytes for a frame that a fault loses."""
+        """Yield the bytes of each frame without waiting for its time; empty bytes for a frame that a fault loses.
+
+        The frames are computed in blocks. A new script takes effect at the beginning of a block, and the last script is
+        repeated without end.
+        """
         self.lost = 0
         self.corrupted = 0
         self._script_start = 0
         block_size = max(1, round(BLOCK_S * self._script.rate_Hz))
-        for first in itertools.count(step=block_size):
+        for first_number in itertools.count(step=block_size):
             if self._next_script is not None:
                 self._script, self._clean_pC = self._next_script
                 self._next_script = None
-                self._script_start = first
-            rows = range(first - self._script_start, first - self._script_start + block_size)
+                self._script_start = first_number
+            first_row = first_number - self._script_start
+            rows = range(first_row, first_row + block_size)
             clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")
             measured_pC = clean_pC if self._noise is None else self._noise(clean_pC, self._rng)
-            for number, charge_pC in enumerate((measured_pC + self._offset_pC).tolist(), first):
+            sent_pC = measured_pC + self._offset_pC
+            for number, charge_pC in enumerate(sent_pC.tolist(), first_number):
                 yield self._frame(number, tuple(charge_pC))
 
     def _frame(self, number: int, charge_pC: tuple[float, ...]) -> bytes:
-        """Encode a frame, and apply the faults."""
+        """Return the bytes of a frame after the faults; empty if a fault loses the frame.
+
+        Args:
+            number: Number of the frame since the start.
+            charge_pC: Charges, pC.
+        """
         faults = self._faults
         is_silent = faults.is_silent(self._script_time_s(number))
         if is_silent or (faults.lose_share and self._rng.random() < faults.lose_share):
             self.lost += 1
             return b""
-        t_us = round(number / self._script.rate_Hz * (1e6 + faults.clock_ppm)) % T_US_MODULUS
+        device_us_per_s = 1e6 + faults.clock_ppm
+        t_us = round(number / self._script.rate_Hz * device_us_per_s) % T_US_MODULUS
         data = self._encode(Frame(number % SEQ_MODULUS, t_us, charge_pC))
         if not faults.corrupt_share:
             return data
@@ -264,15 +276,19 @@ class VirtualSensor:
         return (number - self._script_start) / self._script.rate_Hz
 
     def truth(self, seq: int) -> Truth:
-        """Return the true press in the latest frame with a frame number.
+        """Return the true press in the latest frame with a frame counter.
+
+        Args:
+            seq: Counter of the frame, which wraps to 0 at `SEQ_MODULUS`.
 
         Raises:
-            SceneError: If no frame with this number has been played.
+            SceneError: If no frame with this counter has been played.
         """
-        latest = self._frame_count - 1
-        number = latest - (latest - seq) % SEQ_MODULUS
+        latest_number = self._frame_count - 1
+        frames_since = (latest_number - seq) % SEQ_MODULUS
+        number = latest_number - frames_since
         if number < 0 or not 0 <= seq < SEQ_MODULUS:
-            raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest, SEQ_MODULUS - 1)}")
+            raise SceneError(f"no frame {seq} was played; expected 0 to {min(latest_number, SEQ_MODULUS - 1)}")
         script = self._script
         row = (number - self._script_start) % len(script)
         return Truth(
@@ -356,14 +372,23 @@ class VirtualSensor:
 
 
 def _clean_charges(forward: Charges, script: Script) -> Array:
-    """Compute the touch charges of a script, shape (n, electrodes), pC. They are zero while nothing touches."""
+    """Compute the touch charges of a script, shape (n, electrodes), pC. They are zero while nothing touches.
+
+    Args:
+        forward: Forward map: charges of contacts.
+        script: The presses.
+
+    Raises:
+        SceneError: If the forward map returns charges of another shape, or charges that are not finite.
+    """
     is_touch = script.touching
-    count = int(is_touch.sum())
+    touch_count = int(is_touch.sum())
     contacts = np.column_stack([script.x_mm, script.y_mm, script.force_N])
     touch_pC = forward(contacts[is_touch])
-    if touch_pC.ndim != 2 or len(touch_pC) != count or not np.isfinite(touch_pC).all():
+    has_expected_shape = touch_pC.ndim == 2 and len(touch_pC) == touch_count
+    if not has_expected_shape or not np.isfinite(touch_pC).all():
         raise SceneError(
-            f"forward map: expected finite charges of shape ({count}, electrodes), got shape "
+            f"forward map: expected finite charges of shape ({touch_count}, electrodes), got shape "
             f"{touch_pC.shape} with {np.count_nonzero(~np.isfinite(touch_pC))} not finite"
         )
     charge_pC = np.zeros((len(script), touch_pC.shape[1]))
