@@ -304,11 +304,12 @@ class Posterior:
             Chi-squared, shape (n,), and the largest slope of its square root, shape (n,), 1/mm.
         """
         force_weights = self.charges.force_weights(log_force)
-        expected = np.einsum("nk,nke->ne", force_weights, terms)
+        expected = (force_weights[:, None, :] @ terms)[:, 0]  # shape (n, n_electrode)
         sigma = self.noise.sigma(expected)
         deviation = (charge - expected) / sigma
         slope = largest_slope * force_weights.sum(axis=1)[:, None] / sigma
-        return np.einsum("ne,ne->n", deviation, deviation), np.sqrt(np.einsum("ne,ne->n", slope, slope))
+        chi2 = (deviation**2).sum(axis=1)
+        return chi2, np.linalg.norm(slope, axis=1)
 
     def _inverse_std(self, cells: Cells, terms: Array, log_force: Array) -> Array:
         """Compute the inverse of the smallest standard deviation of the position with unknown force.
@@ -322,13 +323,14 @@ class Posterior:
             Shape (n,), 1/mm.
         """
         force_weights = self.charges.force_weights(log_force)
-        slopes = self.charges.scaled_gradients(onto_disk(cells.centre, self.radius))
+        gradients = self.charges.scaled_gradients(onto_disk(cells.centre, self.radius))
+        # Sums over the terms k of the dependence on the force, for each cell n, electrode e and coordinate i
         expected = np.einsum("nk,nke->ne", force_weights, terms)
-        position_jacobian = np.einsum("nk,nkei->nei", force_weights, slopes)
+        position_jacobian = np.einsum("nk,nkei->nei", force_weights, gradients)
         force_jacobian = self._profile.slope(log_force, expected)[..., None]
         jacobian = np.concatenate([position_jacobian, force_jacobian], axis=2)
-        values = singular_values(jacobian / self.noise.sigma(expected)[..., None])
-        return np.asarray(values[:, 0])
+        largest_to_smallest = singular_values(jacobian / self.noise.sigma(expected)[..., None])
+        return np.asarray(largest_to_smallest[:, 0])
 
     def _integrate_force(self, position: Array, charge: Array) -> tuple[Array, Array]:
         """Return the nodes of the integral over the logarithm of the force, and their weights times the likelihood.
@@ -340,21 +342,24 @@ class Posterior:
         Returns:
             Logarithms of the forces, and logarithms of weight times likelihood, shape (n, N_FORCE_NODES) each.
         """
+        # The interval of integration lies about the best force and is several standard deviations wide.
         terms = self.charges.scaled_charges(position)
-        best = self._profile.best(terms, charge, self.noise)
-        expected = self._profile.charge(best, terms)
-        inverse_std = np.linalg.norm(self._profile.slope(best, expected) / self.noise.sigma(expected), axis=1)
-        half_width = FORCE_HALF_WIDTH_STD / inverse_std
-        smallest, largest = self._profile.log_range
-        low = np.maximum(best - half_width, smallest)[:, None]
-        high = np.minimum(best + half_width, largest)[:, None]
+        best_log_force = self._profile.best(terms, charge, self.noise)
+        best_charge = self._profile.charge(best_log_force, terms)
+        relative_slope = self._profile.slope(best_log_force, best_charge) / self.noise.sigma(best_charge)
+        half_width = FORCE_HALF_WIDTH_STD / np.linalg.norm(relative_slope, axis=1)
+        min_log_force, max_log_force = self._profile.log_range
+        lower = np.maximum(best_log_force - half_width, min_log_force)[:, None]
+        upper = np.minimum(best_log_force + half_width, max_log_force)[:, None]
+
         nodes, weights = np.polynomial.legendre.leggauss(N_FORCE_NODES)
-        log_force = 0.5 * (low + high) + 0.5 * (high - low) * nodes
+        log_force = 0.5 * (lower + upper) + 0.5 * (upper - lower) * nodes
+        # Expected charges of electrode e at position n and node m, as a sum over the terms k
         expected = np.einsum("nmk,nke->enm", self.charges.force_weights(log_force), terms)
         variance = self.noise.variance(expected)
         chi2 = ((charge.T[:, :, None] - expected) ** 2 / variance).sum(axis=0)
         log_likelihood = -0.5 * (chi2 + np.log(variance.prod(axis=0)))
-        return log_force, np.log(weights * (high - low)) + log_likelihood
+        return log_force, np.log(weights * (upper - lower)) + log_likelihood
 
 
 def _moments(press: Integers, position: Array, log_force: Array, log_weight: Array) -> Array:
@@ -369,18 +374,18 @@ def _moments(press: Integers, position: Array, log_force: Array, log_weight: Arr
     Returns:
         Shape (2, n_press, 3), mm and N.
     """
-    first = np.flatnonzero(np.diff(press, prepend=-1))
-    count = np.diff(first, append=press.size)
-    largest = np.maximum.reduceat(log_weight.max(axis=1), first)
-    weight = np.exp(log_weight - np.repeat(largest, count)[:, None])
+    first_row = np.flatnonzero(np.diff(press, prepend=-1))  # the rows of a press follow each other
+    n_row = np.diff(first_row, append=press.size)
+    largest_log_weight = np.maximum.reduceat(log_weight.max(axis=1), first_row)
+    weight = np.exp(log_weight - np.repeat(largest_log_weight, n_row)[:, None])
     force = np.exp(log_force)
     position_weight = weight.sum(axis=1)
+    total_weight = np.add.reduceat(position_weight, first_row)
 
     def expectation(weighted: Array) -> Array:
         """Return the sum over the positions of each press, relative to the sum of the weights."""
-        return np.asarray(np.add.reduceat(weighted, first, axis=0) / total)
+        return np.asarray(np.add.reduceat(weighted, first_row, axis=0) / total_weight)
 
-    total = np.add.reduceat(position_weight, first)
     x, y = (expectation(position_weight * coordinate) for coordinate in position.T)
     x_square, y_square = (expectation(position_weight * coordinate**2) for coordinate in position.T)
     force_mean, force_square, inverse_force, inverse_square = (

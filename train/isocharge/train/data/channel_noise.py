@@ -186,20 +186,30 @@ def usual_size(charge: Array) -> Array:
 
 
 def _variance(value: Array, residual: Array) -> tuple[float, float]:
-    """Estimate white^2 and gain^2 of one channel by weighted least squares.
+    """Estimate the variances white^2 and gain^2 of one channel, for which white^2 + gain^2 Q^2 fits the residuals.
+
+    The fit is a weighted least-squares problem with variances that are not negative. Its weights follow from the
+    previous round, because the standard deviation of a squared residual is proportional to its expectation.
 
     Args:
         value: Charges, shape (n,), pC.
         residual: Residuals, shape (n,), pC.
+
+    Returns:
+        white^2, pC^2, and gain^2, dimensionless.
     """
     columns = np.stack([np.ones_like(value), value**2], axis=1)
-    fit = np.array([np.mean(residual**2), 0.0])
+    mean_square = np.mean(residual**2)
+    smallest_variance = 1e-12 * mean_square + 1e-30
+    column_scale = np.sqrt(np.maximum((columns**2).sum(axis=0), 1e-30)) / np.sqrt(len(value))
+    variances = np.array([mean_square, 0.0])
     for _ in range(ROUNDS):
-        expected = np.maximum(columns @ fit, 1e-12 * np.mean(residual**2) + 1e-30)
-        squares = np.minimum(residual**2, OUTLIER**2 * expected)
-        scale = np.sqrt(np.maximum((columns**2).sum(axis=0), 1e-30)) / np.sqrt(len(value))
-        fit = nnls(columns / scale / expected[:, None], squares / expected)[0] / scale
-    return float(fit[0]), float(fit[1])
+        expected = np.maximum(columns @ variances, smallest_variance)
+        squares = np.minimum(residual**2, OUTLIER**2 * expected)  # limits the influence of outliers
+        weighted_columns = columns / column_scale / expected[:, None]
+        variances = nnls(weighted_columns, squares / expected)[0] / column_scale
+    white_variance, gain_variance = variances.tolist()
+    return white_variance, gain_variance
 
 
 Noise = NoiseModel | ChannelNoise

@@ -82,6 +82,15 @@ def check_measured_dataset(dataset: Dataset) -> None:
 
 
 def _check_variation(name: str, charge: Array) -> None:
+    """Raise an error if nearly all charges of a channel are equal.
+
+    Args:
+        name: Name of the channel.
+        charge: Charges of the channel, shape (n,), pC.
+
+    Raises:
+        PressError: If the charges hardly vary, or vary in only a few presses.
+    """
     values, counts = np.unique(charge, return_counts=True)
     if np.ptp(charge) <= LEAST_VARIATION * np.abs(charge).max():
         raise PressError(
@@ -96,12 +105,21 @@ def _check_variation(name: str, charge: Array) -> None:
 
 
 def _check_size(name: str, charge: Array) -> None:
-    size = float(usual_size(charge[:, np.newaxis])[0])
+    """Raise an error if the charges of a channel are so small or large that their unit is probably not pC.
+
+    Args:
+        name: Name of the channel.
+        charge: Charges of the channel, shape (n,), pC.
+
+    Raises:
+        PressError: If the median of the absolute charges is outside `USUAL_SIZES`.
+    """
+    median_size = float(usual_size(charge[:, np.newaxis])[0])
     smallest, largest = USUAL_SIZES
-    if not smallest <= size <= largest:
+    if not smallest <= median_size <= largest:
         raise PressError(
-            f"channel {shown(name)}: expected charges in pC, of {smallest:g} to {largest:g}, got {size:.3g} as the "
-            "median of their sizes; check the unit of the column"
+            f"channel {shown(name)}: expected charges in pC, of {smallest:g} to {largest:g}, got {median_size:.3g} as "
+            "the median of their sizes; check the unit of the column"
         )
 
 
@@ -128,15 +146,24 @@ def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compare
 
 
 def _check_independence(channels: Mapping[str, Array]) -> None:
+    """Raise an error if the charges of a channel are a linear combination of those of other channels.
+
+    Args:
+        channels: Charges of each channel, shape (n,), pC, by its name.
+
+    Raises:
+        PressError: If the smallest singular value of the standardised charges is nearly zero. The message names the
+            channels that contribute to its singular vector.
+    """
     charge = np.column_stack(list(channels.values()))
     charge = charge / usual_size(charge)
     standardised = (charge - charge.mean(axis=0)) / charge.std(axis=0)
-    _, singular, directions = np.linalg.svd(standardised, full_matrices=False)
-    if singular[-1] > LEAST_INDEPENDENCE * singular[0]:
+    _, singular_values, directions = np.linalg.svd(standardised, full_matrices=False)
+    if singular_values[-1] > LEAST_INDEPENDENCE * singular_values[0]:
         return
     coefficients = np.abs(directions[-1])
-    takes_part = coefficients > LEAST_PARTICIPATION * coefficients.max()
-    dependent = [shown(name) for name, is_part in zip(channels, takes_part, strict=True) if is_part]
+    contributes = coefficients > LEAST_PARTICIPATION * coefficients.max()
+    dependent = [shown(name) for name, is_dependent in zip(channels, contributes, strict=True) if is_dependent]
     raise PressError(
         f"channels {', '.join(dependent)}: expected charges that are linearly independent, got channels of which each "
         "follows from the others; leave out a channel that is a copy or a sum of others"

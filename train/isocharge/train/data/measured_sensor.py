@@ -92,12 +92,26 @@ class PressedArea(Domain):
         return f"a place in the pressed area, x from {left:g} to {right:g} mm and y from {bottom:g} to {top:g} mm,"
 
     def is_outside(self, contact: Array) -> Booleans:
-        """Return which contacts, shape (n, 3), are outside the area or the range of forces; with NaN, none is."""
+        """Return whether contacts are outside the area or the range of forces.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts with NaN do not count as outside.
+
+        Returns:
+            Shape (n,).
+        """
         is_known = ~np.isnan(contact).any(axis=1)
         return np.asarray(is_known & ~self.contains(contact))
 
     def contains(self, contact: Array) -> Booleans:
-        """Return which contacts (x, y, F), shape (n, 3), mm and N, lie in the domain, shape (n,); NaN does not."""
+        """Return whether contacts lie in the domain.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts with NaN do not lie in the domain.
+
+        Returns:
+            Shape (n,).
+        """
         has_force = Domain(np.inf, self.force_range).contains(contact)
         return has_force & inside_polygon(contact[:, 0], contact[:, 1], np.array(self.corners))
 
@@ -108,16 +122,20 @@ def _middle(corners: Array) -> Array:
 
 
 def outline(places: Array) -> Array:
-    """Corners of the area that places cover, shape (n, 2), mm, grown by half the distance between neighbours.
+    """Compute the outline of the area that places cover, enlarged by half the distance between neighbours.
 
-    The triangles between places, without those that are too large for an area that was pressed (Edelsbrunner et al.
-    1983): their limit is the least that leaves one ring with all places inside. Holes are closed.
+    The area consists of the triangles between places whose circumscribed circle is small enough (alpha shape,
+    Edelsbrunner et al. 1983). The limit of the radius is the smallest one for which the triangles contain all places
+    and have a single boundary. Holes are filled.
 
     Args:
-        places: Different (x, y), shape (m, 2), mm.
+        places: Positions (x, y), all different, shape (m, 2), mm.
+
+    Returns:
+        Corners of the outline, anticlockwise, shape (n, 2), mm.
 
     Raises:
-        PressError: If they lie on a line, or almost.
+        PressError: If the places lie on a line, or almost.
     """
     on_a_line = f"expected presses over an area, got {len(places)} places on one line; press beside it, too"
     length, width = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
@@ -127,55 +145,94 @@ def outline(places: Array) -> Array:
         triangles = Delaunay(places).simplices
     except QhullError as error:
         raise PressError(on_a_line) from error
-    spacing = float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
-    sizes = _circumradii(places[triangles])
-    limits = [*LEAST_HOLE * spacing * 2.0 ** np.arange(0.0, 20.0, 0.5), np.inf]
-    rings = (_ring(triangles[sizes <= limit], len(places)) for limit in limits)
-    ring = next((ring for ring in rings if ring is not None), None)
-    if ring is None:
-        raise PressError(f"expected presses over an area, got {len(places)} places that enclose none")
-    return _grown(places[ring], 0.5 * spacing)
+
+    neighbour_distance = cKDTree(places).query(places, 2)[0][:, 1]
+    spacing = float(np.median(neighbour_distance))
+    circumradii = _circumradii(places[triangles])
+    radius_limits = [*LEAST_HOLE * spacing * 2.0 ** np.arange(0.0, 20.0, 0.5), np.inf]
+    for radius_limit in radius_limits:
+        boundary = _single_boundary(triangles[circumradii <= radius_limit], len(places))
+        if boundary is not None:
+            return _enlarged(places[boundary], 0.5 * spacing)
+    raise PressError(f"expected presses over an area, got {len(places)} places that enclose none")
 
 
 def _circumradii(corners: Array) -> Array:
-    """Radii of the circles through triangles, shape (n, 3, 2)."""
-    a = corners[:, 1] - corners[:, 0]
-    b = corners[:, 2] - corners[:, 0]
-    sides = [np.hypot(*side.T) for side in (a, b, b - a)]
-    doubled = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    return np.asarray(np.prod(sides, axis=0) / np.maximum(2.0 * doubled, 1e-30))
+    """Compute the radii of the circumscribed circles of triangles.
+
+    The radius is the product of the lengths of the sides over four times the area.
+
+    Args:
+        corners: Corners (x, y) of the triangles, shape (n, 3, 2), mm.
+
+    Returns:
+        Radii, shape (n,), mm.
+    """
+    first_side = corners[:, 1] - corners[:, 0]
+    second_side = corners[:, 2] - corners[:, 0]
+    third_side = second_side - first_side
+    lengths = [np.hypot(*side.T) for side in (first_side, second_side, third_side)]
+    twice_area = np.abs(first_side[:, 0] * second_side[:, 1] - first_side[:, 1] * second_side[:, 0])
+    return np.asarray(np.prod(lengths, axis=0) / np.maximum(2.0 * twice_area, 1e-30))
 
 
-def _ring(triangles: Integers, count: int) -> list[int] | None:
-    """The outer edges of triangles as one ring, anticlockwise; None if they are more, or a place is in no triangle."""
-    if len(np.unique(triangles)) < count:
+def _single_boundary(triangles: Integers, n_place: int) -> list[int] | None:
+    """Return the boundary of an area of triangles, if it is a single closed line and the area contains all places.
+
+    Args:
+        triangles: Indices of the places at the corners of each triangle, shape (n, 3).
+        n_place: Number of all places.
+
+    Returns:
+        Indices of the places on the boundary, in order; None if there are several closed lines, or if a place belongs
+        to no triangle.
+    """
+    if len(np.unique(triangles)) < n_place:
         return None
-    pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    beside: dict[int, list[int]] = {}
-    for (one, other), times in Counter(map(tuple, pairs.tolist())).items():
-        if times == 1:
-            beside.setdefault(one, []).append(other)
-            beside.setdefault(other, []).append(one)
-    if any(len(others) != 2 for others in beside.values()):
+
+    # An edge on the boundary belongs to one triangle only.
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    neighbours: dict[int, list[int]] = {}
+    for (start, end), n_triangle in Counter(map(tuple, edges.tolist())).items():
+        if n_triangle == 1:
+            neighbours.setdefault(start, []).append(end)
+            neighbours.setdefault(end, []).append(start)
+    if any(len(places) != 2 for places in neighbours.values()):
         return None
-    first = min(beside)
-    ring = [first]
-    at = beside[first][0]
-    while at != first:
-        one, other = beside[at]
-        ring.append(at)
-        at = other if one == ring[-2] else one
-    return ring if len(ring) == len(beside) else None
+
+    # Walk along the boundary until it returns to its first place.
+    first_place = min(neighbours)
+    boundary = [first_place]
+    place = neighbours[first_place][0]
+    while place != first_place:
+        one, other = neighbours[place]
+        previous_place = boundary[-1]
+        boundary.append(place)
+        place = other if one == previous_place else one
+    return boundary if len(boundary) == len(neighbours) else None
 
 
-def _grown(corners: Array, by: float) -> Array:
-    """A polygon whose sides have moved out, mm, without its straight corners."""
-    z = to_complex(corners if area_of(corners) > 0.0 else corners[::-1])
-    along = np.roll(z, -1) - z
-    turn = np.angle(along / np.roll(along, 1))
-    z = z[np.abs(turn) > 1e-6]
-    along = np.roll(z, -1) - z
-    after = -1j * along / np.abs(along)
-    before = np.roll(after, 1)
-    mitre = (before + after) / np.maximum(1.0 + (before * np.conj(after)).real, 1e-9)
-    return to_corners(z + by * mitre * np.minimum(1.0, LONGEST_MITRE / np.abs(mitre)))
+def _enlarged(corners: Array, distance: float) -> Array:
+    """Return a polygon whose sides are moved outwards.
+
+    Args:
+        corners: Corners (x, y) of the polygon in either direction, shape (n, 2), mm.
+        distance: Distance by which each side is moved, mm. The displacement of a sharp corner is limited by
+            `LONGEST_MITRE` times this distance.
+
+    Returns:
+        Corners, anticlockwise, without those between two sides in the same direction, shape (m, 2), mm.
+    """
+    points = to_complex(corners if area_of(corners) > 0.0 else corners[::-1])
+    sides = np.roll(points, -1) - points
+    turn = np.angle(sides / np.roll(sides, 1))
+    points = points[np.abs(turn) > 1e-6]
+
+    # A corner moves along the bisector of the normals of both sides.
+    sides = np.roll(points, -1) - points
+    next_normal = -1j * sides / np.abs(sides)
+    previous_normal = np.roll(next_normal, 1)
+    cosine = (previous_normal * np.conj(next_normal)).real
+    mitre = (previous_normal + next_normal) / np.maximum(1.0 + cosine, 1e-9)
+    limited_mitre = mitre * np.minimum(1.0, LONGEST_MITRE / np.abs(mitre))
+    return to_corners(points + distance * limited_mitre)

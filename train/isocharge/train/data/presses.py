@@ -81,11 +81,20 @@ def is_measured(dataset: Dataset) -> bool:
 
 
 def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array:
-    """Draw contacts (x, y, F), shape (count, 3), mm and N, uniform over the disk, with log-uniform forces."""
+    """Draw contacts whose positions are uniformly distributed over the disk, with log-uniform forces.
+
+    Args:
+        rng: Random number generator.
+        domain: Disk and range of forces.
+        count: Number of contacts.
+
+    Returns:
+        Contacts (x, y, F), shape (count, 3), mm and N.
+    """
     radius = domain.radius * np.sqrt(rng.random(count))
     angle = 2.0 * np.pi * rng.random(count)
-    low, high = np.log(domain.force_range)
-    force = np.exp(rng.uniform(low, high, count))
+    min_log, max_log = np.log(domain.force_range)
+    force = np.exp(rng.uniform(min_log, max_log, count))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), force], axis=1)
 
 

@@ -185,6 +185,7 @@ def _detected_faults(
     n_electrode = charge.shape[1]
 
     def detected_fraction(gain: float) -> float:
+        """Return the fraction of detected presses if the gain of one electrode is wrong, over all electrodes."""
         faulty_charges = []
         for electrode in range(n_electrode):
             gains = np.ones(n_electrode)

@@ -77,21 +77,31 @@ def check_graph(
 def _golden_charges(exact: OutputFunction, presses: LabelledPresses, noise: Noise) -> tuple[Singles, Singles]:
     """Choose charges for the golden vectors: three quarters from presses, and one quarter of extreme charges.
 
-    Only presses whose position has a standard deviation below the median are used. Where 0.2 % of a charge is a
-    millimetre, the last digit of a float32 is 3e-5 mm, and different runtimes do not agree within the tolerance of
-    golden vectors.
+    Only presses whose position has a standard deviation below the median are used. Where a small change of a charge
+    moves the position by millimetres, the rounding of float32 numbers causes differences between runtimes that exceed
+    the tolerance of the golden vectors.
+
+    Args:
+        exact: Network in double precision.
+        presses: Presses without noise.
+        noise: Noise that is added to some of the charges.
+
+    Returns:
+        Charges of presses, shape (n, n_electrode), and extreme charges, shape (m, n_electrode), pC.
     """
     _, std, *_ = exact(presses.charge)
     position_std = std[:, 0] + std[:, 1]
-    certain = presses[np.flatnonzero(position_std <= np.median(position_std))]
-    clean = certain[np.linspace(0, len(certain) - 1, N_GOLDEN // 2).astype(int)]
-    every_second = clean[np.arange(0, len(clean), 2)]
-    noisy = every_second.noisy(noise, seed=2)
-    extreme = every_second.charge * np.geomspace(1e-3, 1e3, len(every_second))[:, None]
-    extreme[0] = 0.0
-    extreme[1] = -extreme[1]
-    ordinary = np.concatenate([clean.charge, noisy])
-    return ordinary.astype(np.float32), extreme.astype(np.float32)
+    well_determined = presses[np.flatnonzero(position_std <= np.median(position_std))]
+    chosen_rows = np.linspace(0, len(well_determined) - 1, N_GOLDEN // 2).astype(int)
+    chosen = well_determined[chosen_rows]
+    every_second = chosen[np.arange(0, len(chosen), 2)]
+    press_charge = np.concatenate([chosen.charge, every_second.noisy(noise, seed=2)])
+
+    # Very small and very large charges, zero charges, and negative charges
+    extreme_charge = every_second.charge * np.geomspace(1e-3, 1e3, len(every_second))[:, None]
+    extreme_charge[0] = 0.0
+    extreme_charge[1] = -extreme_charge[1]
+    return press_charge.astype(np.float32), extreme_charge.astype(np.float32)
 
 
 def _check_finite(session: ort.InferenceSession, n_electrode: int) -> None:

@@ -119,34 +119,63 @@ def _add_answers(build: GraphBuilder, network: FoldedNetwork) -> str:
 
 
 def _add_features(build: GraphBuilder, features: ChargeFeatures) -> str:
-    """Add the input features of the charges and return their name."""
-    factor = 1.0 / features.typical_pC
+    """Add nodes that compute the input features of the charges.
+
+    The features are ln(Q / typical charge), or asinh(Q / typical charge) - mean if charges may be negative.
+
+    Args:
+        build: Builder of the graph.
+        features: Limits, typical charges and means of the features.
+
+    Returns:
+        Name of the tensor with the features.
+    """
+    inverse_typical = 1.0 / features.typical_pC
     if features.mean is None:
         clipped = build.add("Clip", INPUT, build.constant(features.low_pC), build.constant(features.high_pC))
-        return build.add("Log", build.add("Mul", clipped, build.constant(factor)))
-    above = build.add("Max", INPUT, build.constant(features.low_pC))
-    clipped = build.add("Min", above, build.constant(features.high_pC))
-    ratio = build.add("Mul", clipped, build.constant(factor))
+        ratio = build.add("Mul", clipped, build.constant(inverse_typical))
+        return build.add("Log", ratio)
+    not_below = build.add("Max", INPUT, build.constant(features.low_pC))
+    clipped = build.add("Min", not_below, build.constant(features.high_pC))
+    ratio = build.add("Mul", clipped, build.constant(inverse_typical))
     return build.add("Sub", build.add("Asinh", ratio), build.constant(features.mean))
 
 
 def _add_perceptron(build: GraphBuilder, inputs: str, perceptron: Perceptron[Array]) -> str:
-    """Add a perceptron and return the name of its outputs."""
-    value = inputs
+    """Add nodes that evaluate a perceptron with hidden layers and a skip layer.
+
+    Args:
+        build: Builder of the graph.
+        inputs: Name of the tensor with the inputs.
+        perceptron: The perceptron.
+
+    Returns:
+        Name of the tensor with the outputs.
+    """
+    hidden = inputs
     for layer in perceptron.hidden:
-        linear = build.add("Gemm", value, build.constant(layer.weight), build.constant(layer.bias))
-        value = build.add(perceptron.activation.onnx_operator, linear)
-    last = perceptron.last
-    skipped = build.add("Gemm", inputs, build.constant(perceptron.skip), build.constant(last.bias))
-    return build.add("Gemm", value, build.constant(last.weight), skipped)
+        linear = build.add("Gemm", hidden, build.constant(layer.weight), build.constant(layer.bias))
+        hidden = build.add(perceptron.activation.onnx_operator, linear)
+    output_layer = perceptron.last
+    skip_and_bias = build.add("Gemm", inputs, build.constant(perceptron.skip), build.constant(output_layer.bias))
+    return build.add("Gemm", hidden, build.constant(output_layer.weight), skip_and_bias)
 
 
 def _make_model(
     build: GraphBuilder, name: str, n_electrode: int, outputs: Mapping[str, int], **attributes: Any
 ) -> onnx.ModelProto:
-    """Return a model with the input `charge_pC` [n, n_electrode] and outputs [n, width], all float32."""
+    """Return a model with the input `charge_pC` [n, n_electrode] and outputs [n, width], all float32.
+
+    Args:
+        build: Builder with the nodes and constants of the graph.
+        name: Name of the graph.
+        n_electrode: Number of charges.
+        outputs: Width of each output by its name.
+        **attributes: Further arguments of `onnx.helper.make_model`.
+    """
 
     def tensors(widths: Mapping[str, int]) -> list[onnx.ValueInfoProto]:
+        """Return the declarations of float32 tensors with these widths."""
         return [
             helper.make_tensor_value_info(tensor, TensorProto.FLOAT, ["n", width]) for tensor, width in widths.items()
         ]
@@ -189,7 +218,15 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
 
 
 def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
-    """Return the network whose constants a graph holds, if the graph is one of `write_graph`."""
+    """Return the network that a graph evaluates, if the graph was written by `write_graph`.
+
+    Args:
+        graph: The graph.
+        where: Beginning of the error messages.
+
+    Raises:
+        ModelError: If the number or the shapes of the constants are not those of a network.
+    """
     operators = [node.op_type for node in graph.node]
     activation = _activation_of(operators, where)
     constants = _constants_in_order(graph, where)
@@ -217,7 +254,12 @@ def _activation_of(operators: Sequence[str], where: str) -> Activation:
 
 
 def _constants_in_order(graph: onnx.GraphProto, where: str) -> Iterator[Array]:
-    """Yield the constants of a graph in the order in which the nodes use them."""
+    """Yield the constants of a graph in the order in which the nodes use them.
+
+    Args:
+        graph: The graph.
+        where: Beginning of the error message about constants that are not finite.
+    """
     constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
     for node in graph.node:
         for name in node.input:
@@ -285,20 +327,24 @@ class _PlainNode:
 
 
 def _plain_nodes(graph: onnx.GraphProto) -> Iterator[_PlainNode]:
-    """Yield the nodes of a graph with all arbitrary names replaced by numbers."""
-    values: dict[str, object] = {tensor.name: tensor.name for tensor in graph.input}
+    """Yield the nodes of a graph in a form that can be compared with the nodes of another graph.
+
+    The names of tensors inside a graph are arbitrary. They are replaced by the number of the node that computes the
+    tensor, and constants are replaced by their values.
+    """
+    plain_inputs: dict[str, object] = {tensor.name: tensor.name for tensor in graph.input}
     for tensor in graph.initializer:
-        values[tensor.name] = _plain_constant(numpy_helper.to_array(tensor))
+        plain_inputs[tensor.name] = _plain_constant(numpy_helper.to_array(tensor))
     graph_outputs = {tensor.name for tensor in graph.output}
-    for number, node in enumerate(graph.node):
+    for node_index, node in enumerate(graph.node):
         yield _PlainNode(
             operator=node.op_type,
-            inputs=tuple(values.get(name) for name in node.input),
+            inputs=tuple(plain_inputs.get(name) for name in node.input),
             outputs=tuple(name if name in graph_outputs else None for name in node.output),
-            attributes={entry.name: helper.get_attribute_value(entry) for entry in node.attribute},
+            attributes={attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute},
         )
-        for position, name in enumerate(node.output):
-            values[name] = f"result {position} of node {number}"
+        for output_index, name in enumerate(node.output):
+            plain_inputs[name] = f"result {output_index} of node {node_index}"
 
 
 def _plain_constant(values: NDArray[Any]) -> tuple[object, ...]:

@@ -206,10 +206,15 @@ Forces log-uniform, positions uniform over the working area.
 
 
 def _misfit_section(metadata: ModelMetadata, fitted: Fitted) -> str:
-    """Return the paragraph of the card about the misfit."""
+    """Return the paragraph of the card about the misfit.
+
+    Args:
+        metadata: Metadata of the model, with its errors.
+        fitted: The network, its noise and its test presses.
+    """
     errors = metadata.errors
-    unit = fitted.misfit_noise
-    unit_text = f" `{unit.name}` (1 pC and 0.2 %)" if unit != fitted.noise else ""
+    noise = fitted.misfit_noise
+    unit_text = f" `{noise.name}` (1 pC and 0.2 %)" if noise != fitted.noise else ""
     if fitted.good.measured:
         presses_text = "measured presses"
     elif fitted.test.measured:
@@ -222,18 +227,18 @@ def _misfit_section(metadata: ModelMetadata, fitted: Fitted) -> str:
         gain_percent = 100 * errors["found_gain_20_percent"]
         dead_percent = 100 * errors["found_dead_electrode"]
         faults_text = (
-            f"Of presses of about 1 N the former finds {gain_percent:.3g} % where one gain\n"
-            f"is off by 20 %, and {dead_percent:.3g} % where one electrode is dead."
+            f"An alarm at {errors['misfit_p99']:g} finds {gain_percent:.3g} % of the presses of about 1 N with one\n"
+            f"gain that is wrong by 20 %, and {dead_percent:.3g} % of those with one dead electrode."
         )
     meaning_text = "Charges that disagree with each other (a wrong gain, a dead electrode, two presses) raise it."
     if len(metadata.electrodes) == 3:
         meaning_text = (
-            "Three charges and three unknowns: nearly every triple fits some contact, so it sees only what leads out\n"
-            "of the working area or the forces."
+            "Because there are three charges and three unknowns, nearly all charges fit some contact. The misfit is\n"
+            "therefore large only for charges whose contact lies outside the working area or the range of forces."
         )
     return f"""\
-The misfit is the distance, in units of the noise{unit_text}, of the charges from the nearest single contact that the
-model knows; a network gives it, learned from exact searches. 1 % of {presses_text} exceed \
+The misfit is the distance, in units of the noise{unit_text}, of the charges from the charges of the nearest single
+contact. A network estimates it, which was trained on the results of exact searches. 1 % of {presses_text} exceed \
 {errors["misfit_p99"]:g}{rare_text}.
 {meaning_text}
 {faults_text}

@@ -84,6 +84,7 @@ def student_data(model: Path, dataset: Dataset) -> TrainingData:
         )
 
     def answer(charge: Array) -> tuple[Array, Array]:
+        """Return contacts (x, y, F) and standard deviations, each of shape (n, 3), mm and N, for charges in pC."""
         contact = predictor.predict_batch(charge)
         position_and_force = np.stack([contact.x_mm, contact.y_mm, contact.force_N], axis=1)
         std = np.stack([contact.x_std_mm, contact.y_std_mm, contact.force_std_N], axis=1)

@@ -137,19 +137,30 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
 
 
 def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array) -> Array:
-    """Minimise a loss, given with its gradient, by L-BFGS; start again if a line search fails."""
+    """Minimise a loss by the L-BFGS method, which is started again if a line search fails.
+
+    If the method does not converge, a warning is logged.
+
+    Args:
+        loss: Function that returns the loss and its gradient at a position.
+        start: Position at which the search starts, shape (n,).
+
+    Returns:
+        Position with the smallest loss, shape (n,).
+    """
     tolerance = FIRST_STEP * GRADIENT_TOLERANCE
     options = {"ftol": 0.0, "gtol": tolerance, "maxcor": N_UPDATES}
     position = start
-    remaining = MAX_ITERATIONS
+    remaining_iterations = MAX_ITERATIONS
     for _ in range(MAX_STARTS):
-        result = minimize(loss, position, jac=True, method="L-BFGS-B", options=options | {"maxiter": remaining})
+        start_options = options | {"maxiter": remaining_iterations}
+        result = minimize(loss, position, jac=True, method="L-BFGS-B", options=start_options)
         position = result.x
-        remaining -= result.nit
-        if remaining <= 0 or np.abs(result.jac).max() <= tolerance:
+        remaining_iterations -= result.nit
+        if remaining_iterations <= 0 or np.abs(result.jac).max() <= tolerance:
             return np.asarray(position)
-    largest = np.abs(result.jac).max() / FIRST_STEP
-    _log.warning("the correlations are not learned to the end: the gradient is %.1g", largest)
+    largest_gradient = np.abs(result.jac).max() / FIRST_STEP
+    _log.warning("the training of the correlations has not converged: the gradient is %.1g", largest_gradient)
     return np.asarray(position)
 
 

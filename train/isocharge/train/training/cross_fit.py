@@ -246,6 +246,7 @@ def _train_members(
     """
 
     def train(number: int, steps: int) -> Descent:
+        """Train the network of one fold with a number of steps, and return the finished training."""
         is_validation = fold == number
         stage = contact_stage(
             members[number],
@@ -261,16 +262,16 @@ def _train_members(
         return descent
 
     steps = min(FIRST_STEPS, config.steps)
-    first = members[0].contact
-    initial_weights = {name: weight.clone() for name, weight in first.state_dict().items()}
-    best = train(0, steps)
+    first_network = members[0].contact
+    initial_weights = {name: weight.clone() for name, weight in first_network.state_dict().items()}
+    best_training = train(0, steps)
     while 2 * steps <= config.steps:
-        first.load_state_dict(initial_weights)
-        longer = train(0, 2 * steps)
-        if longer.best >= best.best:
-            first.load_state_dict(best.best_weights)
+        first_network.load_state_dict(initial_weights)
+        longer_training = train(0, 2 * steps)
+        if longer_training.best >= best_training.best:
+            first_network.load_state_dict(best_training.best_weights)
             break
-        best = longer
+        best_training = longer_training
         steps = 2 * steps
     for number in range(1, len(members)):
         train(number, steps)
@@ -306,12 +307,13 @@ def _distillation_stage(
     noise: ChannelNoise,
     config: TrainingConfig,
 ) -> TrainingStage:
-    """Return the training of a network on the mean answers of other networks to copies of the presses with noise.
+    """Return the training of a network whose targets are the mean outputs of other networks (distillation).
 
     Args:
-        network: The network that learns.
-        members: Networks whose mean it learns.
-        presses: All presses. The last half as many copies are used for validation.
+        network: The network that is trained.
+        members: Networks whose mean outputs are the targets.
+        presses: All presses. The inputs are copies of their charges with noise of several sizes, in random order. A
+            number of copies that is half the number of presses is used for validation.
         noise: Noise of the presses.
         config: Number of steps, batch size and seed.
     """
@@ -320,18 +322,22 @@ def _distillation_stage(
     order = rng.permutation(len(copies) * len(presses))
     charge = as_tensor(np.concatenate(copies)[order])
     with torch.no_grad():
-        answers = [torch.stack(member.posterior(charge)) for member in members]
-    mean, log_std = torch.stack(answers).mean(dim=0)
+        member_outputs = [torch.stack(member.posterior(charge)) for member in members]
+    target_mean, target_log_std = torch.stack(member_outputs).mean(dim=0)
     n_train = len(charge) - len(presses) // 2
 
     def divergence(rows: Tensor | slice) -> Tensor:
-        own_mean, own_log_std = network.posterior(charge[rows])
-        return distillation_loss(own_mean, own_log_std, mean[rows], log_std[rows])
+        """Return the divergence of the outputs of the network from the targets, for some rows of the charges."""
+        mean, log_std = network.posterior(charge[rows])
+        return distillation_loss(mean, log_std, target_mean[rows], target_log_std[rows])
 
     def loss(_: int, random: torch.Generator) -> Tensor:
-        return divergence(torch.randint(n_train, (config.batch,), generator=random))
+        """Return the divergence for a random batch."""
+        batch_rows = torch.randint(n_train, (config.batch,), generator=random)
+        return divergence(batch_rows)
 
     def score() -> tuple[float, str]:
+        """Return the divergence for the validation charges, and a text with it."""
         validation_loss = divergence(slice(n_train, None)).item()
         return validation_loss, f"{validation_loss:.4f} from the mean of {len(members)} networks"
 

@@ -85,6 +85,14 @@ class Descent:
     """
 
     def __init__(self, stage: TrainingStage, rate: float, patience: int, seed: int) -> None:
+        """Prepare the training; the weights of the stage's network are the initial weights.
+
+        Args:
+            stage: Network, loss and validation.
+            rate: Largest learning rate of Adam.
+            patience: Number of steps without a better validation score after which the training ends.
+            seed: Seed of the batches and of the noise.
+        """
         self.stage = stage
         self.patience = patience
         self.optimisers = _optimisers(stage.network, rate)

@@ -156,7 +156,14 @@ class Split:
 
     @classmethod
     def of(cls, data: TrainingData, training: TrainingConfig) -> "Split":
-        """Split presses within the largest disk in which the map certainly does not fold."""
+        """Split presses into those for training, validation and test, and fit a charge field to them.
+
+        Only presses within the largest disk in which the map certainly does not fold are used.
+
+        Args:
+            data: Presses of the sensor.
+            training: Fractions of the presses, noise and seed.
+        """
         presses = data.presses
         names = data.sensor.electrode_names
         whole_field = ChargeField.fit(data.domain, names, *split_by_position(presses, training.hold_out, training.seed))
@@ -239,6 +246,10 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
 
     BLAS and OpenMP get the same number of threads. Their threads wait actively at barriers, so a busy second core would
     make them many times slower.
+
+    Args:
+        count: Number of threads.
+        seed: Seed of the random numbers.
     """
     previous_count = torch.get_num_threads()
     torch.set_num_threads(count)
@@ -303,6 +314,7 @@ def contact_stage(
     batch = min(config.batch, len(charge))
 
     def loss(step: int, random: torch.Generator) -> Tensor:
+        """Return the loss of a random batch with new noise. It is the warm-up loss in the first steps."""
         rows = torch.randint(len(charge), (batch,), generator=random)
         noisy = with_fresh_noise(charge[rows], noise, random)
         mean, log_std = network.posterior(noisy)
@@ -316,6 +328,7 @@ def contact_stage(
         return distillation_loss(mean, log_std, teacher_mean, teacher_log_std)
 
     def score() -> tuple[float, str]:
+        """Return the loss on the validation presses, and a text with the errors."""
         mean, log_std = network.posterior(validation_charge)
         return validation_score(mean, log_std, validation_target, domain, "presses")
 
@@ -325,7 +338,17 @@ def contact_stage(
 def _misfit_examples(
     split: Split, features: WhitenedFeatures, config: TrainingConfig, run: ResumableRun | None
 ) -> Array:
-    """Return the result of `draw_misfit_examples`, which the run saves because the search takes long."""
+    """Draw the examples for the misfit network. The run saves them, because the search takes long.
+
+    Args:
+        split: Presses for training, and the charge field in which the nearest contacts are searched for.
+        features: Features of the network, which limit the charges.
+        config: Noise, number of examples and seed.
+        run: Run that saves the examples; None if they are not saved.
+
+    Returns:
+        Charges, pC, and residuals, shape (2, n, n_electrode); see `draw_misfit_examples`.
+    """
     noise: Noise = misfit_noise(config.noise_model)
     draw = partial(draw_misfit_examples, split.train, split.field)
     charge_features = features.charge_features
@@ -354,13 +377,17 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     n_train = len(inputs) - n_validation
 
     def squared_distance(rows: Tensor | slice) -> Tensor:
+        """Return the mean squared distance between outputs and targets, for some rows of the examples."""
         return mean_squared_distance(network.misfit_vector(inputs[rows]), targets[rows])
 
     def loss(_: int, random: torch.Generator) -> Tensor:
-        return squared_distance(torch.randint(n_train, (config.batch,), generator=random))
+        """Return the mean squared distance for a random batch."""
+        batch_rows = torch.randint(n_train, (config.batch,), generator=random)
+        return squared_distance(batch_rows)
 
     def score() -> tuple[float, str]:
-        mean = squared_distance(slice(n_train, None)).item()
-        return mean, f"{mean:.4f} on watched charges"
+        """Return the mean squared distance for the validation examples, and a text with it."""
+        validation_loss = squared_distance(slice(n_train, None)).item()
+        return validation_loss, f"{validation_loss:.4f} on watched charges"
 
     return TrainingStage("misfit", network.misfit_vector, loss, score, config.misfit_steps)

@@ -134,16 +134,17 @@ class FoldedNetwork:
             skip: Weights of the skip layer to the angles, shape (n_electrode, 8).
         """
 
-        def insert(own: Array, new: Array) -> Array:
-            contact, misfit_vector = np.split(own, [N_CONTACT_ANSWERS], axis=-1)
-            return np.concatenate([contact, new, misfit_vector], axis=-1)
+        def with_columns(values: Array, angle_values: Array) -> Array:
+            """Insert the columns of the angles between those of the contact and those of the misfit vector."""
+            contact, misfit_vector = np.split(values, [N_CONTACT_ANSWERS], axis=-1)
+            return np.concatenate([contact, angle_values, misfit_vector], axis=-1)
 
-        own = self.layers.last
-        layers = replace(
-            self.layers,
-            last=Layer(insert(own.weight, last.weight), insert(own.bias, last.bias)),
-            skip=insert(self.layers.skip, skip),
+        output_layer = self.layers.last
+        new_output_layer = Layer(
+            with_columns(output_layer.weight, last.weight),
+            with_columns(output_layer.bias, last.bias),
         )
+        layers = replace(self.layers, last=new_output_layer, skip=with_columns(self.layers.skip, skip))
         return replace(self, layers=layers)
 
 

@@ -16,7 +16,16 @@ WARM_UP_STD_WEIGHT = 0.1
 
 
 def with_fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor:
-    """Add noise to charges of any shape, pC."""
+    """Add normally distributed noise to charges.
+
+    Args:
+        charge: Charges without noise, any shape, pC.
+        noise: White noise and noise of the gains.
+        random: Random number generator.
+
+    Returns:
+        Charges with noise, same shape, pC.
+    """
     white = torch.as_tensor(noise.white, dtype=torch.float32)
     gain = torch.as_tensor(noise.gain, dtype=torch.float32)
     sigma = torch.hypot(white, gain * charge)

@@ -57,6 +57,14 @@ class TrainablePerceptron(TrainableNetwork):
     """
 
     def __init__(self, n_input: int, hidden: tuple[int, ...], n_output: int, activation: Activation = TANH) -> None:
+        """Create the layers with random weights. The weights of the skip layer are zero.
+
+        Args:
+            n_input: Number of inputs.
+            hidden: Widths of the hidden layers.
+            n_output: Number of outputs.
+            activation: Activation of the hidden layers.
+        """
         super().__init__()
         self.activation = activation
         self.layers = nn.ModuleList([nn.Linear(*sizes) for sizes in pairwise((n_input, *hidden, n_output))])
@@ -104,6 +112,13 @@ class InverseNetwork(nn.Module):
     """
 
     def __init__(self, domain: Domain, features: WhitenedFeatures, config: NetworkConfig) -> None:
+        """Create the perceptrons with random weights.
+
+        Args:
+            domain: Contacts that the network estimates.
+            features: Features of the charges.
+            config: Widths and activation of the hidden layers.
+        """
         super().__init__()
         self.domain = domain
         self.features = features

@@ -49,31 +49,36 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, c
     Args:
         network: The given network.
         charge: Charges with noise, shape (n, n_electrode), pC.
-        equivalent: Charges for which the given network is right, shape (n, n_electrode), pC.
-        contact: True contacts (x, y, F) of both, shape (n, 3), mm and N.
+        equivalent: Charges of the same contacts on the film for which the given network was trained, shape (n,
+            n_electrode), pC.
+        contact: True contacts (x, y, F), shape (n, 3), mm and N.
     """
     features = network.features.evaluate(charge)
     equivalent_features = network.features.evaluate(equivalent)
+    equivalent_outputs = evaluate(network.layers, equivalent_features)
+    log_contact = np.column_stack([contact[:, :2], np.log(contact[:, 2])])
+
+    # Linear map from the features of `charge` to those of `equivalent`, by least squares
     design = np.column_stack([features, np.ones(len(features))])
     *matrix, shift = np.linalg.lstsq(design, equivalent_features)[0]
-    answers = evaluate(network.layers, equivalent_features)
-    truth = np.column_stack([contact[:, :2], np.log(contact[:, 2])])
-
-    def equivalent_answers(present: Array) -> Array:
-        target = np.array(answers)
-        target[:, LOG_STD] = present[:, LOG_STD]
-        return target
-
-    def scoring_step(present: Array) -> Array:
-        error = np.abs(present[:, MEAN] - truth) * np.exp(-relative_log_std(present))
-        target = present.copy()
-        target[:, LOG_STD] += 0.5 * (np.minimum(error, MAX_ERROR) ** 2 - 1.0)
-        return target
-
     transformed = transform_inputs(network.layers, Layer(np.array(matrix), shift))
-    regressions = [Regression(equivalent_answers, EXACT_RIDGE)]
-    regressions += [Regression(scoring_step, NOISY_RIDGE)] * N_SCORING_STEPS
-    return replace(network, layers=refit_last_layer(transformed, features, regressions))
+
+    def contact_targets(outputs: Array) -> Array:
+        """Return the outputs for the equivalent charges, with the standard deviations of the present outputs."""
+        targets = np.array(equivalent_outputs)
+        targets[:, LOG_STD] = outputs[:, LOG_STD]
+        return targets
+
+    def std_targets(outputs: Array) -> Array:
+        """Return outputs whose standard deviations are changed by one scoring step, from the present outputs."""
+        relative_error = np.abs(outputs[:, MEAN] - log_contact) * np.exp(-relative_log_std(outputs))
+        targets = outputs.copy()
+        targets[:, LOG_STD] += 0.5 * (np.minimum(relative_error, MAX_ERROR) ** 2 - 1.0)
+        return targets
+
+    contact_regression = Regression(contact_targets, EXACT_RIDGE)
+    std_regressions = [Regression(std_targets, NOISY_RIDGE) for _ in range(N_SCORING_STEPS)]
+    return replace(network, layers=refit_last_layer(transformed, features, [contact_regression, *std_regressions]))
 
 
 def add_variance(network: FoldedNetwork, charge: Array, variance: Array) -> FoldedNetwork:

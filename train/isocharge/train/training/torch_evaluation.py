@@ -12,25 +12,43 @@ from isocharge.common.perceptron import Layer, Perceptron
 
 
 def evaluate_features(features: ChargeFeatures, charge: Tensor) -> Tensor:
-    """Compute the input features of charges, shape (..., n_electrode), pC. Finite charges give finite features."""
+    """Compute the input features of charges. Finite charges give finite features.
 
-    def like_charge(values: Array) -> Tensor:
+    Args:
+        features: Limits, typical charges and means of the features.
+        charge: Charges, shape (..., n_electrode), pC.
+
+    Returns:
+        Features, same shape, dimensionless.
+    """
+
+    def as_charge_type(values: Array) -> Tensor:
+        """Convert an array into a tensor with the number type of the charges."""
         return torch.as_tensor(values, dtype=charge.dtype)
 
-    clipped = charge.clamp(like_charge(features.low_pC), like_charge(features.high_pC))
-    ratio = clipped / like_charge(features.typical_pC)
+    clipped = charge.clamp(as_charge_type(features.low_pC), as_charge_type(features.high_pC))
+    ratio = clipped / as_charge_type(features.typical_pC)
     if features.mean is None:
         return torch.log(ratio)
-    return torch.asinh(ratio) - like_charge(features.mean)
+    return torch.asinh(ratio) - as_charge_type(features.mean)
 
 
 def evaluate_hidden_layers(layers: Sequence[Layer[Tensor]], activation: Activation, inputs: Tensor) -> Tensor:
-    """Apply hidden layers to inputs of shape (n, n_input) or (n_batch, n, n_input)."""
+    """Apply hidden layers to inputs.
+
+    Args:
+        layers: Weights and biases of the layers.
+        activation: Activation after each layer.
+        inputs: Shape (n, n_input) or (n_batch, n, n_input).
+
+    Returns:
+        Outputs of the last layer, shape (n, width) or (n_batch, n, width).
+    """
     function = getattr(torch.nn.functional, activation.torch_name)
-    value = inputs
+    outputs = inputs
     for layer in layers:
-        value = function(_evaluate_layer(layer, value))
-    return value
+        outputs = function(_evaluate_layer(layer, outputs))
+    return outputs
 
 
 def evaluate(perceptron: Perceptron[Tensor], inputs: Tensor) -> Tensor:
