@@ -240,14 +240,16 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
     Returns:
         Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1.
     """
-    moved = []
-    for axis, step in enumerate(steps):
-        for sign in (1.0, -1.0):
-            at = contact.copy()
-            at[:, axis] = at[:, 2] * np.exp(sign * step) if axis == 2 else at[:, axis] + sign * step
-            moved.append(at)
-    values = np.asarray(function(np.concatenate(moved))).reshape(3, 2, len(contact), -1)
-    slopes = (values[:, 0] - values[:, 1]) / (2.0 * np.array(steps))[:, None, None]
+    x_step, y_step, log_force_step = steps
+    stepped = np.empty((3, 2, *contact.shape))  # one copy of the contacts for each variable and each direction
+    stepped[:] = contact
+    for direction, sign in enumerate((1.0, -1.0)):
+        stepped[0, direction, :, 0] += sign * x_step
+        stepped[1, direction, :, 1] += sign * y_step
+        stepped[2, direction, :, 2] *= np.exp(sign * log_force_step)
+    values = np.asarray(function(stepped.reshape(-1, 3))).reshape(3, 2, len(contact), -1)
+    value_differences = values[:, 0] - values[:, 1]
+    slopes = value_differences / (2.0 * np.array(steps))[:, None, None]
     return np.moveaxis(slopes, 0, 2)
 
 
@@ -313,13 +315,18 @@ def as_charges(charge: Array, electrode_names: tuple[str, ...]) -> Array:
         charge: Charges, shape (n, n_electrode), pC.
         electrode_names: Names of the electrodes, in the order of the charges.
 
+    Returns:
+        The charges, shape (n, n_electrode), pC.
+
     Raises:
         ChargeError: If the charges are not finite or not one for each electrode.
     """
     charge = np.asarray(charge, dtype=float)
-    count = len(electrode_names)
-    if charge.ndim != 2 or charge.shape[1] != count:
-        raise ChargeError(f"expected charges of shape (n, {count}) for {electrode_names}, got shape {charge.shape}")
+    n_electrode = len(electrode_names)
+    if charge.ndim != 2 or charge.shape[1] != n_electrode:
+        raise ChargeError(
+            f"expected charges of shape (n, {n_electrode}) for {electrode_names}, got shape {charge.shape}"
+        )
     if not np.isfinite(charge).all():
         row, column = np.argwhere(~np.isfinite(charge))[0]
         raise ChargeError(

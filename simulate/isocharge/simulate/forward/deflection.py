@@ -41,24 +41,27 @@ def deflection_field(
         forces: Increasing forces, N.
         distances: Number of distances from 0 to `MAX_DISTANCE`, at least 2.
 
+    Returns:
+        Deflections on rings about each press.
+
     Raises:
         SolveError: If a press has no equilibrium.
     """
-    places = np.linspace(0.0, MAX_DISTANCE * film.radius, distances).tolist()
+    press_distances = np.linspace(0.0, MAX_DISTANCE * film.radius, distances).tolist()
     rings = np.concatenate([[0.0], np.geomspace(0.5 * probe.radius / film.radius, 1.0, RINGS - 1)])
-    table = np.zeros((len(forces), distances, RINGS, ANGLES))
-    for column, distance in enumerate(track(places, "solving the film", distances)):
-        solved: Equilibrium | None = None
-        for row, force in enumerate(forces):
-            solved = press(film, probe, (distance, 0.0), force, start=solved)
-            table[row, column] = _on_rings(solved, distance, rings)
+    deflections = np.zeros((len(forces), distances, RINGS, ANGLES))
+    for column, distance in enumerate(track(press_distances, "solving the film", distances)):
+        equilibrium: Equilibrium | None = None
+        for row, force in enumerate(forces):  # each solve starts from the equilibrium under the previous force
+            equilibrium = press(film, probe, (distance, 0.0), force, start=equilibrium)
+            deflections[row, column] = _on_rings(equilibrium, distance, rings)
     return DeflectionField(
         film=film_to_dict(film),
         probe_radius_mm=probe.radius,
         force_N=forces,
-        distance_mm=tuple(places),
+        distance_mm=tuple(press_distances),
         rings=tuple(rings.tolist()),
-        deflection_mm=table,
+        deflection_mm=deflections,
     )
 
 

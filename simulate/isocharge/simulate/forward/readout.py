@@ -109,15 +109,23 @@ def _on_layout(electrodes: tuple[Electrode, ...], readout: Readout, per_side: in
     """Return the integration points in the layout, before the calibration. The weights are areas, mm^2.
 
     The result is cached, because many films have the same layout.
+
+    Args:
+        electrodes: Electrodes of the layout.
+        readout: Mean over the area of an electrode, or over its edges.
+        per_side: Number of points along a side of an electrode.
+
+    Returns:
+        Points and areas. Electrodes with fewer points than others are filled up with points of the area zero.
     """
     rules = [electrode_rule(electrode, readout, per_side) for electrode in electrodes]
-    count = np.array([len(share) for _, share in rules])
-    points = np.zeros((len(rules), count.max(), 2))
-    areas = np.zeros((len(rules), count.max(), 3))
-    for number, (electrode, (electrode_points, share)) in enumerate(zip(electrodes, rules, strict=True)):
-        points[number, : len(electrode_points)] = electrode_points
-        areas[number, : len(electrode_points)] = electrode.area * share
-    return ReadoutPoints(points, areas, count)
+    point_counts = np.array([len(shares) for _, shares in rules])
+    points = np.zeros((len(rules), point_counts.max(), 2))
+    areas = np.zeros((len(rules), point_counts.max(), 3))
+    for index, (electrode, (electrode_points, shares)) in enumerate(zip(electrodes, rules, strict=True)):
+        points[index, : len(electrode_points)] = electrode_points
+        areas[index, : len(electrode_points)] = electrode.area * shares
+    return ReadoutPoints(points, areas, point_counts)
 
 
 def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
@@ -211,34 +219,51 @@ def electrode_rule(electrode: Electrode, readout: Readout, per_side: int) -> tup
 
 
 def _area_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
-    """Return the points and shares of a mean over the area of the electrode; see `electrode_rule`."""
+    """Return the integration points of a mean over the area of an electrode.
+
+    Args:
+        electrode: The electrode.
+        per_side: Number of points along a side of a square, or along the longest side of a part.
+
+    Returns:
+        Points (x, y), shape (n, 2), mm, and the shares of each point in the means of s11, s22 and s12, which are equal,
+        shape (n, 3).
+    """
     if electrode.square:
-        unit, share = gauss_square(per_side)
-        lower_left = np.array(electrode.corners[0])
-        upper_right = np.array(electrode.corners[2])
-        points = lower_left + unit * (upper_right - lower_left)
+        unit_points, shares = gauss_square(per_side)
+        lower_left, _, upper_right, _ = np.array(electrode.corners)
+        points = lower_left + unit_points * (upper_right - lower_left)
     elif len(electrode.parts) == 1:
-        points, share = gauss_polygon(electrode.parts[0], per_side)
+        points, shares = gauss_polygon(electrode.parts[0], per_side)
     else:
         rules = [gauss_quadrilateral(part, per_side, MAX_PART_SIDE) for part in electrode.parts]
         points = np.concatenate([part_points for part_points, _ in rules])
         weights = np.concatenate([part_weights for _, part_weights in rules])
-        share = weights / weights.sum()
-    return points, np.repeat(share[:, None], 3, axis=1)
+        shares = weights / weights.sum()
+    return points, np.repeat(shares[:, None], 3, axis=1)
 
 
 def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
-    """Return the points and shares of the edge readout (Mirbagheri et al. 2007, eq. 3); see `electrode_rule`.
+    """Return the integration points of the edge readout (Mirbagheri et al. 2007, eq. 3).
 
-    The mean of s11 is over the left and right edges, that of s22 over the lower and upper edges.
+    The mean of s11 is over the left and right edges, and the mean of s22 is over the lower and upper edges.
+
+    Args:
+        electrode: A square electrode.
+        per_side: Half of the number of points on each edge.
+
+    Returns:
+        Points (x, y), shape (n, 2), mm, and the shares of each point in the means of s11, s22 and s12, shape (n, 3).
     """
-    position, share = gauss_line(2 * per_side)
+    position, line_shares = gauss_line(2 * per_side)
     corners = np.array(electrode.corners)
     edges = np.roll(corners, -1, axis=0) - corners
     lower, right, upper, left = corners[:, None] + position[:, None] * edges[:, None]
-    half = 0.5 * share
-    zero = np.zeros_like(share)
-    share_11 = np.stack([half, zero, zero], axis=1)
-    share_22 = np.stack([zero, half, zero], axis=1)
+
+    # Each mean is over two edges, so that an edge has half of the share.
+    half_shares = 0.5 * line_shares
+    zero = np.zeros_like(line_shares)
+    s11_shares = np.stack([half_shares, zero, zero], axis=1)
+    s22_shares = np.stack([zero, half_shares, zero], axis=1)
     points = np.concatenate([left, right, lower, upper])
-    return points, np.concatenate([share_11, share_11, share_22, share_22])
+    return points, np.concatenate([s11_shares, s11_shares, s22_shares, s22_shares])

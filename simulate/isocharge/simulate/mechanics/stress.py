@@ -22,17 +22,15 @@ def strain(slope: Array, amplitude2: float) -> Array:
     Returns:
         (E11, E22, 2 E12), shape (..., 3).
     """
-    first = slope[..., 0, :]
-    second = slope[..., 1, :]
-    scale = np.array([amplitude2, amplitude2, 1.0])
-    return np.stack(
-        [
-            first[..., 0] + 0.5 * (first**2) @ scale,
-            second[..., 1] + 0.5 * (second**2) @ scale,
-            second[..., 0] + first[..., 1] + (first * second) @ scale,
-        ],
-        axis=-1,
-    )
+    slope_1 = slope[..., 0, :]  # derivatives of (U1, U2, W) with respect to X1
+    slope_2 = slope[..., 1, :]  # derivatives of (U1, U2, W) with respect to X2
+
+    # The squares of the in-plane slopes are smaller than that of W by the factor A^2.
+    square_weights = np.array([amplitude2, amplitude2, 1.0])
+    strain_11 = slope_1[..., 0] + 0.5 * (slope_1**2) @ square_weights
+    strain_22 = slope_2[..., 1] + 0.5 * (slope_2**2) @ square_weights
+    double_strain_12 = slope_2[..., 0] + slope_1[..., 1] + (slope_1 * slope_2) @ square_weights
+    return np.stack([strain_11, strain_22, double_strain_12], axis=-1)
 
 
 def stress(strain: Array, poisson: float, moduli: Array | None = None) -> Array:

@@ -122,19 +122,28 @@ def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     The charges of square patches, for biaxial and uniaxial films, and the deflection are compared. The patches lie on
     rings about the centre of the film and round the footprint. The difference of the charges of a patch is relative to
     the largest charge on its ring.
+
+    Args:
+        one: First equilibrium.
+        other: Second equilibrium, to which the differences are relative.
+
+    Returns:
+        Relative difference, dimensionless.
     """
     film_radius = one.film.radius
-    circle = np.exp(2j * np.pi * np.arange(PATCHES_PER_RING) / PATCHES_PER_RING)
-    rings = film_radius * np.array(PATCH_RINGS)[:, None] * circle
-    round_footprint = complex(*one.at) + one.probe.reach * circle
-    centres = np.concatenate([rings, round_footprint[None]])
-    one_charge = _patch_charges(one, centres)
-    other_charge = _patch_charges(other, centres)
-    largest = np.maximum(np.abs(other_charge).max(axis=1, keepdims=True), 1e-300)
-    charge_difference = float((np.abs(one_charge - other_charge) / largest).max())
+    unit_circle = np.exp(2j * np.pi * np.arange(PATCHES_PER_RING) / PATCHES_PER_RING)
+    rings_about_centre = film_radius * np.array(PATCH_RINGS)[:, None] * unit_circle
+    ring_about_footprint = complex(*one.at) + one.probe.reach * unit_circle
+    patch_centres = np.concatenate([rings_about_centre, ring_about_footprint[None]])
+    one_charge = _patch_charges(one, patch_centres)
+    other_charge = _patch_charges(other, patch_centres)
+    largest_on_ring = np.maximum(np.abs(other_charge).max(axis=1, keepdims=True), 1e-300)
+    charge_difference = float((np.abs(one_charge - other_charge) / largest_on_ring).max())
+
     (one_depth,) = deflection(one, np.array([one.at]))
     (other_depth,) = deflection(other, np.array([one.at]))
-    return max(charge_difference, abs(float(one_depth / other_depth) - 1.0))
+    depth_difference = abs(float(one_depth / other_depth) - 1.0)
+    return max(charge_difference, depth_difference)
 
 
 def _patch_charges(solved: Equilibrium, centres: Array) -> Array:
@@ -148,15 +157,21 @@ def _patch_charges(solved: Equilibrium, centres: Array) -> Array:
         Charges in arbitrary units, shape (n_ring, n_patch, 2). Points outside the film do not contribute.
     """
     film_radius = solved.film.radius
-    xi, eta, weight = gauss_reference_square(PATCH_POINTS)
-    points = (centres[:, :, None] + 0.5 * PATCH_SIDE * film_radius * (xi + 1j * eta)).ravel()
-    inside = np.abs(points) < film_radius
+    xi, eta, weights = gauss_reference_square(PATCH_POINTS)
+    half_side = 0.5 * PATCH_SIDE * film_radius
+    points = (centres[:, :, None] + half_side * (xi + 1j * eta)).ravel()
+    is_on_film = np.abs(points) < film_radius
     stress = np.zeros((points.size, 3))
-    stress[inside] = touch_stress(solved, np.stack([points.real, points.imag], axis=1)[inside])
-    mean = np.einsum("rapc,p->rac", stress.reshape(*centres.shape, -1, 3), 0.25 * weight)
-    biaxial = mean[..., 0] + mean[..., 1]
-    uniaxial = 10.0 * mean[..., 0] + mean[..., 1]
-    return np.stack([biaxial, uniaxial], axis=-1)
+    stress[is_on_film] = touch_stress(solved, np.stack([points.real, points.imag], axis=1)[is_on_film])
+
+    # Mean over the integration points p of each patch; the weights of the reference square add up to 4.
+    patch_stress = stress.reshape(*centres.shape, -1, 3)
+    mean_stress = np.einsum("rapc,p->rac", patch_stress, 0.25 * weights)
+    s11 = mean_stress[..., 0]
+    s22 = mean_stress[..., 1]
+    biaxial_charge = s11 + s22
+    uniaxial_charge = 10.0 * s11 + s22
+    return np.stack([biaxial_charge, uniaxial_charge], axis=-1)
 
 
 def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:

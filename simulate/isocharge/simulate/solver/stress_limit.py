@@ -76,20 +76,20 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
         SceneError: If even the smallest force exceeds the limit, or a press cannot exist.
         SolveError: If no equilibrium is reached.
     """
-    low, high = force_range
-    smallest_stress = largest_stress(film, probe, low)
+    min_force, max_force = force_range
+    smallest_stress = largest_stress(film, probe, min_force)
     if smallest_stress > limit:
         raise SceneError(
-            f"stress limit: expected more than {smallest_stress:.3g} MPa, which {low:.3g} N under {probe.notation} "
-            f"make in this film, got {limit:.3g} MPa"
+            f"stress limit: expected more than {smallest_stress:.3g} MPa, which {min_force:.3g} N under "
+            f"{probe.notation} make in this film, got {limit:.3g} MPa"
         )
-    if largest_stress(film, probe, high) <= limit:
-        return high
+    if largest_stress(film, probe, max_force) <= limit:
+        return max_force
 
     def log_stress_ratio(log_force: float) -> float:
         """Return ln(stress / limit), which is nearly linear in ln F because the stress is nearly a power of F."""
         return float(np.log(largest_stress(film, probe, float(np.exp(log_force))) / limit))
 
     # The secant method ends after a step of 1 %, when its error is about 0.01 %.
-    log_force = scipy.optimize.newton(log_stress_ratio, np.log(low), x1=np.log(high), tol=0.01)
+    log_force = scipy.optimize.newton(log_stress_ratio, np.log(min_force), x1=np.log(max_force), tol=0.01)
     return float(np.exp(log_force))
