@@ -67,9 +67,20 @@ def straight_leads(sensor: Sensor, width: float = 0.3, clearance: float = 0.3) -
 
 
 def _possible_paths(centre: Array, radius: float) -> Array:
-    """Return straight paths from a position to the rim in the order of `TRIED_ANGLES`, shape (n, 2, 2), mm."""
-    angle = np.arctan2(centre[1], centre[0]) + TRIED_ANGLES
+    """Return straight paths from a position to the rim, in the order of `TRIED_ANGLES`.
+
+    Args:
+        centre: Start (x, y) of the paths, shape (2,), mm.
+        radius: Radius of the rim, mm.
+
+    Returns:
+        Start and end of each path, shape (n, 2, 2), mm.
+    """
+    x, y = centre
+    angle = np.arctan2(y, x) + TRIED_ANGLES
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    # Distance from the start to the rim along each direction, from |centre + length * direction| = radius
     projection = direction @ centre
     length = np.sqrt(radius**2 - centre @ centre + projection**2) - projection
     start = np.broadcast_to(centre, direction.shape)
@@ -106,9 +117,14 @@ def _distance_from_boxes(points: Array, electrode: Electrode) -> float:
 
 
 def _distance_from_lead(points: Array, lead: Array) -> float:
-    """Return the smallest distance of points, shape (n, 2), from the centre line of a lead, shape (2, 2), mm."""
-    start = lead[0]
-    direction = lead[1] - lead[0]
-    share = np.clip((points - start) @ direction / (direction @ direction), 0.0, 1.0)
-    nearest = start + share[:, None] * direction
-    return float(np.hypot(*(points - nearest).T).min())
+    """Return the smallest distance of points from the centre line of a lead, mm.
+
+    Args:
+        points: Points (x, y), shape (n, 2), mm.
+        lead: Both ends of the lead, shape (2, 2), mm.
+    """
+    start, end = lead
+    direction = end - start
+    share_of_length = np.clip((points - start) @ direction / (direction @ direction), 0.0, 1.0)
+    nearest_points = start + share_of_length[:, None] * direction
+    return float(np.hypot(*(points - nearest_points).T).min())

@@ -70,11 +70,16 @@ class Candidates:
 
         Args:
             tolerance: Distance from a better candidate of the same press below which a candidate is removed, mm.
+
+        Returns:
+            The remaining candidates.
         """
         ordered = self[np.lexsort((self.spread, self.press))]
-        rank = np.arange(ordered.press.size) - np.searchsorted(ordered.press, ordered.press)
+        first_row_of_press = np.searchsorted(ordered.press, ordered.press)
+        rank = np.arange(ordered.press.size) - first_row_of_press  # 0 for the best candidate of a press
         is_distinct = np.ones(rank.size, dtype=bool)
         for candidate_rank in range(1, int(rank.max(initial=0)) + 1):
+            # Compare the candidates of this rank, of all presses together, with those of each better rank.
             rows = np.flatnonzero(rank == candidate_rank)
             for better_rows in rows - 1 - np.arange(candidate_rank)[:, None]:
                 offset = (ordered.contact[rows] - ordered.contact[better_rows])[:, :2]
@@ -144,12 +149,15 @@ class SeedGrid:
         Returns:
             Charges, shape (n, n_node, n_electrode), pC.
         """
+        # Linear interpolation in ln F between the tabulated forces below and above
         fractional_index = np.interp(np.log(force), self.logs, np.arange(self.logs.size))
-        below = np.minimum(fractional_index.astype(int), max(self.logs.size - 2, 0))
-        above = np.minimum(below + 1, self.logs.size - 1)
+        index_below = np.minimum(fractional_index.astype(int), max(self.logs.size - 2, 0))
+        index_above = np.minimum(index_below + 1, self.logs.size - 1)
         node = np.arange(len(self.position))
-        weight = (fractional_index - below)[..., None]
-        return np.asarray((1.0 - weight) * self.nodal[below, node] + weight * self.nodal[above, node])
+        weight_above = (fractional_index - index_below)[..., None]
+        charge_below = self.nodal[index_below, node]
+        charge_above = self.nodal[index_above, node]
+        return np.asarray((1.0 - weight_above) * charge_below + weight_above * charge_above)
 
     def matching_force(self, charge: Array) -> Array:
         """Find the force at which the total charge of each node is equal to the total of given charges.

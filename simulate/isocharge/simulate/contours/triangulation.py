@@ -331,6 +331,9 @@ class Triangulation:
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             step: Changes of x, y and, optionally, ln F times the radius, shape (n, 2) or (n, 3), mm.
+
+        Returns:
+            Contacts, shape (n, 3), mm and N.
         """
         domain = self.charge_map.domain
         position = onto_disk(contact[:, :2] + step[:, :2], INNER_RADIUS * domain.radius)

@@ -177,17 +177,22 @@ class Sweep:
         Returns:
             Positions x + iy (mm), forces (N) and rotations (rad), each of shape (n,).
         """
-        has_forces = self.force_range[0] < self.force_range[1]
+        min_force, max_force = self.force_range
+        has_forces = min_force < max_force
         has_rotations = self.orientation == "random" and period > 0.0
-        dimensions = 2 + has_forces + has_rotations
-        steps = max(1, round(max_count ** (1.0 / dimensions)))
-        rotation_count = steps if has_rotations else 1
-        force_steps = steps if has_forces else 1
-        positions: Complexes = self.radius * lattice(max_count // (rotation_count * force_steps))
-        force_count = max_count // (positions.size * rotation_count) if has_forces else 1
-        force_shares = np.linspace(0.0, 1.0, force_count) if force_count > 1 else np.array([0.5])
+        n_dimension = 2 + has_forces + has_rotations
+        steps_per_dimension = max(1, round(max_count ** (1.0 / n_dimension)))
+        n_rotation = steps_per_dimension if has_rotations else 1
+        initial_n_force = steps_per_dimension if has_forces else 1
+
+        # The lattice may have fewer positions than requested, so the number of forces is computed from it.
+        positions: Complexes = self.radius * lattice(max_count // (n_rotation * initial_n_force))
+        n_force = max_count // (positions.size * n_rotation) if has_forces else 1
+        force_shares = np.linspace(0.0, 1.0, n_force) if n_force > 1 else np.array([0.5])
         forces = self._force(force_shares)
-        rotations: Array = period * np.arange(rotation_count) / rotation_count
-        shape = (positions.size, force_count, rotation_count)
+        rotations: Array = period * np.arange(n_rotation) / n_rotation
+
+        # All combinations of positions, forces and rotations
+        shape = (positions.size, n_force, n_rotation)
         position_index, force_index, rotation_index = np.indices(shape).reshape(3, -1)
         return positions[position_index], forces[force_index], rotations[rotation_index]

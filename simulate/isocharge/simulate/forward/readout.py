@@ -83,14 +83,18 @@ class ReadoutPoints:
             Points for n_electrode * n_line lines, ordered by electrode. The weights are per width of the line,
             pC/(MPa mm).
         """
-        position, share = gauss_line(LINE_POINTS)
+        position, shares = gauss_line(LINE_POINTS)
         start = lines[:, :, :1]
-        step = lines[:, :, 1:] - start
-        points = start + position[:, None] * step
-        weights = sensor.gains[:, None, None] * np.linalg.norm(step, axis=3) * share
-        per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
-        placed = sensor.calibration.place(points.reshape(-1, LINE_POINTS, 2))
-        return cls(placed, weights.reshape(-1, LINE_POINTS, 1) * per_stress, np.full(len(placed), LINE_POINTS))
+        direction = lines[:, :, 1:] - start
+        points = start + position[:, None] * direction
+        placed_points = sensor.calibration.place(points.reshape(-1, LINE_POINTS, 2))
+
+        # Weight of a point: gain times part of the length times charge per area and stress (s11, s22, s12)
+        length = np.linalg.norm(direction, axis=3)
+        weighted_length = (sensor.gains[:, None, None] * length * shares).reshape(-1, LINE_POINTS, 1)
+        charge_per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
+        point_counts = np.full(len(placed_points), LINE_POINTS)
+        return cls(placed_points, weighted_length * charge_per_stress, point_counts)
 
     def charge(self, stress: Array) -> Array:
         """Compute charges from the stress at the points.

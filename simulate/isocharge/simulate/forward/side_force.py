@@ -100,15 +100,18 @@ class SideForceMap:
             SceneError: If a press lies outside the domain.
         """
         contact = self.film.domain.check(contact, "side forces")
-        scaled = self.fields.field_charges(contact, SIDE_FORCE_IS_ODD, self._readout)
+        scaled_charges = self.fields.field_charges(contact, SIDE_FORCE_IS_ODD, self._readout)
         film = self.film.sensor.film
-        per_newton = scaled / side_force_unit(film, amplitude_squared(film, contact[:, 2]))[:, None, None]
-        along, across = np.moveaxis(per_newton, 2, 0)
+        force_unit = side_force_unit(film, amplitude_squared(film, contact[:, 2]))
+        charge_per_newton = scaled_charges / force_unit[:, None, None]
+
+        # Rotate the derivatives from the direction of the press and its perpendicular to x and y.
+        along_press, across_press = np.moveaxis(charge_per_newton, 2, 0)
         angle = np.arctan2(contact[:, 1], contact[:, 0])[:, None]
-        by_x = np.cos(angle) * along - np.sin(angle) * across
-        by_y = np.sin(angle) * along + np.cos(angle) * across
+        x_derivative = np.cos(angle) * along_press - np.sin(angle) * across_press
+        y_derivative = np.sin(angle) * along_press + np.cos(angle) * across_press
         calibration = self.film.sensor.calibration
-        return np.stack([calibration.read(by_x), calibration.read(by_y)], axis=2)
+        return np.stack([calibration.read(x_derivative), calibration.read(y_derivative)], axis=2)
 
     def friction_forces(self, contact: Array, coefficient: float) -> Array:
         """Compute the side forces of a probe with friction on a vertical stage; see `solver.friction`.
@@ -127,9 +130,11 @@ class SideForceMap:
         contact = self.film.domain.check(contact, "side forces")
         distance = np.hypot(contact[:, 0], contact[:, 1])
         force = contact[:, 2]
+        # The side force that prevents slip points along the radius, and friction limits its size.
         holding_share = self.fields.family.weights(distance, force, np.zeros(1)) @ self.holding
         direction = contact[:, :2] / np.maximum(distance, 1e-12)[:, None]
-        return limited((holding_share * force)[:, None] * direction, coefficient * force)
+        force_without_slip = (holding_share * force)[:, None] * direction
+        return limited(force_without_slip, coefficient * force)
 
     def friction_charges(self, contact: Array, coefficient: float) -> Array:
         """Compute the change of the charges by the friction of a probe on a vertical stage, to first order.

@@ -48,28 +48,36 @@ def stress_series(forward_map: ForwardMap) -> StressSeries:
 
     Args:
         forward_map: Forward map of the film. The series covers its distances and forces.
+
+    Returns:
+        Chebyshev coefficients of ln(stress) inside and outside the footprint.
     """
-    distance, force, angle_cosine = _nodes(N_DISTANCES), _nodes(N_FORCES), _nodes(N_ANGLES)
     max_distance_mm = forward_map.domain.radius
-    low_N, high_N = forward_map.domain.force_range
+    min_force_N, max_force_N = forward_map.domain.force_range
     film = forward_map.sensor.film
     inner = np.empty((N_DISTANCES, N_FORCES, N_INNER_RINGS, N_ANGLES))
     outer = np.empty((N_DISTANCES, N_FORCES, N_OUTER_RINGS, N_ANGLES))
-    direction: Complexes = np.exp(1j * np.arccos(angle_cosine))
-    for row, distance_mm in enumerate(0.5 * max_distance_mm * (distance + 1.0)):
+
+    # Chebyshev nodes from -1 to 1, mapped to shares from 0 to 1 of the ranges of distance, force and ring radius
+    distances_mm = max_distance_mm * 0.5 * (_nodes(N_DISTANCES) + 1.0)
+    forces_N = min_force_N * (max_force_N / min_force_N) ** (0.5 * (_nodes(N_FORCES) + 1.0))
+    inner_share = 0.5 * (_nodes(N_INNER_RINGS) + 1.0)
+    outer_share = 0.5 * (_nodes(N_OUTER_RINGS) + 1.0)
+    direction: Complexes = np.exp(1j * np.arccos(_nodes(N_ANGLES)))
+    for row, distance_mm in enumerate(distances_mm):
         shift, probe_ring = _automorphism(distance_mm / film.radius, forward_map.probe.reach / film.radius)
-        inner_rings = probe_ring * np.sqrt(0.5 * (_nodes(N_INNER_RINGS) + 1.0))
-        outer_rings = probe_ring * (MAX_RING / probe_ring) ** (0.5 * (_nodes(N_OUTER_RINGS) + 1.0))
-        for column, force_N in enumerate(low_N * (high_N / low_N) ** (0.5 * (force + 1.0))):
+        inner_rings = probe_ring * np.sqrt(inner_share)
+        outer_rings = probe_ring * (MAX_RING / probe_ring) ** outer_share
+        for column, force_N in enumerate(forces_N):
             for table, rings in ((inner, inner_rings), (outer, outer_rings)):
-                before: Complexes = rings[:, None] * direction
-                points_mm = film.radius * (before + shift) / (1.0 + shift * before)
+                ring_points: Complexes = rings[:, None] * direction
+                points_mm = film.radius * (ring_points + shift) / (1.0 + shift * ring_points)
                 table[row, column] = np.log(_stress_sum(forward_map, distance_mm, force_N, points_mm))
     return StressSeries(
         film=film_to_dict(film),
         probe_radius_mm=forward_map.probe.reach,
         max_distance_mm=max_distance_mm,
-        force_range_N=(low_N, high_N),
+        force_range_N=(min_force_N, max_force_N),
         max_ring=MAX_RING,
         inner=_coefficients(inner),
         outer=_coefficients(outer),

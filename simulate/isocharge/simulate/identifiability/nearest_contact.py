@@ -141,12 +141,19 @@ def search(
 
 
 def _unit_candidates(count: int) -> Array:
-    """Return candidates in unit coordinates of the domain, shape (count, 3)."""
-    sobol = scipy.stats.qmc.Sobol(3, scramble=False).random(count)
-    radius = np.sqrt(sobol[:, 0])
+    """Return contacts that are evenly distributed over the domain, a quarter of them on the edge of the disk.
+
+    Args:
+        count: Number of contacts.
+
+    Returns:
+        Contacts in unit coordinates (x, y, ln F), in which the domain is the unit disk times [-1, 1], shape (count, 3).
+    """
+    radius_sample, angle_sample, force_sample = scipy.stats.qmc.Sobol(3, scramble=False).random(count).T
+    radius = np.sqrt(radius_sample)
     radius[::4] = 1.0
-    angle = 2.0 * np.pi * sobol[:, 1]
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), 2.0 * sobol[:, 2] - 1.0], axis=1)
+    angle = 2.0 * np.pi * angle_sample
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), 2.0 * force_sample - 1.0], axis=1)
 
 
 def _nearest_rows(charge: Array, sigma: Array, candidate_charges: Array, count: int) -> Integers:

@@ -120,6 +120,9 @@ class Amplifier:
             electrodes: Number of channels.
             rate: Readings per second, Hz.
             rng: Generator of the mismatches and of the noise of all readings.
+
+        Returns:
+            The measurement, with the properties of each channel.
         """
         tau = self.tau * (1.0 + self.tau_mismatch * rng.standard_normal(electrodes))
         gain = 1.0 + self.gain_mismatch * rng.standard_normal(electrodes)

@@ -46,11 +46,15 @@ def stress(strain: Array, poisson: float, moduli: Array | None = None) -> Array:
     """
     e11 = strain[..., 0]
     e22 = strain[..., 1]
-    shear = strain[..., 2]
-    plane = 1.0 / (1.0 - poisson**2)
-    isotropic = np.stack(
-        [plane * (e11 + poisson * e22), plane * (e22 + poisson * e11), 0.5 * shear / (1.0 + poisson)], axis=-1
-    )
+    double_e12 = strain[..., 2]
+    plane_modulus = 1.0 / (1.0 - poisson**2)
+    shear_modulus = 0.5 / (1.0 + poisson)
+
+    # Hooke's law for plane stress of an isotropic material
+    s11 = plane_modulus * (e11 + poisson * e22)
+    s22 = plane_modulus * (e22 + poisson * e11)
+    s12 = shear_modulus * double_e12
+    isotropic = np.stack([s11, s22, s12], axis=-1)
     return isotropic if moduli is None else isotropic + strain @ moduli
 
 
@@ -70,6 +74,7 @@ def rotate_stress(local: Array, angle: float | Array) -> Array:
     Returns:
         Stress (s11, s22, s12) in the unrotated frame, shape (..., 3).
     """
+    # Mohr's circle: the mean does not change, and half of the difference and the shear rotate by twice the angle.
     mean = 0.5 * (local[..., 0] + local[..., 1])
     half_difference = 0.5 * (local[..., 0] - local[..., 1])
     shear = local[..., 2]

@@ -112,6 +112,9 @@ class Coating:
     def _normal(self, points: Complexes) -> tuple[Array, Array]:
         """Compute the normal of the edge near each point from the gradient of the covered share.
 
+        Args:
+            points: Film points x + iy, any shape, in film radii.
+
         Returns:
             Components along x and y, each of the shape of `points`. Far from edges both are sqrt(1 / 2).
         """

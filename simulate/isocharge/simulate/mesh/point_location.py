@@ -349,6 +349,7 @@ def _circle_in_sector(placement: Placement, sector: Integers, angular: Array) ->
     first_angle = np.take_along_axis(placement.circle_angles, sector[:, None], axis=1)[:, 0]
     last_angle = np.take_along_axis(placement.circle_angles, (sector + 1)[:, None], axis=1)[:, 0]
     angle_range = last_angle - first_angle
+    # z is a point of the template plane. The conformal map (z + c) / (1 + c z) converts it into a film point.
     z = placement.rho * np.exp(1j * (first_angle + angular * angle_range))
     points = (z + placement.c) / (1.0 + placement.c * z)
     derivative = 1j * angle_range * z * (1.0 - placement.c**2) / (1.0 + placement.c * z) ** 2

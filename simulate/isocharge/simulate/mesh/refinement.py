@@ -343,9 +343,9 @@ def _edges(parts: tuple[Complexes, ...], finest: float) -> Complexes:
     for part in parts:
         for start, end in zip(part, np.roll(part, -1), strict=True):
             length = abs(end - start)
-            count = 2 + int(3.0 * length / finest)
-            share = (np.arange(count) + 0.5) / count
-            edge_points = start + share * (end - start)
+            n_point = 2 + int(3.0 * length / finest)
+            share_of_length = (np.arange(n_point) + 0.5) / n_point
+            edge_points = start + share_of_length * (end - start)
             outward_normal = -1j * (end - start) / length
             points.append(edge_points)
             points_just_outside.append(edge_points + 1e-3 * finest * outward_normal)

@@ -205,7 +205,14 @@ def _outer_product(vector: Array, factor: Array) -> Array:
 
 
 def into_domain(unit: Array) -> Array:
-    """Replace points outside D by the nearest point of D; points and result have the shape (..., 3)."""
+    """Replace points outside of the domain D, the unit disk times [-1, 1], by the nearest points of D.
+
+    Args:
+        unit: Points, shape (..., 3).
+
+    Returns:
+        Points of D, same shape.
+    """
     is_outside_disk, is_outside_interval = _is_beyond(unit, 1.0)
     if not np.count_nonzero(is_outside_disk | is_outside_interval):
         return unit

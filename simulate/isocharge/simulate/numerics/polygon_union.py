@@ -153,12 +153,15 @@ def trace_outline(path: Complexes, width: float) -> Complexes:
         Corners, anticlockwise, shape (2 n,), mm. Corners of a bend sharper than `MIN_BEND` allows are NaN.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        normal = 1j * np.diff(path) / np.abs(np.diff(path))
+        sections = np.diff(path)
+        normal = 1j * sections / np.abs(sections)  # to the left of each section
         normal_before = np.append(normal[:1], normal)
         normal_after = np.append(normal, normal[-1:])
-        bend = 1.0 + (normal_before * np.conj(normal_after)).real
-        bend = np.where(bend < MIN_BEND, np.nan, bend)
-        mitre = 0.5 * width * (normal_before + normal_after) / bend
+
+        # The mitre is the displacement of a corner along the bisector of the normals before and after the point.
+        one_plus_cosine = 1.0 + (normal_before * np.conj(normal_after)).real
+        one_plus_cosine = np.where(one_plus_cosine < MIN_BEND, np.nan, one_plus_cosine)
+        mitre = 0.5 * width * (normal_before + normal_after) / one_plus_cosine
     right_side = path - mitre
     left_side = path + mitre
     return np.append(right_side, left_side[::-1])

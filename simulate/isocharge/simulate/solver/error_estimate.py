@@ -84,15 +84,20 @@ def decay(mesh: PlacedMesh, slope: Array) -> float:
     Returns:
         Mean share over the elements, weighted with the squares of the slopes.
     """
-    size = mesh.resolution.order + 1
-    modal = modal_matrix(mesh.resolution.order)
-    square = slope.transpose(0, 2, 1).reshape(len(slope), 2, size, size)
-    weight = 1.0 / (2.0 * np.arange(size) + 1.0)
-    power = ((modal @ square @ modal.T) ** 2 * np.outer(weight, weight)).sum(axis=1)
-    total = power.sum(axis=(1, 2))
-    top = total - power[:, :-1, :-1].sum(axis=(1, 2))
+    # Coefficients of products of Legendre polynomials in xi and eta, from the values on the square grid of nodes
+    n_node = mesh.resolution.order + 1
+    nodes_to_modes = modal_matrix(mesh.resolution.order)
+    nodal_slope = slope.transpose(0, 2, 1).reshape(len(slope), 2, n_node, n_node)
+    coefficients = nodes_to_modes @ nodal_slope @ nodes_to_modes.T
+
+    # Power of each mode; the norm of the Legendre polynomial of degree n is 1 / (2 n + 1).
+    norm = 1.0 / (2.0 * np.arange(n_node) + 1.0)
+    power = (coefficients**2 * np.outer(norm, norm)).sum(axis=1)
+    total_power = power.sum(axis=(1, 2))
+    highest_power = total_power - power[:, :-1, :-1].sum(axis=(1, 2))
     area = mesh.geometry.weights.sum(axis=1)
-    return float(np.sum(area * np.sqrt(np.maximum(top, 0.0) * total)) / max(np.sum(area * total), 1e-300))
+    weighted_share = area * np.sqrt(np.maximum(highest_power, 0.0) * total_power)
+    return float(np.sum(weighted_share) / max(np.sum(area * total_power), 1e-300))
 
 
 def mesh_error(equilibrium: Equilibrium) -> float:

@@ -79,7 +79,14 @@ class GaussNewton(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         return np.concatenate(batches)
 
     def _search(self, charge: Array) -> Array:
-        """Estimate the contacts of one batch."""
+        """Estimate the contacts of one batch.
+
+        Args:
+            charge: Charges, shape (n, n_electrode), pC.
+
+        Returns:
+            Contacts (x, y, F), shape (n, 3), mm and N. Each is the best result of the searches from several starts.
+        """
         sigma = self.noise.sigma(charge)
         features = self.features_.transform(charge)
         contact = np.empty((len(charge), 3))

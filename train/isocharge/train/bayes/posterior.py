@@ -129,14 +129,17 @@ class Cells:
         """
         fraction = np.ones(len(self))
         centroid = self.centre.copy()
-        edge = np.flatnonzero(self.on_edge(radius))
-        points = centroid[edge, None] + _grid(EDGE_POINTS, self.side / EDGE_POINTS)
+
+        # Cells that the edge of the disk crosses are sampled by a grid of points.
+        edge_cells = np.flatnonzero(self.on_edge(radius))
+        points = centroid[edge_cells, None] + _grid(EDGE_POINTS, self.side / EDGE_POINTS)
         is_inside = np.hypot(points[..., 0], points[..., 1]) <= radius
-        count = is_inside.sum(axis=1)
-        fraction[edge] = np.maximum(count, 0.5) / EDGE_POINTS**2
-        mean_point = np.einsum("np,npi->ni", is_inside, points) / np.maximum(count, 1)[:, None]
-        nearest_point = onto_disk(centroid[edge], radius)
-        centroid[edge] = np.where(count[:, None] > 0, mean_point, nearest_point)
+        n_inside = is_inside.sum(axis=1)
+        fraction[edge_cells] = np.maximum(n_inside, 0.5) / EDGE_POINTS**2
+        point_sum = (points * is_inside[..., None]).sum(axis=1)
+        mean_point = point_sum / np.maximum(n_inside, 1)[:, None]
+        nearest_point = onto_disk(centroid[edge_cells], radius)
+        centroid[edge_cells] = np.where(n_inside[:, None] > 0, mean_point, nearest_point)
         return fraction, centroid
 
 
@@ -232,7 +235,14 @@ class Posterior:
         return self.charges.scaled_charges(onto_disk(cells.centre, self.radius))
 
     def _integrate(self, charge: Array) -> Array:
-        """Compute means and standard deviations, shape (2, n, 3), for charges of shape (n, n_electrode), pC."""
+        """Compute the mean and the standard deviation of the posterior of each press.
+
+        Args:
+            charge: Charges with noise, shape (n, n_electrode), pC.
+
+        Returns:
+            Means and standard deviations of (x, y, F), shape (2, n, 3), mm and N.
+        """
         levels = list(self._integration_cells(charge))
         side = np.concatenate([np.full(len(cells), cells.side) for cells in levels])
         press = np.concatenate([cells.press for cells in levels])

@@ -155,25 +155,29 @@ class LocalPlanes:
         return cls(value, slope, (values - value) / residual_std, distance[:, -1])
 
     def residuals(self, values: Array) -> Array:
-        """Return the differences of values from the nearest point of any plane, shape (m, k).
+        """Compute the differences of values from the nearest point of any plane.
 
         A plane ends at the distance of its farthest neighbour.
 
         Args:
             values: The values, shape (m, k).
+
+        Returns:
+            Differences, shape (m, k).
         """
-        _, candidates = cKDTree(self.value).query(values, CANDIDATES)
+        _, candidate_planes = cKDTree(self.value).query(values, CANDIDATES)
         inverse_slope = np.linalg.pinv(self.slope)
-        best = np.full(values.shape, np.inf)
-        for rows in candidates.T:
-            difference = values - self.value[rows]
-            step = (inverse_slope[rows] @ difference[..., None])[..., 0]
+        smallest_residual = np.full(values.shape, np.inf)
+        for planes in candidate_planes.T:
+            # Project each value onto a plane, and limit the distance of the projection from the centre of the plane.
+            difference = values - self.value[planes]
+            step = (inverse_slope[planes] @ difference[..., None])[..., 0]
             length = np.linalg.norm(step, axis=1)
-            step *= np.minimum(1.0, self.reach[rows] / np.maximum(length, 1e-30))[:, None]
-            residual = difference - (self.slope[rows] @ step[..., None])[..., 0]
-            is_nearer = (residual**2).sum(axis=1) < (best**2).sum(axis=1)
-            best[is_nearer] = residual[is_nearer]
-        return best
+            step *= np.minimum(1.0, self.reach[planes] / np.maximum(length, 1e-30))[:, None]
+            residual = difference - (self.slope[planes] @ step[..., None])[..., 0]
+            is_nearer = (residual**2).sum(axis=1) < (smallest_residual**2).sum(axis=1)
+            smallest_residual[is_nearer] = residual[is_nearer]
+        return smallest_residual
 
 
 def usual_size(charge: Array) -> Array:

@@ -147,33 +147,38 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
         dataset: The dataset.
         fewest: Smallest number of presses that is accepted.
 
+    Returns:
+        Contacts and charges of the presses.
+
     Raises:
         DatasetError: If the dataset has too few presses or positions, fewer than three electrodes or one whose charge
             never varies, or numbers that are not finite or forces that are not positive.
     """
     presses = LabelledPresses.of(dataset)
-    finite = np.isfinite(presses.charge).all(axis=1) & np.isfinite(presses.contact).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
+    is_finite = np.isfinite(presses.charge).all(axis=1) & np.isfinite(presses.contact).all(axis=1)
+    if not is_finite.all():
+        row = int(np.argmin(is_finite))
         raise DatasetError(
             f"sample {row}: expected finite numbers, got the contact {presses.contact[row].tolist()} (mm, mm, N) and "
             f"{presses.charge[row].tolist()} pC"
         )
-    positions = len(np.unique(np.round(presses.contact[:, :2], 3), axis=0))
-    if len(presses) < fewest or positions < min(fewest, FEWEST_POSITIONS):
+    n_position = len(np.unique(np.round(presses.contact[:, :2], 3), axis=0))
+    fewest_positions = min(fewest, FEWEST_POSITIONS)
+    if len(presses) < fewest or n_position < fewest_positions:
         raise DatasetError(
-            f"expected at least {fewest} presses at {min(fewest, FEWEST_POSITIONS)} positions, got {len(presses)} at "
-            f"{positions}; sweep or measure more (from 50 measured presses on, train on a CSV file with --sensor)"
+            f"expected at least {fewest} presses at {fewest_positions} positions, got {len(presses)} at "
+            f"{n_position}; sweep or measure more (from 50 measured presses on, train on a CSV file with --sensor)"
         )
     if presses.charge.shape[1] < 3:
         raise DatasetError(f"expected at least three electrodes to find x, y and force, got {presses.charge.shape[1]}")
     for name, charge in zip(dataset.sensor.electrode_names, presses.charge.T, strict=True):
         if np.ptp(charge) == 0.0:
             raise DatasetError(f"electrode {name!r}: expected charges that vary, got {charge[0]:g} pC everywhere")
-    wrong = np.flatnonzero(presses.contact[:, 2] <= 0.0)
-    if wrong.size:
-        row = int(wrong[0])
-        raise DatasetError(f"sample {row}: expected a positive force, got {presses.contact[row, 2]:g} N")
+    force = presses.contact[:, 2]
+    not_positive = np.flatnonzero(force <= 0.0)
+    if not_positive.size:
+        row = int(not_positive[0])
+        raise DatasetError(f"sample {row}: expected a positive force, got {force[row]:g} N")
     return presses
 
 
@@ -211,14 +216,24 @@ def folds_by_place(contact: Array, count: int) -> Integers:
 
 
 def _before(contact: Array) -> Integers:
-    """Return, for each press, the number of presses at positions that are chosen before its own, shape (n,)."""
-    positions, number, counts = np.unique(
-        np.round(contact[:, :2], 3) + 0.0, axis=0, return_inverse=True, return_counts=True
+    """Return, for each press, the number of presses at positions that are chosen before its own position.
+
+    Positions are chosen in the order of their checksums, which is random but the same for every run.
+
+    Args:
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Shape (n,).
+    """
+    rounded_position = np.round(contact[:, :2], 3) + 0.0  # the addition converts -0.0 into 0.0
+    positions, position_of_press, presses_at_position = np.unique(
+        rounded_position, axis=0, return_inverse=True, return_counts=True
     )
     order = np.argsort([sha256_of(position.tobytes()) for position in positions])
-    before = np.empty_like(counts)
-    before[order] = np.cumsum(counts[order]) - counts[order]
-    return np.asarray(before[number.ravel()])
+    presses_before = np.empty_like(presses_at_position)
+    presses_before[order] = np.cumsum(presses_at_position[order]) - presses_at_position[order]
+    return np.asarray(presses_before[position_of_press.ravel()])
 
 
 def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Dataset:

@@ -151,8 +151,15 @@ def release_films(films: FilmsModel, folder: Path, *, version: int = 1, command:
 
 
 def films_card(films: FilmsModel, errors: FilmsErrors, about: ModelMetadata, fitted: Fitted) -> str:
-    """Return the text of `card.md`."""
-    low, high = fitted.domain.force_range
+    """Return the text of `card.md`.
+
+    Args:
+        films: The network for all films.
+        errors: Errors of the network on films drawn from the prior.
+        about: Metadata of `model.onnx`.
+        fitted: Network of the film that `model.onnx` assumes.
+    """
+    min_force, max_force = fitted.domain.force_range
     spread = films.prior.spread
     known_film = errors.with_known_film
     assumed_film = errors.with_assumed_film
@@ -179,7 +186,7 @@ It can be used before a calibration; its errors are then those of the right colu
 | input | `charge_pC`, float32 [n, {len(about.electrodes)}], touch charges of {electrodes} in pC |
 | outputs | `contact` (x_mm, y_mm, force_N), `contact_std` (one standard deviation of each){correlated}, `misfit` |
 | working area | within {fitted.domain.radius:g} mm of the centre |
-| forces | {low:g} to {high:g} N{yield_text(about)} |
+| forces | {min_force:g} to {max_force:g} N{yield_text(about)} |
 | probe | {about.probes[0]} as described |
 | trained for the noise | {films.noise.name}: {films.noise.white:g} pC and {100 * films.noise.gain:g} % |
 

@@ -138,12 +138,15 @@ def _compare(
         TrainingError: If the graph and the network disagree.
     """
     expected_outputs = exact(charge.astype(float))
-    contact_floor = np.maximum(floors, STD_FACTOR * expected_outputs[1])
+    _, expected_std, *_ = expected_outputs
+    contact_floor = np.maximum(floors, STD_FACTOR * expected_std)
     for expected, (name, given) in zip(expected_outputs, run(session, charge).items(), strict=True):
+        # Differences are relative to the expected value, but at least to the floor.
         floor = contact_floor if name in ("contact", "contact_std") else 1.0
-        difference = np.max(np.abs(expected - given) / np.maximum(np.abs(expected), floor), axis=1)
-        quantile = float(np.quantile(difference, QUANTILE))
-        largest = float(np.max(difference))
+        relative_difference = np.abs(expected - given) / np.maximum(np.abs(expected), floor)
+        largest_of_press = relative_difference.max(axis=1)
+        quantile = float(np.quantile(largest_of_press, QUANTILE))
+        largest = float(largest_of_press.max())
         quantile_tolerance = tolerance_factor * TOLERANCES[name]
         tolerance = EXTREME_FACTOR * TOLERANCES[name]
         if not (quantile <= quantile_tolerance and largest <= tolerance):

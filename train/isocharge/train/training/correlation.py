@@ -118,7 +118,11 @@ def _fit_angles(inputs: Array, deviation: Array) -> Layer[Array]:
     n_input = inputs.shape[1]
 
     def loss(scaled: Array) -> tuple[float, Array]:
-        """Return the loss and its gradient with respect to the flat array of bias and weights over FIRST_STEP."""
+        """Return the loss and its gradient with respect to bias and weights in units of FIRST_STEP.
+
+        Args:
+            scaled: Bias and weights of the three angles over FIRST_STEP, flattened, shape (3 (1 + n_input),).
+        """
         bias, weight = np.split(FIRST_STEP * scaled.reshape(-1, 3), [1])
         single_weight = weight.astype(np.float32)
         angles = single_weight.T @ white_inputs.T + bias.astype(np.float32).T

@@ -106,7 +106,15 @@ class FoldedNetwork:
         return self.outputs_from_answers(self.answers(charge))
 
     def outputs_from_answers(self, answers: Array) -> tuple[Array, ...]:
-        """Compute the outputs from answers of shape (n, n_answer)."""
+        """Compute the outputs of the model from the outputs of the last layer.
+
+        Args:
+            answers: Outputs of the last layer, shape (n, n_answer): x, y and ln F, the logarithms of the standard
+                deviations, the angles of the correlations if there are any, and the misfit vector.
+
+        Returns:
+            Contact, standard deviations, correlations if there are any, and misfit.
+        """
         force = np.exp(answers[:, LOG_FORCE])
         outputs = [
             np.concatenate([answers[:, POSITION], force], axis=1),

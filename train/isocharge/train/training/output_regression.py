@@ -102,28 +102,32 @@ def add_variance(network: FoldedNetwork, charge: Array, variance: Array) -> Fold
 def refit_last_layer(
     perceptron: Perceptron[Array], features: Array, regressions: list[Regression]
 ) -> Perceptron[Array]:
-    """Change the last layer and the skip layer as little as is needed to give other answers.
+    """Fit the last layer and the skip layer to new outputs, by ridge regression of the changes of the weights.
 
-    Only the weights that are not zero change: an answer keeps using the hidden units that it used before.
+    Weights that are zero remain zero, so that an output depends on the same hidden units as before.
 
     Args:
         perceptron: The perceptron.
         features: Inputs of the perceptron, shape (n, n_input).
-        regressions: Regressions, which are done one after the other.
+        regressions: Regressions, which are computed one after the other.
+
+    Returns:
+        The perceptron with new weights.
     """
     hidden_output = evaluate_hidden_layers(perceptron.hidden, perceptron.activation, features)
     n_sample, n_hidden = hidden_output.shape
     n_input = features.shape[1]
     design = np.column_stack([hidden_output, features, np.ones(n_sample)])
     weights = np.vstack([perceptron.last.weight, perceptron.skip, perceptron.last.bias])
-    always_used = np.ones(n_input + 1, dtype=bool)
+    is_skip_or_bias = np.ones(n_input + 1, dtype=bool)
     for regression in regressions:
-        present = design @ weights
-        change = regression.target(present) - present
+        outputs = design @ weights
+        change = regression.target(outputs) - outputs
         for column in np.flatnonzero(change.any(axis=0)):
-            used = np.append(weights[:n_hidden, column] != 0.0, always_used)
-            normal = design[:, used].T @ design[:, used]
-            normal += regression.ridge * n_sample * np.eye(len(normal))
-            weights[used, column] += np.linalg.solve(normal, design[:, used].T @ change[:, column])
+            is_used = np.append(weights[:n_hidden, column] != 0.0, is_skip_or_bias)
+            used_design = design[:, is_used]
+            normal_matrix = used_design.T @ used_design
+            normal_matrix += regression.ridge * n_sample * np.eye(len(normal_matrix))
+            weights[is_used, column] += np.linalg.solve(normal_matrix, used_design.T @ change[:, column])
     last, skip, bias = np.split(weights, [n_hidden, n_hidden + n_input])
     return replace(perceptron, last=Layer(last, bias[0]), skip=skip)

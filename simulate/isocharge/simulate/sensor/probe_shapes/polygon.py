@@ -143,13 +143,14 @@ class Polygon(Probe):
     @property
     def period(self) -> float:
         """Smallest rotation that maps the polygon onto itself, rad."""
+        # A rotation that maps the polygon onto itself maps each corner to the corner that is `step` corners ahead.
         corners = to_complex(np.array(self.corners))
         for step in range(1, corners.size):
             if corners.size % step != 0:
                 continue
             rotation = np.exp(2j * np.pi * step / corners.size)
-            shifted = np.roll(corners, -step)
-            if np.allclose(shifted, corners * rotation, rtol=0.0, atol=1e-9 * self.reach):
+            corners_ahead = np.roll(corners, -step)
+            if np.allclose(corners_ahead, corners * rotation, rtol=0.0, atol=1e-9 * self.reach):
                 return float(math.tau * step / corners.size)
         return math.tau
 
