@@ -13,7 +13,11 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve import Predictor
 from isocharge.serve.flags import STRESS
-from isocharge.simulate import Circle, ForwardMap, Sensor, load_sensor, noise_model
+from isocharge.simulate import Circle, ForwardMap, Sensor, load_sensor, noise_model, parse_probe
+from isocharge.simulate.forward.charge_spline import with_fast_derivatives
+from isocharge.simulate.forward.whole_film import whole_film_map
+from isocharge.simulate.identifiability.mirror_region import has_mirror
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
 FILM_SENSOR = "three-25um-biaxial"
 """Sensor whose film all sensors of the study share; only their electrodes and piezoelectric coefficients differ."""
@@ -21,11 +25,11 @@ FILM_SENSOR = "three-25um-biaxial"
 FILM_RADIUS_mm = 15.001
 """Distance from the centre up to which faults of presses inside the working area need charges, mm."""
 
-AREA_CLEARANCE_mm = 0.5
-"""Smallest distance of a press outside from the edge of the working area, mm."""
-
 FORCE_RANGE_N = (0.05, 2.0)
 """Range of forces, N; it is the range of the released models."""
+
+WHOLE_FILM_FORCES_N = (0.2, 2.0)
+"""Range of forces of presses anywhere on the film, N."""
 
 WRONG_STDS = 4.0
 """Number of reported standard deviations beyond which an answer counts as wrong."""
@@ -106,6 +110,35 @@ def inscribed_radius(corners_mm: Sequence[Sequence[float]]) -> float:
     return float(np.hypot(middles[:, 0], middles[:, 1]).min())
 
 
+def contacts_between(
+    rng: np.random.Generator, inner_mm: float, outer_mm: float, count: int, force_range_N: tuple[float, float]
+) -> Array:
+    """Draw contacts uniform over a ring with log-uniform forces, shape (count, 3), mm and N."""
+    radius = np.sqrt(rng.uniform(inner_mm**2, outer_mm**2, count))
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
+    low, high = np.log(force_range_N)
+    force = np.exp(rng.uniform(low, high, count))
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force])
+
+
+def answer_shares(predictor: Predictor, contact: Array, charge: Array, rng: np.random.Generator) -> Shares:
+    """Add `reference` noise to charges, predict, and count flags and wrong answers.
+
+    Args:
+        predictor: The model.
+        contact: True contacts, shape (n, 3), mm and N.
+        charge: Charges without noise, shape (n, n_electrode), pC.
+        rng: Random number generator of the noise.
+    """
+    answers = predictor.predict_batch(noise_model("reference").add(charge, rng))
+    flags = predictor.validity.batch_flags(answers)
+    flagged: Booleans = np.array([bool(set(words) - {STRESS}) for words in flags])
+    numbers = np.stack(answers, axis=1).astype(float)
+    error = np.abs(numbers[:, :3] - contact)
+    wrong = (error > WRONG_STDS * numbers[:, 3:6]).any(axis=1)
+    return Shares(100.0 * float(flagged.mean()), 100.0 * float((wrong & ~flagged).mean()))
+
+
 class FaultStudy:
     """Presses inside the working area of one released model, with every fault in turn.
 
@@ -126,11 +159,7 @@ class FaultStudy:
 
     def presses_between(self, inner_mm: float, outer_mm: float, count: int) -> Array:
         """Draw contacts uniform over a ring with log-uniform forces, shape (count, 3), mm and N."""
-        radius = np.sqrt(self.rng.uniform(inner_mm**2, outer_mm**2, count))
-        angle = self.rng.uniform(0.0, 2.0 * np.pi, count)
-        low, high = np.log(FORCE_RANGE_N)
-        force = np.exp(self.rng.uniform(low, high, count))
-        return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force])
+        return contacts_between(self.rng, inner_mm, outer_mm, count, FORCE_RANGE_N)
 
     def shares(self, contact: Array, charge: Array) -> Shares:
         """Add noise, predict, and count.
@@ -139,14 +168,7 @@ class FaultStudy:
             contact: True contacts, shape (n, 3), mm and N.
             charge: Charges with the fault and without noise, shape (n, n_electrode), pC.
         """
-        noisy_charge = noise_model("reference").add(charge, self.rng)
-        answers = self.predictor.predict_batch(noisy_charge)
-        flags = self.predictor.validity.batch_flags(answers)
-        flagged: Booleans = np.array([bool(set(words) - {STRESS}) for words in flags])
-        numbers = np.stack(answers, axis=1).astype(float)
-        error = np.abs(numbers[:, :3] - contact)
-        wrong = (error > WRONG_STDS * numbers[:, 3:6]).any(axis=1)
-        return Shares(100.0 * float(flagged.mean()), 100.0 * float((wrong & ~flagged).mean()))
+        return answer_shares(self.predictor, contact, charge, self.rng)
 
     def average(self, faulty_charges: list[Array]) -> Shares:
         """Return the mean over several forms of a fault, for example over the electrode that has it."""
@@ -210,26 +232,75 @@ class FaultStudy:
         return results
 
 
-def outside_results(
-    model: str, forward_map: ForwardMap, edges_mm: tuple[float, ...], presses: int, seed: int
-) -> dict[str, Shares]:
-    """Return the shares of presses outside the working area, by distance from the centre.
+@dataclass(frozen=True)
+class RingShares(Shares):
+    """What happens to presses in a ring about the centre of the film.
 
-    A ring that the working area covers is left out, and one that it covers in part begins outside the area.
+    Attributes:
+        mirrored: Share whose charges a press inside the working area also has within the noise, %. No method can notice
+            these presses.
+    """
+
+    mirrored: float
+
+
+class WholeFilmStudy:
+    """Presses anywhere on the film of one released model.
 
     Args:
         model: Name of the released model.
-        forward_map: Charges of the nominal film up to the largest distance.
-        edges_mm: Radii that part the rings, ascending, mm.
         presses: Number of presses in each ring.
         seed: Seed of the presses and the noise.
     """
-    study = FaultStudy(model, FilmCharges(forward_map, {}), presses, seed)
-    area_edge_mm = study.radius_mm + AREA_CLEARANCE_mm
-    results = {}
-    for inner, outer in pairwise(edges_mm):
-        if outer <= area_edge_mm:
-            continue
-        contact = study.presses_between(max(inner, area_edge_mm), outer, presses)
-        results[f"{inner:g} to {outer:g} mm"] = study.shares(contact, study.charges.nominal.charges(contact))
-    return results
+
+    def __init__(self, model: str, presses: int, seed: int) -> None:
+        self.predictor = Predictor(model)
+        self.presses = presses
+        self.rng = np.random.default_rng(seed)
+        metadata = self.predictor.metadata
+        sensor = sensor_from_dict(metadata.sensor)
+        probe = parse_probe(metadata.probes[0])
+        self.radius_mm = round(inscribed_radius(metadata.working_area_mm), 3)
+        self.inner_map = with_fast_derivatives(ForwardMap.build(sensor, probe, self.radius_mm, FORCE_RANGE_N))
+        self.film_map = whole_film_map(sensor, probe, FORCE_RANGE_N)
+
+    def ring(self, inner_mm: float, outer_mm: float) -> RingShares:
+        """Press a ring, and count what the model answers."""
+        contact = contacts_between(self.rng, inner_mm, outer_mm, self.presses, WHOLE_FILM_FORCES_N)
+        is_inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.inner_map.domain.radius
+        clean_charge = self.film_map.charges(contact)
+        clean_charge[is_inside] = self.inner_map.charges(contact[is_inside])
+        shares = answer_shares(self.predictor, contact, clean_charge, self.rng)
+        is_mirrored = np.zeros(len(contact), dtype=bool)
+        is_mirrored[~is_inside] = has_mirror(self.inner_map, clean_charge[~is_inside], noise_model("reference"))
+        return RingShares(shares.flagged, shares.unnoticed, 100.0 * float(is_mirrored.mean()))
+
+    def rings(self, edges_mm: Sequence[float]) -> dict[str, RingShares]:
+        """Return the shares inside the working area, of every ring outside it, of all these rings, and of the film.
+
+        A ring that the working area covers is left out, and one that it covers in part begins at the edge of the area.
+
+        Args:
+            edges_mm: Radii that part the rings, ascending, mm.
+        """
+        inside = self.ring(0.0, self.radius_mm)
+        results = {"inside the working area": inside}
+        outside = []
+        for inner, outer in pairwise(edges_mm):
+            if outer <= self.radius_mm:
+                continue
+            start = max(inner, self.radius_mm)
+            shares = self.ring(start, outer)
+            results[f"{inner:g} to {outer:g} mm"] = shares
+            outside.append((outer**2 - start**2, shares))
+        results["all outside the working area"] = weighted_mean(outside)
+        results["whole film"] = weighted_mean([(self.radius_mm**2, inside), *outside])
+        return results
+
+
+def weighted_mean(items: Sequence[tuple[float, RingShares]]) -> RingShares:
+    """Return the mean shares of rings, given with their weights."""
+    weights = [weight for weight, _ in items]
+    rows = [(shares.flagged, shares.unnoticed, shares.mirrored) for _, shares in items]
+    flagged, unnoticed, mirrored = np.average(rows, axis=0, weights=weights).tolist()
+    return RingShares(flagged, unnoticed, mirrored)

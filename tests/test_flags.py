@@ -7,15 +7,12 @@ import pytest
 
 from isocharge.serve import Predictor
 from kept import kept
-from press_faults import FaultStudy, FilmCharges, nominal_map, outside_results
+from press_faults import FaultStudy, FilmCharges, WholeFilmStudy, nominal_map
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")
 PAGE = (ROOT / "serve" / "docs" / "unnoticed.md").read_text("utf-8")
 PREDICTIONS = (ROOT / "serve" / "docs" / "predictions.md").read_text("utf-8")
-
-FILM_RADIUS_mm = 20.0
-"""Distance from the centre up to which the film is solved, mm."""
 
 PRESSES = 1500
 SEED = 7
@@ -25,7 +22,7 @@ TOLERANCE = 4.0
 
 
 def column(table_name, model):
-    """Return the shares (flagged, unnoticed) of a table's column, in %, by row."""
+    """Return the shares of a table's column, in %, by row: flagged, unnoticed, and on a whole film also mirrored."""
     lines = re.search(rf"^\| {table_name} \|.*?\n\n", PAGE, re.DOTALL | re.MULTILINE)[0].splitlines()
     header, _, *rows = [[cell.strip(" `") for cell in line.split("|")] for line in lines if line]
     position = header.index(model)
@@ -39,19 +36,24 @@ def column(table_name, model):
 
 @pytest.mark.parametrize("model", ["three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial"])
 def test_shares_of_flagged_and_unnoticed_faults_are_those_of_the_page(model):
-    forward_map = kept(nominal_map, FILM_RADIUS_mm)
-    inside = FaultStudy(model, FilmCharges(forward_map, {}), PRESSES, SEED).results()
-    outside = outside_results(model, forward_map, (10.0, 12.0, 15.0, FILM_RADIUS_mm), PRESSES, SEED)
-    page = column("fault", model) | column("distance", model)
-    compared = 0
-    for fault, shares in (inside | outside).items():
+    forward_map = kept(nominal_map)
+    results = FaultStudy(model, FilmCharges(forward_map, {}), PRESSES, SEED).results()
+    page = column("fault", model)
+    for fault, shares in results.items():
         # Only presses with large charges reach the amplifier's limit, and too few of them are drawn here.
         if not fault.startswith("clipped"):
-            assert page[fault.replace("`", "")] == pytest.approx((shares.flagged, shares.unnoticed), abs=TOLERANCE), (
-                fault
-            )
-            compared += 1
-    assert compared == len(inside) + len(outside) - 1
+            assert page[fault] == pytest.approx((shares.flagged, shares.unnoticed), abs=TOLERANCE), fault
+
+
+@pytest.mark.parametrize("model", ["three-25um-biaxial", "four-25um-biaxial-15mm"])
+def test_shares_of_presses_on_the_whole_film_are_those_of_the_page(model):
+    rings = WholeFilmStudy(model, 500, SEED).rings((15.0, 20.0, 40.0, 43.0))
+    page = column("distance", model)
+    for ring in ("inside the working area", "15 to 20 mm", "40 to 43 mm"):
+        shares = rings[ring]
+        expected = (shares.flagged, shares.unnoticed, shares.mirrored)
+        assert page[ring] == pytest.approx(expected, abs=2.0 * TOLERANCE), ring
+    assert rings["inside the working area"].flagged < 1.0
 
 
 @pytest.mark.parametrize(("model", "electrodes"), [("three-25um-biaxial", "three"), ("four-25um-biaxial", "four")])

@@ -1,4 +1,4 @@
-"""Which faults the released models flag: the tables of serve/docs/unnoticed.md.
+"""Which faults of presses inside the working area the released models flag: a table of serve/docs/unnoticed.md.
 
     python tests/benchmarks/bench_flags.py [--models NAME,...] [--presses 4000] [--seed 1] [--json]
 
@@ -15,10 +15,9 @@ from shared import arguments, print_results
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from press_faults import FaultStudy, Shares, film_charges, nominal_map, outside_results
+from press_faults import FaultStudy, Shares, film_charges
 
-RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial,four-25um-biaxial-15mm,three-25um-biaxial-12mm"
-RING_EDGES_mm = (8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0)
+RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
 
 
 def table(results: dict[str, dict[str, Shares]]) -> list[str]:
@@ -49,19 +48,11 @@ def main() -> None:
     models = requested.models.split(",")
     charges = film_charges()
     inside = {model: FaultStudy(model, charges, requested.presses, requested.seed).results() for model in models}
-    wide_map = nominal_map(RING_EDGES_mm[-1])
-    outside = {
-        model: outside_results(model, wide_map, RING_EDGES_mm, requested.presses, requested.seed) for model in models
-    }
     if requested.json:
-        tables = {"inside": inside, "outside": outside}
-        results = {
-            title: {model: {fault: asdict(shares) for fault, shares in rows.items()} for model, rows in found.items()}
-            for title, found in tables.items()
-        }
+        results = {model: {fault: asdict(shares) for fault, shares in rows.items()} for model, rows in inside.items()}
         print_results("flags", requested, results)
         return
-    print_results("flags", requested, {"inside the working area": table(inside), "outside": table(outside)})
+    print_results("flags", requested, {"inside the working area": table(inside)})
 
 
 if __name__ == "__main__":

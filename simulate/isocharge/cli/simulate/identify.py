@@ -16,9 +16,13 @@ from isocharge.common.files import new_folder, refuse_existing
 from isocharge.simulate import identify, load_sensor, noise_model, parse_probe
 from isocharge.simulate.plots.error_maps import identification_picture
 from isocharge.simulate.plots.figure import picture_bytes
+from isocharge.simulate.plots.mirror_map import mirror_picture
 
 PICTURE = "identify.png"
 """File name of the picture in the output folder."""
+
+MIRROR_PICTURE = "mirror.png"
+"""File name of the picture of the mirror region in the output folder."""
 
 NUMBERS = "identify.json"
 """File name of the numbers in the output folder."""
@@ -43,14 +47,15 @@ def identify_command(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR", help="New folder for picture and numbers. (default: none)"),
+        typer.Option("--output", "-o", metavar="DIR", help="New folder for pictures and numbers. (default: none)"),
     ] = None,
     json: JsonOption = False,
 ) -> None:
     """Compute how well the charges determine a press: error limits over the film, ambiguities and working area.
 
     The errors are Cramer-Rao limits, in mm for the position and in percent for the force. No unbiased method has
-    smaller errors.
+    smaller errors. The mirror region is the part of the film outside the working area where a press has the charges
+    of a press inside it, so that it cannot be noticed.
 
     Example: isocharge simulate identify three-25um-biaxial --probe circle:1.0 --error 0.5 -o limits
     """
@@ -66,12 +71,16 @@ def identify_command(
     if output is not None:
         with new_folder(output) as folder:
             (folder / PICTURE).write_bytes(picture_bytes(identification_picture(identified)))
+            if identified.mirror is not None:
+                (folder / MIRROR_PICTURE).write_bytes(picture_bytes(mirror_picture(identified, identified.mirror)))
             (folder / NUMBERS).write_bytes(json_module.dumps(numbers, indent=1).encode())
     if json:
         show_json(numbers)
     else:
         show(_table(numbers))
     say(identified.summary)
+    if identified.mirror is not None:
+        say(identified.mirror.summary)
 
 
 def _table(numbers: dict[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """Identification: how well the charges of a sensor determine a contact, with limits, folds and the working area."""
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.folds import scaled_derivatives, singular_values
+from isocharge.simulate.identifiability.mirror_region import MirrorRegion, mirror_region
 from isocharge.simulate.identifiability.side_force_limits import (
     MAX_SIDE_FORCE_ERROR,
     SideForceLimits,
@@ -126,6 +127,8 @@ class Identification:
         inner_maps: Limits for the same forces within the working area; empty if the working area has the radius 0.
         side_force: Limits for the same forces if the side force of the probe is unknown; empty with fewer than six
             electrodes.
+        mirror: Places outside the working area where a press has the charges of a press inside it. None if they were
+            not computed, or if there is no working area.
     """
 
     sensor: Sensor
@@ -136,6 +139,7 @@ class Identification:
     maps: tuple[LimitMap, ...] = field(repr=False)
     inner_maps: tuple[LimitMap, ...] = field(repr=False)
     side_force: tuple[SideForceLimits, ...] = field(repr=False, default=())
+    mirror: MirrorRegion | None = field(default=None, repr=False)
 
     @classmethod
     def of(
@@ -231,6 +235,7 @@ class Identification:
                 "determined_share": self.determined_share,
                 "words": self.summary,
             },
+            "mirror_region": None if self.mirror is None else self.mirror.to_dict(),
             "limits_in_working_area": [limits.statistics() for limits in self.inner_maps],
             "limits_with_side_force": [limits.statistics() for limits in self.side_force],
             "by_distance": {
@@ -291,7 +296,10 @@ def identify(
         forward_map = map_to_search(sensor, probe, force_range, executor)
     else:
         forward_map = ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
-    return Identification.of(forward_map, noise, error=error, executor=executor)
+    identification = Identification.of(forward_map, noise, error=error, executor=executor)
+    area_radius = identification.area.radius
+    mirror = mirror_region(sensor, probe, identification.charges, area_radius, noise, executor=executor)
+    return replace(identification, mirror=mirror)
 
 
 def search_radius(sensor: Sensor, probe: Probe) -> float:

@@ -126,6 +126,7 @@ def search(
         Contacts and residuals, as of `explain`.
     """
     candidate_contacts = charge_map.domain.to_contact(INNER_RADIUS * _unit_candidates(candidates))
+    candidate_contacts[:, 2] = np.clip(candidate_contacts[:, 2], *charge_map.domain.force_range)
     candidate_charges = charge_map.charges(candidate_contacts)
     start_rows = []
     for first in range(0, max(len(charge), 1), CHUNK):

@@ -1,0 +1,69 @@
+"""A coarse forward map that covers nearly the whole film, for presses far outside the working area.
+
+It answers questions such as which presses on the film have the charges of another press. Such questions need charges
+within a few percent, and they need them up to the clamp, where an accurate forward map takes minutes.
+"""
+
+from concurrent.futures import Executor
+
+import numpy as np
+
+from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.forward.family import ROTATIONS, Family, check_family
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.mechanics.theory import Theory
+from isocharge.simulate.mesh.blocks import Resolution
+from isocharge.simulate.mesh.template import template_for
+from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.solver.load_case import SolveSettings, layer_for
+
+COARSE_ERROR = 0.05
+"""Largest relative error of a charge of the coarse map, dimensionless. The error is below 0.5 % up to two thirds of the
+film radius."""
+
+COARSE_RESOLUTION = Resolution(order=4, around=8, rings=6, rim=2)
+"""Mesh of the solves."""
+
+DISTANCES = 12
+"""Number of distances from the centre at which presses are solved."""
+
+FORCES = 4
+"""Number of forces at which presses are solved."""
+
+
+def outermost_distance(film: Film, probe: Probe) -> float:
+    """Return the largest distance of a press from the centre that the coarse map covers, mm.
+
+    The probe then leaves a gap to the clamp that is as wide as its reach.
+    """
+    return film.radius - 2.0 * probe.reach
+
+
+def whole_film_map(
+    sensor: Sensor, probe: Probe, force_range: tuple[float, float], *, executor: Executor | None = None
+) -> ForwardMap:
+    """Solve a coarse forward map of nearly the whole film, which takes about 4 s of CPU time.
+
+    Args:
+        sensor: Sensor with an axisymmetric film.
+        probe: Probe that presses the film.
+        force_range: Smallest and largest force, N.
+        executor: Executor that runs the solves; this process if absent.
+
+    Raises:
+        SceneError: If some presses cannot exist.
+        SolveError: If a press has no equilibrium.
+    """
+    film = sensor.film
+    domain = Domain(outermost_distance(film, probe), force_range)
+    check_family(sensor.coated_film, probe, domain)
+    theory = Theory(stretching=True, bending=True, pretensioned=film.pretension != 0.0)
+    middle_force = float(np.sqrt(force_range[0] * force_range[1]))
+    layer = layer_for(film, middle_force)
+    settings = SolveSettings(theory=theory, resolution=COARSE_RESOLUTION, layer=layer)
+    family = Family.spread(domain, (DISTANCES, FORCES), probe.period, ROTATIONS)
+    solved = family.solve(sensor, probe, settings, executor)
+    table = family.unfold(solved, template_for(probe, COARSE_RESOLUTION))
+    return ForwardMap(sensor, probe, family, theory, COARSE_RESOLUTION, layer, table, COARSE_ERROR)

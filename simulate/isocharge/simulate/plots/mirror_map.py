@@ -1,0 +1,64 @@
+"""Picture of the mirror region of a sensor on the whole film."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from isocharge.simulate.identifiability.identification import Identification
+from isocharge.simulate.identifiability.mirror_region import MirrorRegion
+from isocharge.simulate.plots.figure import FELT, INK, new_figure
+from isocharge.simulate.plots.film import draw_circle, draw_electrodes
+
+
+def mirror_picture(identification: Identification, mirror: MirrorRegion) -> Figure:
+    """Draw the mirror region on the film, and its share as a function of the distance from the centre."""
+    figure = new_figure(13.0, 5.8)
+    film_axes, distance_axes = figure.subplots(1, 2)
+    shades = _draw_region(film_axes, identification, mirror)
+    figure.colorbar(shades, ax=film_axes, label="share of the forces that cannot be noticed", shrink=0.85)
+    _draw_distance(distance_axes, mirror)
+    lightest, hardest = mirror.forces[0], mirror.forces[-1]
+    figure.suptitle(
+        f"{identification.sensor.name}: presses of {lightest:.2g} to {hardest:.2g} N with the charges of a press in "
+        "the working area",
+        fontsize=13,
+    )
+    return figure
+
+
+def _draw_region(axes: Any, identification: Identification, mirror: MirrorRegion) -> Any:
+    """Draw the shares as colours, with the clamp, the working area and the electrodes to scale.
+
+    Returns:
+        The coloured cells, for which a colour bar can be drawn.
+    """
+    n_ring, n_sector = mirror.share.shape
+    radius = np.linspace(mirror.inner, mirror.outer, n_ring + 1)
+    angle = 2.0 * np.pi * np.arange(n_sector + 1) / n_sector
+    x = np.outer(radius, np.cos(angle))
+    y = np.outer(radius, np.sin(angle))
+    shades = axes.pcolormesh(x, y, mirror.share, vmin=0.0, vmax=1.0, cmap="Reds")
+    film_radius = identification.sensor.film.radius
+    draw_circle(axes, film_radius, color=INK, lw=2.0)
+    draw_circle(axes, mirror.inner, color=INK, ls="--", lw=1.6)
+    draw_electrodes(axes, identification.sensor)
+    limits = (-1.03 * film_radius, 1.03 * film_radius)
+    title = f"dashed: working area, {mirror.inner:.3g} mm; solid: clamp, {film_radius:g} mm"
+    axes.set(xlim=limits, ylim=limits, aspect="equal", xlabel="x, mm", ylabel="y, mm", title=title)
+    return shades
+
+
+def _draw_distance(axes: Any, mirror: MirrorRegion) -> None:
+    """Draw the share of each ring against its distance from the centre."""
+    edges = np.linspace(mirror.inner, mirror.outer, len(mirror.share) + 1)
+    axes.stairs(100.0 * mirror.share.mean(axis=1), edges, color=FELT, lw=2.0)
+    axes.axvline(mirror.inner, ls="--", color=INK)
+    axes.set(
+        xlim=(0.0, mirror.outer),
+        ylim=(0.0, 105.0),
+        xlabel="distance from the centre, mm",
+        ylabel="presses that cannot be noticed, %",
+        title=f"{100.0 * mirror.total_share:.2g} % of the presses outside the working area",
+    )
+    axes.grid(alpha=0.3)

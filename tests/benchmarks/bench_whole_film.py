@@ -1,0 +1,64 @@
+"""Presses anywhere on the film: which of them a released model answers wrongly without a flag, by distance.
+
+    python tests/benchmarks/bench_whole_film.py [--models NAME,...] [--presses 2000] [--seed 1] [--json]
+
+Presses of a circle of 1 mm with 0.2 to 2 N and `reference` noise, up to 43 mm from the centre of a film with a radius
+of 45 mm. Each cell gives three shares: presses with a flag other than `stress`; presses that are wrong by more than
+four reported standard deviations without such a flag; and presses whose charges a press inside the working area also
+has, so that no method can notice them. The charges come from a coarse forward map (within 5 % near the clamp, 0.5 %
+elsewhere).
+"""
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from bench_flags import percent
+from shared import arguments, print_results
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from press_faults import RingShares, WholeFilmStudy
+
+RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial,four-25um-biaxial-15mm,three-25um-biaxial-12mm"
+RING_EDGES_mm = (8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 43.0)
+
+
+def table(results: dict[str, dict[str, RingShares]]) -> list[str]:
+    """Return the lines of a Markdown table with a column for each model and a row for each ring."""
+    models = list(results)
+    rings = sorted({ring for shares in results.values() for ring in shares}, key=row_order)
+    lines = ["| distance | " + " | ".join(f"`{model}`" for model in models) + " |", "|---" * (len(models) + 1) + "|"]
+    for ring in rings:
+        cells = [cell(results[model].get(ring)) for model in models]
+        lines.append(f"| {ring} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def row_order(ring: str) -> tuple[int, float]:
+    """Return the place of a row: the working area, then the rings from the centre outwards, then the means."""
+    if ring[0].isdigit():
+        return 1, float(ring.split()[0])
+    return (0, 0.0) if ring.startswith("inside") else (2, 0.0 if ring.startswith("all") else 1.0)
+
+
+def cell(shares: RingShares | None) -> str:
+    """Return the three shares of a cell as text; a dash if the working area covers the ring."""
+    if shares is None:
+        return "-"
+    return "; ".join(percent(share) for share in (shares.flagged, shares.unnoticed, shares.mirrored))
+
+
+def main() -> None:
+    requested = arguments(__doc__, models=RELEASED, presses=2000, seed=1, json=False)
+    models = requested.models.split(",")
+    results = {model: WholeFilmStudy(model, requested.presses, requested.seed).rings(RING_EDGES_mm) for model in models}
+    if requested.json:
+        numbers = {model: {name: asdict(ring) for name, ring in rings.items()} for model, rings in results.items()}
+        print_results("whole film", requested, numbers)
+        return
+    print_results("whole film", requested, {"whole film": table(results)})
+
+
+if __name__ == "__main__":
+    main()

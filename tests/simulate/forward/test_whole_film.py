@@ -1,0 +1,35 @@
+"""The coarse forward map of the whole film against direct solves on a finer mesh."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.simulate import Circle, Resolution, SolveSettings, load_sensor, press, touch_charge
+from isocharge.simulate.forward.whole_film import COARSE_ERROR, outermost_distance, whole_film_map
+from kept import kept
+
+SENSOR = load_sensor("four-25um-biaxial")
+FINER = SolveSettings(resolution=Resolution(order=6, around=8, rings=6, rim=3))
+PRESSES = [
+    (11.0, 1.2, 0.005),
+    (24.0, 0.08, 0.005),
+    (29.0, 2.0, 0.01),
+    (36.0, 0.3, COARSE_ERROR),
+    (42.5, 1.2, COARSE_ERROR),
+]
+"""Distance from the centre, mm, force, N, and largest relative error of a charge."""
+
+
+@pytest.mark.parametrize("pretension", [0.0, 0.8])
+def test_coarse_map_agrees_with_direct_solves_up_to_the_clamp(pretension):
+    sensor = replace(SENSOR, film=replace(SENSOR.film, pretension=pretension))
+    coarse = kept(whole_film_map, sensor, Circle(1.0), (0.05, 2.0))
+    for distance, force, error in PRESSES:
+        at = (distance * np.cos(0.7), distance * np.sin(0.7))
+        direct = touch_charge(sensor, press(sensor.film, Circle(1.0), at, force, FINER))
+        np.testing.assert_allclose(coarse.charges(np.array([[*at, force]]))[0], direct, rtol=error)
+
+
+def test_coarse_map_ends_two_probe_radii_before_the_clamp():
+    assert outermost_distance(SENSOR.film, Circle(1.5)) == 42.0

@@ -1,0 +1,75 @@
+"""Presses outside the working area that have the charges of a press inside it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.simulate import Circle, ForwardMap, FunctionMap, load_sensor, noise_model
+from isocharge.simulate.forward.charge_map import Domain, within
+from isocharge.simulate.forward.whole_film import whole_film_map
+from isocharge.simulate.identifiability.mirror_region import MirrorRegion, has_mirror, mirror_region
+from isocharge.simulate.identifiability.nearest_contact import search
+from kept import kept
+
+NOISE = noise_model("reference")
+FORCES = (0.05, 2.0)
+CIRCLE = 10.0 * np.exp(2j * np.pi * np.arange(4) / 4)
+"""Four electrodes on a circle of 10 mm, as x + iy."""
+
+
+def inverse_distance_map(electrodes, radius):
+    """Charges in proportion to the force over the distance between electrode and press.
+
+    Inversion in a circle about the origin divides the distances from every point of the circle by the same factor. If
+    all electrodes lie on the circle of 10 mm, a press at r and one at 100 / r with the force 10 F / r therefore have
+    exactly the same charges.
+    """
+
+    def charges(contact):
+        z = contact[:, 0] + 1j * contact[:, 1]
+        return 1000.0 * contact[:, 2:] / np.abs(z[:, None] - electrodes)
+
+    return FunctionMap(charges, tuple("ABCDE"[: len(electrodes)]), Domain(radius, FORCES))
+
+
+def region_of(electrodes):
+    return MirrorRegion.of(inverse_distance_map(electrodes, 8.0), 8.0, inverse_distance_map(electrodes, 40.0), NOISE)
+
+
+def test_electrodes_on_one_circle_mirror_the_film_by_inversion():
+    region = region_of(CIRCLE)
+    is_inside = 100.0 / region.distance < 7.8
+    is_outside = 100.0 / region.distance > 8.3
+    assert is_inside.sum() > 20
+    assert (region.share[is_inside] >= 0.8).all()  # the lightest press has an image below 0.05 N far outside
+    assert (region.share[is_outside] == 0.0).all()
+    share_of_area = (40.0**2 - (100.0 / 8.0) ** 2) / (40.0**2 - 8.0**2)
+    assert region.total_share == pytest.approx(share_of_area, abs=0.08)
+    assert f"{100.0 * region.total_share:.2g} % have the charges of a press in the working area" in region.summary
+
+
+def test_an_electrode_at_another_radius_removes_the_mirror_region():
+    region = region_of(np.append(CIRCLE, 0.0))
+    assert region.total_share == 0.0
+    assert "differ from those of every press in the working area" in region.summary
+
+
+def test_a_press_at_20_mm_on_the_film_has_the_charges_of_one_at_5_mm():
+    """The mirror image of the circle of 10 mm, R^2 / r; the film itself gives 5.2 mm and 0.24 N."""
+    sensor = load_sensor("four-25um-biaxial")
+    inside = kept(ForwardMap.build, sensor, Circle(1.0), 9.0, FORCES)
+    coarse = replace(kept(whole_film_map, sensor, Circle(1.0), FORCES), sensor=sensor)
+    charge = coarse.charges(np.array([[20.0, 0.0, 0.5], [0.0, -20.0, 0.5], [10.2, 0.0, 0.5]]))
+    contact, residual = search(inside, charge, NOISE.sigma(charge), candidates=512)
+    np.testing.assert_allclose(contact[:2, :2], [[5.2, 0.0], [0.0, -5.2]], atol=0.15)
+    np.testing.assert_allclose(contact[:2, 2], 0.24, atol=0.01)
+    assert (np.linalg.norm(residual[:2], axis=1) < 2.0).all()
+    assert has_mirror(within(inside, 9.0), charge, NOISE).tolist() == [True, True, False]
+
+
+def test_a_film_without_a_working_area_has_no_mirror_region():
+    sensor = load_sensor("four-25um-biaxial")
+    charges = inverse_distance_map(CIRCLE, 8.0)
+    assert mirror_region(sensor, Circle(1.0), charges, 0.0, NOISE) is None
+    assert mirror_region(sensor, Circle(1.0), charges, 43.5, NOISE) is None
