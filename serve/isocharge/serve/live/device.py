@@ -72,6 +72,7 @@ class Gain(Rule, frozen=True, kw_only=True):
     offset: Finite | dict[str, Finite] | None = None
 
     def __post_init__(self) -> None:
+        """Check that the charge of one unit is given in one of the two ways; raise WrongKey otherwise."""
         if self.V_per_unit is not None and self.pC_per_unit is not None:
             raise WrongKey("V_per_unit", "either pC_per_unit, or V_per_unit and feedback_pF", self.V_per_unit)
         if self.V_per_unit is None and self.feedback_pF is not None:
@@ -220,18 +221,26 @@ class Device(DeviceSections, frozen=True):
         )
 
     def _warming_ratio(self, electrodes: tuple[str, ...]) -> Array | float:
-        """Return the charge of each electrode over the mean magnitude of all when the film warms, shape (n_electrode,).
+        """Return how strongly each electrode responds to a warming of the film, relative to the mean of all electrodes.
 
-        The result is 1 if all electrodes are alike.
+        Args:
+            electrodes: Names of the electrodes.
+
+        Returns:
+            Ratio of the charge of each electrode to the mean magnitude, shape (n_electrode,), dimensionless; 1 if the
+            device file does not state the charges.
+
+        Raises:
+            DeviceError: If all charges are 0, or the setting is for other electrodes.
         """
-        per_K = None if self.common_mode is None else self.common_mode.pC_per_K
-        charges = self._for_each_electrode("common_mode.pC_per_K", per_K, electrodes)
-        if charges is None:
+        setting = None if self.common_mode is None else self.common_mode.pC_per_K
+        charge_pC_per_K = self._for_each_electrode("common_mode.pC_per_K", setting, electrodes)
+        if charge_pC_per_K is None:
             return 1.0
-        mean_magnitude = float(np.abs(charges).mean())
+        mean_magnitude = float(np.abs(charge_pC_per_K).mean())
         if not mean_magnitude > 0.0:
-            raise DeviceError(f"{self.where}: common_mode.pC_per_K: expected a number other than 0, got {per_K}")
-        return charges / mean_magnitude
+            raise DeviceError(f"{self.where}: common_mode.pC_per_K: expected a number other than 0, got {setting}")
+        return charge_pC_per_K / mean_magnitude
 
     def check_gain(self, electrodes: tuple[str, ...]) -> None:
         """Raise DeviceError if the gain is for other electrodes."""
@@ -242,11 +251,11 @@ class Device(DeviceSections, frozen=True):
         """Return the charge of one unit with its sign, shape (n_electrode,), pC; None if the gain is 1 pC."""
         if gain.V_per_unit is None:
             return self._for_each_electrode("gain.pC_per_unit", gain.pC_per_unit, electrodes)
-        volts = self._for_each_electrode("gain.V_per_unit", gain.V_per_unit, electrodes)
+        V_per_unit = self._for_each_electrode("gain.V_per_unit", gain.V_per_unit, electrodes)
         feedback_pF = self._for_each_electrode("gain.feedback_pF", gain.feedback_pF, electrodes)
-        if volts is None or feedback_pF is None:
+        if V_per_unit is None or feedback_pF is None:
             return None
-        return volts * feedback_pF
+        return V_per_unit * feedback_pF  # V times pF is pC
 
     def _for_each_electrode(
         self, key: str, setting: float | Mapping[str, float] | None, electrodes: tuple[str, ...]
@@ -302,7 +311,8 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
         complete_table["frames"] = {"format": "auto", **frames}
     sections: dict[str, Any] = structs.asdict(convert(complete_table, DeviceSections, where, DeviceError))
     for name, section in sections.items():
-        if isinstance(section, Rule) and not section.on:
+        is_switched_off = isinstance(section, Rule) and not section.on
+        if is_switched_off:
             sections[name] = None
     return Device(**sections, table=table, where=where)
 

@@ -84,6 +84,9 @@ class LineFit(NamedTuple):
 def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
     """Determine the law by which the charges of a press with a constant force decrease.
 
+    Three laws are fitted and compared by their residuals: a leak, with which ln Q falls linearly with the time; creep,
+    with which ln Q falls linearly with the logarithm of the time; and creep with a thermoelastic step.
+
     Args:
         sizes: Times since the touch, s, and mean magnitudes of the charges at these times, positive, pC.
     """
@@ -91,24 +94,25 @@ def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
         return Fading()
     held_s, size_pC = np.array(sizes).T
     log_size = np.log(size_pC)
-    leak = _fit_line(held_s, log_size)
-    creep = _fit_line(np.log(held_s), log_size)
-    if max(leak.slope, creep.slope) >= 0.0:
+    leak_fit = _fit_line(held_s, log_size)
+    creep_fit = _fit_line(np.log(held_s), log_size)
+    if max(leak_fit.slope, creep_fit.slope) >= 0.0:
         return Fading()
-    if creep.squared_residual > MIN_RESIDUAL_RATIO * leak.squared_residual:
-        return Fading(tau_s=-1.0 / leak.slope)
+    if creep_fit.squared_residual > MIN_RESIDUAL_RATIO * leak_fit.squared_residual:
+        return Fading(tau_s=-1.0 / leak_fit.slope)
 
-    max_squared_residual = min(leak.squared_residual, creep.squared_residual) / MIN_RESIDUAL_RATIO
+    max_squared_residual = min(leak_fit.squared_residual, creep_fit.squared_residual) / MIN_RESIDUAL_RATIO
     creep_and_step = _fit_creep_and_step(held_s, size_pC, max_squared_residual)
     if creep_and_step is not None:
         return creep_and_step
-    if leak.squared_residual > MIN_RESIDUAL_RATIO * creep.squared_residual:
-        return Fading(creep=-float(np.expm1(creep.slope * np.log(10.0))))
+    if leak_fit.squared_residual > MIN_RESIDUAL_RATIO * creep_fit.squared_residual:
+        log_change_per_decade = creep_fit.slope * np.log(10.0)
+        return Fading(creep=-float(np.expm1(log_change_per_decade)))
     return Fading()
 
 
 def _fit_creep_and_step(held_s: Array, size_pC: Array, max_squared_residual: float) -> Fading | None:
-    """Fit creep with a thermoelastic step.
+    """Fit creep with a thermoelastic step: Q = level - creep * log10(t) + step * exp(-t / warmth_s).
 
     Args:
         held_s: Times since the touch, shape (n,), s.
@@ -123,8 +127,8 @@ def _fit_creep_and_step(held_s: Array, size_pC: Array, max_squared_residual: flo
     coefficients = np.linalg.lstsq(design_matrix, size_pC, rcond=None)[0]
     level_pC, creep_pC, step_pC = coefficients.tolist()
     fitted_pC = design_matrix @ coefficients
-    is_physical = level_pC > 0.0 and 0.0 < creep_pC < level_pC and 0.0 < step_pC < level_pC and fitted_pC.min() > 0.0
-    if not is_physical:
+    has_physical_shares = 0.0 < creep_pC < level_pC and 0.0 < step_pC < level_pC
+    if not has_physical_shares or fitted_pC.min() <= 0.0:
         return None
     squared_residual = float(np.square(np.log(size_pC / fitted_pC)).sum())
     if squared_residual >= max_squared_residual:
@@ -133,7 +137,7 @@ def _fit_creep_and_step(held_s: Array, size_pC: Array, max_squared_residual: flo
 
 
 def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
-    """Return why the charges of a press may decrease, and what the user can do; the end of a sentence.
+    """Return the possible cause of a decrease of the charges, and what the user can do, as the end of a sentence.
 
     Args:
         sizes: Times since the touch, s, and mean magnitudes of the charges at these times, positive, pC.
@@ -150,7 +154,7 @@ def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
 
 
 def _fit_line(x: Array, y: Array) -> LineFit:
-    """Fit a straight line to points with the coordinates x and y, each of shape (n,)."""
+    """Fit a straight line to points with the coordinates x and y, each of shape (n,), by least squares."""
     centred_x = x - x.mean()
     centred_y = y - y.mean()
     slope = float(centred_x @ centred_y) / float(centred_x @ centred_x)

@@ -58,6 +58,9 @@ class ChannelPicker:
     def pick(self, frame: Frame) -> Array:
         """Return the values in the order of the electrodes, shape (n_electrode,), in the unit of the device.
 
+        The positions of the channels are looked up again only if the frame has other names, or another number of
+        values, than the previous frame.
+
         Raises:
             ChargeError: If a frame has no value for an electrode.
         """
@@ -69,7 +72,13 @@ class ChannelPicker:
         return np.array(values, dtype=float).reshape(-1)
 
     def _look_up(self, frame: Frame) -> tuple[int, ...]:
-        """Return the position of each electrode's channel among the values of a frame."""
+        """Return the position of each electrode's channel among the values of a frame.
+
+        The channels are assigned by the device file, otherwise by their names, otherwise by their order.
+
+        Raises:
+            ChargeError: If the device file assigns no channels, the names differ, and the number of values is wrong.
+        """
         if self._channels:
             return tuple(self._position(electrode, frame) for electrode in self._electrodes)
         positions = {electrode_of(name): position for position, name in enumerate(frame.names)}
@@ -84,7 +93,11 @@ class ChannelPicker:
         )
 
     def _position(self, electrode: str, frame: Frame) -> int:
-        """Return the position of the channel that the device file assigns to an electrode."""
+        """Return the position of the channel that the device file assigns to an electrode.
+
+        Raises:
+            ChargeError: If the frame has no such channel.
+        """
         name = self._channels.get(electrode, electrode)
         position = position_of(name, frame)
         if position is None:
@@ -219,7 +232,16 @@ class ReadingStream:
         return self.parser.feed(chunk.data)
 
     def advance(self, frame: Frame, chunk: Chunk) -> TimedReading:
-        """Compute the time and the touch charges of the next frame of a chunk."""
+        """Compute the time and the touch charges of the next frame of a chunk.
+
+        Args:
+            frame: The frame.
+            chunk: The chunk, whose arrival determines the time.
+
+        Raises:
+            ChargeError: If the frame has no value for an electrode.
+            TareError: If the film is not left alone for long enough to tare.
+        """
         time_of_reading = self.clock.read(frame.t_us, self.parser.t_us_modulus, chunk.timestamp)
         flags = self._pending_flags + self.gaps.update(frame.seq, self.parser.seq_modulus)
         self._pending_flags = ()
@@ -233,8 +255,8 @@ class ReadingStream:
                 flags=flags,
             )
         except TareError as error:
-            electrode_values = zip(self._electrodes, values.tolist(), strict=True)
-            offsets = ", ".join(f"{name} = {value:.10g}" for name, value in electrode_values)
+            value_of_electrode = dict(zip(self._electrodes, values.tolist(), strict=True))
+            offsets = ", ".join(f"{name} = {value:.10g}" for name, value in value_of_electrode.items())
             raise TareError(
                 f"{error}; if the board rests there without a touch, say so in a device file: [gain] offset = "
                 f"{{{offsets}}}"

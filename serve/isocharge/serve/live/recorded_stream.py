@@ -103,7 +103,8 @@ class RecordedStream:
                 if self._load_requested or self._loading:
                     self._take_model()
                 while self._requests:
-                    self._requests.popleft()()
+                    execute_request = self._requests.popleft()
+                    execute_request()
                 lines: list[str] = []
                 self._current_chunk = (chunk, lines)
                 for record in self._stream.feed(chunk):
@@ -122,8 +123,12 @@ class RecordedStream:
         self._current_chunk = None
 
     def _record(self) -> None:
-        """Begin the recording that was requested."""
-        if not self._recording_requested:  # A later request was executed instead of this one.
+        """Begin the recording that was requested, or end the recording if no recording was requested.
+
+        The stream is restarted, so that the records of the recording depend only on the bytes in the recording. If the
+        file cannot be created, an error is logged.
+        """
+        if not self._recording_requested:  # a later request was executed instead of this one
             return
         self._end_recording()
         recorder = self._recording_requested.pop()
@@ -134,8 +139,9 @@ class RecordedStream:
                 log.error("no recording: %s", error)
                 return
             self._stream.restart()
-            if recorder.model_label != self.predictor.metadata.label:  # The model changed after the request.
-                recorder.model(self.predictor.metadata.label)
+            present_label = self.predictor.metadata.label
+            if recorder.model_label != present_label:  # the model has changed since the request
+                recorder.model(present_label)
 
     def _end_recording(self) -> None:
         """End the present recording, and close it if this object opened it."""
@@ -162,17 +168,24 @@ class RecordedStream:
             loader.shutdown(wait=False)
 
     def _use(self, loaded: "Future[Predictor]") -> None:
-        """Continue with a loaded model; log an error and keep the present model if that fails."""
-        before = self._stream.predictor.metadata.label
+        """Continue with a loaded model. If that fails, log an error and continue with the present model.
+
+        Args:
+            loaded: Result of the thread that has loaded the model.
+        """
+        present_label = self._stream.predictor.metadata.label
         try:
-            predictor = loaded.result()
-            self._stream.use(predictor)
-        except Exception as error:  # Any error of a new model keeps the present one.
-            log.error("%s serves on, because the new model is refused: %s: %s", before, type(error).__name__, error)
+            new_predictor = loaded.result()
+            self._stream.use(new_predictor)
+        except Exception as error:  # after any error of the new model, the present model stays
+            log.error(
+                "%s serves on, because the new model is refused: %s: %s", present_label, type(error).__name__, error
+            )
             return
+        new_label = new_predictor.metadata.label
         if self.recorder is not None:
-            self.recorder.model(predictor.metadata.label)
-        log.warning("%s serves from now on, after %s", predictor.metadata.label, before)
+            self.recorder.model(new_label)
+        log.warning("%s serves from now on, after %s", new_label, present_label)
 
     def _tare(self) -> None:
         """Measure the tare again, and record that."""
@@ -196,7 +209,9 @@ def replay(
     load: Callable[[str], Predictor] | None = None,
     on_marker: Callable[[Marker], object] = lambda _: None,
 ) -> Iterator[PredictionRecord]:
-    """Yield the records of a recording; of each chunk as many records as were used when it was recorded.
+    """Compute the records of a recording again, and yield them.
+
+    Of each chunk, as many records are yielded as were used when the recording was made.
 
     Args:
         recording: The recording.
@@ -229,7 +244,9 @@ def replay(
                 if real_time:
                     if delay_s is None:
                         delay_s = time.time() - chunk.timestamp
-                    time.sleep(max(0.0, chunk.timestamp + delay_s - time.time()))
+                    due_s = chunk.timestamp + delay_s
+                    time.sleep(max(0.0, due_s - time.time()))
+                used_count = len(latencies_us)  # a recording has one latency for each record that was used
                 for number, record in enumerate(stream.feed(chunk)):
-                    if number < len(latencies_us):
+                    if number < used_count:
                         yield record

@@ -171,13 +171,20 @@ class PressWatch:
             self._phase = Phase.lift
 
     def feed(self, timed: TimedReading) -> WatchResult:
-        """Process the next reading."""
+        """Process the next reading, and return the state of the press.
+
+        Args:
+            timed: The reading with its time.
+
+        Returns:
+            The phase with the charges of the reading. A press is returned once, with the reading that completes it.
+        """
         reading = timed.reading
         t_s = timed.time.clock_s
         if RECONNECTED in reading.flags or RESTART in reading.flags:
             self._rest.clear()
             return self._refuse(AWAY, Phase.taring)
-        if reading.charge_pC is None:  # There is no tare yet, or the frame is invalid.
+        if reading.charge_pC is None:  # there is no tare yet, or the frame is invalid
             if TARE in reading.flags:
                 self._phase = Phase.taring
             return WatchResult(self._phase)
@@ -194,15 +201,20 @@ class PressWatch:
         return result._replace(charge_pC=charge_pC, held_s=held_s)
 
     def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
-        """Store a frame in which nothing touches, and refuse a press that has ended before it was steady."""
+        """Store a frame in which nothing touches, and refuse a press that has ended before it was steady.
+
+        Args:
+            charge_pC: Charges of the frame, shape (n_electrode,), pC.
+            t_s: Time of the frame, s.
+        """
         rule = self._rule
         held_s = self._end_s - self._begin_s
         is_press_unfinished = self._phase is Phase.settling
         self._phase = Phase.waiting
-        if t_s > self._end_s + rule.edge_s:
+        if t_s > self._end_s + rule.edge_s:  # the finger has left the film
             self._rest.append((t_s, charge_pC))
-        oldest_s = t_s - rule.rest_s - rule.edge_s
-        while self._rest and self._rest[0][0] < oldest_s:
+        oldest_rest_s = t_s - rule.rest_s - rule.edge_s
+        while self._rest and self._rest[0][0] < oldest_rest_s:
             self._rest.popleft()
 
         if is_press_unfinished and held_s >= rule.min_held_s:
@@ -211,12 +223,16 @@ class PressWatch:
         return WatchResult(Phase.waiting, charge_pC)
 
     def _begin_press(self, t_s: float) -> None:
-        """Begin a press at a time, s, and measure the rest just before it."""
-        rest = [charge_pC for rest_s, charge_pC in self._rest if rest_s <= t_s - self._rule.edge_s]
-        self._has_rest = len(rest) >= MIN_REST_FRAMES
+        """Begin a press at a time, s, and measure the rest just before it.
+
+        The latest frames before the press are left out, because the finger may have touched the film already.
+        """
+        rest_end_s = t_s - self._rule.edge_s
+        rest_charges_pC = [charge_pC for frame_s, charge_pC in self._rest if frame_s <= rest_end_s]
+        self._has_rest = len(rest_charges_pC) >= MIN_REST_FRAMES
         self._rest_pC = np.zeros(len(self._electrodes))
-        if rest:
-            self._rest_pC = np.mean(rest, axis=0)
+        if rest_charges_pC:
+            self._rest_pC = np.mean(rest_charges_pC, axis=0)
         self._rest.clear()
         self._window.clear()
         self._sizes.clear()
@@ -227,7 +243,17 @@ class PressWatch:
         self._min_scatter_pC = np.inf
 
     def _process_press(self, reading: Reading, charge_pC: Array, t_s: float) -> WatchResult:
-        """Add a frame to the window of a press, and take or refuse the press if it is decided."""
+        """Add a frame to the window of a press, and accept the press if it is steady.
+
+        Args:
+            reading: The frame.
+            charge_pC: Charges of the frame minus the rest, shape (n_electrode,), pC.
+            t_s: Time of the frame, s.
+
+        Returns:
+            The phase `taken` with the press if it is steady, `refused` with the reason if it cannot become steady, and
+            otherwise `settling`.
+        """
         rule = self._rule
         self._end_s = t_s
         held_s = t_s - self._begin_s
@@ -239,8 +265,9 @@ class PressWatch:
         self._window.append(WindowFrame(t_s, charge_pC, reading.flags))
         while self._window[0].t_s < t_s - rule.window_s:
             self._window.popleft()
-        is_full = held_s >= rule.window_s and len(self._window) >= rule.min_frames
-        if is_full and t_s - self._check_s >= rule.window_s / CHECKS_PER_WINDOW:
+        is_window_full = held_s >= rule.window_s and len(self._window) >= rule.min_frames
+        is_check_due = t_s - self._check_s >= rule.window_s / CHECKS_PER_WINDOW
+        if is_window_full and is_check_due:
             self._check_s = t_s
             press = self._steady_press(reading)
             if press is not None:
@@ -252,13 +279,20 @@ class PressWatch:
         return WatchResult(Phase.settling, reason=self._reason)
 
     def _steady_press(self, reading: Reading) -> SteadyPress | None:
-        """Return the press in the window if it is steady; otherwise None, and keep the reason."""
+        """Return the press in the window if it is steady; otherwise store the reason and return None.
+
+        Windows with a much larger scatter than earlier windows contain a jerk. Their size is not used to determine the
+        law of a decrease, and their reason is not stored.
+
+        Args:
+            reading: The latest frame, which has the noise of the charges at rest.
+        """
         press = self._measure_window()
         scatter_pC = float(press.scatter_pC.max())
         is_calm = scatter_pC <= MAX_SCATTER_RATIO * self._min_scatter_pC
         self._min_scatter_pC = min(self._min_scatter_pC, scatter_pC)
-        has_landed_before_window = press.held_s >= 2.0 * press.window_s
-        if is_calm and has_landed_before_window:
+        began_before_window = press.held_s >= 2.0 * press.window_s
+        if is_calm and began_before_window:
             middle_s = press.held_s - 0.5 * press.window_s
             self._sizes.append((middle_s, float(np.abs(press.charge_pC).mean())))
 
@@ -273,23 +307,24 @@ class PressWatch:
         return None
 
     def _measure_window(self) -> SteadyPress:
-        """Fit a straight line to each charge in the window."""
+        """Fit a straight line to each charge in the window, and return the mean, the scatter and the change."""
         frame_times, charges, flags = zip(*self._window, strict=True)
         begin_s = frame_times[0]
         end_s = self._end_s
         times_s = np.array(frame_times) - begin_s
-        charge_pC = np.array(charges)
+        charge_pC = np.array(charges)  # shape (frames, n_electrode)
         window_s = float(end_s - begin_s)
 
+        # Least squares: with centred times, the slope is independent of the mean.
         centred_s = times_s - times_s.mean()
-        slope = centred_s @ charge_pC / max(float(centred_s @ centred_s), 1e-30)
+        slope_pC_per_s = centred_s @ charge_pC / max(float(centred_s @ centred_s), 1e-30)
         mean_pC = charge_pC.mean(axis=0)
-        residual_pC = charge_pC - mean_pC - np.outer(centred_s, slope)
+        residual_pC = charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)
         different_flags = dict.fromkeys(flag for frame_flags in flags for flag in frame_flags)
         return SteadyPress(
             charge_pC=mean_pC,
             scatter_pC=residual_pC.std(axis=0),
-            drift_pC=slope * window_s,
+            drift_pC=slope_pC_per_s * window_s,
             held_s=end_s - self._begin_s,
             window_s=window_s,
             frames=len(charges),
@@ -309,7 +344,9 @@ def unsteadiness(
     electrodes: tuple[str, ...],
     sizes: Sequence[tuple[float, float]],
 ) -> str:
-    """Return why a press is not steady, as a part of a sentence; an empty string if it is steady.
+    """Return the reason why a press is not steady, as a part of a sentence; an empty string if it is steady.
+
+    A press is steady if its charges scatter little about a straight line and this line changes little over the window.
 
     Args:
         rule: Conditions for a steady press.
@@ -319,12 +356,13 @@ def unsteadiness(
         sizes: Time since the touch, s, and mean magnitude of the charges, pC, of each window so far.
     """
     mean_size_pC = float(np.abs(press.charge_pC).mean())
-    noise_pC = np.hypot(noise_pC, rule.relative_noise * mean_size_pC)
-    relative_scatter = press.scatter_pC / noise_pC
+    expected_scatter_pC = np.hypot(noise_pC, rule.relative_noise * mean_size_pC)
+    relative_scatter = press.scatter_pC / expected_scatter_pC
     if relative_scatter.max() > rule.max_scatter_sigmas:
         worst = int(relative_scatter.argmax())
         return f"the charge of {electrodes[worst]} shakes by {press.scatter_pC[worst]:.2g} pC"
 
+    # Standard deviation of the change over a window of n frames of a line that is fitted to noise: sqrt(12 / n).
     drift_std_pC = press.scatter_pC * np.sqrt(12.0 / press.frames)
     size_pC = np.maximum(np.abs(press.charge_pC), mean_size_pC)
     max_drift_pC = rule.max_relative_drift * size_pC + rule.drift_sigmas * drift_std_pC
@@ -334,10 +372,19 @@ def unsteadiness(
 
 
 def _drift_reason(press: SteadyPress, sizes: Sequence[tuple[float, float]]) -> str:
-    """Return what changes: the force if all charges change equally, otherwise the position; `sizes` as above."""
-    relative_slope = press.drift_pC / np.maximum(np.abs(press.charge_pC), MIN_CHARGE_pC) / press.window_s
+    """Return the reason for a drift of the charges, as a part of a sentence.
+
+    The force changes if all charges change in proportion; otherwise the position changes.
+
+    Args:
+        press: A window of the press.
+        sizes: Time since the touch, s, and mean magnitude of the charges, pC, of each window so far.
+    """
+    charge_size_pC = np.maximum(np.abs(press.charge_pC), MIN_CHARGE_pC)
+    relative_slope = press.drift_pC / charge_size_pC / press.window_s  # shape (n_electrode,), 1/s
     mean_slope = float(relative_slope.mean())
-    if np.abs(relative_slope - mean_slope).max() > MAX_SLOPE_DIFFERENCE * abs(mean_slope):
+    largest_difference = np.abs(relative_slope - mean_slope).max()
+    if largest_difference > MAX_SLOPE_DIFFERENCE * abs(mean_slope):
         return "the press moves: the ratios of the charges change"
     if mean_slope > 0.0:
         return f"the charges rise by {100.0 * mean_slope:.2g} % per second: hold the force"

@@ -164,7 +164,9 @@ class TouchStream:
         self._set_model(predictor)
 
     def _set_model(self, predictor: Predictor) -> None:
-        """Build the stages that the device file asks for, and use them from the next frame on.
+        """Build the stages that the device file requests, and use them from the next frame on.
+
+        All stages are built before the first attribute is changed, so that an error changes nothing.
 
         Raises:
             ModelError: If a stage cannot use the model. The stream then keeps its stages.
@@ -194,12 +196,12 @@ class TouchStream:
             ModelError: If the model has other electrodes, or the electrodes in another order, or a stage cannot use
                 the model. The stream then keeps its present model.
         """
-        before = self.predictor.metadata
-        after = predictor.metadata
-        if after.electrodes != before.electrodes:
+        present = self.predictor.metadata
+        new = predictor.metadata
+        if new.electrodes != present.electrodes:
             raise ModelError(
-                f"model {after.label}: expected the electrodes {before.electrodes} of {before.label}, got "
-                f"{after.electrodes}; start another stream for it"
+                f"model {new.label}: expected the electrodes {present.electrodes} of {present.label}, got "
+                f"{new.electrodes}; start another stream for it"
             )
         self._set_model(predictor)
 
@@ -234,7 +236,10 @@ class TouchStream:
             stage.reset()
 
     def restart(self) -> None:
-        """Return to the state of a new stream, so that records depend only on the bytes from now on; keep `totals`."""
+        """Return to the state of a new stream, so that all further records depend only on further bytes.
+
+        The counts of `totals` continue.
+        """
         self._before_restart = self.totals()
         self._readings.restart()
         self._discard_contact()
@@ -268,11 +273,11 @@ class TouchStream:
             self.counts.outages += 1
             self._discard_contact()
         frames = self._readings.frames(chunk)
-        last = len(frames) - 1
         skipped_flags = set[str]()
-        for number, frame in enumerate(frames):
+        for number, frame in enumerate(frames, start=1):
             timed = self._readings.advance(frame, chunk)
-            if self._policy is Policy.latest and number < last:
+            is_last = number == len(frames)
+            if self._policy is Policy.latest and not is_last:
                 self.counts.skipped += 1
                 skipped_flags.update(timed.reading.flags)
                 continue
@@ -291,17 +296,23 @@ class TouchStream:
         self._readings.finish()
 
     def _record(self, chunk: Chunk, frame: Frame, timed: TimedReading) -> PredictionRecord:
-        """Return the record of a frame. Its latency is measured after everything else has been computed."""
-        reading, when = timed
-        contact_frame = ContactFrame(reading, when.clock_s, reading.flags)
+        """Return the record of a frame. Its latency is measured after everything else has been computed.
+
+        Args:
+            chunk: The chunk in which the frame ends.
+            frame: The frame.
+            timed: Charges of the frame, and its time.
+        """
+        reading, reading_time = timed
+        contact_frame = ContactFrame(reading, reading_time.clock_s, reading.flags)
         for stage in self._stages:
             stage.step(contact_frame)
         tare_pC = None
         if reading.tare is not None:
             tare_pC = reading.tare.charge_pC
         return PredictionRecord(
-            timestamp=when.host_s,
-            t_device_us=when.device_us,
+            timestamp=reading_time.host_s,
+            t_device_us=reading_time.device_us,
             seq=frame.seq,
             **_contact_fields(contact_frame),
             contact=reading.contact,
@@ -329,7 +340,10 @@ class TouchStream:
 
 
 def _contact_fields(frame: ContactFrame) -> Mapping[str, Any]:
-    """Return the fields of a record that describe its contact."""
+    """Return the fields of a record that describe its contact.
+
+    The fields are null if the frame is invalid. If nothing touches, the force is 0 and the position is null.
+    """
     if frame.contact is not None:
         return frame.contact.fields()
     if INVALID in frame.flags:
