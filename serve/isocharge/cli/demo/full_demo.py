@@ -263,7 +263,13 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
 
 
 def _draw_live_paths(axes: Any, forward_map: ForwardMap, followed: Array) -> None:
-    """Draw the true and the estimated path of each press of the live part."""
+    """Draw the true and the estimated path of each press of the live part.
+
+    Args:
+        axes: Axes of matplotlib.
+        forward_map: Forward map of the film, whose layout is drawn.
+        followed: Frames of the live part, columns as in `FollowedPress`, shape (n, 7), mm and N.
+    """
     press_number = followed[:, 0]
     true_xy = followed[:, 1:3]
     estimated_xy = followed[:, 4:6]
@@ -281,11 +287,11 @@ def _draw_live_paths(axes: Any, forward_map: ForwardMap, followed: Array) -> Non
 def _draw_error_against_force(axes: Any, force: Array, error: Array) -> None:
     """Draw the position errors (mm) of presses against their forces (N), with median and 95th percentile."""
     axes.loglog(force, error, ".", color=PRESSED, ms=2, alpha=0.5)
-    edges = np.geomspace(force.min(), force.max(), 13)
-    centres = np.sqrt(edges[:-1] * edges[1:])
+    bin_edges = np.geomspace(force.min(), force.max(), 13)
+    bin_centres = np.sqrt(bin_edges[:-1] * bin_edges[1:])
     for percentile, style, label in ((50, "-", "median"), (95, "--", "95 %")):
-        line = binned_statistic(force, error, partial(np.percentile, q=percentile), edges).statistic
-        axes.plot(centres, line, style, color=FELT, label=label)
+        errors = binned_statistic(force, error, partial(np.percentile, q=percentile), bin_edges).statistic
+        axes.plot(bin_centres, errors, style, color=FELT, label=label)
     axes.legend()
     axes.set(title="position error of test presses", xlabel="force, N", ylabel="error, mm", ylim=(2e-3, None))
     axes.grid(alpha=0.3, which="both")

@@ -37,8 +37,8 @@ def bench_command(
     contenders = in_process_contenders(predictor, press_charges(predictor, loaded.golden.charge_pC))
     with shown_progress():
         timings = take_turns(contenders, seconds)
-    names = [name for names in ERROR_NAMES.values() for name in names]
-    errors = {name: loaded.metadata.errors[name] for name in names if name in loaded.metadata.errors}
+    reported_names = [name for group in ERROR_NAMES.values() for name in group]
+    errors = {name: loaded.metadata.errors[name] for name in reported_names if name in loaded.metadata.errors}
     if json:
         report = {"model": loaded.metadata.label, "seconds": seconds, "machine": machine()}
         report |= {"timings": [timing._asdict() for timing in timings], "errors": errors}
@@ -48,7 +48,13 @@ def bench_command(
 
 
 def _lines(model: Model, timings: list[Timing], errors: dict[str, float]) -> Iterator[str]:
-    """Yield the lines of the report."""
+    """Yield the lines of the report: the machine, a table of the timings, and a table of the errors of the model.
+
+    Args:
+        model: The model.
+        timings: Timing of each kind of call.
+        errors: Errors of the model by the names in its metadata.
+    """
     yield f"{model.metadata.label}, presses of its golden vectors; answers checked against golden.json"
     yield ", ".join(f"{name} {value}" for name, value in machine().items())
     yield ""

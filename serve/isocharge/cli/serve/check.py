@@ -64,24 +64,25 @@ def _text(check: PressCheck) -> Iterator[str]:
             f"p value {agreement.p_value:.2g}"
         )
     if check.position_mm is not None:
-        x = agreement.shift_x
-        y = agreement.shift_y
-        yield f"shift ({x.mean:.3f} +- {x.std:.3f}, {y.mean:.3f} +- {y.std:.3f}) mm"
+        shift_x = agreement.shift_x
+        shift_y = agreement.shift_y
+        yield f"shift ({shift_x.mean:.3f} +- {shift_x.std:.3f}, {shift_y.mean:.3f} +- {shift_y.std:.3f}) mm"
     if check.force_percent is not None:
-        yield f"scale of the force {1.0 + agreement.force.mean:.4f} +- {agreement.force.std:.4f}"
+        relative_force = agreement.force
+        yield f"scale of the force {1.0 + relative_force.mean:.4f} +- {relative_force.std:.4f}"
     yield ""
     yield check.verdict
     yield from (f"- {note}" for note in check.notes)
 
 
 def _press_lines(check: PressCheck) -> Iterator[str]:
-    """Yield a table of the presses, in the order of the file."""
-    chi_squared = np.nansum(check.errors.squared_ratio, axis=1)
-    largest = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
+    """Yield a table of the presses with the largest errors, in the order of the file."""
+    chi_squared = np.nansum(check.errors.squared_ratio, axis=1)  # one value for each press
+    worst_presses = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
     if check.presses > MAX_ROWS:
         yield f"the {MAX_ROWS} worst of {check.presses} presses; --json has all"
     yield f"{check.errors.row_noun:>6}{'x, mm':>9}{'y, mm':>9}{'force, N':>10}{'off, mm':>9}{'off, %':>9}  flags"
-    for press in sorted(largest.tolist()):
+    for press in sorted(worst_presses.tolist()):
         yield _press_line(check.errors.row(press))
 
 

@@ -104,7 +104,7 @@ def http_command(
 
 @contextmanager
 def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
-    """Create the counters of the servers and, for JSON, the log on stderr, which is written by another thread.
+    """Yield the counters of the servers and, for JSON, set up the log on stderr, which is written by another thread.
 
     Args:
         log: Value of `--log`.
@@ -133,7 +133,14 @@ def _report(traffic: Traffic, level: str, event: str, message: str) -> None:
 
 
 def _grpc(handler: Handler, host: str, port: int | None, tls: Tls | None) -> AbstractContextManager[str]:
-    """Return the context of the gRPC server, which yields its address; an empty address if there is no port."""
+    """Return a context in which the gRPC server runs, and which yields the address of the server.
+
+    Args:
+        handler: Handler of the HTTP server, whose models, limits and token are used.
+        host: Name or address on which the server listens.
+        port: Port; None for no gRPC server, whose address is empty.
+        tls: Certificate and key; None for no TLS.
+    """
     if port is None:
         return nullcontext("")
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # the core of gRPC would print errors that are reported anyway

@@ -120,6 +120,7 @@ def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
     electrodes = tuple(first.charge_raw_pC or ())
 
     def row(record: Any) -> tuple[Any, ...]:
+        """Return the values of a record in the order of `names`."""
         numbers = [getattr(record, name) for name in NUMBERS]
         charges = record.charge_pC or {}
         charge_pC = [charges.get(name) for name in electrodes]
@@ -155,14 +156,15 @@ class _Groups(NamedTuple):
             time_s: Times since the first record, shape (n,), s.
             unit_s: Length of the unit of the time axis, s.
         """
-        group_size = -(-len(time_s) // MAX_GROUPS)
-        start = np.arange(0, len(time_s), group_size)
-        last = np.append(start[1:], len(time_s)) - 1
+        group_size = -(-len(time_s) // MAX_GROUPS)  # rounded up
+        start = np.arange(0, len(time_s), group_size)  # first record of each group
+        last = np.append(start[1:], len(time_s)) - 1  # last record of each group
         start_s = time_s[start]
         end_s = time_s[last]
         usual_length_s = float(np.median(np.diff(start_s))) if len(start) > 1 else 0.0
         min_gap_s = max(MIN_GAP_S, MIN_GAP_GROUPS * usual_length_s)
-        after_gap = np.flatnonzero(start_s[1:] - end_s[:-1] > min_gap_s) + 1
+        gap_s = start_s[1:] - end_s[:-1]
+        after_gap = np.flatnonzero(gap_s > min_gap_s) + 1
         return cls(start, start_s / unit_s, end_s / unit_s, after_gap)
 
     def draw_band(self, axes: Any, lower: Array, upper: Array, **style: Any) -> None:
@@ -236,7 +238,16 @@ def _draw_charges(axes: Any, groups: _Groups, traces: dict[str, Array]) -> None:
 
 
 def _draw_flags(axes: Any, groups: _Groups, traces: dict[str, Array], words: list[str]) -> None:
-    """Draw the times at which flags are set. A single record is drawn as a short bar, so that it is visible."""
+    """Draw the times at which flags are set, with one row of bars for each flag.
+
+    A single record is drawn as a short bar, so that it is visible.
+
+    Args:
+        axes: Axes of matplotlib.
+        groups: Groups of records, each of which is drawn as one bar.
+        traces: Columns of the records.
+        words: The flags, from the lowest row to the highest.
+    """
     min_length = 2e-3 * max(float(groups.end_time[-1]), 1e-9)
     lengths = np.maximum(groups.end_time - groups.start_time, min_length)
     for height, word in enumerate(words):
@@ -277,9 +288,19 @@ def _draw_path(axes: Any, traces: dict[str, Array], time: Array, time_label: str
 def _draw_contacts(
     axes: Any, traces: dict[str, Array], position_mm: Array, contacts: Integers, time: Array, time_label: str
 ) -> None:
-    """Draw contacts as dots, some of them with an ellipse, and crosses on those that may be wrong."""
+    """Draw contacts as dots, ellipses of two standard deviations around some of them, and crosses on doubtful contacts.
+
+    Args:
+        axes: Axes of matplotlib.
+        traces: Columns of the records.
+        position_mm: Position of each record, shape (n, 2), mm.
+        contacts: Numbers of the records that are drawn.
+        time: Time of each record, shape (n,), in the unit of the label.
+        time_label: Label of the scale of colours.
+    """
     force_N = np.clip(traces["force_N"][contacts], 0.0, None)
-    size = 3.0 + 30.0 * force_N / max(float(force_N.max()), 1e-9)
+    relative_force = force_N / max(float(force_N.max()), 1e-9)
+    size = 3.0 + 30.0 * relative_force
     dots = axes.scatter(*position_mm[contacts].T, c=time[contacts], s=size, lw=0.0, alpha=0.8, zorder=4)
     axes.figure.colorbar(dots, ax=axes, shrink=0.6, label=time_label, location="bottom", pad=0.02)
 

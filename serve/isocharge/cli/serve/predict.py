@@ -49,7 +49,15 @@ def predict_command(
 
 
 def _read_charges(file: str, electrodes: tuple[str, ...]) -> Array:
-    """Read the charges of a file, or of CSV text on stdin for `-`, shape (n, electrodes), pC."""
+    """Read charges, and return them in the order of the electrodes, shape (n, electrodes), pC.
+
+    Args:
+        file: Path of a CSV or Parquet file; `-` for CSV text on stdin.
+        electrodes: Names of the electrodes.
+
+    Raises:
+        InputError: If the charges cannot be read.
+    """
     if file != "-":
         return read_charge_file(Path(file), electrodes, say)
     try:

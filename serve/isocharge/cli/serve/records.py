@@ -48,15 +48,21 @@ RecordWriter = Callable[[PredictionRecord], object]
 def write_records(
     records: Iterable[PredictionRecord], writers: Iterable[RecordWriter], latencies: deque[float]
 ) -> None:
-    """Pass each record to one writer after the other, announce each new tare, and collect the latencies."""
-    tare = None
+    """Pass each record to all writers, print each new tare, and collect the latencies.
+
+    Args:
+        records: The records.
+        writers: Functions that write a record, which are called in their order.
+        latencies: Collects the latency of each record, us.
+    """
+    tare_pC = None
     for record in records:
         for write in writers:
             write(record)
-        if record.tare_pC != tare:
-            tare = record.tare_pC
-            if tare is not None:
-                say("tared: " + ", ".join(f"{name} {charge:.2f} pC" for name, charge in tare.items()))
+        if record.tare_pC != tare_pC:
+            tare_pC = record.tare_pC
+            if tare_pC is not None:
+                say("tared: " + ", ".join(f"{name} {charge:.2f} pC" for name, charge in tare_pC.items()))
         if record.latency_us is not None:
             latencies.append(record.latency_us)
 
@@ -93,13 +99,18 @@ def say_missing_records(outputs: Outputs) -> None:
 
 
 def summary(touch: TouchStream, latencies: deque[float]) -> str:
-    """Return the counts of frames and faults, and percentiles of the latency, as a text."""
+    """Return the counts of frames and faults, and percentiles of the latency, as a text.
+
+    Args:
+        touch: The stream.
+        latencies: Latencies of the latest records, us.
+    """
     totals = touch.totals()
-    stream = touch.counts
+    counts = touch.counts
     text = (
         f"{totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated, {totals.restarts} restarts; "
         f"{totals.crc_errors} CRC errors, {totals.malformed} malformed, {totals.bytes_dropped} bytes dropped, "
-        f"{totals.resyncs} resynchronisations; {stream.outages} reconnects, {stream.skipped} skipped"
+        f"{totals.resyncs} resynchronisations; {counts.outages} reconnects, {counts.skipped} skipped"
     )
     if not latencies:
         return text

@@ -72,12 +72,12 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
     """
     if text != "auto":
         return parse_radius_mm(text)
-    areas = []
+    radii = []
     for probe in probes:
         area = working_area(map_to_search(sensor, probe, force), noise_model("reference"))
         say(f"{probe.notation}: {area.summary}")
-        areas.append(area)
-    radius = min(area.radius for area in areas)
+        radii.append(area.radius)
+    radius = min(radii)
     if radius == 0.0:
         raise InputError(
             "--radius auto: the charges determine the contact nowhere well enough; see 'isocharge simulate identify', "

@@ -30,15 +30,26 @@ class LazyCommand(NamedTuple):
 
 
 def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer:
-    """Return a group that imports a command when the command is called, completed or asked for its help."""
+    """Return a group of commands that are imported only when they are needed.
+
+    A command is imported when it is called, completed, or asked for its help. The help of the group needs only the
+    summaries.
+
+    Args:
+        summary: Summary of the group.
+        commands: The commands by name.
+    """
 
     class LazyGroup(TyperGroup):
+        """A group with the names and the summaries of the commands."""
+
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
             for name, command in commands.items():
                 self.add_command(TyperCommand(name, help=command.summary, short_help=command.summary))
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+            """Import the command that the arguments name."""
             name, command, remaining_args = super().resolve_command(ctx, args)
             if name is not None and name in commands:
                 command = load_command(commands[name])

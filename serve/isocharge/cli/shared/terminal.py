@@ -175,11 +175,18 @@ def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[Non
 
 
 def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
-    """Return a handler of SIGHUP that calls `act`, or stops as by Ctrl-C if the terminal of this command was closed."""
-    terminals = [number for number in (0, 1, 2) if os.isatty(number)]
+    """Return a handler of SIGHUP, which the system also sends if the terminal of a command is closed.
+
+    Args:
+        act: Function that the handler calls if the terminal is open. Otherwise the handler stops the command like
+            Ctrl-C.
+    """
+    terminals = [descriptor for descriptor in (0, 1, 2) if os.isatty(descriptor)]
 
     def act_or_stop() -> None:
-        if not all(map(os.isatty, terminals)):
+        """Call `act`, or stop the command if its terminal was closed."""
+        is_open = all(map(os.isatty, terminals))
+        if not is_open:
             raise KeyboardInterrupt
         act()
 
@@ -277,12 +284,15 @@ def _progress_bars() -> Iterator[Listener]:
         rows: dict[str, TaskID] = {}
 
         def show(title: str, done: int, total: int, note: str) -> None:
-            title = printable(title)
-            note = printable(note)
-            if title not in rows:
-                rows[title] = bars.add_task(title, total=total, note=note)
-            elif done < bars.tasks[rows[title]].completed:  # the same work has started again, and so does its clock
-                bars.reset(rows[title])
-            bars.update(rows[title], completed=done, total=total, note=note)
+            """Show the progress of the work with a title, in a bar of its own."""
+            shown_title = printable(title)
+            shown_note = printable(note)
+            if shown_title not in rows:
+                rows[shown_title] = bars.add_task(shown_title, total=total, note=shown_note)
+            row = rows[shown_title]
+            has_restarted = done < bars.tasks[row].completed
+            if has_restarted:
+                bars.reset(row)  # the time starts again, too
+            bars.update(row, completed=done, total=total, note=shown_note)
 
         yield show

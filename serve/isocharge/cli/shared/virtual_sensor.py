@@ -58,26 +58,41 @@ def film_charges(forward_map: ForwardMap) -> Charges:
 
 
 def _charges(forward_map: ForwardMap, contact: Array) -> Array:
-    min_force = forward_map.domain.force_range[0]
-    force = contact[:, 2]
-    share = (force.clip(max=min_force) / min_force) ** (2.0 / 3.0)
+    """Compute the charges of contacts, also below the smallest force of the forward map; see `film_charges`.
+
+    Args:
+        forward_map: Charges of the presses in its domain.
+        contact: Contacts (x, y, force), shape (n, 3), mm and N.
+
+    Returns:
+        Charges, shape (n, electrodes), pC.
+    """
+    min_force_N = forward_map.domain.force_range[0]
+    force_N = contact[:, 2]
+    charge_share = (force_N.clip(max=min_force_N) / min_force_N) ** (2.0 / 3.0)  # 1 from the smallest force on
     contact_in_domain = contact.copy()
-    contact_in_domain[:, 2] = force.clip(min=min_force)
-    return forward_map.charges(contact_in_domain) * share[:, None]
+    contact_in_domain[:, 2] = force_N.clip(min=min_force_N)
+    return forward_map.charges(contact_in_domain) * charge_share[:, None]
 
 
 def measuring(amplifier: Amplifier, rate_Hz: float) -> Callable[..., Any]:
-    """Return the amplifier as the function that the virtual sensor calls, in pC. Its state begins with the first call.
+    """Return the amplifier as the function that the virtual sensor calls to measure charges.
 
     Args:
         amplifier: The amplifier.
         rate_Hz: Frames per second, Hz.
+
+    Returns:
+        Function of the charges of consecutive frames, shape (n, electrodes), pC, and of a source of random numbers. It
+        returns the measured charges. The running amplifier, with its drift and its noise, is created by the first call.
     """
-    states: list[Any] = []
+    running_amplifier: Callable[[Any], Any] | None = None
 
     def measure(charge_pC: Any, rng: Any) -> Any:
-        if not states:
-            states.append(amplifier.start(charge_pC.shape[1], rate_Hz, rng))
-        return states[0](charge_pC)
+        """Return the measured charges of the next frames."""
+        nonlocal running_amplifier
+        if running_amplifier is None:
+            running_amplifier = amplifier.start(charge_pC.shape[1], rate_Hz, rng)
+        return running_amplifier(charge_pC)
 
     return measure
