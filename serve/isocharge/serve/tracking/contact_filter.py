@@ -87,6 +87,7 @@ class ContactFilter:
         position = None
         log_force = None
 
+        # A filter returns None if the measured value is too far from its prediction.
         dt_s = t_s - self._t_s
         if self._tracked is not None and 0.0 < dt_s <= MAX_GAP_s:
             position = self._position_filter.step(measured.position, dt_s, measured.shape, position_noise)
@@ -98,7 +99,7 @@ class ContactFilter:
         if position is None:
             self._position_filter = TwoModeFilter.start(measured.position, position_noise, POSITION_MOTION)
             position = Estimate(measured.position, position_noise)
-        if log_force is None:  # A force that jumps restarts only its own filter.
+        if log_force is None:  # a force that jumps restarts only its own filter
             self._force_filter = TwoModeFilter.start(measured.log_force, force_noise, FORCE_MOTION)
             log_force = Estimate(measured.log_force, force_noise)
         self._outliers = 0
@@ -107,9 +108,15 @@ class ContactFilter:
         return self._tracked
 
     def _measured(self, contact: Contact, flags: tuple[str, ...]) -> MeasuredContact:
-        """Return the contact in the form in which the filters process it."""
+        """Return the contact in the form in which the filters process it.
+
+        Args:
+            contact: Contact predicted by the model.
+            flags: Flags of the frame. Some flags reduce the share of the variance that is noise, because the error of
+                the model is larger.
+        """
         correlation = contact.xy_correlation
-        if math.isnan(correlation):  # The model provides no correlations.
+        if math.isnan(correlation):  # the model provides no correlations
             correlation = 0.0
         shape, position_variance = CovarianceShape.of_position(contact.x_std_mm, contact.y_std_mm, correlation)
         force_N = max(MIN_FORCE_N, contact.force_N)
@@ -126,7 +133,15 @@ class ContactFilter:
         )
 
     def _is_outlier(self, position: complex, previous: TrackedContact, dt_s: float) -> bool:
-        """Return whether to ignore a frame that is far from the contact, and count such frames."""
+        """Return whether to ignore a frame that is far from the contact, and count such frames.
+
+        After `MAX_OUTLIERS` consecutive frames, the position counts as the position of a new contact.
+
+        Args:
+            position: Measured position x + iy, mm.
+            previous: Smoothed contact of the previous frame.
+            dt_s: Time since the previous frame, s.
+        """
         distance_mm = abs(position - complex(previous.x_mm, previous.y_mm))
         if distance_mm < MAX_SPEED_mm_per_s * dt_s:
             return False
@@ -136,11 +151,18 @@ class ContactFilter:
     def _tracked_contact(
         self, contact: Contact, measured: MeasuredContact, position: Estimate, log_force: Estimate
     ) -> TrackedContact:
-        """Return the smoothed contact, whose standard deviations include the constant errors of the model."""
+        """Return the smoothed contact, whose standard deviations include the constant errors of the model.
+
+        Args:
+            contact: Contact predicted by the model.
+            measured: The same contact in the form in which the filters process it.
+            position: Smoothed position x + iy, mm.
+            log_force: Smoothed logarithm of the force.
+        """
         constant_share = self._constant_share
         std_ratio = math.sqrt(position.variance / measured.position_variance + constant_share)
-        log_force_std = measured.log_force_std
-        log_force_variance = log_force.variance + log_force_std * log_force_std * constant_share
+        constant_log_force_variance = measured.log_force_std * measured.log_force_std * constant_share
+        log_force_std = math.sqrt(log_force.variance + constant_log_force_variance)
         force_N = math.exp(log_force.value.real)
         moving_probability = self._position_filter.moving_probability
         velocity = moving_probability * self._position_filter.velocity
@@ -150,7 +172,7 @@ class ContactFilter:
             force_N=force_N,
             x_std_mm=contact.x_std_mm * std_ratio,
             y_std_mm=contact.y_std_mm * std_ratio,
-            force_std_N=force_N * math.sqrt(log_force_variance),
+            force_std_N=force_N * log_force_std,
             vx_mm_s=velocity.real,
             vy_mm_s=velocity.imag,
             moving=moving_probability,

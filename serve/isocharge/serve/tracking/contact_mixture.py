@@ -193,16 +193,18 @@ class ContactMixture:
     def _process_step(self, t_s: float) -> None:
         """Update the mixture with the average of the frames of a step, which ends at time `t_s`."""
         charges, times_s = zip(*self._step_frames, strict=True)
-        count = len(times_s)
-        mean_s = sum(times_s) / count
-        dt_s = mean_s - self._t_s
+        frame_count = len(times_s)
+        mean_time_s = sum(times_s) / frame_count
+        dt_s = mean_time_s - self._t_s
         self._step_frames = []
         self._step_begin_s = t_s
-        self._t_s = mean_s
+        self._t_s = mean_time_s
 
+        # The average reduces the noise of single frames, but not the slow noise.
         charge_pC = np.mean(charges, axis=0)
-        variance = self._noise.variance(charge_pC) / count + (SLOW_NOISE_STD * charge_pC) ** 2
-        measurement = Measurement(charge_pC, variance)
+        frame_noise_pC2 = self._noise.variance(charge_pC) / frame_count
+        slow_noise_pC2 = (SLOW_NOISE_STD * charge_pC) ** 2
+        measurement = Measurement(charge_pC, frame_noise_pC2 + slow_noise_pC2)
 
         components = None
         if self._components is not None and 0.0 < dt_s < MAX_GAP_s:
@@ -214,7 +216,13 @@ class ContactMixture:
         self._hypotheses = [] if components is None else self._group(components)
 
     def _search(self, measurement: Measurement) -> Components | None:
-        """Search the whole film for contacts that explain the charges; return None if there is none."""
+        """Search the whole film for contacts that explain the charges.
+
+        Components are placed on a spiral that covers the film, with large variances, and updated with the charges.
+
+        Returns:
+            The components that explain the charges; None if there are none.
+        """
         n_electrode = measurement.charge_pC.size
         mean = np.zeros((N_INITIAL_COMPONENTS, N_MOTION + n_electrode))
         mean[:, CONTACT] = self._initial_contacts
@@ -240,19 +248,21 @@ class ContactMixture:
         """
         predicted = predict_components(components, dt_s)
         best = predicted.best
-        mean = predicted.mean[best].copy()
-        covariance = predicted.covariance[best].copy()
-        log_weight = predicted.log_weight[best] + math.log(SUDDEN_CHANGE_RATE * dt_s)
+        added_mean = predicted.mean[best].copy()
+        added_covariance = predicted.covariance[best].copy()
+        added_log_weight = predicted.log_weight[best] + math.log(SUDDEN_CHANGE_RATE * dt_s)
 
-        if self._squared_innovation(predicted, measurement) > SQUARED_GATE:
+        is_surprising = self._squared_innovation(predicted, measurement) > SQUARED_GATE
+        is_fast = np.hypot(added_mean[X_RATE], added_mean[Y_RATE]) > SPEED_STD
+        if is_surprising:  # the velocity may have changed
             rate_variance = np.array([NEW_SPEED_STD, NEW_SPEED_STD, FORCE_RATE_STD]) ** 2
-            covariance[RATES, RATES] += np.diag(rate_variance)
-            covariance[CONTACT, CONTACT] += np.diag(rate_variance * dt_s**2)
-            predicted = predicted.with_component(mean, covariance, log_weight)
-        elif np.hypot(mean[X_RATE], mean[Y_RATE]) > SPEED_STD:
-            mean[CONTACT] -= dt_s * mean[RATES]
-            mean[RATES] = 0.0
-            predicted = predicted.with_component(mean, covariance, log_weight)
+            added_covariance[RATES, RATES] += np.diag(rate_variance)
+            added_covariance[CONTACT, CONTACT] += np.diag(rate_variance * dt_s**2)
+            predicted = predicted.with_component(added_mean, added_covariance, added_log_weight)
+        elif is_fast:  # the contact may have stopped at its previous position
+            added_mean[CONTACT] -= dt_s * added_mean[RATES]
+            added_mean[RATES] = 0.0
+            predicted = predicted.with_component(added_mean, added_covariance, added_log_weight)
         return self._update(predicted, measurement, UPDATE_ITERATIONS)
 
     def _squared_innovation(self, components: Components, measurement: Measurement) -> float:
@@ -273,16 +283,25 @@ class ContactMixture:
         Returns:
             The charges, shape (n, n_electrode), pC, and their derivatives, shape (n, n_electrode, 6 + n_electrode).
         """
-        charge_pC, contact_jacobian = self.charges.linearised(mean[:, CONTACT])
-        gains = np.exp(mean[:, GAINS])
-        charge_pC = charge_pC * gains
+        film_charge_pC, film_jacobian = self.charges.linearised(mean[:, CONTACT])
+        gains = np.exp(mean[:, GAINS])  # the state has the logarithms of the gains
+        charge_pC = film_charge_pC * gains
+
+        # Derivatives with respect to the contact, its rates and the logarithms of the gains.
+        contact_jacobian = film_jacobian * gains[:, :, None]
         rate_jacobian = np.zeros((*charge_pC.shape, 3))
         gain_jacobian = charge_pC[:, :, None] * np.eye(charge_pC.shape[1])
-        jacobian = np.concatenate([contact_jacobian * gains[:, :, None], rate_jacobian, gain_jacobian], axis=2)
+        jacobian = np.concatenate([contact_jacobian, rate_jacobian, gain_jacobian], axis=2)
         return charge_pC, jacobian
 
     def _linearise_update(self, state: Array, prior: Components, measurement: Measurement) -> LinearisedUpdate:
-        """Linearise the update of the components about a state of each, shape (n, 6 + n_electrode)."""
+        """Linearise the Kalman update of the components.
+
+        Args:
+            state: State of each component about which the charges are linearised, shape (n, 6 + n_electrode).
+            prior: Predicted components.
+            measurement: Charges of this step.
+        """
         charge_pC, jacobian = self._charges_and_jacobian(state)
         transposed = jacobian.swapaxes(1, 2)
         cross_covariance = jacobian @ prior.covariance
@@ -310,31 +329,36 @@ class ContactMixture:
         linearised = self._linearise_update(state, prior, measurement)
         for _ in range(iterations):
             transposed = linearised.cross_covariance.swapaxes(1, 2)
-            step = prior.mean + (transposed @ linearised.weighted_innovation)[:, :, 0] - state
+            state_correction = (transposed @ linearised.weighted_innovation)[:, :, 0]
+            step = prior.mean + state_correction - state
             state = state + _limit_iteration_step(step)
             linearised = self._linearise_update(state, prior, measurement)
 
+        # Likelihood of each component: -2 ln p = squared misfit + squared change of the state + ln det(covariance).
         weighted = linearised.weighted_innovation
         squared_misfit = ((measurement.charge_pC - linearised.charge_pC) ** 2 / measurement.variance).sum(axis=1)
         squared_state_change = (weighted.swapaxes(1, 2) @ linearised.charge_covariance @ weighted)[:, 0, 0]
         square = squared_misfit + squared_state_change
-        log_determinant = np.linalg.slogdet(linearised.innovation_covariance)[1]
+        _, log_determinant = np.linalg.slogdet(linearised.innovation_covariance)
         log_weight = prior.log_weight - 0.5 * (square + log_determinant)
-        log_weight[np.hypot(state[:, X], state[:, Y]) > MAX_RELATIVE_RADIUS * self.charges.radius_mm] = -np.inf
+        is_outside_film = np.hypot(state[:, X], state[:, Y]) > MAX_RELATIVE_RADIUS * self.charges.radius_mm
+        log_weight[is_outside_film] = -np.inf
         best = int(log_weight.argmax())
-        if not (square[best] < MAX_SQUARE and np.isfinite(log_weight[best])):
+        is_explained = square[best] < MAX_SQUARE and np.isfinite(log_weight[best])
+        if not is_explained:
             return None
 
-        cross_covariance = linearised.cross_covariance
-        gain = np.linalg.solve(linearised.innovation_covariance, cross_covariance)
-        covariance = prior.covariance - cross_covariance.swapaxes(1, 2) @ gain
-        covariance = 0.5 * (covariance + covariance.swapaxes(1, 2))
+        covariance = _updated_covariance(prior, linearised)
         misfit = math.sqrt(squared_misfit[best])
         updated = Components(state, covariance, log_weight - log_weight[best], misfit)
         return self._split_at_fold(prune_components(updated))
 
     def _split_at_fold(self, components: Components) -> Components:
-        """Add a component towards each side of a fold if the most probable component extends across the fold."""
+        """Add a component towards each side of a fold if the most probable component extends across the fold.
+
+        Returns:
+            The components, with two additional components if there is a fold.
+        """
         best = components.best
         mean = components.mean[best]
         covariance = components.covariance[best]
@@ -354,9 +378,10 @@ class ContactMixture:
         removed_share = 1.0 - SPLIT_STD_RATIO**2
         narrow_covariance = covariance - removed_share * np.outer(direction, direction)
         log_weight = components.log_weight[best] - 0.5 * SPLIT_DISTANCE**2
+        split = components
         for added_mean in mean + SPLIT_DISTANCE * np.outer(sides, direction):
-            components = components.with_component(added_mean, narrow_covariance, log_weight)
-        return components
+            split = split.with_component(added_mean, narrow_covariance, log_weight)
+        return split
 
     def _is_across_fold(self, state: Array, other_states: Array) -> Booleans:
         """Return whether the orientation of the map from contacts to charges differs between two states.
@@ -374,15 +399,19 @@ class ContactMixture:
         return np.asarray(orientation < 0.0)
 
     def _group(self, components: Components) -> list[ContactHypothesis]:
-        """Combine the components that describe the same contact, in descending order of the probability."""
+        """Combine the components that describe the same contact.
+
+        Returns:
+            The contacts, in descending order of their probability.
+        """
         probability = np.exp(components.log_weight - components.log_weight.max())
         probability /= probability.sum()
         remaining = np.argsort(-probability, kind="stable")
         hypotheses = []
         while remaining.size:
             is_same = self._is_same_contact(components, remaining)
-            rows = remaining[is_same]
-            hypotheses.append(combine_components(components.select(rows), probability[rows]))
+            group = remaining[is_same]
+            hypotheses.append(combine_components(components.select(group), probability[group]))
             remaining = remaining[~is_same]
         return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)
 
@@ -407,6 +436,15 @@ class ContactMixture:
         return np.asarray(is_same)
 
 
+def _updated_covariance(prior: Components, linearised: LinearisedUpdate) -> Array:
+    """Return the covariance of each component after a Kalman update, shape (n, 6 + n_electrode, 6 + n_electrode)."""
+    cross_covariance = linearised.cross_covariance
+    gain = np.linalg.solve(linearised.innovation_covariance, cross_covariance)
+    covariance = prior.covariance - cross_covariance.swapaxes(1, 2) @ gain
+    symmetric = 0.5 * (covariance + covariance.swapaxes(1, 2))  # rounding errors would make it asymmetric
+    return np.asarray(symmetric)
+
+
 def _limit_iteration_step(step: Array) -> Array:
     """Shorten steps of the state, shape (n, 6 + n_electrode), to those within which the linearisation is accurate."""
     position_excess = np.hypot(step[:, X], step[:, Y]) / MAX_ITERATION_STEP_mm
@@ -416,7 +454,10 @@ def _limit_iteration_step(step: Array) -> Array:
 
 
 def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
-    """Return contacts (x, y, ln F) of medium force on a spiral that covers the film, shape (n, 3)."""
+    """Return contacts (x, y, ln F) of medium force on a spiral that covers the film, shape (n, 3).
+
+    On this spiral (Vogel 1979), each contact takes the same share of the area.
+    """
     number = np.arange(N_INITIAL_COMPONENTS)
     angle = GOLDEN_ANGLE * number
     relative_radius = np.sqrt((number + 0.5) / N_INITIAL_COMPONENTS)

@@ -57,14 +57,17 @@ class CovarianceShape(NamedTuple):
         Returns:
             The shape, and the square root of the determinant of the covariance, mm^2.
         """
+        # The determinant is (x_std * y_std)^2 * (1 - correlation^2). The shape is the covariance divided by the square
+        # root of the determinant, and its inverse is stored, divided by the number of dimensions.
         uncorrelated_share = 1.0 - correlation * correlation
         root = math.sqrt(max(uncorrelated_share, MIN_UNCORRELATED_SHARE))
+        size_mm2 = x_std_mm * y_std_mm * root
         dimensions = 2
         scale = dimensions * root
         inverse_xx = y_std_mm / (x_std_mm * scale)
         inverse_yy = x_std_mm / (y_std_mm * scale)
         inverse_xy = -correlation / scale
-        return cls(inverse_xx, inverse_yy, inverse_xy, dimensions), x_std_mm * y_std_mm * root
+        return cls(inverse_xx, inverse_yy, inverse_xy, dimensions), size_mm2
 
     def mean_square(self, difference: complex) -> float:
         """Compute the squared Mahalanobis distance of a difference x + iy, divided by the number of dimensions."""
@@ -104,6 +107,9 @@ class NoiseEstimate(NamedTuple):
     ) -> "NoiseEstimate":
         """Return the estimate after another measured value.
 
+        The value is compared with the linear extrapolation of the two previous values. The mean of the squared errors,
+        relative to the variance that the model states, is the estimate.
+
         Args:
             measured: The measured value: a position x + iy, mm, or the logarithm of a force.
             dt_s: Time since the latest measured value, s, at least `MIN_INTERVAL_s`.
@@ -112,14 +118,16 @@ class NoiseEstimate(NamedTuple):
         """
         change = measured - self.measured
         rate = change / dt_s
-        if self.dt_s <= 0.0:
+        if self.dt_s <= 0.0:  # there is no previous rate yet
             return self._replace(measured=measured, rate=rate, dt_s=dt_s)
 
+        # The error is x2 - (1 + r) x1 + r x0, with the ratio r of the intervals, so the variances of three values add.
         time_ratio = dt_s / self.dt_s
         extrapolation_variance = stated_variance * (1.0 + time_ratio * time_ratio + (1.0 + time_ratio) ** 2)
-        square = shape.mean_square(change - self.rate * dt_s) / extrapolation_variance
-        square = min(square, MAX_RELATIVE_SQUARE * self.relative_variance)
+        extrapolation_error = change - self.rate * dt_s
+        relative_square = shape.mean_square(extrapolation_error) / extrapolation_variance
+        limited_square = min(relative_square, MAX_RELATIVE_SQUARE * self.relative_variance)
         frames = min(self.frames + 1, MAX_FRAMES)
-        variance = self.relative_variance + (square - self.relative_variance) / frames
-        variance = min(max(variance, MIN_RELATIVE_VARIANCE), MAX_RELATIVE_VARIANCE)
-        return NoiseEstimate(variance, frames, measured, rate, dt_s)
+        mean_square = self.relative_variance + (limited_square - self.relative_variance) / frames
+        relative_variance = min(max(mean_square, MIN_RELATIVE_VARIANCE), MAX_RELATIVE_VARIANCE)
+        return NoiseEstimate(relative_variance, frames, measured, rate, dt_s)

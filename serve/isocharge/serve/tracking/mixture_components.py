@@ -173,6 +173,7 @@ def predict_components(components: Components, dt_s: float) -> Components:
     transition[CONTACT, RATES] = dt_s * np.eye(3)
     covariance = transition @ components.covariance @ transition.T
 
+    # The process noise of the position is proportional to the squared speed, because a resting contact rarely starts.
     squared_speed = (mean[:, VELOCITY] ** 2).sum(axis=1)
     relative_density = np.maximum(squared_speed / POSITION_MOTION.velocity_variance, MIN_ACCELERATION_SHARE)
     position_density = POSITION_MOTION.acceleration_density * relative_density
@@ -199,25 +200,36 @@ def _add_process_noise(covariance: Array, value: int, rate: int, density: Array 
 
 
 def prune_components(components: Components) -> Components:
-    """Remove improbable components, merge similar ones, and keep at most `MAX_COMPONENTS`."""
+    """Return the components without improbable components, and with similar components merged.
+
+    Of the other components, the `MAX_COMPONENTS` most probable ones are selected.
+    """
     log_weight = components.log_weight.copy()
-    descending = np.argsort(-log_weight, kind="stable")
-    kept: list[int] = []
-    for row in descending[log_weight[descending] > MIN_LOG_WEIGHT].tolist():
-        similar = _similar_component(components, row, kept)
-        if similar is None:
-            kept.append(row)
-        else:
-            log_weight[similar] = np.logaddexp(log_weight[similar], log_weight[row])
-    return components._replace(log_weight=log_weight).select(kept[:MAX_COMPONENTS])
+    descending_rows = np.argsort(-log_weight, kind="stable")
+    probable_rows = descending_rows[log_weight[descending_rows] > MIN_LOG_WEIGHT]
+    selected: list[int] = []
+    for row in probable_rows.tolist():
+        similar_row = _similar_component(components, row, selected)
+        if similar_row is None:
+            selected.append(row)
+        else:  # add the probability of this component to the similar component
+            log_weight[similar_row] = np.logaddexp(log_weight[similar_row], log_weight[row])
+    return components._replace(log_weight=log_weight).select(selected[:MAX_COMPONENTS])
 
 
 def _similar_component(components: Components, row: int, candidates: list[int]) -> int | None:
-    """Return the first candidate whose motion state is similar to that of a component; None if there is none."""
+    """Return the first candidate whose motion is similar to the motion of a component; None if there is none.
+
+    Args:
+        components: All components.
+        row: Row of the component.
+        candidates: Rows of the candidates.
+    """
     mean = components.mean[:, MOTION]
     std = np.sqrt(components.covariance[row].diagonal()[MOTION])
     for candidate in candidates:
-        if (np.abs(mean[row] - mean[candidate]) < MERGE_DISTANCE * std).all():
+        distance = np.abs(mean[row] - mean[candidate])
+        if (distance < MERGE_DISTANCE * std).all():
             return candidate
     return None
 
@@ -229,10 +241,11 @@ def combine_components(components: Components, probability: Array) -> ContactHyp
         components: The components.
         probability: Probability of each component, shape (n,).
     """
-    total = probability.sum()
-    share = probability / total
+    total_probability = probability.sum()
+    share = probability / total_probability
     mean = share @ components.mean
     deviation = components.mean - mean
     covariance_within = np.tensordot(share, components.covariance, 1)
     covariance_between = (share[:, None] * deviation).T @ deviation
-    return ContactHypothesis(mean, covariance_within + covariance_between, float(total), components.misfit)
+    covariance = covariance_within + covariance_between
+    return ContactHypothesis(mean, covariance, float(total_probability), components.misfit)

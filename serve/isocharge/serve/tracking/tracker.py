@@ -79,7 +79,7 @@ class Tracker:
         """
         self.mixture_contact = None
         if contact is None:
-            if INVALID in flags:
+            if INVALID in flags:  # an invalid frame does not end a touch
                 return self._tracked, None
             return None, self._end_touch(t_s)
 
