@@ -100,17 +100,24 @@ class RecordedTape(Tape):
         self._map(LIVE_SAMPLES)
 
     def append(self, samples: Samples) -> None:
-        """Append samples, and update the overview."""
+        """Append samples, and update the overview.
+
+        Times that are missing or decrease are replaced by the latest time before them, so that the times never
+        decrease. The memory is doubled as often as necessary.
+
+        Args:
+            samples: The samples, shape (n,).
+        """
         if not len(samples):
             return
-        samples = samples.copy()
+        ordered = samples.copy()
         _, latest_s = self.span()
-        rising_s = np.maximum.accumulate(np.nan_to_num(samples["timestamp"], nan=0.0))
-        samples["timestamp"] = np.maximum(rising_s, latest_s)
-        while self.total + len(samples) > len(self._ring):
+        known_s = np.nan_to_num(samples["timestamp"], nan=0.0)
+        ordered["timestamp"] = np.maximum(np.maximum.accumulate(known_s), latest_s)
+        while self.total + len(ordered) > len(self._ring):
             self._map(2 * len(self._ring))
-        super().append(samples)
-        self._update_overview(samples)
+        super().append(ordered)
+        self._update_overview(ordered)
 
     def close(self) -> None:
         """Close the file of the samples."""
@@ -125,21 +132,28 @@ class RecordedTape(Tape):
         return [round(force_N, 3) for force_N in self._max_force_N]
 
     def _update_overview(self, samples: Samples) -> None:
-        """Update the largest force of each piece. If there are too many pieces, join them in pairs."""
+        """Update the largest force of each piece of time. If there are too many pieces, join them in pairs.
+
+        Args:
+            samples: New samples, shape (n,), whose times do not decrease.
+        """
         elapsed_s = samples["timestamp"] - self.timestamp(0)
         while elapsed_s[-1] >= MAX_PIECES * self._piece_s:
-            pairs = [self._max_force_N[k : k + 2] for k in range(0, len(self._max_force_N), 2)]
+            pairs = [self._max_force_N[first : first + 2] for first in range(0, len(self._max_force_N), 2)]
             self._max_force_N = [max(pair) for pair in pairs]
             self._piece_s *= 2.0
-        piece = (elapsed_s / self._piece_s).astype(int)
-        new_pieces = int(piece[-1]) + 1 - len(self._max_force_N)
-        self._max_force_N += [0.0] * new_pieces
+        piece_of_sample = (elapsed_s / self._piece_s).astype(int)
+        piece_count = int(piece_of_sample[-1]) + 1
+        new_piece_count = piece_count - len(self._max_force_N)
+        self._max_force_N += [0.0] * new_piece_count
 
+        # Neighbouring samples of one piece form a run.
         force_N = np.nan_to_num(samples["force_N"], nan=0.0)
-        starts = np.flatnonzero(np.diff(piece, prepend=-1))
-        largest_N = np.maximum.reduceat(force_N, starts)
-        for number, largest in zip(piece[starts].tolist(), largest_N.tolist(), strict=True):
-            self._max_force_N[number] = max(self._max_force_N[number], largest)
+        run_starts = np.flatnonzero(np.diff(piece_of_sample, prepend=-1))
+        run_pieces = piece_of_sample[run_starts].tolist()
+        run_max_N = np.maximum.reduceat(force_N, run_starts).tolist()
+        for piece, max_force_N in zip(run_pieces, run_max_N, strict=True):
+            self._max_force_N[piece] = max(self._max_force_N[piece], max_force_N)
 
 
 @dataclass
@@ -379,7 +393,12 @@ class Viewer:
         return messages
 
     def _next_samples_message(self, max_samples: int, now_s: float) -> bytes | None:
-        """Return a message with the next samples; None if there are no new samples."""
+        """Return a message with the next samples; None if there are no new samples.
+
+        Args:
+            max_samples: Largest number of samples in the message. More samples are coalesced.
+            now_s: Unix time, s.
+        """
         tape = self._hub.tape
         stop = self._first_hidden_sample()
         start = max(self._next_sample, tape.oldest)
@@ -395,7 +414,11 @@ class Viewer:
         return samples_message(self._sent_messages, now_s, samples, self._missed_samples, begin_anew=begins_anew)
 
     def _first_hidden_sample(self) -> int:
-        """Return the number of the first sample after the position in the recording; for a live stream, after all."""
+        """Return the number of the first sample that the viewer does not see yet.
+
+        In a recording, this is the first sample after the position. In a live stream, it is the number after the latest
+        sample.
+        """
         tape = self._hub.tape
         playhead = self._playhead
         if playhead is None or not tape.total:
@@ -409,7 +432,12 @@ class Viewer:
         return tape.index(position_s)
 
     def _advance(self, playhead: Playhead, now_s: float) -> None:
-        """Advance the position in the recording by the time since the latest call."""
+        """Advance the position in the recording by the time since the latest call.
+
+        Args:
+            playhead: The position.
+            now_s: Unix time, s.
+        """
         step_s = max(now_s - self._latest_advance_s, 0.0)
         self._latest_advance_s = now_s
         is_complete = self._hub.state.get("is_complete", False)

@@ -132,7 +132,7 @@ class PageEnd(LinkEnd):
     def receive_messages(self) -> list[Message]:
         """Return the messages that have arrived, without waiting."""
         messages: list[Message] = []
-        with suppress(OSError):
+        with suppress(OSError):  # BlockingIOError means that no further message has arrived
             while data := self.messages.recv(MAX_MESSAGE_BYTES, socket.MSG_DONTWAIT):
                 messages.append(json.loads(data))
         return messages

@@ -60,12 +60,13 @@ OTHER_PREFIX = "other_"
 def _live_numbers() -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of the numbers of a record, and of its `other` contact, that the samples contain."""
 
-    def names(fields: Sequence[Field]) -> tuple[str, ...]:
+    def live_names(fields: Sequence[Field]) -> tuple[str, ...]:
+        """Return the names of the fields that are numbers and are shown on the live page."""
         return tuple(field.name for field in fields if field.meaning.is_shown_live and field.kind == "number")
 
-    (other,) = (field for field in RECORD_FIELDS if field.name == "other")
-    numbers = tuple(name for name in names(RECORD_FIELDS) if name != "timestamp")
-    return numbers, names(other.parts)
+    (other_field,) = (field for field in RECORD_FIELDS if field.name == "other")
+    record_names = tuple(name for name in live_names(RECORD_FIELDS) if name != "timestamp")
+    return record_names, live_names(other_field.parts)
 
 
 RECORD_NUMBERS, OTHER_NUMBERS = _live_numbers()
@@ -80,11 +81,17 @@ class SampleFormat:
     """
 
     def __init__(self, electrodes: tuple[str, ...]) -> None:
-        """Compute the layout."""
+        """Compute the layout of a sample, whose size is a multiple of 8 bytes.
+
+        Args:
+            electrodes: Names of the electrodes.
+        """
         self.electrodes = electrodes
         n_electrode = len(electrodes)
         n_number = len(RECORD_NUMBERS) + len(OTHER_NUMBERS)
-        padding = -(8 + 4 * (n_number + 2 + n_electrode)) % 8
+        # The time has 8 bytes. All numbers, the flags, the number of records and the charges have 4 bytes each.
+        used_bytes = 8 + 4 * (n_number + 2 + n_electrode)
+        padding = -used_bytes % 8
         self._struct = struct.Struct(f"<d{n_number}fII{n_electrode}f{padding}x")
         names = (*RECORD_NUMBERS, *(f"{OTHER_PREFIX}{name}" for name in OTHER_NUMBERS))
         fields: list[Any] = [
@@ -105,20 +112,23 @@ class SampleFormat:
         return {"bytes": self.dtype.itemsize, "offsets": offsets}
 
     def pack(self, record: PredictionRecord) -> bytes:
-        """Return a record as a sample."""
+        """Return a record as the bytes of a sample. The page shows the tracked contact if there is one."""
         bits = CONTACT_BIT if record.contact else 0
-        for word in record.flags:
-            bits |= FLAG_BITS[word]
-        values = [getattr(record, name) for name in RECORD_NUMBERS]
-        tracked = record.tracked
-        if tracked is not None:
-            values = [getattr(tracked, name, value) for name, value in zip(RECORD_NUMBERS, values, strict=True)]
-        other = record.other
-        values += [None if other is None else getattr(other, name) for name in OTHER_NUMBERS]
+        for flag in record.flags:
+            bits |= FLAG_BITS[flag]
+
+        values = []
+        for name in RECORD_NUMBERS:
+            value = getattr(record, name)
+            if record.tracked is not None:
+                value = getattr(record.tracked, name, value)  # the tracked contact does not have all numbers
+            values.append(value)
+        values += [None if record.other is None else getattr(record.other, name) for name in OTHER_NUMBERS]
         numbers = [math.nan if value is None else value for value in values]
-        charges = record.charge_pC or {}
-        known_charges = [charges.get(name) for name in self.electrodes]
-        charge_pC = [math.nan if charge is None else charge for charge in known_charges]
+
+        charge_by_electrode = record.charge_pC or {}
+        charges = [charge_by_electrode.get(name) for name in self.electrodes]
+        charge_pC = [math.nan if charge is None else charge for charge in charges]
         timestamp = math.nan if record.timestamp is None else record.timestamp
         try:
             return self._struct.pack(timestamp, *numbers, bits, 1, *charge_pC)
@@ -314,9 +324,9 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
         "deflection": None if field is None else field.to_json(),
         "sample": SampleFormat(metadata.electrodes).describe(),
     }
-    more = {electrode: leads for electrode, (_, *leads) in electrode_polygons.items() if leads}
-    if more:
-        description["more_mm"] = more
+    leads_mm = {electrode: leads for electrode, (_, *leads) in electrode_polygons.items() if leads}
+    if leads_mm:
+        description["more_mm"] = leads_mm
     return description
 
 
@@ -354,17 +364,33 @@ class _Polygon(Struct):
 
 
 def _designed_polygons(parts: Mapping[str, Any], name: str) -> list[list[Point]]:
-    """Return the polygons of an electrode in the design. An electrode without polygons is a square around a point."""
+    """Return the polygons of an electrode in the design, each a list of corners (x, y), mm.
+
+    An electrode without polygons is a square around a point.
+
+    Args:
+        parts: Section `electrodes` of a sensor file.
+        name: Name of the electrode.
+    """
     part = parts[name]
     if isinstance(part, _Polygon):
         return [part.polygon_mm, *part.more_mm]
-    x, y = part
-    half = 0.5 * parts["side_mm"]
-    return [[(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]]
+    x_mm, y_mm = part
+    half_side_mm = 0.5 * parts["side_mm"]
+    left = x_mm - half_side_mm
+    right = x_mm + half_side_mm
+    bottom = y_mm - half_side_mm
+    top = y_mm + half_side_mm
+    return [[(left, bottom), (right, bottom), (right, top), (left, top)]]
 
 
 def _calibrated_corners(corners: list[Point], calibration: Any) -> list[list[float]]:
-    """Return corners that are rotated and shifted by the result of a calibration."""
+    """Return corners that are rotated about the centre and then shifted by the result of a calibration.
+
+    Args:
+        corners: Corners (x, y) in the design, mm.
+        calibration: Section `calibration` of a sensor, with `rotation_deg` and `shift_mm`; empty for a design.
+    """
     shift_x, shift_y = calibration.get("shift_mm", (0.0, 0.0))
     angle = math.radians(calibration.get("rotation_deg", 0.0))
     cosine = math.cos(angle)

@@ -48,7 +48,7 @@ QUADRILATERAL = 4
 
 
 def playground_html(models: tuple[str, ...] = MODELS) -> str:
-    """Return the playground as HTML.
+    """Return the playground as a single HTML page, which contains its scripts, its styles and the networks.
 
     Args:
         models: Names or paths of the models.
