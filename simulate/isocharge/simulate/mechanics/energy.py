@@ -142,9 +142,15 @@ class Membrane:
     """
 
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
+        """Store the mesh and the dimensionless groups of the film.
+
+        Args:
+            geometry: Integration rules of the elements.
+            groups: Dimensionless groups of the press.
+        """
         self.geometry = geometry
         self.groups = groups
-        self._scale = np.array([groups.amplitude2, groups.amplitude2, 1.0])
+        self._scale = np.array([groups.amplitude2, groups.amplitude2, 1.0])  # weights of the squares of U1, U2 and W
 
     @property
     def _deviator(self) -> Array | None:
@@ -167,26 +173,49 @@ class Membrane:
         return total
 
     def _slope(self, field: Array) -> Array:
-        """Compute d(U1, U2, W)/d(X1, X2) at the quadrature points, shape (n_element, n_point, 2, 3)."""
+        """Compute d(U1, U2, W)/d(X1, X2) at the quadrature points.
+
+        Args:
+            field: Scaled displacements, shape (n_node, 3).
+
+        Returns:
+            Shape (n_element, n_point, 2, 3): the derivative, then the component.
+        """
         slope = self.geometry.stacked @ field[self.geometry.nodes]
         return slope.reshape(*self.geometry.gradient.shape[:3], 3)
 
     def _stretch(self, slope: Array) -> Array:
-        """Compute F with the indices (..., derivative, component) from the slopes, shape (..., 2, 3)."""
+        """Compute the scaled deformation gradient F = d_ia + A^2 U_i,a for i = 1, 2 and F_3a = W,a.
+
+        Args:
+            slope: d(U1, U2, W)/d(X1, X2), shape (..., 2, 3).
+
+        Returns:
+            F with the indices (..., a, i), shape (..., 2, 3).
+        """
         stretch: Array = slope * self._scale
         stretch[..., 0, 0] += 1.0
         stretch[..., 1, 1] += 1.0
         return stretch
 
     def energy(self, field: Array) -> float:
-        """Compute the stretching energy of a field, shape (n_node, 3)."""
+        """Compute the stretching energy of a field.
+
+        Args:
+            field: Scaled displacements, shape (n_node, 3).
+
+        Returns:
+            Energy of the meshed part of the film, dimensionless.
+        """
         slope = self._slope(field)
-        elastic = strain(slope, self.groups.amplitude2)
-        density = 0.5 * np.sum(elastic * self._stress(elastic), axis=-1)
-        density += 0.5 * self.groups.tension * np.sum(slope**2 @ self._scale, axis=-1)
+        elastic_strain = strain(slope, self.groups.amplitude2)
+        energy_density = 0.5 * np.sum(elastic_strain * self._stress(elastic_strain), axis=-1)
+
+        # The part of the pretension, from which the integral of div U is subtracted, is quadratic in the slopes.
+        energy_density += 0.5 * self.groups.tension * np.sum(slope**2 @ self._scale, axis=-1)
         if self._deviator is not None:
-            density += 0.5 * np.sum(slope * (self._deviator @ slope) @ self._scale, axis=-1)
-        return float(np.sum(density * self.geometry.weights))
+            energy_density += 0.5 * np.sum(slope * (self._deviator @ slope) @ self._scale, axis=-1)
+        return float(np.sum(energy_density * self.geometry.weights))
 
     def forces(self, field: Array) -> Array:
         """Compute the internal forces of the elements, which are the gradient of the stretching energy.
@@ -199,12 +228,18 @@ class Membrane:
         """
         geometry = self.geometry
         slope = self._slope(field)
-        total = self._stress(strain(slope, self.groups.amplitude2))
-        traction = _tensor(total) @ self._stretch(slope) + self.groups.tension * self._scale * slope
+        elastic_stress = self._stress(strain(slope, self.groups.amplitude2))
+
+        # Derivative of the energy density with respect to the slopes, shape (n_element, n_point, 2, 3)
+        traction = _tensor(elastic_stress) @ self._stretch(slope)
+        traction += self.groups.tension * self._scale * slope
         if self._deviator is not None:
             traction += self._scale * (self._deviator @ slope)
-        traction *= geometry.weights[..., None, None]
-        return np.asarray(geometry.stacked.transpose(0, 2, 1) @ traction.reshape(len(traction), -1, 3))
+
+        # Integral over the elements, with the derivatives of the basis functions
+        weighted_traction = traction * geometry.weights[..., None, None]
+        transposed_gradient = geometry.stacked.transpose(0, 2, 1)
+        return np.asarray(transposed_gradient @ weighted_traction.reshape(len(traction), -1, 3))
 
     def tangent(self, field: Array) -> Array:
         """Compute the second derivatives of the stretching energy of the elements.
@@ -224,6 +259,8 @@ class Membrane:
         if self.groups.anisotropy is not None:
             total_stress += self.groups.anisotropy.tension
         weighted_stress = _tensor(total_stress * geometry.weights[..., None])
+
+        # One block for each pair of components; the matrix is symmetric, so that half of the blocks are transposed.
         n_element, _, _, n_local = gradient.shape
         transposed_gradient = np.ascontiguousarray(geometry.stacked.transpose(0, 2, 1))
         matrix = np.empty((n_element, 3, n_local, 3, n_local))
@@ -239,6 +276,9 @@ class Membrane:
     def _moduli(self, stretch: Array, i: int, j: int) -> Array:
         """Compute the material part of d(traction_ia)/d(slope_jb) for a pair of components.
 
+        It is the product of the derivatives of the strain with respect to both slopes with the elasticity matrix. For
+        the isotropic elasticity matrix, the product is written out.
+
         Args:
             stretch: F, shape (n_element, n_point, 2, 3).
             i: Component of the traction.
@@ -248,24 +288,26 @@ class Membrane:
             Shape (n_element, n_point, 2, 2), with the indices a and b.
         """
         poisson = self.groups.poisson
-        plane = 1.0 / (1.0 - poisson**2)
-        shear = 0.5 / (1.0 + poisson)
-        a = stretch[..., 0, i]
-        b = stretch[..., 1, i]
-        c = stretch[..., 0, j]
-        d = stretch[..., 1, j]
-        block = np.empty((*a.shape, 2, 2))
-        block[..., 0, 0] = plane * a * c + shear * b * d
-        block[..., 1, 1] = plane * b * d + shear * a * c
-        block[..., 0, 1] = plane * poisson * a * d + shear * b * c
-        block[..., 1, 0] = plane * poisson * b * c + shear * a * d
+        plane_modulus = 1.0 / (1.0 - poisson**2)
+        shear_modulus = 0.5 / (1.0 + poisson)
+        i1 = stretch[..., 0, i]  # F_i1 and so on
+        i2 = stretch[..., 1, i]
+        j1 = stretch[..., 0, j]
+        j2 = stretch[..., 1, j]
+        block = np.empty((*i1.shape, 2, 2))
+        block[..., 0, 0] = plane_modulus * i1 * j1 + shear_modulus * i2 * j2
+        block[..., 1, 1] = plane_modulus * i2 * j2 + shear_modulus * i1 * j1
+        block[..., 0, 1] = plane_modulus * poisson * i1 * j2 + shear_modulus * i2 * j1
+        block[..., 1, 0] = plane_modulus * poisson * i2 * j1 + shear_modulus * i1 * j2
         if self.groups.anisotropy is not None:
-            block += _strain_by_slope(a, b) @ self.groups.anisotropy.moduli @ _strain_by_slope(c, d).swapaxes(-1, -2)
+            i_derivative = _strain_by_slope(i1, i2)
+            j_derivative = _strain_by_slope(j1, j2)
+            block += i_derivative @ self.groups.anisotropy.moduli @ j_derivative.swapaxes(-1, -2)
         if self.geometry.coat is not None:
             coated, moduli = self.geometry.coat
-            strain_by_i = _strain_by_slope(a[coated], b[coated])
-            strain_by_j = _strain_by_slope(c[coated], d[coated])
-            block[coated] += strain_by_i @ moduli @ strain_by_j.swapaxes(-1, -2)
+            i_derivative = _strain_by_slope(i1[coated], i2[coated])
+            j_derivative = _strain_by_slope(j1[coated], j2[coated])
+            block[coated] += i_derivative @ moduli @ j_derivative.swapaxes(-1, -2)
         return block
 
 
@@ -293,9 +335,15 @@ class Bending:
     """
 
     def __init__(self, geometry: Geometry, stiffness: float) -> None:
+        """Compute the matrices L and M of a mesh.
+
+        Args:
+            geometry: Integration rules of the elements.
+            stiffness: Bending stiffness beta, dimensionless.
+        """
         self.geometry = geometry
         self.stiffness = stiffness
-        weights = np.repeat(geometry.weights, 2, axis=1)[..., None]
+        weights = np.repeat(geometry.weights, 2, axis=1)[..., None]  # one weight for each of both derivatives
         self._laplace = geometry.stacked.transpose(0, 2, 1) @ (weights * geometry.stacked)
         self._mass = replace(geometry, constraint=None).gather(geometry.mass)
         self._factor: SuperLU | None = None
@@ -309,14 +357,17 @@ class Bending:
         Returns:
             lap W at the nodes, shape (n_node,).
         """
-        weak = self.geometry.gather((self._laplace @ deflection[self.geometry.nodes][..., None])[..., 0])
+        element_values = (self._laplace @ deflection[self.geometry.nodes][..., None])[..., 0]
+        weak_laplacian = self.geometry.gather(element_values)  # L W
         constraint = self.geometry.constraint
         if constraint is None:
-            return np.asarray(-weak / self._mass)
+            return np.asarray(-weak_laplacian / self._mass)
         if self._factor is None:  # the constraint makes the mass matrix non-diagonal
-            hanging = diags_array((constraint.diagonal() == 0.0).astype(float))
-            self._factor = splu((constraint.T @ diags_array(self._mass) @ constraint + hanging).tocsc())
-        return np.asarray(-(constraint @ self._factor.solve(weak)))
+            constrained_mass = constraint.T @ diags_array(self._mass) @ constraint
+            is_hanging = constraint.diagonal() == 0.0
+            unit_diagonal = diags_array(is_hanging.astype(float))  # keeps the matrix regular
+            self._factor = splu((constrained_mass + unit_diagonal).tocsc())
+        return np.asarray(-(constraint @ self._factor.solve(weak_laplacian)))
 
     def energy(self, deflection: Array) -> float:
         """Compute the bending energy of a deflection W, shape (n_node,)."""

@@ -98,12 +98,18 @@ class DimensionlessGroups:
             bending: Whether the theory includes bending.
             angle: Direction of the press from the centre of the film, rad.
             side_force: Force (Fx, Fy) of the probe on the film along the film, N.
+
+        Returns:
+            The groups, which describe the press completely.
         """
         amplitude2 = float(amplitude_squared(film, force))
-        side_x, side_y = side_force
-        along = side_x * np.cos(angle) + side_y * np.sin(angle)
-        across = side_y * np.cos(angle) - side_x * np.sin(angle)
-        side_unit = side_force_unit(film, amplitude2)
+        side_load = (0.0, 0.0)
+        if any(side_force):
+            side_x, side_y = side_force
+            along_press = side_x * np.cos(angle) + side_y * np.sin(angle)
+            across_press = side_y * np.cos(angle) - side_x * np.sin(angle)
+            side_unit = side_force_unit(film, amplitude2)
+            side_load = (float(along_press / side_unit), float(across_press / side_unit))
         pressure_unit = film.young * film.thickness * amplitude2**1.5 / film.radius
         compression = 0.0
         if film.back_volume is not None:
@@ -115,7 +121,7 @@ class DimensionlessGroups:
             bending=slenderness(film) / amplitude2 if bending else 0.0,
             poisson=film.poisson,
             anisotropy=_anisotropy(film, amplitude2, angle) if film.is_anisotropic else None,
-            side_load=(float(along / side_unit), float(across / side_unit)) if any(side_force) else (0.0, 0.0),
+            side_load=side_load,
             static_pressure=film.static_pressure / pressure_unit,
             ambient_pressure=AMBIENT_PRESSURE / pressure_unit if compression else 0.0,
             compression=compression,
@@ -182,15 +188,30 @@ def scaled_stress(strained: Array, groups: DimensionlessGroups) -> Array:
 
 
 def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:
-    """Compute the direction-dependent properties of a film, in axes rotated by the direction of the press (rad)."""
+    """Compute the direction-dependent properties of a film, in axes rotated with the press.
+
+    Args:
+        film: The film.
+        amplitude2: Square A^2 of the amplitude.
+        angle: Direction of the press from the centre of the film, rad.
+
+    Returns:
+        Differences from the isotropic elasticity matrix and from the mean pretension.
+    """
+    # Difference from the isotropic elasticity matrix in the axes of the film, where E1 = E root and E2 = E / root
+    plane_modulus = 1.0 / (1.0 - film.poisson**2)
+    root = np.sqrt(film.young_ratio)
+    change_11 = plane_modulus * (root - 1.0)
+    change_22 = plane_modulus * (1.0 / root - 1.0)
+    isotropic_shear = 0.5 / (1.0 + film.poisson)
+    change_shear = 0.0 if film.shear is None else film.shear / film.young - isotropic_shear
+    moduli_in_film_axes = np.diag([change_11, change_22, change_shear])
     rotation = stress_rotation(film.axis - angle)
-    plane = 1.0 / (1.0 - film.poisson**2)
-    ratio = np.sqrt(film.young_ratio)
-    shear_modulus = 0.0 if film.shear is None else film.shear / film.young - 0.5 / (1.0 + film.poisson)
-    in_film_axes = np.diag([plane * (ratio - 1.0), plane * (1.0 / ratio - 1.0), shear_modulus])
-    moduli = rotation @ in_film_axes @ rotation.T
-    difference, shear_tension = film.deviator
-    tension = rotate_stress(np.array([difference, -difference, shear_tension]), -angle) / (film.young * amplitude2)
+    moduli = rotation @ moduli_in_film_axes @ rotation.T
+
+    half_difference, shear_tension = film.deviator
+    deviator = np.array([half_difference, -half_difference, shear_tension])
+    tension = rotate_stress(deviator, -angle) / (film.young * amplitude2)
     return Anisotropy(moduli, tension)
 
 

@@ -90,24 +90,45 @@ def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
     the footprint is the sum of the pretension and of the stress S = E W'^2 / 2 of a membrane without pretension. The
     equilibrium of S W' with the load gives W'^3 = F / (pi R h E). If the induced stress dominates, the charges hardly
     change.
+
+    Args:
+        film: The film.
+        probe: The probe, whose reach is R.
+        force: Force F, N.
+
+    Returns:
+        Relative change, dimensionless.
     """
-    squared_slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young)) ** 2
+    slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young))
     pretension_strain = film.pretension / film.young
-    strain = pretension_strain + 0.5 * squared_slope
-    squared_length = slenderness(film) / strain * (film.radius / probe.reach) ** 2
-    return PROBE_WEIGHT * float(squared_length * pretension_strain / strain)
+    total_strain = pretension_strain + 0.5 * slope**2
+    # Squared ratio of the bending length sqrt(D / (h S)) to the reach of the footprint
+    squared_length_ratio = slenderness(film) / total_strain * (film.radius / probe.reach) ** 2
+    pretension_share = pretension_strain / total_strain
+    return PROBE_WEIGHT * float(squared_length_ratio * pretension_share)
 
 
 def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
     """Estimate the strain that the footprint induces in a taut film, relative to the strain of the pretension T.
 
-    The slope at the footprint is F / (2 pi R h T). If the bending length exceeds the footprint, bending reduces it.
+    The slope at the footprint is F / (2 pi R h T). If the bending length exceeds the footprint, bending reduces the
+    slope.
+
+    Args:
+        film: The film.
+        probe: The probe, whose reach is R.
+        force: Force F, N.
+
+    Returns:
+        Ratio of the strains, dimensionless. It is zero for a film without pretension.
     """
     if film.pretension == 0.0:
         return 0.0
-    slope = force / (2.0 * np.pi * probe.reach * film.thickness * film.pretension)
-    squared_length = slenderness(film) * film.young / film.pretension * (film.radius / probe.reach) ** 2
-    return float(0.5 * slope**2 * film.young / film.pretension / (1.0 + squared_length) ** 2)
+    pretension_strain = film.pretension / film.young
+    membrane_slope = force / (2.0 * np.pi * probe.reach * film.thickness * film.pretension)
+    squared_length_ratio = slenderness(film) / pretension_strain * (film.radius / probe.reach) ** 2
+    slope = membrane_slope / (1.0 + squared_length_ratio)
+    return float(0.5 * slope**2 / pretension_strain)
 
 
 def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:

@@ -34,27 +34,42 @@ class Assembly:
     """
 
     def __init__(self, mesh: Template, components: int, odd: bool = False) -> None:
-        line = np.arange(mesh.resolution.order + 1)
-        on_edge = (line == line[0]) | (line == line[-1])
-        shell = (on_edge[:, None] | on_edge[None, :]).ravel()
+        """Number the unknowns, and compute the sparsity pattern of the skeleton matrix.
+
+        Args:
+            mesh: Template of the mesh.
+            components: Number of unknowns per node.
+            odd: Whether the fields are odd about the line of symmetry.
+        """
         self.components = components
         self.odd = odd
         self.free = _free(mesh, components, odd)
-        within = np.arange(components)[:, None]  # an element's unknowns are numbered component by component
-        self._outer, self._inner = ((within * shell.size + np.flatnonzero(part)).ravel() for part in (shell, ~shell))
-        unknown = (components * mesh.nodes[:, None] + within).reshape(len(mesh.nodes), -1)
+
+        # Local numbers of the unknowns on the sides of an element and in its interior, component by component
+        line = np.arange(mesh.resolution.order + 1)
+        is_end = (line == line[0]) | (line == line[-1])
+        is_on_side = (is_end[:, None] | is_end[None, :]).ravel()
+        component = np.arange(components)[:, None]
+        n_local = is_on_side.size
+        self._outer = (component * n_local + np.flatnonzero(is_on_side)).ravel()
+        self._inner = (component * n_local + np.flatnonzero(~is_on_side)).ravel()
+        unknown = (components * mesh.nodes[:, None] + component).reshape(len(mesh.nodes), -1)
         self.inner_global = unknown[:, self._inner]
         self.outer_global = unknown[:, self._outer]
-        in_skeleton = np.zeros(self.free.size, dtype=bool)
-        in_skeleton[self.outer_global.ravel()] = True
-        self.skeleton = np.flatnonzero(in_skeleton & self.free.ravel())
-        number = np.full(self.free.size, -1, dtype=np.intp)
-        number[self.skeleton] = np.arange(self.skeleton.size)
-        self._set_pattern(number[self.outer_global])
+
+        # The skeleton consists of the free unknowns on sides.
+        is_in_skeleton = np.zeros(self.free.size, dtype=bool)
+        is_in_skeleton[self.outer_global.ravel()] = True
+        self.skeleton = np.flatnonzero(is_in_skeleton & self.free.ravel())
+        skeleton_number = np.full(self.free.size, -1, dtype=np.intp)
+        skeleton_number[self.skeleton] = np.arange(self.skeleton.size)
+        self._set_pattern(skeleton_number[self.outer_global])
         self.follow = None
         if mesh.constraint is not None:
-            each = kron(mesh.constraint, eye_array(components)).tocsr()[self.skeleton][:, self.skeleton]
-            self.follow = each[:, each.diagonal() > 0.0].tocsc()
+            node_constraint = kron(mesh.constraint, eye_array(components)).tocsr()
+            skeleton_constraint = node_constraint[self.skeleton][:, self.skeleton]
+            does_not_hang = skeleton_constraint.diagonal() > 0.0
+            self.follow = skeleton_constraint[:, does_not_hang].tocsc()
         self._reorder()
 
     def _set_pattern(self, skeleton_numbers: Integers) -> None:
@@ -82,18 +97,22 @@ class Assembly:
 
     def _reorder(self) -> None:
         """Renumber the skeleton unknowns so that the factorisation has little fill-in (minimum degree)."""
+        # The order is that of a matrix with this pattern and a dominant diagonal, which needs no pivoting.
         pattern = self._skeleton(np.ones(self._indices.size))
         dominant = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
         order = np.argsort(_factorise(dominant, "MMD_AT_PLUS_A").perm_c)
         if self.follow is not None:
             self.follow = self.follow[:, order]
             return
+
+        # Permute a matrix whose entries are their own positions, which shows the new position of each entry.
         pattern.data = np.arange(pattern.nnz)
-        numbered = pattern[:, order][order]
-        numbered.sort_indices()
-        self._place = np.append(np.argsort(numbered.data), numbered.nnz)[self._place]
-        self._indices = numbered.indices
-        self._indptr = numbered.indptr
+        permuted = pattern[:, order][order]
+        permuted.sort_indices()
+        new_position = np.append(np.argsort(permuted.data), permuted.nnz)
+        self._place = new_position[self._place]
+        self._indices = permuted.indices
+        self._indptr = permuted.indptr
         self.skeleton = self.skeleton[order]
 
     def factor(self, matrix: Array) -> "Factor":
@@ -108,13 +127,18 @@ class Assembly:
         inner = self._inner
         outer = self._outer
         size = matrix.shape[1] * self.components
-        matrix = matrix.transpose(0, 2, 1, 4, 3).reshape(-1, size, size)
+        matrix = matrix.transpose(0, 2, 1, 4, 3).reshape(-1, size, size)  # unknowns component by component
+
+        # Static condensation: eliminate the interior unknowns of each element.
         coupling = matrix[:, inner[:, None], outer]
         inverse = np.linalg.inv(matrix[:, inner[:, None], inner]).astype(float, copy=False)
         reduced = inverse @ coupling
-        schur = matrix[:, outer[:, None], outer] - coupling.transpose(0, 2, 1) @ reduced
-        data = np.bincount(self._place, schur.ravel(), self._indices.size + 1)[:-1]
-        return Factor(self, inverse, coupling, reduced, _factorise(self._skeleton(data), "NATURAL"))
+        schur_complement = matrix[:, outer[:, None], outer] - coupling.transpose(0, 2, 1) @ reduced
+
+        # Sum the Schur complements of the elements; the last position collects the entries of fixed unknowns.
+        skeleton_entries = np.bincount(self._place, schur_complement.ravel(), self._indices.size + 1)[:-1]
+        skeleton_factor = _factorise(self._skeleton(skeleton_entries), "NATURAL")
+        return Factor(self, inverse, coupling, reduced, skeleton_factor)
 
     def _skeleton(self, data: np.ndarray) -> csc_matrix:
         """Return the matrix of the skeleton unknowns that do not hang, from the entries of its sparsity pattern."""
@@ -128,6 +152,15 @@ class Factor:
     """Factorisation of the matrix K of a mesh."""
 
     def __init__(self, assembly: Assembly, inverse: Array, coupling: Array, reduced: Array, skeleton: SuperLU) -> None:
+        """Store the factors.
+
+        Args:
+            assembly: Numbers of the unknowns.
+            inverse: Inverse of the block of the interior unknowns of each element, shape (n_element, n_inner, n_inner).
+            coupling: Block between interior and outer unknowns, shape (n_element, n_inner, n_outer).
+            reduced: Product of `inverse` and `coupling`, same shape.
+            skeleton: Factorisation of the matrix of the skeleton unknowns.
+        """
         self._assembly = assembly
         self._inverse = inverse
         self._coupling = coupling
@@ -145,19 +178,25 @@ class Factor:
             (U1, U2, W) at the nodes, shape (n_node, 3). Fixed unknowns are zero.
         """
         assembly = self._assembly
-        padded = np.zeros(assembly.free.shape)
-        padded[:, :3] = right
-        flat = padded.ravel()
-        inner_solution = self._inverse @ flat[assembly.inner_global][..., None]
+        padded_right = np.zeros(assembly.free.shape)
+        padded_right[:, :3] = right
+        flat_right = padded_right.ravel()
+
+        # Eliminate the interior unknowns from the right-hand side.
+        inner_solution = self._inverse @ flat_right[assembly.inner_global][..., None]
         condensed = self._coupling.transpose(0, 2, 1) @ inner_solution
-        reduced_right = flat - np.bincount(assembly.outer_global.ravel(), condensed.ravel(), flat.size)
+        reduced_right = flat_right - np.bincount(assembly.outer_global.ravel(), condensed.ravel(), flat_right.size)
+
+        # Solve for the unknowns of the skeleton.
         skeleton_right = reduced_right[assembly.skeleton]
         if assembly.follow is None:
             skeleton_solution = self._skeleton.solve(skeleton_right)
         else:
             skeleton_solution = assembly.follow @ self._skeleton.solve(assembly.follow.T @ skeleton_right)
-        solution = np.zeros(flat.size)
+        solution = np.zeros(flat_right.size)
         solution[assembly.skeleton] = skeleton_solution
+
+        # Substitute them back into the equations of the interior unknowns.
         correction = self._reduced @ solution[assembly.outer_global][..., None]
         solution[assembly.inner_global] = (inner_solution - correction)[..., 0]
         return solution.reshape(assembly.free.shape)[:, :3]

@@ -134,27 +134,37 @@ def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
         elastic: The discrete film.
         assembly: Linear solver for its mesh.
     """
-    flat = np.zeros((assembly.free.shape[0], 3))
-    factor = assembly.factor(elastic.tangent(flat))
-    field = factor.solve(-elastic.residual(flat))
-    size = np.inf
-    for solves in range(2, 2 + MAX_REFINEMENTS):
-        balance = elastic.residual(field)
-        balance[:, 2] = _linear_residual(elastic, field)[:, 2]
-        step = factor.solve(-balance)
-        size = _energy_norm(elastic, field, step[:, 2], balance[:, 2])
-        field = field + step
-        if size <= REFINEMENT_TOLERANCE:
-            return NewtonResult(
-                field, True, solves, size, f"linear theory, solved to round-off: corrected by {size:.0e}"
-            )
-    return NewtonResult(field, False, solves, size, "the linear system is too near to singular")
+    flat_field = np.zeros((assembly.free.shape[0], 3))
+    factor = assembly.factor(elastic.tangent(flat_field))
+    field = factor.solve(-elastic.residual(flat_field))
+    n_solve = 1
+    correction_size = np.inf
+    for _ in range(MAX_REFINEMENTS):
+        # In-plane residual with the stress that W induces; transverse residual without it
+        residual = elastic.residual(field)
+        residual[:, 2] = _linear_residual(elastic, field)[:, 2]
+        correction = factor.solve(-residual)
+        n_solve += 1
+        correction_size = _energy_norm(elastic, field, correction[:, 2], residual[:, 2])
+        field = field + correction
+        if correction_size <= REFINEMENT_TOLERANCE:
+            message = f"linear theory, solved to round-off: corrected by {correction_size:.0e}"
+            return NewtonResult(field, True, n_solve, correction_size, message)
+    return NewtonResult(field, False, n_solve, correction_size, "the linear system is too near to singular")
 
 
 def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
-    """Compute the residual without the forces of the induced stress, shape (n_node, 3).
+    """Compute the residual without the forces of the induced stress.
 
-    These forces are cubic in the field, so the residuals at two amplitudes separate them from the linear forces.
+    These forces are cubic in the field, so the residuals at two amplitudes separate them from the linear forces: with
+    r(a) = k a + c a^3, the linear part is k = (8 r(a) - r(2 a)) / (6 a).
+
+    Args:
+        elastic: The discrete film.
+        field: Scaled displacements, shape (n_node, 3).
+
+    Returns:
+        Residual, shape (n_node, 3).
     """
     amplitude = 0.01
     flat = elastic.residual(np.zeros_like(field))
@@ -305,7 +315,15 @@ def _chord_steps(iterate: _Iterate, factor: TangentFactor, before: float, tolera
 def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
     """Return a step that is a descent direction of the energy.
 
-    If the given step is not one, return the step with the smallest added tension in the tangent that makes it one.
+    If the given step is not a descent direction, a tension is added to the tangent and doubled until the step is one.
+
+    Args:
+        iterate: Present iterate.
+        assembly: Linear solver for the mesh.
+        step: Newton step, shape (n_node, 3).
+
+    Returns:
+        The step, shape (n_node, 3).
     """
     elastic = iterate.elastic
     tension = FIRST_DESCENT_TENSION * GUARD_TENSION * float(np.cbrt(elastic.groups.total_load)) ** 2
@@ -322,6 +340,10 @@ def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
     """Halve a step until it lowers the energy sufficiently (condition of Armijo).
 
     If the change of the energy is within round-off, the step must lower the residual instead.
+
+    Args:
+        iterate: Present iterate.
+        step: Full step, shape (n_node, 3).
 
     Returns:
         The iterate after the step, or None if no step length is accepted.

@@ -123,6 +123,13 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
     The order is increased at most `MAX_EXTRA_ORDERS` times. If a finer mesh has no equilibrium, return the equilibrium
     of the finer one of the two previous meshes, with the difference of these meshes as its error. If two meshes have
     different equilibria, the status of the result is "failed".
+
+    Args:
+        case: The press and its accuracy.
+        start: Equilibrium of a similar press from which the first solve starts; None if there is none.
+
+    Returns:
+        Equilibrium on the finest mesh. Its `proven_error` is the difference from the previous mesh.
     """
     solved = _solve(case, choose_mesh(case), start)
     for _ in range(MAX_EXTRA_ORDERS):
@@ -149,6 +156,14 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
 
 def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equilibrium:
     """Solve a press on one mesh.
+
+    Args:
+        case: The press and its accuracy.
+        mesh: The mesh.
+        start: Equilibrium of a similar press from which the solve starts; None if there is none.
+
+    Returns:
+        The equilibrium. Its status is "failed" if no equilibrium was found.
 
     Raises:
         SceneError: If an element of the mesh is folded.
@@ -183,7 +198,15 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 
 
 def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
-    """Solve the film before the contact, under the static pressure alone, and add it to the equilibrium of a press."""
+    """Solve the film before the contact, under the static pressure alone, and add it to the equilibrium of a press.
+
+    Args:
+        equilibrium: Equilibrium of the press.
+        tolerance: Relative residual at which the solve has converged.
+
+    Returns:
+        The equilibrium of the press with the film before the contact as `rest`.
+    """
     mesh = equilibrium.mesh
     elastic = ElasticFilm(mesh.geometry, equilibrium.groups.without_probe)
     solver = assembly(mesh.template, elastic.components)

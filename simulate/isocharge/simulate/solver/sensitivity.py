@@ -54,40 +54,65 @@ def _tension(direction: tuple[float, float, float]) -> Change:
         direction: Components (T11, T22, T12) of one unit.
     """
 
-    def change(solved: Equilibrium, value: float) -> Equilibrium:
-        tension = value * (1.0 + solved.groups.tension) * np.array(direction)
-        return replace(solved, groups=replace(solved.groups, anisotropy=Anisotropy(np.zeros((3, 3)), tension)))
+    def with_tension(solved: Equilibrium, value: float) -> Equilibrium:
+        """Return the equilibrium with an uneven pretension of this size."""
+        unit = 1.0 + solved.groups.tension
+        anisotropy = Anisotropy(moduli=np.zeros((3, 3)), tension=value * unit * np.array(direction))
+        return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
 
-    return change
+    return with_tension
 
 
 def _stiffness(angle: float) -> Change:
-    """Return the function for ln(E1 / E2) of an orthotropic film whose axis 1 lies at an angle (rad)."""
+    """Return the function that makes a film orthotropic.
 
-    def change(solved: Equilibrium, value: float) -> Equilibrium:
+    The value of the imperfection is ln(E1 / E2). To first order, E1 = E (1 + value / 2) and E2 = E (1 - value / 2).
+
+    Args:
+        angle: Angle of axis 1 from the direction of the press, rad.
+    """
+
+    def with_stiffness_ratio(solved: Equilibrium, log_ratio: float) -> Equilibrium:
+        """Return the equilibrium of a film with this ln(E1 / E2)."""
+        plane_modulus = 1.0 / (1.0 - solved.groups.poisson**2)
+        change_along_axis_1 = 0.5 * log_ratio * plane_modulus
+        moduli_in_film_axes = np.diag([change_along_axis_1, -change_along_axis_1, 0.0])
         rotation = stress_rotation(angle)
-        plane = 1.0 / (1.0 - solved.groups.poisson**2)
-        moduli = rotation @ np.diag([0.5 * value * plane, -0.5 * value * plane, 0.0]) @ rotation.T
-        return replace(solved, groups=replace(solved.groups, anisotropy=Anisotropy(moduli, np.zeros(3))))
+        anisotropy = Anisotropy(moduli=rotation @ moduli_in_film_axes @ rotation.T, tension=np.zeros(3))
+        return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
 
-    return change
+    return with_stiffness_ratio
 
 
 def _poisson(solved: Equilibrium, value: float) -> Equilibrium:
-    """Add a value to Poisson's ratio."""
-    before = solved.groups.poisson
-    after = before + value
-    bending = solved.groups.bending * (1.0 - before**2) / (1.0 - after**2)
-    return replace(solved, groups=replace(solved.groups, poisson=after, bending=bending))
+    """Return the equilibrium of a film whose Poisson's ratio is larger by a value.
+
+    The bending stiffness, which contains 1 / (1 - poisson^2), changes accordingly.
+
+    Args:
+        solved: The solved press.
+        value: Change of Poisson's ratio.
+    """
+    poisson = solved.groups.poisson
+    changed_poisson = poisson + value
+    bending = solved.groups.bending * (1.0 - poisson**2) / (1.0 - changed_poisson**2)
+    return replace(solved, groups=replace(solved.groups, poisson=changed_poisson, bending=bending))
 
 
 def _oval(direction: complex) -> Change:
-    """Return the function for an oval clamp; `direction` is exp(2 i alpha) for a long axis at the angle alpha."""
+    """Return the function that makes the clamp of a film oval.
 
-    def change(solved: Equilibrium, value: float) -> Equilibrium:
+    The value of the imperfection is the parameter e of the oval; see `PlacedMesh.oval`.
+
+    Args:
+        direction: exp(2 i alpha), where alpha is the angle of the long axis from the direction of the press.
+    """
+
+    def with_oval(solved: Equilibrium, value: float) -> Equilibrium:
+        """Return the equilibrium of a film with an oval clamp."""
         return replace(solved, mesh=replace(solved.mesh, oval=value * direction))
 
-    return change
+    return with_oval
 
 
 FIELDS = {
@@ -100,15 +125,20 @@ FIELDS = {
 
 
 def _side_load(direction: tuple[float, float]) -> Change:
-    """Return the function for a side load, in units of E h a A^2; `direction` is its direction (x, y)."""
+    """Return the function that adds a side load to a press. Its value is the load in units of E h a A^2.
 
-    def change(solved: Equilibrium, value: float) -> Equilibrium:
+    Args:
+        direction: Unit vector (x, y) of the side load.
+    """
+
+    def with_side_load(solved: Equilibrium, value: float) -> Equilibrium:
+        """Return the equilibrium with an additional side load."""
         load_x, load_y = solved.groups.side_load
-        added_x, added_y = direction
-        side_load = (load_x + value * added_x, load_y + value * added_y)
+        unit_x, unit_y = direction
+        side_load = (load_x + value * unit_x, load_y + value * unit_y)
         return replace(solved, groups=replace(solved.groups, side_load=side_load))
 
-    return change
+    return with_side_load
 
 
 SIDE_FORCE_FIELDS = (StressField(_side_load((1.0, 0.0)), False), StressField(_side_load((0.0, 1.0)), True))
@@ -154,7 +184,16 @@ def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array
 
 
 def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: Surface) -> Array:
-    """Compute the change of the scaled stress at the nodes by each field, shape (n_field, n_element, n_local, 3)."""
+    """Compute the change of the scaled stress at the nodes by each field.
+
+    Args:
+        solved: The solved press.
+        fields: The fields.
+        surface: Surface in the thickness.
+
+    Returns:
+        Change per unit of the imperfection, shape (n_field, n_element, n_local, 3).
+    """
     with single_threaded_blas():
         components = 3 if solved.groups.bending == 0.0 else 4
         elastic = ElasticFilm(solved.mesh.geometry, solved.groups)
