@@ -114,6 +114,14 @@ def test_links_lead_to_a_file_and_to_a_heading(page):
         assert not anchor or anchor in anchors(path.read_text("utf-8")), target
 
 
+def test_the_readme_is_short():
+    """At most 80 words stand above the first code block, and about 600 words in all."""
+    text = re.sub(r"\]\([^)]*\)", "]", PAGES["README.md"])
+    words = [word for word in text.split() if re.search(r"\w", word)]
+    assert len(text[: text.index("```")].split()) <= 80
+    assert len(words) <= 650
+
+
 SITE_CONTENTS = (ROOT / ".ci" / "docs" / "contents.md").read_text("utf-8")
 
 

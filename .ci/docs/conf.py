@@ -14,16 +14,26 @@ from typing import Any
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(Path(__file__).parent))
 
+import commands  # noqa: E402
 import reference  # noqa: E402
 
+from isocharge.serve.viewer.playground_page import playground_html  # noqa: E402
+
 PORTIONS = ("simulate", "train", "serve")
-HOME, REFERENCE, GALLERY = "README", "build/reference", "build/gallery"
+HOME, REFERENCE, GALLERY, COMMANDS = "README", "build/reference", "build/gallery", "build/commands"
 
 project = "isocharge"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
 extensions += ["sphinx_gallery.gen_gallery"]
 root_doc = HOME
-include_patterns = ["*.md", "models/**/card.md", "models/README.md", f"{REFERENCE}/**", f"{GALLERY}/**"]
+include_patterns = [
+    "*.md",
+    f"{COMMANDS}.md",
+    "models/**/card.md",
+    "models/README.md",
+    f"{REFERENCE}/**",
+    f"{GALLERY}/**",
+]
 include_patterns += [pattern for name in PORTIONS for pattern in (f"{name}/README.md", f"{name}/docs/*.md")]
 exclude_patterns = [f"{GALLERY}/**/{name}" for name in ("*.py", "*.ipynb", "*.zip", "*.json")]
 myst_heading_anchors = 3
@@ -57,10 +67,12 @@ def add_contents(_app: Any, page: str, source: list[str]) -> None:
         source[0] += (ROOT / ".ci" / "docs" / "contents.md").read_text("utf-8")
 
 
-def copy_home(app: Any, error: Exception | None) -> None:
-    """The first page under the name that servers look for."""
+def add_whole_pages(app: Any, error: Exception | None) -> None:
+    """Add the first page under the name that servers look for, and the playground."""
     if error is None:
-        shutil.copy(Path(app.outdir) / f"{HOME}.html", Path(app.outdir) / "index.html")
+        folder = Path(app.outdir)
+        shutil.copy(folder / f"{HOME}.html", folder / "index.html")
+        (folder / "playground.html").write_text(playground_html(), "utf-8")
 
 
 def setup(app: Any) -> None:
@@ -68,7 +80,9 @@ def setup(app: Any) -> None:
     names = reference.modules()
     reference.check_docstrings(names)
     reference.write_pages(names, ROOT / REFERENCE)
+    commands.write_page(ROOT / f"{COMMANDS}.md")
     app.connect("source-read", add_contents)
     app.connect("autodoc-skip-member", reference.is_of_scikit_learn)
     app.connect("autodoc-process-docstring", reference.plain_text, priority=400)
-    app.connect("build-finished", copy_home)
+    app.connect("autodoc-process-docstring", reference.list_attributes, priority=600)
+    app.connect("build-finished", add_whole_pages)

@@ -7,6 +7,7 @@ from pathlib import Path
 from pkgutil import walk_packages
 from typing import Any
 
+ATTRIBUTE = re.compile(r":ivar (?P<names>[^:]+): ?(?P<text>.*)")
 DOTTED = re.compile(r"`(isocharge(?:\.\w+)+)`")
 
 
@@ -33,14 +34,26 @@ def check_docstrings(names: list[str]) -> None:
 
 
 def write_pages(names: list[str], folder: Path) -> None:
-    """A page for each module, and a list of all of them."""
+    """A page for each module, and a list of all of them.
+
+    The pages of the modules are in no table of contents, because each page of the site repeats the tables.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        lines = [name, "=" * len(name), "", f".. automodule:: {name}", "   :members:", "   :show-inheritance:"]
+        lines = [
+            ":orphan:",
+            "",
+            name,
+            "=" * len(name),
+            "",
+            f".. automodule:: {name}",
+            "   :members:",
+            "   :show-inheritance:",
+        ]
         if hasattr(import_module(name), "__all__"):  # a package's public names are explained where they are defined
             lines += ["   :imported-members:", "   :no-index:"]
         _write(folder / f"{name}.rst", lines)
-    _write(folder / "index.rst", ["Reference", "=========", "", ".. toctree::", "", *(f"   {name}" for name in names)])
+    _write(folder / "index.rst", ["Modules", "=======", "", *(f"* :doc:`{name}`" for name in names)])
 
 
 def _write(path: Path, lines: list[str]) -> None:
@@ -66,6 +79,29 @@ def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, li
         shown.append(line if code else _escaped(line))
     if kind in ("attribute", "data"):
         shown.insert(0, "\\ ")  # what is before a colon in the first line would be taken for a type
+    lines[:] = shown
+
+
+def list_attributes(_app: Any, _kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
+    """Write the attributes of a class as a list of names with their descriptions.
+
+    Napoleon writes a field `:ivar NAMES: text` for each attribute, and Sphinx takes the first of several names, as in
+    `x_mm, y_mm`, for a type.
+    """
+    shown: list[str] = []
+    in_attributes = False
+    for line in lines:
+        attribute = ATTRIBUTE.match(line)
+        if attribute:
+            if not in_attributes:
+                shown += [":Attributes:", ""]
+            in_attributes = True
+            shown.append(f"    * **{attribute['names']}**: {attribute['text']}")
+        elif in_attributes and (not line.strip() or line.startswith(" ")):
+            shown.append(f"      {line.lstrip()}".rstrip())
+        else:
+            in_attributes = False
+            shown.append(line)
     lines[:] = shown
 
 

@@ -4,7 +4,9 @@ import json
 import os
 import re
 import runpy
+import shlex
 import shutil
+import ssl
 import subprocess
 import sys
 import tomllib
@@ -12,9 +14,11 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
+import jsonschema_rs
 import numpy as np
 import pytest
 import tritonclient.http as triton
+import trustme
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -118,19 +122,108 @@ def test_triton_is_started_with_the_backend_for_onnx_beside_its_own(monkeypatch,
 # systemd
 
 
-@pytest.fixture
-def unit(tmp_path):
-    """The unit with the program of this environment, which `verify` looks for."""
-    path = tmp_path / "isocharge.service"
-    program = str(Path(sys.executable).with_name("isocharge"))
-    path.write_text(UNIT.read_text().replace("ExecStart=/opt/isocharge/bin/isocharge", f"ExecStart={program}"))
-    return path
+SYSTEMD = DEPLOY / "systemd"
+PROGRAM = str(Path(sys.executable).with_name("isocharge"))
+
+
+def installed_unit(folder, names):
+    """Copy units and their drop-ins into a folder, with the program of this environment, and return the first."""
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(exist_ok=True)
+        text = (SYSTEMD / path.name).read_text()
+        path.write_text(text.replace("ExecStart=/opt/isocharge/bin/isocharge", f"ExecStart={PROGRAM}"))
+    return folder / names[0]
+
+
+def verified(unit):
+    """Exit code and messages of `systemd-analyze verify`."""
+    done = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True, timeout=60, check=False)
+    return done.returncode, done.stdout + done.stderr
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
-def test_systemd_finds_nothing_wrong_with_the_unit(unit):
-    done = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["isocharge.service"],
+        ["isocharge.service", "isocharge.service.d/tls.conf"],
+        ["isocharge-stream.service"],
+    ],
+)
+def test_systemd_finds_nothing_wrong_with_a_unit(tmp_path, names):
+    unit = installed_unit(tmp_path, names)
+    assert verified(unit) == (0, "")
+    last = tmp_path / names[-1]
+    last.write_text(last.read_text().replace(PROGRAM, "/nowhere/isocharge"))
+    assert "/nowhere/isocharge" in verified(unit)[1]  # so verify has read this file
+
+
+def unit_command(name):
+    """The words of the command of a unit, without the program."""
+    return shlex.split(re.findall(r"^ExecStart=(\S.*)$", (SYSTEMD / name).read_text(), re.MULTILINE)[0])[1:]
+
+
+def compose_command(name):
+    """The words of the command of a service of the compose file."""
+    return yaml.safe_load(COMPOSE.read_text())["services"][name]["command"]
+
+
+COMPOSE = DEPLOY / "compose/compose.yaml"
+
+SERVICES = [
+    (unit_command("tls.conf"), "${CREDENTIALS_DIRECTORY}"),
+    (unit_command("isocharge-stream.service"), "${CREDENTIALS_DIRECTORY}"),
+    (compose_command("server"), "/run/secrets"),
+    (compose_command("stream"), "/run/secrets"),
+]
+
+
+@pytest.mark.parametrize(("words", "secrets"), SERVICES, ids=["unit", "stream unit", "container", "stream container"])
+def test_the_command_of_a_service_listens_with_tls_and_needs_the_token(words, secrets, tmp_path, monkeypatch):
+    """On a free port of this machine; the stream reads frames from a pipe in place of the port."""
+    authority = trustme.CA()
+    issued = authority.issue_cert("127.0.0.1")
+    issued.cert_chain_pems[0].write_to_path(tmp_path / "fullchain.pem")
+    issued.private_key_pem.write_to_path(tmp_path / "privkey.pem")
+    (tmp_path / "board.toml").write_text('name = "board"\n')
+    line = " ".join(word.replace(secrets, str(tmp_path)) for word in words)
+    line = re.sub(r"0\.0\.0\.0(:| --port )\d+", r"127.0.0.1\g<1>0", line)
+    line = re.sub(r"--port /dev/\S+", "--port -", line)
+    monkeypatch.setenv("ISOCHARGE_TOKEN", "s3cret")
+    process = subprocess.Popen(
+        [PROGRAM, *line.split()], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        url = next(found[0] for text in process.stdout if (found := re.search(r"https://127\.0\.0\.1:\d+", text)))
+        trusted = ssl.create_default_context()
+        authority.configure_trust(trusted)
+        path = "/session.json" if "stream" in words else "/v2/models/three-25um-biaxial"
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            urllib.request.urlopen(url + path, timeout=20, context=trusted)
+        request = urllib.request.Request(url + path, headers={"Authorization": "Bearer s3cret"})
+        with urllib.request.urlopen(request, timeout=20, context=trusted) as answer:
+            assert json.loads(answer.read())
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
+
+
+def test_the_compose_file_agrees_with_the_schema_of_compose():
+    schema = json.loads((ROOT / "tests/data/compose/compose_spec.json").read_text())
+    for path in (COMPOSE, DEPLOY / "monitoring/compose.yaml"):
+        content = yaml.safe_load(path.read_text())
+        jsonschema_rs.validate(schema, content)
+        content["services"][next(iter(content["services"]))]["prots"] = []
+        assert not jsonschema_rs.is_valid(schema, content)
+
+
+def test_every_secret_of_the_compose_file_exists_and_is_used():
+    content = yaml.safe_load(COMPOSE.read_text())
+    for service in content["services"].values():
+        used = {word.removeprefix("/run/secrets/") for word in service["command"] if word.startswith("/run/secrets/")}
+        assert used == set(service["secrets"])
+        assert used <= set(content["secrets"])
 
 
 # Images

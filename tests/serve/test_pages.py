@@ -75,6 +75,8 @@ def check_commands(example, folder, printed):
     if "/infer" in example:
         outputs = json.loads(printed[printed.index("{") :])["outputs"]
         assert outputs[0]["data"] == pytest.approx([3.0, -2.0, 1.0], abs=0.02)
+    if "session.json" in example:
+        assert '"sensor":"three-25um-biaxial"' in printed
     if "serve check" in example:
         assert f"```text\n{printed}```" in PAGES["measured_presses.md"]
     if "doctor" in example:
@@ -84,13 +86,13 @@ def check_commands(example, folder, printed):
 
 
 def on_free_ports(example):
-    """The example with ports that nobody uses."""
+    """The example with ports that nobody uses, on this machine only."""
     with ExitStack() as stack:
-        for port in ("8000", "8001"):
+        for port in ("8000", "8001", "8443", "8444"):
             free = stack.enter_context(socket.socket())
             free.bind(("127.0.0.1", 0))
             example = example.replace(port, str(free.getsockname()[1]))
-    return example
+    return example.replace("0.0.0.0", "127.0.0.1")
 
 
 def test_every_flag_is_explained():

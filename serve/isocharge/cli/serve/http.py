@@ -10,9 +10,8 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.serve.records import LogFormat
-from isocharge.cli.shared.live_page import TokenOption, given_token
+from isocharge.cli.shared.live_page import TlsCertOption, TlsKeyOption, TokenOption, given_tls, given_token
 from isocharge.cli.shared.terminal import announce, say, write_stderr
-from isocharge.common.errors import InputError
 from isocharge.common.extras import require
 from isocharge.common.writer_queue import WriterQueue
 from isocharge.serve.network.address import Address, Tls, Token, check_exposure
@@ -59,14 +58,8 @@ def http_command(
         ),
     ] = None,
     token: TokenOption = None,
-    tls_cert: Annotated[
-        Path | None,
-        typer.Option("--tls-cert", metavar="PEM", help="Certificate chain; turns TLS on. (default: no TLS)"),
-    ] = None,
-    tls_key: Annotated[
-        Path | None,
-        typer.Option("--tls-key", metavar="PEM", help="Private key of it. (default: in the certificate's file)"),
-    ] = None,
+    tls_cert: TlsCertOption = None,
+    tls_key: TlsKeyOption = None,
     log: Annotated[
         LogFormat,
         typer.Option("--log", help="On stderr: sentences for people, or a line of JSON for each request and message."),
@@ -82,11 +75,9 @@ def http_command(
     token = given_token(token)
     address = Address(host, port, uds)
     check_exposure(address if grpc_port is None else Address(host), has_token=token is not None)
-    if tls_key is not None and tls_cert is None:
-        raise InputError("--tls-key: expected --tls-cert too, got the key alone")
+    tls = given_tls(tls_cert, tls_key)
     secret = None if token is None else Token(token)
     browser_check = BrowserCheck(host, allow_host or (), any_host=secret is not None or uds is not None)
-    tls = None if tls_cert is None else Tls(tls_cert, tls_key)
     with suppress(KeyboardInterrupt), _traffic(log, token) as traffic:
         store = open_model_store(models)
         for reason in store.refusals():

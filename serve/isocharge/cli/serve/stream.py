@@ -20,7 +20,17 @@ from isocharge.cli.serve.records import (
     summary,
     write_records,
 )
-from isocharge.cli.shared.live_page import LiveOption, PageFeed, TokenOption, answering, live_page, page_address
+from isocharge.cli.shared.live_page import (
+    LiveOption,
+    PageFeed,
+    TlsCertOption,
+    TlsKeyOption,
+    TokenOption,
+    answering,
+    live_page,
+    page_address,
+    page_tls,
+)
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.port_hints import doctor_is_named, no_frames_hint
 from isocharge.cli.shared.terminal import (
@@ -128,6 +138,8 @@ def stream_command(
     ] = False,
     live: LiveOption = None,
     token: TokenOption = None,
+    tls_cert: TlsCertOption = None,
+    tls_key: TlsKeyOption = None,
 ) -> None:
     """Follow a sensor live: read its port, and print position (mm) and force (N) for every frame of charges.
 
@@ -141,6 +153,7 @@ def stream_command(
     if name is not None and not (0 < len(name) <= MAX_NAME_CHARACTERS and is_printable(name)):
         raise InputError(f"--name: expected 1 to {MAX_NAME_CHARACTERS} printable characters, got {shown(name)}")
     address = None if live is None else page_address(live, token)
+    tls = page_tls(live, tls_cert, tls_key)
     predictor = Predictor(model, models=models)
     board = load_device(device)
     if offset_limit_pC is not None:
@@ -156,7 +169,7 @@ def stream_command(
         page = None
         if address is not None:
             folder = find_model(model, models)
-            page = stack.enter_context(live_page(address, token, path.frame_id, predictor.metadata, folder))
+            page = stack.enter_context(live_page(address, token, path.frame_id, predictor.metadata, folder, tls=tls))
         source = stack.enter_context(
             open_source(port, baud=baud, reconnect=reconnect, request=board.request, wait=wait)
         )
@@ -216,6 +229,8 @@ def replay_command(
     output: OutputOption = None,
     live: LiveOption = None,
     token: TokenOption = None,
+    tls_cert: TlsCertOption = None,
+    tls_key: TlsKeyOption = None,
 ) -> None:
     """Play a recording of raw bytes again: the same model and device give the same records, bit for bit.
 
@@ -225,6 +240,7 @@ def replay_command(
     Example: isocharge serve replay touch.rec --real-time
     """
     address = None if live is None else page_address(live, token)
+    tls = page_tls(live, tls_cert, tls_key)
     recording = Recording(file)
     clock = RecordedClock()
     folder = find_model(model, models) if model else find_labelled_model(recording.model, models)
@@ -242,7 +258,7 @@ def replay_command(
             write_records(played(), writers, latencies)
         else:
             link = stack.enter_context(
-                live_page(address, token, file.name, predictor.metadata, folder, is_recording=True)
+                live_page(address, token, file.name, predictor.metadata, folder, is_recording=True, tls=tls)
             )
             feed = PageFeed(link, path)
             writers.append(feed.write)

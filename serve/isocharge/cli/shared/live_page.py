@@ -21,7 +21,7 @@ from isocharge.common.extras import require
 from isocharge.serve import PredictionRecord, Recorder, TouchStream
 from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.network.address import Address, check_exposure
+from isocharge.serve.network.address import Address, Tls, check_exposure
 from isocharge.serve.port import recording
 from isocharge.serve.viewer.link import ReaderEnd, make_link
 from isocharge.serve.viewer.messages import (
@@ -68,6 +68,41 @@ TokenOption = Annotated[
     ),
 ]
 
+TlsCertOption = Annotated[
+    Path | None,
+    typer.Option("--tls-cert", metavar="PEM", help="Certificate chain; turns TLS on. (default: no TLS)"),
+]
+
+TlsKeyOption = Annotated[
+    Path | None,
+    typer.Option("--tls-key", metavar="PEM", help="Private key of it. (default: in the certificate's file)"),
+]
+
+
+def given_tls(certificate: Path | None, key: Path | None) -> Tls | None:
+    """Return the TLS files of the options; None without a certificate.
+
+    Raises:
+        InputError: If the key is given without a certificate.
+    """
+    if certificate is not None:
+        return Tls(certificate, key)
+    if key is not None:
+        raise InputError("--tls-key: expected --tls-cert too, got the key alone")
+    return None
+
+
+def page_tls(live: str | None, certificate: Path | None, key: Path | None) -> Tls | None:
+    """Return the TLS files of the live page; None without a certificate.
+
+    Raises:
+        InputError: If the key is given without a certificate, or a certificate without a page.
+    """
+    tls = given_tls(certificate, key)
+    if tls is not None and live is None:
+        raise InputError("--tls-cert: expected --live too, because only the page uses TLS, got the certificate alone")
+    return tls
+
 
 def given_token(token: str | None) -> str | None:
     """Return the token of the option or of the environment.
@@ -100,7 +135,14 @@ def page_address(live: str, token: str | None) -> Address:
 
 @contextmanager
 def live_page(
-    address: Address, token: str | None, name: str, metadata: ModelMetadata, model: Path, *, is_recording: bool = False
+    address: Address,
+    token: str | None,
+    name: str,
+    metadata: ModelMetadata,
+    model: Path,
+    *,
+    is_recording: bool = False,
+    tls: Tls | None = None,
 ) -> Iterator[ReaderEnd]:
     """Run the page of a stream in a process of its own, and print its address.
 
@@ -111,6 +153,7 @@ def live_page(
         metadata: Metadata of the model that estimates the contacts.
         model: Folder of the version of the model.
         is_recording: Whether the stream is a recording, which waits until its page reads.
+        tls: Certificate and key; None for no TLS.
 
     Yields:
         The reader's end of the link to the page.
@@ -124,7 +167,7 @@ def live_page(
 
     description = describe_film(name, metadata, find_field(model, metadata))
     reader, end = make_link()
-    page = Page(end, description, address, given_token(token), is_recording)
+    page = Page(end, description, address, given_token(token), is_recording, tls)
     with closing(reader), page_process(page) as url, closing(reader):  # the page's process ends when its reader closes
         if is_recording:
             reader.enable_waiting()

@@ -14,7 +14,7 @@ from typing import Any
 import uvloop
 
 from isocharge.common.errors import IsochargeError, ListenError
-from isocharge.serve.network.address import Address, Token
+from isocharge.serve.network.address import Address, Tls, Token
 from isocharge.serve.viewer.hub import Hub
 from isocharge.serve.viewer.link import PageEnd
 from isocharge.serve.viewer.server import Access, PageServer
@@ -42,6 +42,7 @@ class Page:
         address: Address on which the page listens.
         token: Secret that viewers must send; None if no token is required.
         is_recording: Whether the stream is a recording.
+        tls: Certificate and key; None for no TLS.
     """
 
     link: PageEnd
@@ -49,6 +50,7 @@ class Page:
     address: Address
     token: str | None = None
     is_recording: bool = False
+    tls: Tls | None = None
 
 
 @contextmanager
@@ -59,7 +61,7 @@ def page_process(page: Page) -> Iterator[str]:
         The URL of the page.
 
     Raises:
-        InputError: If the token cannot be used.
+        InputError: If the token or the TLS files cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
     context = get_context("spawn")
@@ -86,16 +88,17 @@ def run_page(page: Page, announce: Callable[[str], object]) -> None:
         announce: Function that is called with the URL when the server listens.
 
     Raises:
-        InputError: If the token cannot be used.
+        InputError: If the token or the TLS files cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
     access = Access(None if page.token is None else Token(page.token), page.address.host)
+    tls_context = None if page.tls is None else page.tls.context()
     hub = Hub(page.link, page.description, is_recording=page.is_recording)
     with closing(hub), page.address.listen(BACKLOG) as listening:
-        announce(page.address.url(listening, secure=False))
+        announce(page.address.url(listening, secure=page.tls is not None))
 
         async def serve() -> None:
-            async with PageServer(hub, access).listening(listening):
+            async with PageServer(hub, access).listening(listening, tls_context):
                 await hub.run()
 
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:

@@ -18,6 +18,7 @@ import json
 import logging
 import secrets
 import socket
+import ssl
 import time
 from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from http import HTTPStatus
@@ -203,11 +204,19 @@ class PageServer:
         self._id = secrets.token_hex(8)
 
     @contextlib.asynccontextmanager
-    async def listening(self, listening: socket.socket) -> AsyncIterator[None]:
-        """Answer requests on a listening socket while the block runs."""
+    async def listening(
+        self, listening: socket.socket, tls_context: ssl.SSLContext | None = None
+    ) -> AsyncIterator[None]:
+        """Answer requests on a listening socket while the block runs.
+
+        Args:
+            listening: The socket.
+            tls_context: TLS context of the server; None for no TLS.
+        """
         async with serve(
             self._serve_viewer,
             sock=listening,
+            ssl=tls_context,
             process_request=self._answer,
             select_subprotocol=_select_subprotocol,
             compression=None,

@@ -1,0 +1,42 @@
+"""The page of all commands, from the same declarations as `--help`."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from isocharge.cli.main import app
+
+WIDTH = 100
+"""Width of the help texts, characters."""
+
+INTRODUCTION = """# Commands and options
+
+This page contains the help of every command. It is generated from the declarations of the commands, so it agrees with
+`isocharge COMMAND --help`. [REFERENCE.md](../REFERENCE.md#commands) names the page that explains each command.
+"""
+
+
+def write_page(path: Path) -> None:
+    """Write the page with the help of all commands."""
+    root = typer.main.get_command(app)
+    sections = [INTRODUCTION]
+    for words, command in _commands(root, ("isocharge",)):
+        name = " ".join(words)
+        context = typer.Context(command, info_name=name, terminal_width=WIDTH, max_content_width=WIDTH)
+        sections.append(f"## {name}\n\n```text\n{command.get_help(context)}\n```\n")
+    text = "\n".join(sections)
+    if not path.exists() or path.read_text("utf-8") != text:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, "utf-8")
+
+
+def _commands(group: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield the words and the command of each command in a group and in its groups."""
+    for name in group.list_commands(None):
+        _, command, _ = group.resolve_command(None, [name])
+        if hasattr(command, "list_commands"):
+            yield from _commands(command, (*words, name))
+        else:
+            yield (*words, name), command
