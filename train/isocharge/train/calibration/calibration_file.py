@@ -210,24 +210,34 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
 
 
 def _read_parameters(path: Path, table: _CalibrationFile, prior: FilmPrior) -> tuple[Array, Array]:
-    """Return the parameters, and their standard deviations over those of the prior, each of shape (n_parameter,)."""
+    """Read the parameters, and check that they are within the bounds of the films.
+
+    Args:
+        path: The file, for error messages.
+        table: Contents of the file.
+        prior: Distribution of the films.
+
+    Returns:
+        Parameters, and their standard deviations over those of the prior, each of shape (n_parameter,).
+
+    Raises:
+        PressError: If a value is outside the bounds, or a standard deviation is too large.
+    """
     units = prior.file_factors
-    parameters = np.array([estimate.value for estimate in table.parameters.values()]) / units
-    lower, upper = prior.bounds
-    tolerance = BOUND_TOLERANCE * prior.std
-    for name, estimate, std_unit, unit, value, low, high, rounding in zip(
-        prior.names, table.parameters.values(), prior.std, units, parameters, lower, upper, tolerance, strict=True
-    ):
-        if not low - rounding <= value <= high + rounding:
+    lower, upper = (bound * units for bound in prior.bounds)  # in the units of the file
+    tolerance = BOUND_TOLERANCE * prior.std * units
+    largest_std = LARGEST_STD * prior.std * units
+    for index, (name, estimate) in enumerate(table.parameters.items()):
+        if not lower[index] - tolerance[index] <= estimate.value <= upper[index] + tolerance[index]:
             raise PressError(
-                f"{path}: parameters.{name}.value: expected {low * unit:.6g} to {high * unit:.6g}, as these films "
+                f"{path}: parameters.{name}.value: expected {lower[index]:.6g} to {upper[index]:.6g}, as these films "
                 f"have, got {estimate.value:g}"
             )
-        if estimate.std > LARGEST_STD * std_unit * unit:
+        if estimate.std > largest_std[index]:
             raise PressError(
-                f"{path}: parameters.{name}.std: expected at most {LARGEST_STD * std_unit * unit:.6g}, "
-                f"got {estimate.std:g}"
+                f"{path}: parameters.{name}.std: expected at most {largest_std[index]:.6g}, got {estimate.std:g}"
             )
+    parameters = np.array([estimate.value for estimate in table.parameters.values()]) / units
     std = np.array([estimate.std for estimate in table.parameters.values()]) / units / prior.std
     return parameters, std
 
@@ -235,7 +245,22 @@ def _read_parameters(path: Path, table: _CalibrationFile, prior: FilmPrior) -> t
 def _read_coefficients(
     path: Path, table: _Discrepancy, problem: CalibrationProblem, parameter_std: Array
 ) -> tuple[Array, Array]:
-    """Return the coefficients, and the standard deviations of parameters and coefficients together."""
+    """Read the coefficients of the film, and check their number and size.
+
+    Args:
+        path: The file, for error messages.
+        table: Section `discrepancy` of the file.
+        problem: The calibration that needs the estimate.
+        parameter_std: Standard deviations of the parameters over those of the prior, shape (n_parameter,).
+
+    Returns:
+        Coefficients, shape (n_coefficient,), and the standard deviations of parameters and coefficients together, shape
+        (n_parameter + n_coefficient,).
+
+    Raises:
+        PressError: If there are too few or too many numbers, if a number is too large, or if the standard deviations
+            contradict those of the parameters.
+    """
     expected_count = problem.charges.n_coefficient
     if len(table.coefficients) != expected_count:
         raise PressError(
@@ -267,7 +292,20 @@ def _read_coefficients(
 
 
 def _with_temperature(path: Path, table: _Temperature, correlations: Array, std: Array) -> Array:
-    """Return a matrix of correlations with a last row and column for the change of the pretension with temperature."""
+    """Append the correlations of the change of the pretension with temperature to a matrix of correlations.
+
+    Args:
+        path: The file, for error messages.
+        table: Section `temperature` of the file.
+        correlations: Correlations of the unknowns of the film, shape (n, n).
+        std: Standard deviations of the unknowns of the film, shape (n,).
+
+    Returns:
+        Correlations, shape (n + 1, n + 1). The last row and column are those of the change of the pretension.
+
+    Raises:
+        PressError: If the number of correlations is wrong, or the change of the pretension is too large.
+    """
     change = table.pretension_per_K
     largest_Pa_per_K = LARGEST_STD * PRETENSION_PER_KELVIN.std_with_temperatures * PASCAL_FACTOR
     for key, number in (("value", change.value), ("std", change.std)):
@@ -276,14 +314,14 @@ def _with_temperature(path: Path, table: _Temperature, correlations: Array, std:
                 f"{path}: temperature.pretension_per_K.{key}: expected at most {largest_Pa_per_K:g} Pa/K, "
                 f"got {number:g}"
             )
-    row: list[Correlation] = table.correlations or [0.0] * std.size
-    if len(row) != std.size:
+    given_row: list[Correlation] = table.correlations or [0.0] * std.size
+    if len(given_row) != std.size:
         raise PressError(
             f"{path}: temperature.correlations: expected {std.size} numbers, one for each unknown of the film, "
-            f"got {len(row)}"
+            f"got {len(given_row)}"
         )
-    without_variance = (std == 0.0) | (change.std == 0.0)
-    temperature_row = _numbers(path, "temperature.correlations", [row], without_variance[None])[0]
+    may_be_null = (std == 0.0) | (change.std == 0.0)  # the correlation of a constant is not defined
+    temperature_row = _numbers(path, "temperature.correlations", [given_row], may_be_null[None])[0]
     extended = np.eye(std.size + 1)
     extended[:-1, :-1] = correlations
     extended[-1, :-1] = temperature_row
@@ -292,17 +330,31 @@ def _with_temperature(path: Path, table: _Temperature, correlations: Array, std:
 
 
 def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Array) -> Array:
-    """Return correlations as a symmetric matrix with ones on its diagonal, shape (n, n); null is taken for zero."""
+    """Read a matrix of correlations, and check that it is symmetric with ones on its diagonal.
+
+    Args:
+        path: The file, for error messages.
+        key: Key of the matrix, for error messages.
+        rows: Rows of the matrix. The correlations of an unknown without variance are null, and become zero.
+        std: Standard deviations of the unknowns, shape (n,).
+
+    Returns:
+        Correlations, shape (n, n).
+
+    Raises:
+        PressError: If the matrix has another shape, or is not a matrix of correlations.
+    """
     if [len(row) for row in rows] != [std.size] * std.size:
         raise PressError(f"{path}: {key}: expected {std.size} rows of as many numbers")
-    without_variance = np.add.outer(std == 0.0, std == 0.0)
-    matrix = _numbers(path, key, rows, without_variance)
+    may_be_null = np.add.outer(std == 0.0, std == 0.0)
+    matrix = _numbers(path, key, rows, may_be_null)
     diagonal = np.where(std == 0.0, 1.0, np.diag(matrix))
-    if np.abs(diagonal - 1.0).max() > CORRELATION_TOLERANCE:
-        number = int(np.abs(diagonal - 1.0).argmax())
+    deviation_from_one = np.abs(diagonal - 1.0)
+    if deviation_from_one.max() > CORRELATION_TOLERANCE:
+        index = int(deviation_from_one.argmax())
         raise PressError(
-            f"{path}: {key}[{number}][{number}]: expected 1, the correlation of an unknown with itself, "
-            f"got {diagonal[number]:g}"
+            f"{path}: {key}[{index}][{index}]: expected 1, the correlation of an unknown with itself, "
+            f"got {diagonal[index]:g}"
         )
     asymmetry = np.abs(matrix - matrix.T)
     if asymmetry.max() > CORRELATION_TOLERANCE:
@@ -316,11 +368,21 @@ def _correlations(path: Path, key: str, rows: list[list[Correlation]], std: Arra
 
 
 def _numbers(path: Path, key: str, rows: list[list[Correlation]], may_be_null: Booleans) -> Array:
-    """Return rows as an array; null is taken for zero where it may stand, and refused elsewhere."""
+    """Convert rows of correlations into an array, in which null becomes zero.
+
+    Args:
+        path: The file, for error messages.
+        key: Key of the rows, for error messages.
+        rows: Rows of numbers and null, all of the same length.
+        may_be_null: Where null is allowed, of the shape of the rows.
+
+    Raises:
+        PressError: If a row contains null where a number is needed.
+    """
     matrix = np.array([[np.nan if value is None else value for value in row] for row in rows])
-    wrong = np.isnan(matrix) & ~may_be_null
-    if wrong.any():
-        row, column = np.argwhere(wrong)[0]
+    is_missing = np.isnan(matrix) & ~may_be_null
+    if is_missing.any():
+        row, column = np.argwhere(is_missing)[0]
         raise PressError(
             f"{path}: {key}: expected a number from -1 to 1 in row {row + 1}, column {column + 1}, got null; calibrate "
             "anew"

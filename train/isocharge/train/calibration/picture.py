@@ -52,36 +52,61 @@ def calibration_picture(result: CalibrationResult) -> Figure:
 
 
 def _draw_error(axes: Any, result: CalibrationResult, error: ContactError, title: str) -> Any:
+    """Draw a map of the position error that the uncertainty of the film causes, and the electrodes.
+
+    Args:
+        axes: Axes of matplotlib.
+        result: The calibration, which contains the positions of the map.
+        error: Errors at these positions.
+        title: Beginning of the title.
+
+    Returns:
+        The coloured areas, for which a colour bar can be drawn.
+    """
+    # Neighbouring contacts have different forces, so that the map shows the rms error of several neighbours.
     x, y, _ = result.sensitivity.contact.T
-    nearest = np.argsort(np.hypot(x[:, None] - x, y[:, None] - y), axis=1)[:, :NEIGHBOURS]
-    smooth = np.clip(np.sqrt((error.each_mm[nearest] ** 2).mean(axis=1)), *LEVELS_MM)
+    distance = np.hypot(x[:, None] - x, y[:, None] - y)
+    nearest = np.argsort(distance, axis=1)[:, :NEIGHBOURS]
+    rms_error = np.sqrt((error.each_mm[nearest] ** 2).mean(axis=1))
     levels = np.geomspace(*LEVELS_MM, 25)
-    shades = axes.tricontourf(Triangulation(x, y), smooth, levels, norm=LogNorm(), cmap="viridis")
+    shades = axes.tricontourf(
+        Triangulation(x, y), np.clip(rms_error, *LEVELS_MM), levels, norm=LogNorm(), cmap="viridis"
+    )
+    sensor, _ = result.film
     title = f"{title}: {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)"
-    draw_layout(axes, result.film[0], result.problem.domain.radius, title)
+    draw_layout(axes, sensor, result.problem.domain.radius, title)
     return shades
 
 
 def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
-    """95 % intervals after the presses within those before, each in units of the standard deviation before."""
+    """Draw the 95 % intervals of the quantities before and after the presses.
+
+    The horizontal axis is the difference from the prior mean, in prior standard deviations.
+
+    Args:
+        axes: Axes of matplotlib.
+        result: The calibration.
+    """
     quantities = list(result.quantities.values())[::-1]
-    change = (result.posterior.parameters - result.problem.before.parameters) / result.problem.prior.std
-    centre = np.array([quantity.weights @ change / quantity.before_std for quantity in quantities])
-    half = np.array([NORMAL_95 * quantity.std / quantity.before_std for quantity in quantities])
+    scaled_change = (result.posterior.parameters - result.problem.before.parameters) / result.problem.prior.std
+    centre = np.array([quantity.weights @ scaled_change / quantity.before_std for quantity in quantities])
+    half_width = np.array([NORMAL_95 * quantity.std / quantity.before_std for quantity in quantities])
     row = np.arange(len(quantities))
-    identified = np.array([quantity.identified for quantity in quantities])
+    is_identified = np.array([quantity.identified for quantity in quantities])
     axes.barh(row, 4.0, left=-2.0, color=ASSUMED, height=0.72, label="assumed before, 95 %")
-    for some, colour, label in (
-        (identified, FITTED, "identified by the presses, 95 %"),
-        (~identified, INK, "not identified"),
+    for chosen, colour, label in (
+        (is_identified, FITTED, "identified by the presses, 95 %"),
+        (~is_identified, INK, "not identified"),
     ):
-        axes.errorbar(centre[some], row[some], xerr=half[some], fmt="w|", ecolor=colour, elinewidth=5, label=label)
-    for number, quantity in enumerate(quantities):
-        text = f"{quantity.value:.3g} ± {quantity.std:.2g}"
-        axes.annotate(text, (4.2, number), va="center", fontsize=8, annotation_clip=False)
+        axes.errorbar(
+            centre[chosen], row[chosen], xerr=half_width[chosen], fmt="w|", ecolor=colour, elinewidth=5, label=label
+        )
+    for index, quantity in enumerate(quantities):
+        value_text = f"{quantity.value:.3g} ± {quantity.std:.2g}"
+        axes.annotate(value_text, (4.2, index), va="center", fontsize=8, annotation_clip=False)
     axes.set(
-        title="what the presses tell",
-        xlabel="from what was assumed, in its standard deviations",
+        title="quantities that the presses determine",
+        xlabel="difference from the assumed value, in its standard deviations",
         xlim=(-4.0, 4.0),
         yticks=row,
         yticklabels=[quantity.name for quantity in quantities],
@@ -91,6 +116,12 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
 
 
 def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
+    """Draw the residual of each press as a bar, relative to its expected size. Excluded presses are red.
+
+    Args:
+        axes: Axes of matplotlib.
+        result: The calibration.
+    """
     posterior = result.posterior
     lines = result.presses.lines
     residual = np.sqrt(posterior.chi2 / np.maximum(posterior.degrees_of_freedom, 1.0))
@@ -99,9 +130,9 @@ def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
     axes.axhline(1.0, color=INK, lw=0.8, ls="--")
     ticks = np.arange(0, len(lines), max(1, len(lines) // 20))
     axes.set(
-        title="how well the film fits",
+        title="residuals of the presses",
         xlabel=f"{result.presses.row_noun} of the press",
-        ylabel="residual over what noise and rig explain",
+        ylabel="residual, relative to its expected size",
         xticks=ticks,
         xticklabels=[lines[tick] for tick in ticks],
     )

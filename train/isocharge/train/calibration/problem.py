@@ -104,11 +104,11 @@ class FilmEstimate:
         return self.joint if self.coefficients.size else self.covariance
 
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> "FilmEstimate":
-        """Return the estimate after the film may have drifted (`DRIFT`).
+        """Return the estimate for a later time, whose covariance contains a possible drift of the film (`DRIFT`).
 
         Args:
-            prior: The films.
-            knows_temperature: Whether temperatures are known since as well.
+            prior: Distribution of the films.
+            knows_temperature: Whether the temperature at the later time is known.
         """
         drift_std = np.array([DRIFT.get(name.partition(" ")[0], REMOUNTED) for name in prior.names])
         if knows_temperature and self.warming is not None:
@@ -122,12 +122,17 @@ class FilmEstimate:
         return FilmEstimate(parameters, covariance, self.coefficients, joint, self.warming)
 
     def at_temperature(self, at_C: float, prior: FilmPrior) -> "FilmEstimate":
-        """Return the film at another temperature, a linear map of the estimate: there and back is the same film.
+        """Return the estimate of the film at another temperature.
 
-        Without `warming` the temperature of the estimate is unknown, and the estimate stays as it is.
+        Only the pretension changes with the temperature. The change is linear, so that the opposite change restores the
+        estimate. If `warming` is None, the temperature of the estimate is unknown, and the estimate is not changed.
+
+        Args:
+            at_C: The other temperature, degrees Celsius.
+            prior: Distribution of the films.
 
         Raises:
-            PressError: If the films do not reach so far.
+            PressError: If the pretension would be outside the bounds of the films.
         """
         if self.warming is None:
             return self
@@ -141,16 +146,17 @@ class FilmEstimate:
                 f"at {at_C:g} C the pretension would be {parameters[pretension]:.2f} MPa; expected {lower:g} to "
                 f"{upper:g} MPa: a temperature nearer to that of the presses"
             )
+        # Covariance of the unknowns after adding the warming to the pretension, first in its row, then in its column
         scaled_change = change_K / prior.std[pretension]
         covariance = self.unknown_covariance.copy()
         warming_covariance = self.warming.covariance.copy()
         covariance[pretension] += scaled_change * warming_covariance
         warming_covariance[pretension] += scaled_change * self.warming.std**2
         covariance[:, pretension] += scaled_change * warming_covariance
-        count = len(parameters)
+        n_parameter = len(parameters)
         return FilmEstimate(
             parameters=parameters,
-            covariance=covariance[:count, :count],
+            covariance=covariance[:n_parameter, :n_parameter],
             coefficients=self.coefficients,
             joint=covariance if self.joint.size else self.joint,
             warming=self.warming._replace(at_C=at_C, covariance=warming_covariance),
@@ -237,17 +243,19 @@ class CalibrationProblem:
             release: Whether the network will be released. Only such a network learns correlations and gets presses
                 for measuring its errors.
         """
-        about: dict[str, Any] = {} if release else {"correlation": False, "n_test": 0}
-        described = self.charges.forward_map(parameters)
-        own = self.films.forward_map(parameters)
+        options: dict[str, Any] = {} if release else {"correlation": False, "n_test": 0}
+        sensor_map = self.charges.forward_map(parameters)
+        network_map = self.films.forward_map(parameters)
 
-        def over_own(contact: Array) -> Array:
+        def charge_factor(contact: Array) -> Array:
+            """Return the charges of the film over those for which the network was trained, shape (n, n_electrode)."""
             if self.prior is self.films.prior:
                 return factor(contact)
-            return np.asarray(factor(contact) * described.charges(contact) / own.charges(contact))
+            electrode_factor = sensor_map.charges(contact) / network_map.charges(contact)
+            return np.asarray(factor(contact) * electrode_factor)
 
-        fitted = self.films.film(parameters, added_variance=added_variance, charge_factor=over_own, **about)
-        return replace(fitted, sensor=described.sensor)
+        fitted = self.films.film(parameters, added_variance=added_variance, charge_factor=charge_factor, **options)
+        return replace(fitted, sensor=sensor_map.sensor)
 
     @property
     def domain(self) -> Domain:
@@ -303,6 +311,9 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
         probe: The probe. Its radius must be within the spread of the films.
         models: Folder of models that is searched first.
 
+    Returns:
+        The first network that fits.
+
     Raises:
         ModelError: If no network was trained for this layout; the message says how to train one.
     """
@@ -314,11 +325,14 @@ def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> Film
         except SensorError as error:
             reasons.append(f"{folder.parent.name}: {error}")
             continue
-        low, high = films.prior.bounds
-        outside = np.array(films.prior.names)[(parameters < low) | (parameters > high)]
-        if not outside.size:
+        lower, upper = films.prior.bounds
+        is_outside = (parameters < lower) | (parameters > upper)
+        if not is_outside.any():
             return films
-        reasons.append(f"{folder.parent.name}: {', '.join(outside)}: farther from its films than it was trained for")
+        outside_names = np.array(films.prior.names)[is_outside]
+        reasons.append(
+            f"{folder.parent.name}: {', '.join(outside_names)}: farther from its films than it was trained for"
+        )
     raise ModelError(
         f"no network for all films fits the sensor {sensor.name!r} under {probe.notation} "
         f"({'; '.join(reasons) or 'none is installed'}); train one first, once for a layout: "
