@@ -1,4 +1,4 @@
-"""Starts the Triton of the wheel `nvidia-pytriton` on a folder of models, with the backend `onnxruntime` beside.
+"""Starts Triton from the wheel `nvidia-pytriton` for a folder of models, with the backend `onnxruntime` of this folder.
 
     python serve/deploy/triton/start.py models --port 8000
 
@@ -16,46 +16,77 @@ HERE = Path(__file__).parent
 
 
 def backends(pytriton: Path) -> Path:
-    """A folder of backends in this environment: that of the wheel for Python, with the stub for this one, and ours."""
+    """Create the folder of backends in this environment, and return it.
+
+    It contains the Python backend of the wheel, the stub that starts the Python of this environment, and the backend
+    `onnxruntime` of this folder.
+
+    Args:
+        pytriton: Folder of the installed package `pytriton`.
+    """
     folder = Path(sys.prefix) / "triton-backends"
     shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree(pytriton / "tritonserver/backends/python", folder / "python")  # Triton follows no link out of it
+    shutil.copytree(pytriton / "tritonserver/backends/python", folder / "python")  # Triton does not follow links
     stub = pytriton / "tritonserver/python_backend_stubs" / "{}.{}".format(*sys.version_info)
     shutil.copy2(stub / "triton_python_backend_stub", folder / "python")
     shutil.copytree(HERE / "onnxruntime", folder / "onnxruntime")
     return folder
 
 
+def server_command(pytriton: Path, options: argparse.Namespace) -> list[str]:
+    """Return the command that starts Triton.
+
+    Args:
+        pytriton: Folder of the installed package `pytriton`.
+        options: Options of the command line.
+    """
+    command = [
+        str(pytriton / "tritonserver/bin/tritonserver"),
+        f"--model-repository={options.models.resolve()}",
+        f"--backend-directory={backends(pytriton)}",
+        f"--http-address={options.host}",
+        f"--http-port={options.port}",
+        "--allow-metrics=false",
+    ]
+    if options.grpc_port is None:
+        command.append("--allow-grpc=false")
+    else:
+        command += [f"--grpc-address={options.host}", f"--grpc-port={options.grpc_port}"]
+    return command
+
+
+def server_environment(pytriton: Path) -> dict[str, str]:
+    """Return the environment variables of this process, with the folders of Triton first in the search paths.
+
+    Args:
+        pytriton: Folder of the installed package `pytriton`.
+    """
+    first_folders = {
+        "LD_LIBRARY_PATH": pytriton.parent / "nvidia_pytriton.libs",
+        "PATH": Path(sys.executable).parent,  # the stub of the Python backend starts the Python that it finds here
+        "PYTHONPATH": pytriton.parent,
+    }
+    environment = dict(os.environ)
+    for name, folder in first_folders.items():
+        others = os.environ.get(name)
+        environment[name] = f"{folder}:{others}" if others else str(folder)
+    return environment
+
+
 def main() -> None:
+    """Replace this process by Triton."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", type=Path, help="folder of models: NAME/config.pbtxt, NAME/VERSION/model.onnx")
     parser.add_argument("--host", default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=8000, help="of HTTP")
-    parser.add_argument("--grpc-port", type=int, help="of gRPC (default: no gRPC)")
-    asked = parser.parse_args()
+    parser.add_argument("--port", type=int, default=8000, help="port of HTTP")
+    parser.add_argument("--grpc-port", type=int, help="port of gRPC (default: no gRPC)")
+    options = parser.parse_args()
     package = importlib.util.find_spec("pytriton")
     if package is None or package.origin is None:
         sys.exit("this needs pytriton: pip install nvidia-pytriton onnxruntime, in an environment of its own")
     pytriton = Path(package.origin).parent
-    words = [
-        str(pytriton / "tritonserver/bin/tritonserver"),
-        f"--model-repository={asked.models.resolve()}",
-        f"--backend-directory={backends(pytriton)}",
-        f"--http-address={asked.host}",
-        f"--http-port={asked.port}",
-        "--allow-metrics=false",
-        *(["--allow-grpc=false"] if asked.grpc_port is None else []),
-        *([] if asked.grpc_port is None else [f"--grpc-address={asked.host}", f"--grpc-port={asked.grpc_port}"]),
-    ]
-    paths = {
-        "LD_LIBRARY_PATH": pytriton.parent / "nvidia_pytriton.libs",
-        "PATH": Path(sys.executable).parent,  # the stub takes its Python from here
-        "PYTHONPATH": pytriton.parent,
-    }
-    environment = {
-        name: f"{path}:{os.environ[name]}" if os.environ.get(name) else f"{path}" for name, path in paths.items()
-    }
-    os.execve(words[0], words, os.environ | environment)
+    command = server_command(pytriton, options)
+    os.execve(command[0], command, server_environment(pytriton))
 
 
 if __name__ == "__main__":
