@@ -116,21 +116,26 @@ def design_command(
 
 
 def _table(found: Design) -> str:
-    """Format the electrode positions and the errors before and after."""
-    rows = []
+    """Return a table of the electrode positions, and of the errors before and after the design.
+
+    Args:
+        found: Result of the design. It has no errors before the design if the initial sensor has fewer than three
+            electrodes.
+    """
+    lines = []
     for electrode in found.sensor.electrodes:
         x, y = electrode.centre
-        rows.append(f"{electrode.name:<10} {x:9.3f} {y:9.3f} mm")
-    rows.append("position error limit, mm     worst      rms")
+        lines.append(f"{electrode.name:<10} {x:9.3f} {y:9.3f} mm")
+    lines.append("position error limit, mm     worst      rms")
     for name, errors in (("before", found.before), ("after", found.after)):
         if errors is None:
             continue
-        for level, values in errors.to_dict().items():
-            title = f"{name}, {level.replace('_', ' ')}"
-            worst = _error_text(values["worst_mm"], found.case.radius)
-            rms = _error_text(values["rms_mm"], found.case.radius)
-            rows.append(f"{title:<26} {worst:>7} {rms:>8}")
-    return "\n".join(rows)
+        for condition, statistics in errors.to_dict().items():
+            title = f"{name}, {condition.replace('_', ' ')}"
+            worst = _error_text(statistics["worst_mm"], found.case.radius)
+            rms = _error_text(statistics["rms_mm"], found.case.radius)
+            lines.append(f"{title:<26} {worst:>7} {rms:>8}")
+    return "\n".join(lines)
 
 
 def _error_text(error: float, radius: float) -> str:

@@ -84,13 +84,20 @@ def identify_command(
 
 
 def _table(numbers: dict[str, Any]) -> str:
-    """Format the error statistics within the working area as a table."""
-    area = numbers["working_area"]
-    head = f"within {area['radius_mm']:g} mm    position, mm: median    rms  worst    force, %: median    rms  worst"
-    rows = [
-        f"{row['force_N']:8g} N {row['position_median_mm']:25.3f} {row['position_rms_mm']:6.3f} "
-        f"{row['position_worst_mm']:6.3f} {row['force_median_percent']:18.2f} {row['force_rms_percent']:6.2f} "
-        f"{row['force_worst_percent']:6.2f}"
-        for row in numbers["limits_in_working_area"]
-    ]
-    return "\n".join([head, *rows])
+    """Return the error statistics within the working area as a table with one line for each force.
+
+    Args:
+        numbers: Result of `Identification.to_dict`.
+    """
+    radius_mm = numbers["working_area"]["radius_mm"]
+    lines = [f"within {radius_mm:g} mm    position, mm: median    rms  worst    force, %: median    rms  worst"]
+    for limits in numbers["limits_in_working_area"]:
+        position_text = (
+            f"{limits['position_median_mm']:25.3f} {limits['position_rms_mm']:6.3f} {limits['position_worst_mm']:6.3f}"
+        )
+        force_text = (
+            f"{limits['force_median_percent']:18.2f} {limits['force_rms_percent']:6.2f} "
+            f"{limits['force_worst_percent']:6.2f}"
+        )
+        lines.append(f"{limits['force_N']:8g} N {position_text} {force_text}")
+    return "\n".join(lines)

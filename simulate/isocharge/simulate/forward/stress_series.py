@@ -102,13 +102,25 @@ def _automorphism(distance: float, probe_radius: float) -> tuple[float, float]:
 
 
 def _stress_sum(forward_map: ForwardMap, distance_mm: float, force_N: float, points_mm: Complexes) -> Array:
-    """Compute s11 + s22 at points x + iy under a press on the x axis, MPa."""
-    count = points_mm.size
+    """Compute the sum s11 + s22 of the stresses under a press on the x axis.
+
+    Args:
+        forward_map: Forward map of the film.
+        distance_mm: Distance of the press from the centre, mm.
+        force_N: Force of the press, N.
+        points_mm: Points x + iy, any shape, mm.
+
+    Returns:
+        Sum of the stresses, of the shape of `points_mm`, MPa.
+    """
+    # The charge of an "electrode" with one point and these weights is the sum of the stresses.
+    n_point = points_mm.size
     points = np.stack([points_mm.real.ravel(), points_mm.imag.ravel()], axis=1)
-    weights = np.tile([1.0, 1.0, 0.0], (count, 1, 1))
-    readout = ReadoutPoints(points[:, None], weights, np.ones(count, dtype=int))
-    stress = forward_map.field_charges(np.array([[distance_mm, 0.0, force_N]]), EVEN_FIELD, readout)
-    return np.asarray(stress[0, :, 0].reshape(points_mm.shape))
+    weights = np.tile([1.0, 1.0, 0.0], (n_point, 1, 1))
+    readout = ReadoutPoints(points[:, None], weights, np.ones(n_point, dtype=int))
+    contact = np.array([[distance_mm, 0.0, force_N]])
+    stress_sum = forward_map.field_charges(contact, EVEN_FIELD, readout)
+    return np.asarray(stress_sum[0, :, 0].reshape(points_mm.shape))
 
 
 def _coefficients(values: Array) -> Array:

@@ -73,10 +73,21 @@ class BackPressure:
         return self._copies * float(self.weights @ deflection)
 
     def _air_energy(self, deflection: Array) -> float:
-        """Compute the energy of the air over p0 V0, which is -ln(1 - x) - x for the compression x."""
+        """Compute the energy of the air over p0 V0, which is -ln(1 - x) - x for the compression x.
+
+        Args:
+            deflection: W at the nodes, shape (n_node,).
+
+        Returns:
+            Energy, dimensionless; infinite if no air remains.
+        """
         x = self.groups.compression * self._volume(deflection)
         if x >= 1.0:
             return np.inf
         if abs(x) < SERIES_BELOW:
-            return x**2 * (1.0 / 2.0 + x * (1.0 / 3.0 + x * (1.0 / 4.0 + x * (1.0 / 5.0 + x / 6.0))))
+            # Taylor series x^2 / 2 + x^3 / 3 + ..., evaluated by Horner's scheme
+            series = 1.0 / 6.0
+            for exponent in (5.0, 4.0, 3.0, 2.0):
+                series = 1.0 / exponent + x * series
+            return x**2 * series
         return float(-np.log1p(-x) - x)

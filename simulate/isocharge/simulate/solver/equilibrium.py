@@ -150,7 +150,15 @@ def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array
 
 
 def _induced_stress(equilibrium: Equilibrium, surface: Surface) -> Array:
-    """Compute the scaled stress that all loads add to the pretension; see `nodal_stress`."""
+    """Compute the scaled stress that all loads add to the pretension.
+
+    Args:
+        equilibrium: The solved press.
+        surface: Surface in the thickness; see `touch_stress`.
+
+    Returns:
+        (S11, S22, S12) at the nodes in units of E_young A^2, shape (n_element, n_local, 3).
+    """
     slope = node_slope(equilibrium)
     strained = strain(slope, equilibrium.groups.amplitude2)
     if surface != "middle":

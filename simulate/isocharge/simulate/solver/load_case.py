@@ -251,17 +251,25 @@ def place_coated(
         resolution: Fineness of the mesh.
         layer: Width of the thin rings at the rim, in film radii.
         whole: Whether to mesh the whole film although film and footprint are symmetric.
+
+    Returns:
+        The mesh, in film radii and rotated with the press.
     """
     mesh = place(film, probe, at, resolution, layer, whole=whole)
     if film.coat is None:
         return mesh
-    angle = float(np.arctan2(at[1], at[0]))
+    x, y = at
+    angle = float(np.arctan2(y, x))
     rotation_and_scale = np.exp(-1j * angle) / film.radius
     coat_layers = tuple(
         tuple(to_complex(np.array(part)) * rotation_and_scale for part in coat_layer) for coat_layer in film.coat.layers
     )
-    film_moduli = scaled_stress(np.eye(3), DimensionlessGroups.of(film, 1.0, bending=False, angle=angle))
-    coat_moduli = film.coat.stiffness / (film.young * film.thickness) * stress(np.eye(3), film.poisson)
+
+    # The stresses of the three unit strains are the columns of an elasticity matrix, here over E of the film.
+    unit_strains = np.eye(3)
+    film_moduli = scaled_stress(unit_strains, DimensionlessGroups.of(film, 1.0, bending=False, angle=angle))
+    stiffness_ratio = film.coat.stiffness / (film.young * film.thickness)
+    coat_moduli = stiffness_ratio * stress(unit_strains, film.poisson)
     return coated(mesh, coat_layers, film_moduli, coat_moduli)
 
 
@@ -270,6 +278,13 @@ def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSetting
 
     The width is six bending lengths. If the starting equilibrium has the same mesh and a similar width, its width is
     reused, so that its field can be the first iterate.
+
+    Args:
+        film: The film.
+        force: Force, N.
+        probe: The probe.
+        settings: Settings of the solver.
+        start: Mesh of the starting equilibrium; None if there is none.
     """
     layer = layer_for(film, force)
     if start is None or not MIN_LAYER_REUSE < start.layer / layer < MAX_LAYER_REUSE:

@@ -246,9 +246,19 @@ def _solve_nonlinear(
 
     The first iterate is the field of the starting equilibrium if it has the same mesh, or else the field of Schwerin.
     If Newton's method fails, the load is applied in steps.
+
+    Args:
+        case: The press and its tolerance.
+        elastic: The discrete film.
+        solver: Linear solver for the mesh.
+        mesh: The mesh.
+        start: Equilibrium of a similar press; None if there is none.
+
+    Returns:
+        The result, which may not have converged.
     """
-    z = mesh.placement.to_template(from_oval(mesh.node_points, mesh.oval))
-    schwerin_field = schwerin_start(z, float(mesh.placement.rho), elastic.groups)
+    template_points = mesh.placement.to_template(from_oval(mesh.node_points, mesh.oval))
+    schwerin_field = schwerin_start(template_points, float(mesh.placement.rho), elastic.groups)
     if elastic.groups.static_pressure != 0.0:
         schwerin_field += _static_start(mesh, elastic.groups)
     result = solve_newton(elastic, solver, _start_field(start, mesh.template, schwerin_field), case.tolerance)

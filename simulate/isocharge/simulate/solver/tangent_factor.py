@@ -57,14 +57,20 @@ def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, guard
         assembly: Linear solver for its mesh.
         field: Scaled displacements, shape (n_node, 3).
         guard: Additional tension; see `ElasticFilm.tangent`.
+
+    Returns:
+        Factorisation of the tangent, including the stiffness of the trapped air.
     """
-    factor = assembly.factor(elastic.tangent(field, guard))
-    if elastic.back is None or elastic.groups.compression == 0.0 or assembly.odd:
-        return factor
+    film_factor = assembly.factor(elastic.tangent(field, guard))
+    has_air = elastic.back is not None and elastic.groups.compression != 0.0
+    if elastic.back is None or not has_air or assembly.odd:
+        return film_factor
+
+    # The stiffness of the air is c v v', so that the formula of Sherman and Morrison gives the inverse.
     weights = elastic.back.weights
     uniform_pressure = np.zeros_like(field)
     uniform_pressure[:, 2] = weights
-    response = factor.solve(uniform_pressure)
-    stiffness = elastic.back.stiffness(field[:, 2])
-    share = stiffness / (1.0 + stiffness * float(weights @ response[:, 2]))
-    return _AirFactor(factor, weights, response, share)
+    response = film_factor.solve(uniform_pressure)
+    air_stiffness = elastic.back.stiffness(field[:, 2])
+    share = air_stiffness / (1.0 + air_stiffness * float(weights @ response[:, 2]))
+    return _AirFactor(film_factor, weights, response, share)

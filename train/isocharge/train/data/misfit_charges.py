@@ -72,21 +72,36 @@ def draw_misfit_examples(
 def _residuals(
     charge_map: ChargeMap, charge: Array, sigma: Array, chosen: LabelledPresses, near: Booleans, candidates: int
 ) -> Array:
-    """Return the residuals of charges at the nearest contact, in units of their noise, shape (n, n_electrode).
+    """Compute the residuals of charges at the nearest contact.
 
-    Charges that are `near` to those of their own press are compared with contacts around it. The charge map is scaled
-    so that it is exact at this press. For all other charges the nearest contact is searched.
+    Charges that are similar to those of the press from which they were made are compared with contacts near this press.
+    The charge map is scaled so that it is exact at this press. For all other charges, the nearest contact is searched
+    for among many candidates.
+
+    Args:
+        charge_map: Map from contacts to charges.
+        charge: Charges, shape (n, n_electrode), pC.
+        sigma: Standard deviations of the noise of these charges, same shape, pC.
+        chosen: Presses from which the charges were made.
+        near: Whether each of the charges is similar to those of its press, shape (n,).
+        candidates: Number of candidates of a search.
+
+    Returns:
+        Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
     """
     residual = np.zeros_like(charge)
     near_rows = np.flatnonzero(near)
     start = chosen.contact[near_rows]
-    scale = np.clip(chosen.charge[near_rows] / charge_map.charges(start), 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
-    _, residual[near_rows] = explain(charge_map, charge[near_rows] / scale, sigma[near_rows] / scale, start)
-    far_rows = np.flatnonzero(~near | (np.linalg.norm(residual, axis=1) > FAR))
-    _, searched = search(charge_map, charge[far_rows], sigma[far_rows], candidates=candidates)
-    is_smaller = (residual[far_rows] ** 2).sum(axis=1) < (searched**2).sum(axis=1)
-    keep = near[far_rows] & is_smaller
-    residual[far_rows] = np.where(keep[:, None], residual[far_rows], searched)
+    map_factor = np.clip(chosen.charge[near_rows] / charge_map.charges(start), 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
+    _, residual[near_rows] = explain(charge_map, charge[near_rows] / map_factor, sigma[near_rows] / map_factor, start)
+
+    # A large residual near the press may be a local minimum, so a search is made for these charges, too.
+    searched_rows = np.flatnonzero(~near | (np.linalg.norm(residual, axis=1) > FAR))
+    _, searched_residual = search(charge_map, charge[searched_rows], sigma[searched_rows], candidates=candidates)
+    near_residual = residual[searched_rows]
+    is_near_smaller = (near_residual**2).sum(axis=1) < (searched_residual**2).sum(axis=1)
+    use_near = near[searched_rows] & is_near_smaller
+    residual[searched_rows] = np.where(use_near[:, None], near_residual, searched_residual)
     return residual
 
 
@@ -111,34 +126,99 @@ def draw_charges(rng: np.random.Generator, charge: Array, others: Array, noise: 
 
 
 def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noise: Noise) -> Array:
-    """Draw charges of one kind, shape (n, n_electrode), pC.
+    """Draw charges of one kind.
 
-    Charges of any sign are moved and fill the box in units of their noise, positive charges in logarithms.
+    Args:
+        kind: Name of the kind; see `KINDS`.
+        rng: Random number generator.
+        charge: Charges of presses, shape (n, n_electrode), pC.
+        others: Charges of further presses, shape (m, n_electrode), pC.
+        noise: Noise of good presses.
+
+    Returns:
+        Charges of the kind, shape (n, n_electrode), pC.
     """
-    each = (len(charge), 1)
     match kind:
-        case "moved" if isinstance(noise, ChannelNoise):
-            far = 10.0 ** rng.uniform(-1.0, FARTHEST, each)
-            return noise.charge(noise.level(charge) + far * rng.standard_normal(charge.shape))
-        case "any" if isinstance(noise, ChannelNoise):
-            level = noise.level(others)
-            low, high = level.min(axis=0), level.max(axis=0)
-            return noise.charge(rng.uniform(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, charge.shape))
         case "noisy":
             return noise.add(charge, rng)
-        case "moved":  # in any direction, by a thousandth up to a factor of seven
-            factor = np.exp(10.0 ** rng.uniform(-3.0, 0.3, each) * rng.standard_normal(charge.shape))
-        case "gains":  # half of the electrodes off by 15 %
-            factor = np.exp(0.15 * (rng.random(charge.shape) < 0.5) * rng.standard_normal(charge.shape))
-        case "dying":  # one electrode keeps a share of its charge, down to a thousandth
-            dead = rng.integers(charge.shape[1], size=each) == np.arange(charge.shape[1])
-            factor = np.where(dead, 10.0 ** rng.uniform(-3.0, 0.0, each), 1.0)
-        case "scaled":  # all by a common factor from a hundredth to a hundred, and a little each
-            charge = charge * 10.0 ** rng.uniform(-2.0, 2.0, each)
-            factor = np.exp(0.05 * rng.standard_normal(charge.shape))
+        case "moved":
+            return _moved_charges(rng, charge, noise)
+        case "gains":
+            return charge * _wrong_gains(rng, charge.shape)
+        case "dying":
+            return charge * _failing_gains(rng, charge.shape)
+        case "scaled":
+            return charge * _common_factors(rng, charge.shape)
         case "two":
             return charge + others[rng.integers(len(others), size=len(charge))]
-        case _:  # uniform in logarithms, from what counts as nothing to 10 nC or to what counts as most
-            decades = np.where(rng.random(each) < 0.3, np.log10(HIGHEST_CHARGE), 4.0)
-            return 10.0 ** (decades * rng.random(charge.shape))
-    return charge * factor
+        case _:
+            return _any_charges(rng, charge.shape, others, noise)
+
+
+def _moved_charges(rng: np.random.Generator, charge: Array, noise: Noise) -> Array:
+    """Move charges in random directions by random distances.
+
+    Charges of any sign are moved by up to 10^FARTHEST standard deviations of their noise. Positive charges are changed
+    by factors of which the logarithms are normally distributed, from a thousandth up to a factor of about seven.
+
+    Args:
+        rng: Random number generator.
+        charge: Charges, shape (n, n_electrode), pC.
+        noise: Noise of good presses; a `ChannelNoise` for charges of any sign.
+
+    Returns:
+        Moved charges, same shape, pC.
+    """
+    one_per_press = (len(charge), 1)
+    if isinstance(noise, ChannelNoise):
+        distance = 10.0 ** rng.uniform(-1.0, FARTHEST, one_per_press)
+        return noise.charge(noise.level(charge) + distance * rng.standard_normal(charge.shape))
+    distance = 10.0 ** rng.uniform(-3.0, 0.3, one_per_press)
+    return np.asarray(charge * np.exp(distance * rng.standard_normal(charge.shape)))
+
+
+def _wrong_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Draw gains of which about half are wrong by 15 % (standard deviation), shape (n, n_electrode)."""
+    is_wrong = rng.random(shape) < 0.5
+    return np.exp(0.15 * is_wrong * rng.standard_normal(shape))
+
+
+def _failing_gains(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Draw gains that are 1 for all electrodes but one, whose gain is between 0.001 and 1, shape (n, n_electrode)."""
+    n_press, n_electrode = shape
+    is_failing = rng.integers(n_electrode, size=(n_press, 1)) == np.arange(n_electrode)
+    failing_gain = 10.0 ** rng.uniform(-3.0, 0.0, (n_press, 1))
+    return np.where(is_failing, failing_gain, 1.0)
+
+
+def _common_factors(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Draw factors from 0.01 to 100 that are nearly equal for all electrodes of a press, shape (n, n_electrode)."""
+    n_press, _ = shape
+    common_factor = 10.0 ** rng.uniform(-2.0, 2.0, (n_press, 1))
+    return np.asarray(common_factor * np.exp(0.05 * rng.standard_normal(shape)))
+
+
+def _any_charges(rng: np.random.Generator, shape: tuple[int, ...], others: Array, noise: Noise) -> Array:
+    """Draw charges from a box that contains the charges of all presses.
+
+    Charges of any sign are uniformly distributed in units of their noise. The logarithms of positive charges are
+    uniformly distributed, from 1 pC to 10 nC or, for some presses, to the largest charge of the network.
+
+    Args:
+        rng: Random number generator.
+        shape: Shape (n, n_electrode) of the charges.
+        others: Charges of presses, which determine the box for charges of any sign, shape (m, n_electrode), pC.
+        noise: Noise of good presses; a `ChannelNoise` for charges of any sign.
+
+    Returns:
+        Charges, shape (n, n_electrode), pC.
+    """
+    if isinstance(noise, ChannelNoise):
+        level = noise.level(others)
+        lowest = level.min(axis=0)
+        highest = level.max(axis=0)
+        margin = 0.5 * (highest - lowest)
+        return noise.charge(rng.uniform(lowest - margin, highest + margin, shape))
+    n_press, _ = shape
+    largest_decade = np.where(rng.random((n_press, 1)) < 0.3, np.log10(HIGHEST_CHARGE), 4.0)
+    return 10.0 ** (largest_decade * rng.random(shape))
