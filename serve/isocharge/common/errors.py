@@ -1,4 +1,4 @@
-"""The exceptions of isocharge. Each also inherits from the built-in exception that fits it.
+"""The exceptions of isocharge. Each class also inherits from the built-in exception with the most similar meaning.
 
 A message states what was expected, what was given, where, and what to do. The command line maps the exceptions to exit
 codes in `isocharge.cli.main` (2 for wrong input, 1 for everything else), the servers map them to HTTP and gRPC statuses

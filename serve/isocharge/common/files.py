@@ -228,7 +228,10 @@ def as_output_errors(path: Path, advice: str = "choose another output") -> Itera
 
 
 def remove_empty(folders: Iterable[Path]) -> None:
-    """Remove those of the folders that are empty. Inner folders must come before outer folders."""
+    """Remove the folders that are empty, and leave all other folders unchanged.
+
+    Inner folders must come before outer folders.
+    """
     for folder in folders:
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()

@@ -73,7 +73,9 @@ MAX_NAME_CHARACTERS = 1_000
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPresses:
-    """n presses. Two objects are equal if their numbers and electrodes are equal, whatever lines they come from.
+    """Charges and contacts of n measured presses.
+
+    Two objects are equal if their numbers and electrodes are equal, even if they come from different lines of a file.
 
     Attributes:
         contact: x_mm, y_mm, force_N, shape (n, 3); NaN if unknown. x and y are known both or not at all.
@@ -125,7 +127,7 @@ class MeasuredPresses:
 
     @property
     def placed(self) -> Booleans:
-        """Presses of which position and force are known, shape (n,)."""
+        """Whether both the position and the force of each press are known, shape (n,)."""
         return np.asarray(np.isfinite(self.contact).all(axis=1))
 
     @property
@@ -192,7 +194,7 @@ class MeasuredPresses:
                 raise PressError(f"{name}: expected an array of shape {shape}, got {given}")
 
     def _check_values(self) -> None:
-        """Raise PressError if a number is not allowed in its column, if only x or only y is given, or no charge is."""
+        """Raise PressError if a number is not allowed, if only one of x and y is given, or if no charge is given."""
         rules = PRESS_RULES | dict.fromkeys(self.electrodes, CHARGE_RULE)
         for name in UNCERTAINTY:
             rules[name] = replace(rules[name], may_be_empty=False)

@@ -159,7 +159,7 @@ def _check_lzma_dictionary(data: bytes, entry: zipfile.ZipInfo) -> None:
 
 
 def _unpacked(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytearray:
-    """Decompress an entry; it must not be longer than the archive declares."""
+    """Decompress an entry, and check that it is not longer than the archive declares."""
     unpacked = bytearray()
     with archive.open(entry) as file:
         while piece := file.read(READ_BYTES):

@@ -295,7 +295,7 @@ def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
 
 
 def _union_members(kind: Any) -> Iterator[Any]:
-    """Yield the members of a union without their annotations. Any other type is its own only member."""
+    """Yield the members of a union without their annotations. A type that is no union is its only member."""
     if get_origin(kind) is Annotated:
         yield from _union_members(get_args(kind)[0])
     elif get_origin(kind) in (Union, UnionType):

@@ -114,7 +114,7 @@ class WriterQueue(Generic[T]):
                 self._change.notify_all()
 
     def _next(self) -> T | None:
-        """Wait until the consumer would accept an item, and return the oldest; None if the queue is at its end."""
+        """Wait until the consumer would accept an item, and return the oldest item; None if the queue has ended."""
         while True:
             with self._change:
                 self._change.wait_for(lambda: self._waiting or self._is_closed)

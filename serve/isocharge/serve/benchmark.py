@@ -114,7 +114,7 @@ def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
 
 
 def press_charges(predictor: Predictor, golden_pC: Singles, seed: int = 0) -> Singles:
-    """Draw presses from the golden vectors of a model whose contacts have no flag.
+    """Draw charges at random from the golden vectors of a model, without presses whose contacts have flags.
 
     Args:
         predictor: The model.

@@ -1,4 +1,4 @@
-"""The words in a record's `flags`, and what each of them says."""
+"""The words in the field `flags` of a record, and the meaning of each word."""
 
 TARE = "tare"
 OUTSIDE = "outside"

@@ -1,1 +1,1 @@
-"""`isocharge demo`: the whole path once, with pictures."""
+"""The command `isocharge demo`: simulation, training, live service and pictures in one run."""

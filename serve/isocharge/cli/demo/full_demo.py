@@ -169,7 +169,7 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
 
 
 def _contact_of(record: PredictionRecord) -> tuple[float, float, float]:
-    """Return x, y (mm) and force (N) of a record; zeros for what the record does not contain."""
+    """Return x, y (mm) and force (N) of a record. A value that the record does not contain is returned as 0."""
     return record.x_mm or 0.0, record.y_mm or 0.0, record.force_N or 0.0
 
 
@@ -194,7 +194,7 @@ def _test_presses(forward_map: ForwardMap, predictor: Predictor, sweep: Sweep) -
 
 
 def _position_error(presses: Array) -> Array:
-    """Compute the distance between true and estimated position, mm, from rows that end with both (x, y, F)."""
+    """Compute the distances between true and estimated positions, mm. Each row ends with both contacts, (x, y, F)."""
     return position_error(presses[:, -3:], presses[:, -6:-3])
 
 

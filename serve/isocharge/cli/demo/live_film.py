@@ -1,4 +1,4 @@
-"""A virtual sensor on the live page, followed with the released model."""
+"""A virtual sensor on the live page, whose contacts are estimated by the released model."""
 
 from contextlib import ExitStack, closing
 

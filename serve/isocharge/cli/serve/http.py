@@ -68,7 +68,8 @@ def http_command(
     """Serve models over HTTP, and over gRPC if asked, with the Open Inference Protocol v2 of Triton and KServe.
 
     Charges are in pC, positions in mm, forces in N. Prints the address once the server answers; `/` there is a page for
-    people, `/openapi.json` for programs, `/metrics` for Prometheus. Ctrl-C stops it after the requests that have begun.
+    people, `/openapi.json` for programs, `/metrics` for Prometheus. Ctrl-C stops the server after it has answered the
+    requests that have begun.
 
     Example: isocharge serve http --port 8000
     """

@@ -1,4 +1,4 @@
-"""Where the records of `serve stream` and `serve replay` go: options, writers, and the summary at the end."""
+"""Output of the records of `serve stream` and `serve replay`: options, writers, and the summary at the end."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -90,7 +90,7 @@ def outputs_of(targets: Sequence[str] | None, touch: TouchStream, *, is_live: bo
 
 
 def say_missing_records(outputs: Outputs) -> None:
-    """Print how many records are missing in each output; the outputs are closed."""
+    """Print how many records are missing in each output. The outputs must have been closed."""
     for target, missing in outputs.not_written.items():
         if missing is not None:
             say(f"{target}: {missing} records not written, the oldest: the output was too slow")

@@ -146,7 +146,7 @@ def stream_command(
     The first 100 frames (0.5 s at 200 Hz) are the tare, the charges at rest: leave the film alone meanwhile. The signal
     SIGUSR1 starts a new tare; SIGUSR2 goes back to the film as it was calibrated; SIGHUP takes the latest version of
     MODEL, without losing a frame. Ctrl-C stops. If the reader of stdout is too slow for a sensor, the oldest lines are
-    dropped and counted in the summary; --record gets everything.
+    dropped and counted in the summary; a recording (--record) is complete.
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """
@@ -234,8 +234,8 @@ def replay_command(
 ) -> None:
     """Play a recording of raw bytes again: the same model and device give the same records, bit for bit.
 
-    --device takes the place of the recorded description of the board, if that was wrong. With --live the recording is
-    there to be played, at any speed, until Ctrl-C.
+    --device replaces the recorded description of the board, if that description was wrong. With --live, the recording
+    can be played on a page at any speed, until Ctrl-C.
 
     Example: isocharge serve replay touch.rec --real-time
     """

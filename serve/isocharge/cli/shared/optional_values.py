@@ -11,7 +11,7 @@ from typer.core import TyperCommand
 
 
 class OptionalValue(NamedTuple):
-    """How an option behaves whose value may be omitted.
+    """Description of an option whose value may be omitted.
 
     Attributes:
         default: Value of the option if the command line contains the option without a value.

@@ -11,7 +11,7 @@ from isocharge.serve.port.source import STDIN
 
 @contextmanager
 def doctor_is_named(port: str, device: Path | None) -> Iterator[None]:
-    """Add the next command to the message if the bytes of a port contain no frames.
+    """Add advice to the error message if the bytes of a port contain no frames.
 
     Args:
         port: Value of `--port`.
@@ -27,7 +27,7 @@ def doctor_is_named(port: str, device: Path | None) -> Iterator[None]:
 
 
 def no_frames_hint(port: str, device: Path | None) -> str:
-    """Return what to do about a port whose bytes contain no frames of a known format.
+    """Return advice for a port whose bytes contain no frames of a known format.
 
     Args:
         port: Value of `--port`.

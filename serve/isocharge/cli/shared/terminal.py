@@ -215,7 +215,7 @@ def this_command() -> str:
 
 @contextmanager
 def warnings_to_stderr() -> Iterator[None]:
-    """Print the warnings of all packages. Those of simulation and training begin with `caution:`."""
+    """Print the warnings of all packages. Warnings of simulation and training begin with `caution:`."""
     handler = logging.StreamHandler()
     logger = logging.getLogger("isocharge")
     handler.setFormatter(_WarningFormatter())

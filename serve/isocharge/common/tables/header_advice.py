@@ -28,7 +28,7 @@ _LABEL_AND_UNIT = re.compile(r"(.*?)(?:\s*[\[(]\s*([^\[\]()]+?)\s*[\])]|[\s_/]+(
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """How a column may be called by other programs.
+    """Names that other programs use for a column.
 
     Attributes:
         noun: What the column is, for messages: "column" or "electrode".

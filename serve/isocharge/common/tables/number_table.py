@@ -64,7 +64,7 @@ CHARGE_RULE = ColumnRule("a charge in pC", meaning=ColumnMeaning("electrode", "p
 
 @dataclass(frozen=True)
 class NumberColumns:
-    """Columns of numbers and the rows of the file that they come from.
+    """Columns of numbers, and the numbers of the rows from which they were read.
 
     Attributes:
         values: The columns by name, each of shape (n,); NaN for an empty cell.
@@ -101,7 +101,7 @@ class NumberColumns:
 
 
 def _value_text(value: float) -> str:
-    """Return a number for a message, with as many digits as it needs to be recognised."""
+    """Return a number for a message, with enough digits to recognise the number."""
     if np.isnan(value):
         return "an empty cell"
     short = f"{value:.6g}"

@@ -177,7 +177,7 @@ def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
 
 @contextmanager
 def _damage_explained(where: str, error: type[InputError]) -> Iterator[None]:
-    """Convert the errors of pyarrow in the block, which has one class for each kind of damage, to `error`."""
+    """Convert exceptions of pyarrow in the block, which differ for each kind of damage, to `error`."""
     from pyarrow import ArrowException
 
     try:

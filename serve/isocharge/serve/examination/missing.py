@@ -30,7 +30,7 @@ GAIN_REQUESTS = {
 
 @dataclass(frozen=True)
 class BoardFindings:
-    """Results of the port check from which the missing things are derived.
+    """Results of the port check from which the missing settings and properties are derived.
 
     Attributes:
         capture: The frames.
@@ -54,7 +54,7 @@ class BoardFindings:
 
 
 def missing_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield one sentence for each condition of a contact that the board does not meet."""
+    """Yield one sentence for each setting or property that the board needs for a contact and does not have."""
     capture = findings.capture
     if not capture.bytes_seen:
         yield "not one byte came: check power and cable, and whether the board sends unasked (if not: --request)"

@@ -229,7 +229,7 @@ def _touch_sentence(
 
 
 def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
-    """Return whether the film is tared with a device file.
+    """Return whether a tare of the film succeeds with the settings of a device file.
 
     The result is also true if the device file has no tare, or if there are too few frames for two tares, so that a
     missing tare proves nothing. It is false if there are no frames, or if reading the frames raises an error.

@@ -126,7 +126,7 @@ def _finite_medians(block: Array) -> Array:
 
 
 def resolution_of(column: Array) -> float:
-    """Return the standard deviation of the rounding of a channel: that of whole numbers, or 0 for other values."""
+    """Return the standard deviation of the rounding errors of a channel: 12**-0.5 for whole numbers, otherwise 0."""
     finite = column[np.isfinite(column)]
     is_whole = bool((finite == np.round(finite)).all())
     return 12.0**-0.5 if is_whole else 0.0

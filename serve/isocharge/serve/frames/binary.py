@@ -1,8 +1,8 @@
 """The binary frame of isocharge: (version u8, seq u16, t_us u32, n u8, flags u8, n x f32 pC, CRC u16), encoded by COBS.
 
 All numbers are little-endian. The CRC is CRC-16/CCITT-FALSE over everything before it. A zero byte ends each frame and
-occurs nowhere else, so a parser that has lost its place is in step again after the next zero: a damaged frame does not
-affect its neighbours.
+occurs nowhere else. After damaged bytes, the parser therefore continues with the frame that follows the next zero, and
+a damaged frame does not affect its neighbours.
 """
 
 import binascii

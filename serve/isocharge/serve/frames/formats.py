@@ -13,7 +13,7 @@ _PIECE = re.compile(rb"[^\0\n]*[\0\n]|[^\0\n]+")
 
 
 class AutoParser(Parser):
-    """Parser that recognises whether a board sends our binary frames or lines of text.
+    """Parser that recognises whether a board sends the binary frames of isocharge or lines of text.
 
     Bytes that come before the format is recognised are dropped.
 
@@ -89,7 +89,7 @@ class TextFrames(FrameSection, tag="text", frozen=True):
 
 
 class AutoFrames(TextFrames, tag="auto", frozen=True):
-    """Our binary frames or lines of text, whichever the board sends."""
+    """The binary frames of isocharge or lines of text, whichever the board sends."""
 
     def parser(self) -> Parser:
         """Create a parser."""

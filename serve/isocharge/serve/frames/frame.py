@@ -50,7 +50,10 @@ class SequenceGaps:
         self._last_seq: int | None = None
 
     def reset(self) -> None:
-        """Treat the next frame as the first one of a new connection, so that it is no gap. The counters are kept."""
+        """Treat the next frame as the first frame of a new connection, so that no gap is counted before it.
+
+        The counters are kept.
+        """
         self._last_seq = None
 
     def update(self, seq: int | None, modulus: int = SEQ_MODULUS) -> tuple[str, ...]:

@@ -152,7 +152,7 @@ class TextParser(DelimitedParser):
     def _name_columns(self, header: Line, size: int) -> list[Frame]:
         """Use the names in a header as the names of the columns, unless they have names. Return no frames.
 
-        A header that comes after the layout is known is a reset of the board, or text that is no header.
+        If a header arrives after the layout is known, the board was reset, or the line only looks like a header.
 
         Args:
             header: The header.

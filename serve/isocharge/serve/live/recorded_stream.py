@@ -59,7 +59,7 @@ class RecordedStream:
         self._requests.append(self._tare)
 
     def request_film_reset(self) -> None:
-        """Request to go back to the film as it was calibrated. It may also be called from a signal handler."""
+        """Request a reset of the followed film to its calibration. It may also be called from a signal handler."""
         self._requests.append(self._reset_film)
 
     def request_recording(self, recorder: Recorder | None) -> None:
@@ -194,7 +194,7 @@ class RecordedStream:
             self.recorder.tare()
 
     def _reset_film(self) -> None:
-        """Go back to the film as it was calibrated, and record that."""
+        """Reset the followed film to its calibration, and record the reset."""
         self._stream.reset_film()
         if self.recorder is not None:
             self.recorder.back()

@@ -77,7 +77,7 @@ class SteadyRule(NamedTuple):
 
 
 class Phase(StrEnum):
-    """What a press watch waits for, or what has just happened."""
+    """State of a press watch: what the watch waits for, or the result of the latest reading."""
 
     taring = "taring"
     lift = "lift"

@@ -1,4 +1,4 @@
-"""The stream from chunks of bytes to prediction records: readings of the charges, each with the answer of a model."""
+"""The stream from chunks of bytes to prediction records: readings of the charges, each with its contact."""
 
 import math
 import time
@@ -41,7 +41,7 @@ class Policy(StrEnum):
 
 @dataclass(slots=True)
 class StreamCounts:
-    """Counts of a stream, in addition to those of its parser and of its frame numbers.
+    """Counts of a stream that are not among the counts of its parser and of its frame numbers.
 
     Attributes:
         records: Number of records.
@@ -55,7 +55,7 @@ class StreamCounts:
 
 
 class StreamTotals(NamedTuple):
-    """All counts of a stream since its begin, across restarts; see `FrameCounts` and `SequenceGaps`."""
+    """All counts of a stream since it began, also before a restart; see `FrameCounts` and `SequenceGaps`."""
 
     frames: int = 0
     lost: int = 0
@@ -217,7 +217,7 @@ class TouchStream:
 
     @property
     def answering_predictor(self) -> Predictor:
-        """The model of the film as it is now: that of the follower where the film is followed."""
+        """The current model. If the film is followed, this is the model of the film at its estimated pretension."""
         return self._model.predictor
 
     def tare(self) -> None:
@@ -226,7 +226,7 @@ class TouchStream:
         self._discard_contact()
 
     def reset_film(self) -> None:
-        """Go back to the film as it was calibrated, where it is followed."""
+        """Reset the followed film to its calibration. If the film is not followed, nothing changes."""
         if self._film_stage is not None:
             self._film_stage.reset_film()
 
@@ -335,7 +335,7 @@ class TouchStream:
         return {name: q if math.isfinite(q) else None for name, q in zip(self._electrodes, values, strict=True)}
 
     def _misfit(self, charge_pC: Array) -> Reals:
-        """Return the misfit of the film as it is now, shape (n,), for charges of shape (n, electrodes), pC."""
+        """Return the misfits, shape (n,), of charges of shape (n, electrodes), pC, with the current model."""
         return self.answering_predictor.predict_batch(charge_pC).misfit
 
 

@@ -1,8 +1,8 @@
 """Files that belong to one `model.onnx` and lie beside it, such as `charges.npz`.
 
-`golden.json` holds the checksum of each companion file. A companion file of another model has the right format and
-would give wrong answers, so a file with another checksum, or without one, is refused. Models that were written before
-companion files had checksums are still read, with a warning in the log.
+`golden.json` holds the checksum of each companion file. A companion file of another model has the right format, but
+would give wrong contacts. Therefore a file with another checksum, or without a checksum, is refused. Models that were
+written before companion files had checksums are still read, with a warning in the log.
 """
 
 import logging

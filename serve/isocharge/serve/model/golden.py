@@ -192,7 +192,7 @@ class _Tolerance(Struct):
 
 
 class _File(Struct):
-    """The content of `golden.json`. Whether it has one output row for each press is checked when the model is read."""
+    """The content of `golden.json`. The number of rows of the outputs is checked when the model is read."""
 
     sha256: Text
     inputs: _Inputs

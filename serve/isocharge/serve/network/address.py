@@ -229,7 +229,9 @@ class Token:
 
 @dataclass(frozen=True, kw_only=True)
 class ServerLimits:
-    """Limits of one server. The defaults admit the largest batch of four electrodes as JSON with all digits.
+    """Limits of one server.
+
+    With the defaults, the largest batch of presses with four electrodes is accepted as JSON with all digits.
 
     Attributes:
         batch: Largest number of presses in one request.

@@ -7,7 +7,8 @@ and can read the answers too. Three headers that pages cannot change reveal such
 
 - `Host` is the name that the browser asked for. A rebound name is neither an IP address nor a name of this server.
 - `Origin` names the site of the page that sent the request.
-- `Sec-Fetch-Site` says whether the page belongs to the same site. Browsers send it with requests without `Origin`, too.
+- `Sec-Fetch-Site` states whether the page belongs to the same site. Browsers also send it with
+  requests without `Origin`.
 
 Programs other than browsers send neither `Origin` nor `Sec-Fetch-Site`, so only their `Host` is checked.
 """

@@ -37,7 +37,7 @@ def discard(output: Output) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class OutputContext:
-    """What an output may need to know about the stream.
+    """Properties of the stream that an output may need.
 
     Attributes:
         electrodes: Names of the electrodes, in the order of the charges.

@@ -79,7 +79,7 @@ def _load_kind(entry_point: EntryPoint) -> OutputKind:
 
 
 def _failure(target: str, error: Exception) -> OutputError:
-    """Return the error for people that stands for an unexpected one, such as one of another package."""
+    """Return the error that is shown for an unexpected exception, such as an exception in another package."""
     return OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
 
 

@@ -1,7 +1,8 @@
 """Records as UDP datagrams, one JSON object in each.
 
-The UDP server of PlotJuggler with the JSON protocol takes one object per datagram, uses its number `timestamp`, makes a
-series of every number by the path to it, as in `charge_pC/A`, and ignores nulls: it reads a record as it is.
+The UDP server of PlotJuggler with the JSON protocol can read the records without a conversion. It expects one object in
+each datagram, uses the number `timestamp`, ignores nulls, and shows a series for every other number under the path to
+the number, such as `charge_pC/A`.
 """
 
 import socket

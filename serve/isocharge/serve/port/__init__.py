@@ -1,4 +1,4 @@
-"""Where bytes come from and when: serial port, file, recording, and the device's clock.
+"""Sources of bytes and their times: serial ports, files, recordings, and the clock of the device.
 
 May import: nothing else of isocharge.serve.
 """

@@ -39,7 +39,10 @@ class ReadingTime(NamedTuple):
 
     @property
     def clock_s(self) -> float:
-        """Clock of the device if it sends one, otherwise the arrival, s. All readings of a stream use the same one."""
+        """Clock of the device if it sends one, otherwise the arrival, s.
+
+        All readings of a stream use the same clock.
+        """
         return self.host_s if self.device_us is None else self.device_us * 1e-6
 
 

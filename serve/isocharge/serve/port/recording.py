@@ -1,4 +1,4 @@
-"""Recordings: the chunks of a port and the records that came of them, a line of JSON each, written as they come.
+"""Recordings: files of the chunks of a port and of the records that were computed from them, one line of JSON each.
 
     {"isocharge_recording": 1, "model": "three/1", "policy": "every", "device": {...}, "name": "left"}
     {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
@@ -9,8 +9,8 @@
     {"marker": [timestamp, "text"]}               a moment that somebody noted
 
 Everything in a replay is recomputed except `latency_us`, which is copied from the recording because it belongs to the
-original run. So the same model gives the same records, bit for bit. Whole lines are written at once; a line that a full
-disk or a power cut left unfinished is ignored.
+original run. The same model therefore gives the same records, bit for bit. Whole lines are written at once; a line that
+a full disk or a power cut left unfinished is ignored.
 """
 
 import base64
@@ -132,7 +132,7 @@ class Recorder:
         self._write('{"tare": true}')
 
     def back(self) -> None:
-        """Write a request to go back to the film as it was calibrated."""
+        """Write a request to reset the followed film to its calibration."""
         self._write('{"back": true}')
 
     def model(self, label: str) -> None:
@@ -167,7 +167,7 @@ class Event(NamedTuple):
 
 
 class Back(NamedTuple):
-    """A request to go back to the film as it was calibrated."""
+    """A request to reset the followed film to its calibration."""
 
 
 class NewModel(NamedTuple):

@@ -197,7 +197,10 @@ class SerialLine:
         return data
 
     def _receive_by_pyserial(self, timeout_s: float) -> bytes:
-        """Wait for a byte, s, and return all bytes that have arrived, for a line without a file descriptor."""
+        """Wait up to `timeout_s` for a byte, and return all bytes that have arrived.
+
+        The line has no file descriptor.
+        """
         if timeout_s != self._serial.timeout:  # Setting the timeout costs a system call.
             self._serial.timeout = timeout_s
         data: bytes = self._serial.read(1)

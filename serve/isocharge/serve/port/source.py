@@ -1,4 +1,4 @@
-"""Sources of bytes: ports, files and the standard input. Each is a context manager and an iterator of chunks.
+"""Sources of bytes: ports, files and the standard input. Each source is a context manager and an iterator of chunks.
 
 A port is any URL that pyserial accepts: `/dev/ttyACM0`, a pseudo-terminal, `socket://host:port`, `rfc2217://host:port`
 or `loop://`. In addition, `tcp://host:port` means the same as `socket://`, and `udp://host:port` receives datagrams. On

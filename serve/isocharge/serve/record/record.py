@@ -50,7 +50,7 @@ class TrackedContact(Struct, frozen=True):
 
 
 class OtherContact(Struct, frozen=True):
-    """Another contact that explains the charges as well, while it is not known which of the two touches."""
+    """Another contact that explains the charges equally well. Which of the two contacts is real is not known yet."""
 
     x_mm: Annotated[float, Meaning("Position x.", "mm", is_shown_live=True)]
     y_mm: Annotated[float, Meaning("Position y.", "mm", is_shown_live=True)]
@@ -67,7 +67,7 @@ class FollowedFilm(Struct, frozen=True):
 
 
 class Tracking(Struct, frozen=True):
-    """What the tracking of contacts adds to a record."""
+    """Fields that the tracking of contacts adds to a record."""
 
     tracked: Annotated[
         TrackedContact | None,
@@ -88,7 +88,7 @@ NO_TRACKING = Tracking()
 
 
 class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
-    """One reading of a sensor and the answer of a model.
+    """One reading of a sensor and the contact that a model computed from the reading.
 
     The meanings and units of the fields are in their annotations; `serve/docs/record.md` shows them as a table.
     """
@@ -153,7 +153,7 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
 
     @property
     def event(self) -> str | None:
-        """What begins with this record; None if contacts are not tracked, or nothing begins."""
+        """Event that begins with this record; None if contacts are not tracked, or no event begins."""
         return None if self.tracking is None else self.tracking.event
 
     @property

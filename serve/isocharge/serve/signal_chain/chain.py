@@ -1,6 +1,6 @@
-"""The signal chain: from the numbers of a board to touch charges, and to whether something touches.
+"""The signal chain: from the numbers of a board to touch charges and the detection of a touch.
 
-`Chain` has the settings of all stages. `SignalChain` has the stages that these settings ask for, in this order:
+`Chain` has the settings of all stages. `SignalChain` has the stages that these settings request, in this order:
 
 1. gain: the device's unit to pC, with offset, sign and gain of each channel;
 2. limit: a charge at the limit of the converter;
@@ -191,6 +191,6 @@ class SignalChain:
         )
 
     def reset_tare(self) -> None:
-        """Measure the tare again from the next quiet frames, however long that takes; the hum stays known."""
+        """Measure the tare again from the next quiet frames, however long that takes. The estimate of the hum stays."""
         for stage in self.stages:
             stage.reset()

@@ -1,6 +1,6 @@
 """Compensation of the film's memory together with the leak of the amplifiers: creep, thermoelastic step and warmth.
 
-The film answers a step of the touch charge q with that step times
+A step of the touch charge q changes the charge of the film by this step times
 
     h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / warmth_s).
 
@@ -14,13 +14,14 @@ approximated by a sum of exponentials with one time constant in each decade (a P
 and is solved for q frame by frame. Here y is the output of the amplifier after the leak is compensated
 (`isocharge.serve.signal_chain.leak`), r_j is the touch charge smoothed with the time constant tau_j, and d is the
 pyroelectric charge of each electrode. The film follows the air within warmth_s, so the slope of d decays with this time
-constant. One product of a matrix with the state (r_j, d, slope of d, q) advances all of this.
+constant. The state (r_j, d, slope of d, q) is advanced by one product with a matrix.
 
 Out of contact q is 0, and d is observed. A fading-memory filter (g = 1 - f^2, h = (1 - f)^2; Brookner 1998, chapter 1)
 estimates d and its slope. During a touch both are predicted from their values of `look_back_s` before the touch.
 
-The charge that remains after a release shows how well creep and thermoelastic step are known. A Kalman filter of their
-two scale factors is updated with it, as far as it exceeds what warmth may have changed since the touch began.
+The charge that remains after a release shows how well creep and thermoelastic step are known. A Kalman filter estimates
+the two scale factors from this charge. The noise of this measurement includes the change that warmth may have caused
+since the touch began.
 """
 
 import math

@@ -61,7 +61,7 @@ class ChainFrame:
 
 
 class Stage(ABC):
-    """One stage of the signal chain. Its settings and its state are inside it."""
+    """One stage of the signal chain. The object contains the settings and the state of the stage."""
 
     @abstractmethod
     def step(self, frame: ChainFrame) -> None:

@@ -51,10 +51,10 @@ class Gain(Stage):
 
 
 class Limit(Stage):
-    """Notices charges at the limit of the converter."""
+    """Marks frames with a charge at the limit of the converter."""
 
     def __init__(self, limit_pC: float) -> None:
-        """Set the largest charge that the converter can show, pC."""
+        """Set the largest charge that the converter can represent, pC."""
         self._limit_pC = limit_pC
 
     def step(self, frame: ChainFrame) -> None:
@@ -72,11 +72,11 @@ class HumStage(Stage):
         self._hum = Hum.start(n_electrode)
 
     def step(self, frame: ChainFrame) -> None:
-        """Subtract the hum from a frame, and learn it."""
+        """Subtract the hum from a frame, and update the estimate of the hum."""
         self._hum, frame.charge_pC = remove_hum(self._rule, self._hum, frame.charge_pC, frame.t_s, frame.dt_s)
 
     def reset(self) -> None:
-        """Keep the hum, but compare the next frame with no earlier one."""
+        """Keep the estimate of the hum, but do not compare the next frame with an earlier frame."""
         self._hum = self._hum._replace(raw_pC=None)
 
 
@@ -182,7 +182,7 @@ class LeakStage(OffsetStage):
         self._leak = None
 
     def add_warming(self, change: WarmingChange) -> None:
-        """Take the warming off the touch charge that the stage integrates."""
+        """Subtract the warming from the touch charge that the stage integrates."""
         assert self._leak is not None
         self._leak = self._leak._replace(charge_pC=self._leak.charge_pC - change.charge_pC)
 
@@ -225,7 +225,7 @@ class MemoryStage(OffsetStage):
         self._report(frame)
 
     def begin_touch(self, frame: ChainFrame) -> None:
-        """Predict the warmth of the touch from before it."""
+        """Predict the warmth during a touch from its values before the touch."""
         assert self._memory is not None
         self._memory = begin_touch(self._rule, self._memory)
         self._report(frame)

@@ -1,1 +1,1 @@
-"""A contact in time: what the frames before say about where and how hard the film is touched now."""
+"""Tracking of a contact from frame to frame, which improves the estimates of its position and its force."""

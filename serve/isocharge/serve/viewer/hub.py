@@ -1,8 +1,8 @@
 """Distribution of the samples of a stream to the viewers of the live page.
 
 The tape stores the samples by number: the latest samples of a live stream, or all samples of a recording. A viewer
-confirms each message that it has drawn. Only then it receives the next message, in which all samples that arrived in
-the meantime are coalesced. No messages are queued for a slow viewer.
+confirms each message that it has drawn. It receives the next message only after this confirmation. All samples that
+arrived in the meantime are coalesced in this message. No messages are queued for a slow viewer.
 """
 
 import asyncio
@@ -86,7 +86,7 @@ class Tape:
 
 
 class RecordedTape(Tape):
-    """All samples of a recording, stored in a temporary file. Times that go back are replaced by the latest time.
+    """All samples of a recording, stored in a temporary file. Times that decrease are replaced by the latest time.
 
     Args:
         dtype: NumPy type of a sample.

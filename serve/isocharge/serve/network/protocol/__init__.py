@@ -2,7 +2,8 @@
 
 May import: network, prediction, model.
 
-HTTP (`isocharge.serve.network.http`) and gRPC (`isocharge.serve.network.grpc`) carry it; neither is imported here.
+The transports `isocharge.serve.network.http` and `isocharge.serve.network.grpc` import this package, which imports
+neither of them.
 """
 
 from isocharge.serve.network.protocol.handler import Handler

@@ -1,7 +1,7 @@
 """Answers requests of the Open Inference Protocol: method, path, headers and body in; status, headers and body out.
 
 This module knows no transport. A request may be answered from any thread. Most answers take microseconds, and the
-largest batch takes milliseconds; `may_block` returns for which paths a server should use another thread.
+largest batch takes milliseconds. The method `may_block` states for which paths a server should use another thread.
 """
 
 import re
