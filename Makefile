@@ -58,6 +58,7 @@ release: $(VENV)/installed
 	$(BIN)/isocharge train fit --sensor four-25um-uniaxial --radius auto -o models/four-25um-uniaxial
 	$(BIN)/isocharge train fit --sensor four-25um-biaxial-15mm --radius 15 -o models/four-25um-biaxial-15mm
 	$(BIN)/isocharge train fit --sensor three-25um-biaxial-12mm --radius 12 -o models/three-25um-biaxial-12mm
+	$(BIN)/isocharge train fit --sensor eight-25um-biaxial --radius 15 -o models/eight-25um-biaxial
 	$(BIN)/isocharge train fit --sensor four-25um-biaxial --films -o models/four-25um-biaxial-films
 	$(BIN)/isocharge train fit --sensor three-25um-biaxial --films -o models/three-25um-biaxial-films
 	$(BIN)/isocharge train fit --sensor four-25um-uniaxial --films --radius 7 -o models/four-25um-uniaxial-films

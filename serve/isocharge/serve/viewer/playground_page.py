@@ -19,7 +19,7 @@ from isocharge.serve.model.model_folder import find_model, load_model
 from isocharge.serve.prediction.contact import Validity
 from isocharge.serve.viewer.messages import describe_film
 
-MODELS = ("three-25um-biaxial", "four-25um-biaxial")
+MODELS = ("three-25um-biaxial", "four-25um-biaxial", "eight-25um-biaxial")
 """Names of the released models that the page shows, in the order of its buttons."""
 
 SCRIPTS = (
