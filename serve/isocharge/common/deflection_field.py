@@ -157,6 +157,7 @@ class _File(Struct):
     deflection: bytes
 
     def __post_init__(self) -> None:
+        """Check that the keys of the file fit each other; raise WrongKey for the first key that does not."""
         if set(self.film) != set(FILM_KEYS):
             raise WrongKey("film", f"the keys {', '.join(FILM_KEYS)}", list(self.film))
         for key in ("force_N", "distance_mm", "rings"):

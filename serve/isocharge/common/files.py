@@ -102,7 +102,14 @@ def refuse_existing(path: Path) -> None:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name, flush it to disk, and then rename it. An existing file is replaced."""
+    """Write a file under a temporary name, flush it to disk, and then rename it.
+
+    A reader therefore sees either the complete old file or the complete new file.
+
+    Args:
+        path: The file. An existing file is replaced.
+        data: Content of the file.
+    """
     temporary = _temporary_path(path)
     try:
         with temporary.open("wb") as file:

@@ -120,6 +120,10 @@ def finite_number(arrays: Mapping[str, np.ndarray], name: str) -> float:
 def text_item(arrays: Mapping[str, np.ndarray], name: str) -> str:
     """Return a text that a file holds as an array without dimensions.
 
+    Args:
+        arrays: Arrays of the file, by name.
+        name: Name of the array.
+
     Raises:
         ValueError: If the array is missing or is not a single text.
     """
@@ -148,7 +152,17 @@ def _checked_entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _check_lzma_dictionary(data: bytes, entry: zipfile.ZipInfo) -> None:
-    """Refuse an entry whose LZMA properties (APPNOTE.TXT of the zip format, 5.8.8) request a large dictionary."""
+    """Check that an entry that is compressed with LZMA does not request a large dictionary.
+
+    The size of the dictionary is a part of the LZMA properties (APPNOTE.TXT of the zip format, 5.8.8).
+
+    Args:
+        data: Bytes of the archive.
+        entry: The entry.
+
+    Raises:
+        ValueError: If the dictionary is too large.
+    """
     name_length, extra_length = _LOCAL_HEADER.unpack_from(data, entry.header_offset)
     start = entry.header_offset + _LOCAL_HEADER.size + name_length + extra_length
     _, _, _, dictionary_bytes = _LZMA_PROPERTIES.unpack_from(data, start)
@@ -159,7 +173,15 @@ def _check_lzma_dictionary(data: bytes, entry: zipfile.ZipInfo) -> None:
 
 
 def _unpacked(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytearray:
-    """Decompress an entry, and check that it is not longer than the archive declares."""
+    """Decompress an entry, and check that it is not longer than the archive declares.
+
+    Args:
+        archive: The archive.
+        entry: The entry.
+
+    Raises:
+        ValueError: If the entry is longer. Decompression stops at this length.
+    """
     unpacked = bytearray()
     with archive.open(entry) as file:
         while piece := file.read(READ_BYTES):
@@ -170,7 +192,15 @@ def _unpacked(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytearray:
 
 
 def _array_of(content: bytearray, name: str) -> np.ndarray:
-    """Return the array in the bytes of an npy file, without a copy of its numbers."""
+    """Return the array in the bytes of an npy file, without a copy of its numbers.
+
+    Args:
+        content: Bytes of the npy file.
+        name: Name of the array, for error messages.
+
+    Raises:
+        ValueError: If the version is not supported, the array has Python objects, or its shape does not fit the bytes.
+    """
     header = io.BytesIO(content[: MAX_HEADER_CHARACTERS + 16])
     version = np.lib.format.read_magic(header)
     if version == (1, 0):

@@ -331,7 +331,15 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
-    """Raise OutputExists if a draft belongs to a run with other settings."""
+    """Check that a draft belongs to a run with the same settings.
+
+    Args:
+        folder: Folder of the draft.
+        identity: Settings of the present run.
+
+    Raises:
+        OutputExists: If the settings differ or cannot be read.
+    """
     try:
         saved = read_json(folder / "run.json", "the settings of a run", InputError, dict[str, Any])
     except InputError as error:
@@ -347,7 +355,13 @@ def _check_same_run(folder: Path, identity: dict[str, Any]) -> None:
 
 
 def _differences(saved: Any, current: Any, name: str = "") -> Iterator[str]:
-    """Yield descriptions of the settings in which two runs differ."""
+    """Yield descriptions of the settings in which two runs differ.
+
+    Args:
+        saved: Settings of the unfinished run, or a part of them.
+        current: Settings of the present run, or the same part of them.
+        name: Name of this part; empty for all settings.
+    """
     if isinstance(saved, dict) and isinstance(current, dict):
         for key in sorted(saved.keys() | current.keys()):
             if saved.get(key) != current.get(key):

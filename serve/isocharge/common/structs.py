@@ -255,6 +255,11 @@ def _mistakes_in_keys(table: Mapping[str, Any], struct: type[Struct], path: str)
     """Yield unknown keys, missing keys, and mistakes in the values of the keys.
 
     Nothing is yielded if the tag of the table selects another struct.
+
+    Args:
+        table: The table.
+        struct: Struct that declares the expected keys.
+        path: Path to the table, such as "film"; empty for the whole file.
     """
     config = struct.__struct_config__
     if config.tag is not None and table.get(str(config.tag_field)) != config.tag:

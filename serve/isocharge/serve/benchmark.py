@@ -103,7 +103,13 @@ def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = t
 
 
 def _turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
-    """Call a function for the length of a turn, and return the durations of the calls, ns."""
+    """Call a function repeatedly for the length of a turn, and return the durations of the calls, ns.
+
+    Args:
+        call: The function.
+        turn_ns: Length of the turn, ns. At least `MIN_CALLS` calls are made.
+        clock: Function that returns the time, ns.
+    """
     durations_ns: list[int] = []
     turn_end_ns = clock() + turn_ns
     while len(durations_ns) < MIN_CALLS or clock() < turn_end_ns:

@@ -122,7 +122,13 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None) ->
 
 @contextmanager
 def _step(name: str, description: str, durations_s: dict[str, float]) -> Iterator[None]:
-    """Announce a step, show its progress, and store its duration, s."""
+    """Print the title of a step, show its progress during the block, and store its duration.
+
+    Args:
+        name: Name of the step.
+        description: What the step does.
+        durations_s: Durations of the steps by name, s, to which the duration of this step is added.
+    """
     say(f"\n{len(durations_s) + 1}. {name}: {description}")
     start_s = time.perf_counter()
     with shown_progress():
@@ -138,6 +144,11 @@ def _free_name(base: Path) -> Path:
 
 def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, StreamTotals]:
     """Play a virtual sensor, read its port, and print estimate and truth twice a second.
+
+    Args:
+        forward_map: Charges of the presses of the virtual sensor.
+        predictor: The model that estimates the contacts.
+        seconds: Duration, s.
 
     Returns:
         One row for each frame with a press, columns as in `FollowedPress`, shape (n, 7), mm and N; and the counts of
@@ -285,7 +296,13 @@ def _draw_live_paths(axes: Any, forward_map: ForwardMap, followed: Array) -> Non
 
 
 def _draw_error_against_force(axes: Any, force: Array, error: Array) -> None:
-    """Draw the position errors (mm) of presses against their forces (N), with median and 95th percentile."""
+    """Draw the position errors of presses against their forces, with the median and the 95th percentile.
+
+    Args:
+        axes: Axes of matplotlib.
+        force: Forces of the presses, shape (n,), N.
+        error: Position errors of the presses, shape (n,), mm.
+    """
     axes.loglog(force, error, ".", color=PRESSED, ms=2, alpha=0.5)
     bin_edges = np.geomspace(force.min(), force.max(), 13)
     bin_centres = np.sqrt(bin_edges[:-1] * bin_edges[1:])

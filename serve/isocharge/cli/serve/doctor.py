@@ -193,10 +193,14 @@ def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
 
 
 def _setting(key: str, text: str) -> Any:
-    """Return the number of an option for all electrodes, or one for each as in `A=0.1,B=-0.1`.
+    """Return the value of an option of the gain: a number, or a number for each electrode.
+
+    Args:
+        key: Key of the setting in a device file, such as `pc_per_unit`, from which the name of the option follows.
+        text: Value of the option, such as `0.1` or `A=0.1,B=-0.1`.
 
     Raises:
-        InputError: If the text is neither.
+        InputError: If the text has neither of these forms.
     """
     try:
         if "=" not in text:
@@ -296,7 +300,12 @@ def _numbering_line(examination: Examination) -> str:
 
 
 def _channel_line(channel: ChannelHealth, unit: str) -> str:
-    """Return the row of a channel in the table."""
+    """Return the row of a channel in the table.
+
+    Args:
+        channel: Health of the channel.
+        unit: Unit of the channel: "pC", "counts" or "V".
+    """
     figures = (channel.offset_pC, channel.noise_pC, channel.drift_pC_per_s, *channel.hum_pC)
     all_decimals = VOLT_DECIMALS if unit == "V" else DECIMALS
     cells = [f"{printable(channel.name):8.8s}"]

@@ -115,7 +115,14 @@ def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
 
 
 def _report(traffic: Traffic, level: str, event: str, message: str) -> None:
-    """Report an event of the server as a line of the log or, without a log, as a sentence on stderr."""
+    """Report an event of the server as a line of the log or, without a log, as a sentence on stderr.
+
+    Args:
+        traffic: Counters of the server, which have the log.
+        level: Level of the event in the log.
+        event: Name of the event.
+        message: Description of the event.
+    """
     if traffic.log is not None:
         traffic.log.message(level, event, message)
     elif event == "refused":

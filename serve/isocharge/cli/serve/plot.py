@@ -270,6 +270,12 @@ def _draw_path(axes: Any, traces: dict[str, Array], time: Array, time_label: str
     """Draw the path of the contacts on the film, true to scale.
 
     Each press is a line. The colour of the dots shows the time, and their size shows the force.
+
+    Args:
+        axes: Axes of matplotlib.
+        traces: Columns of the records.
+        time: Time of each record, shape (n,), in the unit of the label.
+        time_label: Label of the scale of colours.
     """
     position_mm = np.column_stack([traces["x_mm"], traces["y_mm"]])
     contacts = _every_nth(np.flatnonzero(~np.isnan(position_mm[:, 0])), MAX_POINTS)

@@ -160,6 +160,11 @@ def virtual_command(
 def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) -> tuple[Sensor, Probe]:
     """Return sensor and probe as described, or a random variation of them if there is a seed.
 
+    Args:
+        sensor_name: Name or file of the sensor.
+        probe_text: Probe in the notation of `--probe`.
+        film_seed: Seed of the random variation; None for no variation.
+
     Raises:
         InputError: If there is a seed and the probe is not a circle, because the radius of the probe is varied, too.
     """
@@ -190,6 +195,10 @@ def _untouched_frame(rate_Hz: float) -> Script:
 
 def _encoder(frames: FrameFormat, device: Path | None) -> Encode:
     """Return the function that encodes a frame as bytes.
+
+    Args:
+        frames: Format of the frames, if there is no device file.
+        device: Device file that describes the frames; None if there is none.
 
     Raises:
         InputError: If the device file does not describe frames.

@@ -185,6 +185,7 @@ class PageFeed:
     """
 
     def __init__(self, link: ReaderEnd, touch: TouchStream, live: RecordedStream | None = None) -> None:
+        """Begin without records; the arguments are described in the class."""
         self._link = link
         self._touch = touch
         self._live = live

@@ -69,6 +69,7 @@ class CsvTable(NumberTable):
         super().__init__(header, names, where, error, expected)
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
+        """Convert the cells of the requested columns to numbers, row by row; see `NumberTable.read`."""
         positions = {name: self.header.index(name) for name in rules}
         line_numbers = array("q")
         numbers = array("d")  # the chosen columns of one row after another
@@ -158,6 +159,12 @@ def _numbered_rows(
     lines: Iterable[str], names: Collection[str], where: str, error: type[InputError]
 ) -> Iterator[tuple[int, list[str]]]:
     """Yield the line number, from 1, and the cells of each row that is neither blank nor a comment.
+
+    Args:
+        lines: Lines of the text, each with its line end.
+        names: Names that have a meaning. A line that begins with # and one of these names is not a comment.
+        where: Name of the file, for error messages.
+        error: Class of the errors.
 
     Raises:
         error: If the lines are not CSV text in UTF-8.

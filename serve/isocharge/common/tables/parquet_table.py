@@ -70,6 +70,7 @@ class ParquetTable(NumberTable):
         super().__init__(header, names, where, error, expected)
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
+        """Decode the requested columns; see `NumberTable.read`."""
         row_count = self._metadata.num_rows
         if row_count > most_rows:
             self._refuse_row_count(most_rows)
@@ -78,6 +79,15 @@ class ParquetTable(NumberTable):
         return NumberColumns(values, row_numbers, self.row_noun)
 
     def _read_column(self, name: str, rule: ColumnRule) -> Array:
+        """Return one column as float64, shape (n,), with NaN for null.
+
+        Args:
+            name: Name of the column.
+            rule: Rule of the column, whose description appears in error messages.
+
+        Raises:
+            error: If the column has no numbers, or the file is damaged.
+        """
         from pyarrow.types import is_integer
 
         field = self._schema.field(self.header.index(name))
@@ -93,7 +103,12 @@ class ParquetTable(NumberTable):
         return numbers
 
     def _decode(self, index: int, name: str) -> Array:
-        """Decode one column as Parquet stores it, in batches of rows, shape (n,)."""
+        """Return one column as float64, shape (n,), decoded in batches of rows.
+
+        Args:
+            index: Number of the column among the columns as Parquet stores them.
+            name: Name of the column, for error messages.
+        """
         row_count = self._metadata.num_rows
         numbers = np.empty(row_count)
         row = 0
@@ -156,7 +171,16 @@ def require_pyarrow() -> None:
 
 
 def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
-    """Check the marks at both ends of a file and the size of its metadata, before pyarrow reads all of the metadata."""
+    """Check the marks at both ends of a file and the size of its metadata, before pyarrow reads all of the metadata.
+
+    Args:
+        file: The file.
+        where: Name of the file, for error messages.
+        error: Class of the errors.
+
+    Raises:
+        error: If the file is not Parquet, was cut off, or has very large metadata.
+    """
     first_mark = file.read(len(MARK))
 
     # A Parquet file ends with the size of its metadata (u32, little-endian) and the mark.

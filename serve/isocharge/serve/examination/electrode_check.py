@@ -259,6 +259,11 @@ def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
     The change is the difference between a block and the rest level, which follows a slow drift until the press begins.
     The press has ended when the change is small again.
 
+    Args:
+        blocks: Source of the averaged values.
+        electrode: Electrode near which the press is expected, for the error message.
+        timeout_s: Longest time to wait, s.
+
     Raises:
         PressCheckError: If the press does not begin and end within `timeout_s`.
     """

@@ -124,6 +124,10 @@ def _extrapolate_rest(
 def _block_means(values: Array, times_s: Array) -> Array | None:
     """Compute the means of the channels over blocks of `BLOCK_S`, without the last block, which may be incomplete.
 
+    Args:
+        values: Values of the channels, shape (n, channels), in any unit.
+        times_s: Times since the first frame, shape (n,), s.
+
     Returns:
         Means, shape (blocks, channels); None if a value is not finite, or a block has no value.
     """

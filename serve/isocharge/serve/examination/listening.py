@@ -118,7 +118,15 @@ def listen(
 
 
 def _listen(url: str, baud: int, seconds: float, request: Request | None, wait: float) -> ReceivedData:
-    """Listen to a port at one baud rate for some time, s, or until the port is lost, and return the received bytes."""
+    """Listen to a port at one baud rate, and return the received bytes.
+
+    Args:
+        url: The port.
+        baud: Baud rate, bit/s.
+        seconds: Time of listening, s. It is shorter if the port is lost.
+        request: Request that the board needs; None if the board sends frames by itself.
+        wait: Time to wait until the port can be opened, s.
+    """
     received = ReceivedData(url, baud, request)
     with Port(url, baud=baud, request=request, wait=wait) as port:
         start_s = time.monotonic()

@@ -233,6 +233,11 @@ def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: 
 
     The result is also true if the device file has no tare, or if there are too few frames for two tares, so that a
     missing tare proves nothing. It is false if there are no frames, or if reading the frames raises an error.
+
+    Args:
+        received: Bytes that the board sent while the film was at rest.
+        table: Content of the device file.
+        electrodes: Electrodes of the model.
     """
     frame_count = 0
     try:

@@ -98,6 +98,7 @@ class CounterWrap:
     """
 
     def __init__(self, usual_moduli: Iterable[int], initial_modulus: int, max_steps: int) -> None:
+        """Begin without any value; the arguments are described in the class."""
         self._usual_moduli = tuple(usual_moduli)
         self._modulus = initial_modulus
         self._max_steps = max_steps

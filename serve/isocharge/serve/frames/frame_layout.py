@@ -140,6 +140,10 @@ class Field(Settings, frozen=True):
         """Return a value in the form that `struct` packs.
 
         A counter or a clock that does not fit its field wraps. A channel that does not fit is set to its limit.
+
+        Args:
+            value: The value, in the unit of the field.
+            byte_order: Byte order of the frame. Only fields of three bytes, which `struct` cannot pack, need it.
         """
         count = value / self.scale
         if self.kind in ("f32", "f64"):

@@ -84,6 +84,7 @@ class TextParser(DelimitedParser):
     """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
+        """Begin without a layout; the arguments are described in the class."""
         super().__init__(b"\n", MAX_LINE_LENGTH, "text of a layout that is not clear yet")
         self.layout: Layout | None = None
         self._columns = columns

@@ -175,6 +175,11 @@ def _numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, float]]
     """Return every number of a JSON value with the path to it, such as `charge.A` or `charge.0.re`.
 
     Numbers more than `MAX_JSON_LEVEL` levels deep are left out.
+
+    Args:
+        path: Path to the value; empty for the whole text.
+        content: The value: a number, a list, an object, or a value that contains no number.
+        level: Number of objects and lists that contain the value.
     """
     if isinstance(content, float):  # Integers were read as floats.
         return [(path, content)]

@@ -110,7 +110,13 @@ class Gain(Rule, frozen=True, kw_only=True):
 
 
 def _setting_of(setting: float | Mapping[str, float] | None, electrode: str, default: float) -> float:
-    """Return the value of a setting for an electrode; the default if there is none."""
+    """Return the value of a setting for an electrode.
+
+    Args:
+        setting: A number for all electrodes, numbers by electrode, or None if there is no such setting.
+        electrode: Name of the electrode.
+        default: Value that is returned if there is no setting for this electrode.
+    """
     if setting is None:
         return default
     if isinstance(setting, Mapping):
@@ -248,7 +254,15 @@ class Device(DeviceSections, frozen=True):
             self._gain_pC(self.gain, electrodes)
 
     def _gain_pC(self, gain: Gain, electrodes: tuple[str, ...]) -> Array | None:
-        """Return the charge of one unit with its sign, shape (n_electrode,), pC; None if the gain is 1 pC."""
+        """Return the charge of one unit of the board with its sign, shape (n_electrode,), pC.
+
+        Args:
+            gain: Section `[gain]` of the device file.
+            electrodes: Names of the electrodes.
+
+        Returns:
+            The charges; None if the section states no charge, so that one unit is 1 pC.
+        """
         if gain.V_per_unit is None:
             return self._for_each_electrode("gain.pC_per_unit", gain.pC_per_unit, electrodes)
         V_per_unit = self._for_each_electrode("gain.V_per_unit", gain.V_per_unit, electrodes)

@@ -95,6 +95,10 @@ class ChannelPicker:
     def _position(self, electrode: str, frame: Frame) -> int:
         """Return the position of the channel that the device file assigns to an electrode.
 
+        Args:
+            electrode: Name of the electrode.
+            frame: A frame of the board.
+
         Raises:
             ChargeError: If the frame has no such channel.
         """

@@ -227,7 +227,16 @@ def _check_checksum(data: bytes, golden: Golden, path: Path) -> None:
 
 
 def _check_golden_shapes(golden: Golden, metadata: ModelMetadata, path: Path) -> None:
-    """Raise ModelError if the golden vectors do not fit the number of electrodes or the number of presses."""
+    """Check that the golden vectors fit the number of electrodes, and that all outputs have one row for each press.
+
+    Args:
+        golden: Golden vectors.
+        metadata: Metadata of the model.
+        path: File of the golden vectors, for error messages.
+
+    Raises:
+        ModelError: If a shape is wrong.
+    """
     shape = golden.charge_pC.shape
     n_electrode = len(metadata.electrodes)
     if len(shape) != 2 or shape[0] == 0 or shape[1] != n_electrode:
@@ -359,6 +368,11 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
 
 def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> None:
     """Check that an existing `config.pbtxt` describes a model with this name and these electrodes.
+
+    Args:
+        path: The file, which need not exist.
+        name: Name of the model.
+        electrodes: Names of the electrodes.
 
     Raises:
         ModelError: If the file exists and describes another model.

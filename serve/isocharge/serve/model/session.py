@@ -191,6 +191,12 @@ class BoundPress:
     """
 
     def __init__(self, session: ort.InferenceSession, electrodes: int) -> None:
+        """Allocate the memory of one press, and bind it to a session.
+
+        Args:
+            session: Session of the model.
+            electrodes: Number of electrodes.
+        """
         charges = np.zeros((1, electrodes), dtype=np.float32)
         self.columns = _columns(output_widths(session))
         self.size = max(part.stop for part in self.columns.values())
@@ -290,6 +296,10 @@ def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
 def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
     """Convert the charges of one press to an array of shape (electrodes,), float32, pC.
 
+    Args:
+        charge_pC: Charges, pC, in the order of the electrodes.
+        electrodes: Names of the electrodes.
+
     Raises:
         ChargeError: If the number of charges is wrong, or a charge is not finite. The message names the electrode.
     """
@@ -320,7 +330,15 @@ def _expected_charges(electrodes: tuple[str, ...]) -> str:
 
 
 def _as_numbers(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> NDArray[np.number]:
-    """Convert charges to an array of numbers; raise ChargeError if they are not numbers."""
+    """Convert charges to an array of numbers.
+
+    Args:
+        charge_pC: Charges of one press or of several presses, pC.
+        electrodes: Names of the electrodes, for error messages.
+
+    Raises:
+        ChargeError: If the charges are not numbers.
+    """
     expected = _expected_charges(electrodes)
     try:
         charges = np.asarray(charge_pC)
@@ -352,7 +370,16 @@ def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...], *, is_single_
 
 
 def _checked_float32(charges: NDArray[np.number], electrodes: tuple[str, ...], is_single_press: bool) -> Singles:
-    """Convert charges to float32 and check each of them; raise ChargeError for the first row with a bad charge."""
+    """Convert charges to float32, and check each of them.
+
+    Args:
+        charges: Charges, shape (n, electrodes), pC.
+        electrodes: Names of the electrodes, for the error message.
+        is_single_press: Whether the error message omits the number of the row.
+
+    Raises:
+        ChargeError: If a charge is not finite. The message names the bad charges of the first row that has any.
+    """
     with np.errstate(over="ignore"):  # charges beyond the range of float32 become infinite and are refused below
         converted = np.ascontiguousarray(charges, dtype=np.float32)
     rows, columns = np.nonzero(~np.isfinite(converted))

@@ -76,7 +76,12 @@ def _kind_and_command(name: str, head: bytes) -> tuple[str, str] | None:
 
 
 def _is_table_of_presses(name: str, first_line: bytes) -> bool:
-    """Return whether a file is a CSV with the columns of presses or records, or a .csv file with only electrodes."""
+    """Return whether a file is a CSV with the columns of presses or records, or a .csv file with only electrodes.
+
+    Args:
+        name: Name of the file.
+        first_line: First line of the file.
+    """
     header = first_line.decode("utf-8", "replace").strip()
     columns = {column.strip().strip('"') for column in header.split(",")}
     if columns & PRESS_COLUMNS:

@@ -147,6 +147,7 @@ class SerialLine:
     """
 
     def __init__(self, url: str, baud: int) -> None:
+        """Open the line without delays for the collection of bytes; the arguments are described in the class."""
         # pyserial is imported only here, so that programs that only predict need not wait for the import.
         serial = importlib.import_module("serial")
         if url.startswith("tcp://"):
@@ -227,6 +228,7 @@ class UdpSocket:
     """
 
     def __init__(self, url: str) -> None:
+        """Open the socket and bind it to the address; the argument is described in the class."""
         parts = urlsplit(url)
         if parts.port is None or parts.path or parts.query:
             raise ValueError(f"expected {UDP_SCHEME}HOST:PORT, got {url!r}")

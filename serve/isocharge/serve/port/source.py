@@ -89,6 +89,7 @@ class Port:
         request: Request | None = None,
         wait: float = 0.0,
     ) -> None:
+        """Store the settings. The port is opened when the context is entered; see the class for the arguments."""
         self.url = url
         self.outages = 0
         self._baud = baud

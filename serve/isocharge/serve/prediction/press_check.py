@@ -122,6 +122,10 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     the working area and the range of forces of the model. A few bad presses are reported and excluded if all other
     presses agree with the model.
 
+    Args:
+        predictor: The model.
+        presses: The presses, with at least the electrodes of the model.
+
     Raises:
         PressError: If the charges of one of the model's electrodes are missing.
     """
@@ -187,6 +191,10 @@ def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
 
     The limit of the probability is divided by the number of presses (Bonferroni), so that all presses together exceed
     it by chance with the probability `BAD_PRESS_PROBABILITY`.
+
+    Args:
+        errors: Errors of all presses.
+        is_compared: Which presses are compared, shape (n,).
     """
     max_probability = BAD_PRESS_PROBABILITY / max(1, int(is_compared.sum()))
     squared_ratio = errors.squared_ratio  # of x, y and the force, shape (n, 3), NaN if unknown
@@ -218,7 +226,16 @@ def _force_summary(errors: PressErrors, rows: Booleans) -> ErrorSummary | None:
 
 
 def _frequent_misfits(errors: PressErrors, rows: Booleans, metadata: ModelMetadata) -> str:
-    """Return a statement about the presses with a misfit above the limit; empty if chance explains their number."""
+    """Return a statement about the number of presses with a misfit above the limit of the model.
+
+    Args:
+        errors: Errors of all presses.
+        rows: Which presses are counted, shape (n,).
+        metadata: Metadata of the model.
+
+    Returns:
+        The statement; empty if chance explains the number.
+    """
     has_misfit = np.array([MISFIT in flags for flags in errors.flags], dtype=np.bool_)
     count = int(rows.sum())
     misfit_count = int((has_misfit & rows).sum())
@@ -269,7 +286,13 @@ def _verdict(
 
 
 def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: ErrorSummary | None) -> Iterator[str]:
-    """Yield notes about the remedies for a model that does not fit, depending on an earlier calibration."""
+    """Yield notes about the remedies for a model that does not fit.
+
+    Args:
+        metadata: Metadata of the model, which state whether it was calibrated.
+        position: Errors of the positions; None if no position is known.
+        force: Errors of the forces; None if no force is known.
+    """
     options = []
     if position is not None:
         options.append(f"--position-std {_explaining_rig_std(position) / math.sqrt(2.0):.2g}")

@@ -206,7 +206,12 @@ class Memory(NamedTuple):
 
     @classmethod
     def start(cls, rule: MemoryRule, output_pC: Array) -> "Memory":
-        """Return the state at the first frame after the tare."""
+        """Return the state at the first frame after the tare, without warmth and without a memory of earlier presses.
+
+        Args:
+            rule: Memory of the film.
+            output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
+        """
         rows_pC = np.zeros((len(INITIAL_PROPAGATION), output_pC.size))
         scale_variance = rule.known**2
         variances = ScaleVariances(creep=scale_variance, step=scale_variance, covariance=0.0)

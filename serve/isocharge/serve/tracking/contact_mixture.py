@@ -266,7 +266,12 @@ class ContactMixture:
         return self._update(predicted, measurement, UPDATE_ITERATIONS)
 
     def _squared_innovation(self, components: Components, measurement: Measurement) -> float:
-        """Compute the squared Mahalanobis distance of the innovation of the most probable component."""
+        """Compute the squared Mahalanobis distance of the innovation of the most probable component.
+
+        Args:
+            components: Predicted components.
+            measurement: Charges of this step.
+        """
         best = components.best
         charge_pC, jacobian = self._charges_and_jacobian(components.mean)
         charge_covariance = jacobian @ components.covariance @ jacobian.swapaxes(1, 2)

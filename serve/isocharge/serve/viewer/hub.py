@@ -265,6 +265,7 @@ class Hub:
     """
 
     def __init__(self, link: PageEnd, description: dict[str, Any], *, is_recording: bool) -> None:
+        """Begin without samples and without viewers; the arguments are described in the class."""
         self.description = description
         self.state: dict[str, Any] = {}
         self.version = 0
@@ -341,6 +342,7 @@ class Viewer:
     """
 
     def __init__(self, hub: Hub) -> None:
+        """Begin with the latest samples of a live stream, or at the start of a recording."""
         now_s = time.time()
         self.wake = asyncio.Event()
         self._hub = hub

@@ -333,6 +333,10 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
 def _electrode_polygons(sensor: Any, electrodes: tuple[str, ...]) -> dict[str, list[list[list[float]]]]:
     """Return the polygons of each electrode on the real film: its pad, then further metal such as leads.
 
+    Args:
+        sensor: Description of the sensor in the metadata of the model, which may be incomplete.
+        electrodes: Names of the electrodes.
+
     Returns:
         Polygons by electrode, each a list of corners (x, y), mm; empty if the sensor has an unknown form.
     """

@@ -82,6 +82,10 @@ def _page_data(series: StressSeries, models: tuple[str, ...]) -> dict[str, Any]:
 def _describe_model(name: str, series: StressSeries) -> dict[str, Any]:
     """Return the description of a model for the page, with its network.
 
+    Args:
+        name: Name or path of the model.
+        series: Stress of the film that the playground contains.
+
     Raises:
         ModelError: If the model is missing, or its film or electrodes cannot be shown.
     """

@@ -164,6 +164,11 @@ class Service:
     """Answers calls with the models, the token and the limits of a handler."""
 
     def __init__(self, handler: Handler) -> None:
+        """Register the function that answers each method.
+
+        Args:
+            handler: Handler of the HTTP server, whose models, limits, token and counters are used.
+        """
         store = handler.store
         self._store = store
         self._limits = handler.limits
@@ -241,6 +246,11 @@ class Service:
     async def _answer_call(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes | None:
         """Check the number of calls and the token, and answer the messages of a call.
 
+        Args:
+            name: Name of the method.
+            context: Context of the call.
+            call: Properties of the call for counters and log.
+
         Returns:
             The response; None for the method `STREAM`, whose responses have been sent.
         """
@@ -255,6 +265,11 @@ class Service:
     async def _answer_message(self, name: str, context: grpc.aio.ServicerContext, call: _Call) -> bytes:
         """Return the serialized response to the only message of a call.
 
+        Args:
+            name: Name of the method.
+            context: Context of the call, from which the message is read.
+            call: Properties of the call for counters and log.
+
         Raises:
             RequestError: If the call ends without a message, or the message is not valid.
             TimeoutError: If the message does not arrive in time.
@@ -267,7 +282,15 @@ class Service:
         return self._answer(name, data, call)
 
     async def _answer_stream(self, context: grpc.aio.ServicerContext, call: _Call) -> None:
-        """Send a response to each message of a stream."""
+        """Send a response to each message of a stream.
+
+        Args:
+            context: Context of the call, from which messages are read and to which responses are written.
+            call: Properties of the call for counters and log.
+
+        Raises:
+            TimeoutError: If the client sends no message, or does not read a response, in time.
+        """
         timeout_s = self._limits.header_seconds
         while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
             async with asyncio.timeout(self._limits.body_seconds):
@@ -349,6 +372,12 @@ class Service:
     async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
         """Wait for the next message of a call, and return it; return grpc.aio.EOF at the end of the call.
 
+        While the call waits, a new call may replace it.
+
+        Args:
+            context: Context of the call.
+            timeout_s: Longest time to wait, s.
+
         Raises:
             TimeoutError: If the message does not arrive in time, or a new call replaces this call.
         """
@@ -423,7 +452,13 @@ def _event_loop() -> Iterator[asyncio.AbstractEventLoop]:
 
 
 async def _start(handler: Handler, address: str, tls: Tls | None) -> tuple[grpc.aio.Server, int]:
-    """Start a server on `host:port`, and return it with the port on which it listens."""
+    """Start a server, and return it with the port on which it listens.
+
+    Args:
+        handler: Handler of the HTTP server.
+        address: `host:port`; the port 0 selects a free port.
+        tls: Certificate and key; None for no TLS.
+    """
     limits = handler.limits
     server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=2 * limits.connections)
     server.add_generic_rpc_handlers((Service(handler).handlers(),))

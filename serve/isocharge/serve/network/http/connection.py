@@ -86,6 +86,7 @@ class Connection(asyncio.Protocol):
     """
 
     def __init__(self, handler: Handler, connections: "set[Connection]", loop: asyncio.AbstractEventLoop) -> None:
+        """Begin a connection without data; the arguments are described in the class."""
         self.deadline = math.inf
         self.has_completed_request = False
         self._handler = handler

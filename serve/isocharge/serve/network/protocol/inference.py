@@ -287,7 +287,13 @@ def _packer(count: int) -> Callable[..., None]:
 
 
 def _from_array(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> Singles:
-    """Return the charges from values of any kind; raise RequestError or ChargeError if they are not valid."""
+    """Return the charges from values of any kind; raise RequestError or ChargeError if they are not valid.
+
+    Args:
+        values: Content of the key `data` of the request.
+        shape: Number of presses and number of electrodes.
+        electrodes: Names of the electrodes, for error messages.
+    """
     numbers = _as_array(values)
     press_count, electrode_count = shape
     is_numeric = numbers.dtype.kind in "fiu"  # floating-point numbers, and integers with and without sign
@@ -393,7 +399,16 @@ def infer(loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]) -> 
 def _infer_single_press(
     loaded: LoadedVersion, charge_pC: Singles, names: tuple[str, ...]
 ) -> tuple[dict[str, Rows], int, int]:
-    """Run the model for one press in bound memory, which is faster than `session.run`; see `infer`."""
+    """Run the model for one press in bound memory, which is faster than `session.run`.
+
+    Args:
+        loaded: The model.
+        charge_pC: Charges of the press, shape (electrodes,), pC.
+        names: Names of the requested outputs.
+
+    Returns:
+        The outputs by name; 0, because the misfit is always computed; and 1 if the misfit is above the limit, else 0.
+    """
     press = loaded.press()
     row = np.empty((1, press.size), np.float32)  # all outputs of the press, one after the other
     try:
