@@ -8,7 +8,7 @@ import typer
 
 from isocharge.cli.main import app
 
-WIDTH = 100
+WIDTH = 88
 """Width of the help texts, characters."""
 
 INTRODUCTION = """# Commands and options

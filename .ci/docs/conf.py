@@ -21,6 +21,7 @@ from isocharge.serve.viewer.playground_page import playground_html  # noqa: E402
 
 PORTIONS = ("simulate", "train", "serve")
 HOME, REFERENCE, GALLERY, COMMANDS = "README", "build/reference", "build/gallery", "build/commands"
+PLAYGROUND = "serve/docs/playground"
 
 project = "isocharge"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
@@ -62,9 +63,11 @@ sphinx_gallery_conf = {
 
 
 def add_contents(_app: Any, page: str, source: list[str]) -> None:
-    """Put the contents of the site under the first page."""
+    """Put the contents of the site under the first page, and links to the playground into its page."""
     if page == HOME:
         source[0] += (ROOT / ".ci" / "docs" / "contents.md").read_text("utf-8")
+    if page == PLAYGROUND:
+        source[0] = source[0].replace("`playground.html`", '<a href="../../playground.html">playground.html</a>')
 
 
 def add_whole_pages(app: Any, error: Exception | None) -> None:

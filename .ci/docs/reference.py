@@ -86,12 +86,14 @@ def list_attributes(_app: Any, _kind: str, _name: str, _object: Any, _options: A
     """Write the attributes of a class as a list of names with their descriptions.
 
     Napoleon writes a field `:ivar NAMES: text` for each attribute, and Sphinx takes the first of several names, as in
-    `x_mm, y_mm`, for a type.
+    `x_mm, y_mm`, for a type. The types, in fields `:vartype NAME:`, are left out.
     """
     shown: list[str] = []
     in_attributes = False
     for line in lines:
         attribute = ATTRIBUTE.match(line)
+        if line.startswith(":vartype "):
+            continue
         if attribute:
             if not in_attributes:
                 shown += [":Attributes:", ""]

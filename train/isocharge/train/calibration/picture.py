@@ -27,7 +27,7 @@ NEIGHBOURS = 12
 
 def calibration_picture(result: CalibrationResult) -> Figure:
     """Draw maps of the remaining error, the quantities in units of their prior, and the residuals of the presses."""
-    figure = new_figure(15.0, 9.4)
+    figure = new_figure(11.0, 8.8)
     (before, after), (identified, residuals) = figure.subplots(2, 2, height_ratios=(1.15, 1.0))
     then, now = (
         ("before it was moved", "moved to another temperature")
@@ -43,7 +43,7 @@ def calibration_picture(result: CalibrationResult) -> Figure:
         after.plot(*contact[bad, :2].T, "X", color=FELT, mec=INK, ms=9, label="left out")
     if len(contact):
         after.legend(loc="upper right", fontsize=8)
-    label = "rms error of the position that the film leaves, mm"
+    label = "position error by the film (rms), mm"
     figure.colorbar(shades, ax=[before, after], label=label, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%g")
     _draw_quantities(identified, result)
     _draw_residuals(residuals, result)
@@ -73,7 +73,7 @@ def _draw_error(axes: Any, result: CalibrationResult, error: ContactError, title
         Triangulation(x, y), np.clip(rms_error, *LEVELS_MM), levels, norm=LogNorm(), cmap="viridis"
     )
     sensor, _ = result.film
-    title = f"{title}: {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)"
+    title = f"{title}:\n{error.position_mm:.2g} mm, {error.force_percent:.2g} % of force (rms)"
     draw_layout(axes, sensor, result.problem.domain.radius, title)
     return shades
 
@@ -93,9 +93,9 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
     half_width = np.array([NORMAL_95 * quantity.std / quantity.before_std for quantity in quantities])
     row = np.arange(len(quantities))
     is_identified = np.array([quantity.identified for quantity in quantities])
-    axes.barh(row, 4.0, left=-2.0, color=ASSUMED, height=0.72, label="assumed before, 95 %")
+    axes.barh(row, 4.0, left=-2.0, color=ASSUMED, height=0.72, label="before the presses")
     for chosen, colour, label in (
-        (is_identified, FITTED, "identified by the presses, 95 %"),
+        (is_identified, FITTED, "identified"),
         (~is_identified, INK, "not identified"),
     ):
         axes.errorbar(
@@ -105,8 +105,8 @@ def _draw_quantities(axes: Any, result: CalibrationResult) -> None:
         value_text = f"{quantity.value:.3g} ± {quantity.std:.2g}"
         axes.annotate(value_text, (4.2, index), va="center", fontsize=8, annotation_clip=False)
     axes.set(
-        title="quantities that the presses determine",
-        xlabel="difference from the assumed value, in its standard deviations",
+        title="quantities with 95 % intervals",
+        xlabel="difference from the assumed value, in standard deviations",
         xlim=(-4.0, 4.0),
         yticks=row,
         yticklabels=[quantity.name for quantity in quantities],
