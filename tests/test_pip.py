@@ -20,7 +20,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 VERSION = PROJECT["version"]
 
 COMMANDS_OF_EXTRAS = {
-    "simulate": "simulate point three-25um-biaxial --at 1 2 --force 1",
+    "simulate": "simulate point three-25um-biaxial --at 1,2 --force 1",
     "train": "train distil --help",
     "http": "serve http --help",
     "grpc": "serve http --help",
@@ -73,9 +73,9 @@ def base(tmp_path_factory, wheel):
     return install(str(wheel), tmp_path_factory.mktemp("fresh"), timeout=280)
 
 
-def run(base, *words, cwd):
+def run(base, *words, cwd, timeout=60):
     return subprocess.run(
-        [base / words[0], *words[1:]], cwd=cwd, capture_output=True, text=True, timeout=60, check=False
+        [base / words[0], *words[1:]], cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False
     )
 
 
@@ -147,7 +147,7 @@ def test_the_wheel_with_an_extra_runs_the_readme_and_a_command_of_the_extra(whee
     assert done.stdout.splitlines() == re.findall(r"^print\(.*\)  # (.+)$", example, re.MULTILINE), done.stderr
     (tmp_path / "frames.txt").write_text("942.9,910.4,690.8\n" * 200)
     write_table(table({"A": [942.9], "B": [910.4], "C": [690.8]}), tmp_path / "charges.parquet")
-    done = run(bin_folder, "isocharge", *COMMANDS_OF_EXTRAS[extra].split(), cwd=tmp_path)
+    done = run(bin_folder, "isocharge", *COMMANDS_OF_EXTRAS[extra].split(), cwd=tmp_path, timeout=600)
     assert done.returncode == 0, done.stderr
 
 
