@@ -1,6 +1,8 @@
-"""Air behind the film and static pressure: against a closed form and an independent collocation."""
+"""Air behind the film and static pressure: against a closed form, a collocation and scikit-fem."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,6 +32,9 @@ ATMOSPHERE = 0.101325
 
 CAVITY = 20.0 * np.pi * 45.0**2
 """Volume of a cavity of 20 mm behind the film, mm^3."""
+
+SKFEM_CASES = json.loads((Path(__file__).parents[2] / "data" / "film_cases_air_skfem.json").read_text())
+"""Charges by an independent finite-element program; see the entry `method` of the file."""
 
 MEMBRANE = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=True), accuracy=1e-4)
 
@@ -157,6 +162,22 @@ def test_charges_with_back_pressure_equal_those_of_a_collocation(back_volume, st
     charge = touch_charge(sensor, press(sensor.film, Circle(1.0), (0.0, 0.0), force, MEMBRANE))
     expected = axisymmetric_charges(sensor, 1.0, force, static_pressure)
     np.testing.assert_allclose(charge, expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("case", SKFEM_CASES["cases"])
+def test_charges_with_back_pressure_equal_those_of_scikit_fem(case):
+    sensor = load_sensor("four-25um-uniaxial")
+    film = replace(
+        sensor.film,
+        pretension=case["pretension_MPa"],
+        back_volume=case["back_volume_mm3"],
+        static_pressure=1e-6 * case["static_pressure_Pa"],
+    )
+    solved = press(film, Circle(case["probe_radius_mm"]), tuple(case["at_mm"]), case["force_N"])
+    charge = touch_charge(replace(sensor, film=film), solved)
+    expected = np.array(case["charge_pC"])
+    np.testing.assert_allclose(charge, expected, atol=1e-3 * np.abs(expected).max())
+    assert deflection(solved, [case["at_mm"]])[0] == pytest.approx(case["deflection_mm"], rel=2e-3)
 
 
 def test_a_very_large_back_volume_equals_a_vented_back():
