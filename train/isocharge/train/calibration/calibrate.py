@@ -13,13 +13,14 @@ from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import MeasuredPresses, row_words
 from isocharge.common.statistics import rms
 from isocharge.simulate import Circle, Sensor
+from isocharge.train.calibration.closed_back import CLOSED_BACK_CAUTION, has_closed_back, refuse_closed_back
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
 from isocharge.train.calibration.cross_validation import HeldOutAnswers, cross_validate
 from isocharge.train.calibration.diagnosis import check_channels, check_places, explain, find_mistakes, misfit
 from isocharge.train.calibration.film_fit import MISTAKE_PROBABILITY, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.hypotheses import Hypothesis
 from isocharge.train.calibration.nuisances import NUISANCES, NuisanceEstimate
-from isocharge.train.calibration.press_data import PressData, temperatures
+from isocharge.train.calibration.press_data import PressData, no_presses, temperatures
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity, quantities, summarise
 from isocharge.train.films.films_model import AddedVariance
@@ -291,6 +292,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
     _check_enough_measured(presses, problem)
     presses, domain_cautions = _within_domain(presses, problem)
     if misfit(presses, problem.charges) > MISLEADING_MISFIT and find_mistakes(presses, problem.charges):
+        refuse_closed_back(presses, problem.charges)
         raise explain(presses, problem.charges, np.nan)
     at_C = None
     if presses.knows_temperature:
@@ -380,12 +382,6 @@ def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved:
     return CalibrationResult(problem, no_presses(problem.electrodes), posterior, moved=moved)
 
 
-def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:
-    """Return an empty list of presses for electrodes of these names."""
-    no_std = np.empty(0)
-    return MeasuredPresses(np.empty((0, 3)), np.empty((0, len(electrodes))), no_std, no_std, electrodes, ())
-
-
 def _check_enough_measured(presses: MeasuredPresses, problem: CalibrationProblem) -> None:
     """Raise PressError if position and force of all presses are unknown and the charges have no redundancy."""
     if np.isnan(presses.contact).all() and len(problem.electrodes) <= 3:
@@ -415,6 +411,7 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
     is_unusual = posterior.imperfect or posterior.bad.any() or film_probability < ODD_PROBABILITY
     is_mistaken = is_unusual and bool(find_mistakes(presses, problem.charges))
     if is_unexplained or film_probability < STRAINED_PROBABILITY or is_mistaken:
+        refuse_closed_back(presses, problem.charges)
         worst = max(chi2 / max(degrees_of_freedom, 1.0), squared_distance / deviation.size)
         raise explain(presses, problem.charges, float(np.sqrt(worst)))
 
@@ -456,6 +453,8 @@ def _cautions(presses: MeasuredPresses, problem: CalibrationProblem, posterior: 
             f"only {len(good)} {noun}: a wrong one among so few cannot be recognised, and the stated errors include "
             "this possibility; with more than three presses they become much smaller"
         )
+    if posterior.imperfect and has_closed_back(good, problem.charges):
+        yield CLOSED_BACK_CAUTION
     for nuisance in NUISANCES:
         if posterior.probability(nuisance.name) > PROBABLE:
             yield nuisance.caution(posterior.nuisances[nuisance.name])

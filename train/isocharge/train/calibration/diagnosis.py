@@ -101,7 +101,9 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
         if np.isnan(column).all():
             raise PressError(f"electrode {name!r}: no press has a charge of it; a calibration needs all electrodes")
     shares = _shares(charge)
-    least = np.min([1.0 + 0.0 * shares, *map(_shares, _expected(charges, placed) if len(placed) else ())], axis=0)
+    least = np.min(
+        [1.0 + 0.0 * shares, *map(_shares, expected_charges(charges, placed) if len(placed) else ())], axis=0
+    )
     for name, column, share, smallest in zip(presses.electrodes, charge.T, shares, least, strict=True):
         if share < DEAD_SHARE * smallest:
             raise PressError(
@@ -126,7 +128,7 @@ def _shares(charge: Array) -> Array:
     return np.asarray(typical / np.maximum(others, 1e-9))
 
 
-def _expected(charges: FilmCharges, contact: Array) -> Array:
+def expected_charges(charges: FilmCharges, contact: Array) -> Array:
     """Return charges on the prior's mean film with each of `PRETENSIONS`, shape (n_pretension, n, n_electrode), pC."""
     prior = charges.prior
     contact = charges.into_domain(contact)
@@ -144,8 +146,8 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     if not len(placed):
         return []
     sentences, contacts, measured = zip(*_tried(placed, charges), strict=True)
-    expected = np.split(_expected(charges, np.concatenate(contacts)), len(contacts), axis=1)
-    mistakes = [*zip(map(partial(_misfit, charges), contacts, measured, expected), sentences, strict=True)]
+    expected = np.split(expected_charges(charges, np.concatenate(contacts)), len(contacts), axis=1)
+    mistakes = [*zip(map(partial(charge_misfit, charges), contacts, measured, expected), sentences, strict=True)]
     limit = CLEARER * misfit(presses, charges)
     least_misfit = min(mistake_misfit for mistake_misfit, _ in mistakes)
     return [
@@ -163,11 +165,20 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
     placed = presses[presses.placed]
     if not len(placed):
         return 0.0
-    return _misfit(charges, placed.contact, placed.charge_pC, _expected(charges, placed.contact))
+    return charge_misfit(charges, placed.contact, placed.charge_pC, expected_charges(charges, placed.contact))
 
 
-def _misfit(charges: FilmCharges, contact: Array, charge: Array, expected: Array) -> float:
-    """Return the mean squared logarithm of measured over expected charges, in units of the spread of films."""
+def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected: Array) -> float:
+    """Return the distance of measured charges from the nearest of several films, dimensionless.
+
+    It is the mean squared logarithm of measured over expected charges, in units of the spread of films.
+
+    Args:
+        charges: The films of the calibration, whose domain the presses must not leave.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        charge: Measured charges, shape (n, n_electrode), pC.
+        expected: Charges of each film, shape (n_film, n, n_electrode), pC.
+    """
     if (charges.into_domain(contact) != contact).any(axis=1).mean() > 0.2:
         return np.inf
     log_ratio = np.log(np.maximum(charge, 1e-3)) - np.log(np.maximum(expected, 1e-3))
@@ -199,7 +210,7 @@ def _orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ..
     """
     orders = set()
     log_measured = np.log(np.maximum(presses.charge_pC, 1e-3))
-    for expected in _expected(charges, presses.contact):
+    for expected in expected_charges(charges, presses.contact):
         log_ratio = log_measured[:, :, None] - np.log(np.maximum(expected, 1e-3))[:, None]
         distance = np.nansum(np.minimum((log_ratio - np.nanmedian(log_ratio)) ** 2, 4.0), axis=0)
         _, electrode_of_column = linear_sum_assignment(distance)

@@ -153,3 +153,9 @@ def temperatures(presses: MeasuredPresses) -> Array:
     number = np.arange(len(presses))
     measured = np.isfinite(presses.temperature_C)
     return np.interp(number, number[measured], presses.temperature_C[measured])
+
+
+def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:
+    """Return an empty list of presses for electrodes of these names."""
+    no_std = np.empty(0)
+    return MeasuredPresses(np.empty((0, 3)), np.empty((0, len(electrodes))), no_std, no_std, electrodes, ())

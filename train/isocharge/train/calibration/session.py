@@ -15,8 +15,9 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.train.calibration.calibrate import FEW, CalibrationResult, calibrate, no_presses
+from isocharge.train.calibration.calibrate import FEW, CalibrationResult, calibrate
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
+from isocharge.train.calibration.press_data import no_presses
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 
 MIN_PRESSES = 2

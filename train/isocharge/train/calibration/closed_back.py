@@ -1,0 +1,121 @@
+"""Recognition of a closed back: presses of a film behind which air is trapped.
+
+A calibration assumes a vented back. If the back is closed, the trapped air carries a part of the load, and the charges
+of the electrodes away from the probe are much smaller. No film of the prior has such charges. A calibration describes
+them by a large discrepancy, or refuses them. The presses are therefore compared with a few films with a closed back,
+which are solved directly. The comparison takes a few seconds and is made only if films with a vented back misfit.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import PressError, SceneError, SolveError
+from isocharge.common.measured_presses import MeasuredPresses
+from isocharge.simulate import SolveSettings, press, touch_charge
+from isocharge.train.calibration.diagnosis import CLEARER, PRETENSIONS, charge_misfit, expected_charges
+from isocharge.train.calibration.film_charges import FilmCharges
+
+MIN_VENTED_MISFIT = 0.5
+"""Misfit of films with a vented back, as `charge_misfit` returns it, below which the back is not examined."""
+
+CAVITY_DEPTH_mm = 20.0
+"""Depth of the cavity of the films that are compared. The air behind it is nearly incompressible, and that behind
+deeper cavities up to about 200 mm is, too."""
+
+INTERPOLATED_COUNT = 25
+"""Number of pretensions between those of `PRETENSIONS` for which charges are interpolated."""
+
+MAX_EXAMINED = 8
+"""Largest number of presses that are compared."""
+
+ACCURACY = 5e-3
+"""Target of the relative error of a charge. It is far below the effect of a closed back."""
+
+CLOSED_BACK_CAUTION = (
+    "films with a closed back explain the presses far better than films with a vented back: air is probably trapped "
+    "behind the film and carries a part of the load; vent the back and press again"
+)
+"""Warning for presses that a calibration describes by a large discrepancy."""
+
+
+def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
+    """Return whether films with a closed back explain the presses far better than films with a vented back.
+
+    Args:
+        presses: The presses. Those without a place or a force are not used.
+        charges: Charges of the films of the calibration.
+    """
+    placed = presses[presses.placed]
+    if not len(placed):
+        return False
+    examined = placed[np.unique(np.linspace(0, len(placed) - 1, MAX_EXAMINED).round().astype(int))]
+    vented_charges = _interpolated(expected_charges(charges, examined.contact))
+    vented_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, vented_charges)
+    if not MIN_VENTED_MISFIT < vented_misfit < np.inf:
+        return False
+    contact = charges.into_domain(examined.contact)
+    try:
+        solved_charges = np.array([_closed_charges(charges, share, contact) for share in PRETENSIONS])
+    except (SceneError, SolveError):
+        return False
+    closed_charges = _interpolated(solved_charges)
+    closed_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, closed_charges)
+    return closed_misfit < CLEARER * vented_misfit
+
+
+def refuse_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> None:
+    """Raise an error if films with a closed back explain presses that no film with a vented back explains.
+
+    Args:
+        presses: The presses.
+        charges: Charges of the films of the calibration.
+
+    Raises:
+        PressError: If films with a closed back explain the presses.
+    """
+    if has_closed_back(presses, charges):
+        raise PressError(
+            f"no film of {charges.prior.sensor.name!r} with a vented back explains these {len(presses)} presses, but "
+            "films with a closed back do: air is trapped behind the film; vent the back and press again"
+        )
+
+
+def _interpolated(charge: Array) -> Array:
+    """Interpolate charges between the pretensions of `PRETENSIONS`.
+
+    Args:
+        charge: Charges for each of `PRETENSIONS`, shape (n_pretension, n, n_electrode), pC.
+
+    Returns:
+        Charges for `INTERPOLATED_COUNT` pretensions, shape (INTERPOLATED_COUNT, n, n_electrode), pC.
+    """
+    shares = np.linspace(PRETENSIONS[0], PRETENSIONS[-1], INTERPOLATED_COUNT)
+    weights = np.array([np.interp(shares, PRETENSIONS, unit) for unit in np.eye(len(PRETENSIONS))])
+    return np.asarray(np.einsum("ki,kne->ine", weights, charge))
+
+
+def _closed_charges(charges: FilmCharges, pretension_share: float, contact: Array) -> Array:
+    """Compute the charges of the mean film of the prior with a closed back.
+
+    Args:
+        charges: Charges of the films of the calibration.
+        pretension_share: Pretension over the largest pretension of the prior.
+        contact: Presses (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Shape (n, n_electrode), pC.
+    """
+    prior = charges.prior
+    parameters = prior.mean.copy()
+    parameters[prior.index("pretension")] = pretension_share * prior.spread.pretension
+    sensor, probe = prior.film(parameters)
+    back_volume = CAVITY_DEPTH_mm * np.pi * sensor.film.radius**2
+    closed = replace(sensor, film=replace(sensor.film, back_volume=back_volume))
+    settings = SolveSettings(accuracy=ACCURACY)
+    rows = [
+        touch_charge(closed, press(closed.coated_film, probe, (x, y), force, settings))
+        for x, y, force in contact.tolist()
+    ]
+    return np.array(rows)
