@@ -25,6 +25,7 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.forward.readout import thermal_charge
+from isocharge.simulate.mechanics.film_temperature import warmed
 from isocharge.simulate.mechanics.theory import theory_by_name, theory_for
 from isocharge.simulate.solver.error_estimate import estimated_error, summary
 from isocharge.simulate.solver.friction import check_friction, friction_force
@@ -52,7 +53,12 @@ def point_command(
     ] = "auto",
     temperature: Annotated[
         float,
-        typer.Option("--temperature", metavar="K", help="Temperature step of the film, K, whose charge is added."),
+        typer.Option(
+            "--temperature",
+            metavar="K",
+            help="Temperature step of the film, K: its charge is added, and it changes the pretension if the sensor file "
+            "has expansion coefficients.",
+        ),
     ] = 0.0,
     side_force: Annotated[
         str | None,
@@ -78,7 +84,7 @@ def point_command(
     """
     if not 1e-8 <= accuracy <= 1.0:
         raise InputError(f"--accuracy: expected a relative error from 1e-8 to 1, got {accuracy}")
-    film_sensor = load_sensor(sensor)
+    film_sensor = warmed(load_sensor(sensor), temperature)
     footprint = parse_probe(probe)
     if theory == "auto":
         selected_theory = theory_for(film_sensor, footprint, (force, force), accuracy)

@@ -198,21 +198,30 @@ def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:
     Returns:
         Differences from the isotropic elasticity matrix and from the mean pretension.
     """
-    # Difference from the isotropic elasticity matrix in the axes of the film, where E1 = E root and E2 = E / root
+    rotation = stress_rotation(film.axis - angle)
+    moduli = rotation @ orthotropic_moduli(film) @ rotation.T
+
+    half_difference, shear_tension = film.deviator
+    deviator = np.array([half_difference, -half_difference, shear_tension])
+    tension = rotate_stress(deviator, -angle) / (film.young * amplitude2)
+    return Anisotropy(moduli, tension)
+
+
+def orthotropic_moduli(film: Film) -> Array:
+    """Compute the difference of the elasticity matrix C over E from that of the isotropic film, in the film's axes.
+
+    The moduli along the axes are E1 = E root and E2 = E / root.
+
+    Returns:
+        Shape (3, 3).
+    """
     plane_modulus = 1.0 / (1.0 - film.poisson**2)
     root = np.sqrt(film.young_ratio)
     change_11 = plane_modulus * (root - 1.0)
     change_22 = plane_modulus * (1.0 / root - 1.0)
     isotropic_shear = 0.5 / (1.0 + film.poisson)
     change_shear = 0.0 if film.shear is None else film.shear / film.young - isotropic_shear
-    moduli_in_film_axes = np.diag([change_11, change_22, change_shear])
-    rotation = stress_rotation(film.axis - angle)
-    moduli = rotation @ moduli_in_film_axes @ rotation.T
-
-    half_difference, shear_tension = film.deviator
-    deviator = np.array([half_difference, -half_difference, shear_tension])
-    tension = rotate_stress(deviator, -angle) / (film.young * amplitude2)
-    return Anisotropy(moduli, tension)
+    return np.diag([change_11, change_22, change_shear])
 
 
 def side_force_unit(film: Film, amplitude2: Array | float) -> Any:

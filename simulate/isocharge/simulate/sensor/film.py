@@ -41,6 +41,12 @@ MAX_YOUNG_RATIO = 10.0
 MAX_OVAL = 0.1
 """Largest parameter e of an oval clamp for which the mesh has been tested, dimensionless."""
 
+MAX_EXPANSION = 1e-3
+"""Largest size of a thermal expansion coefficient, 1/K. Larger values are probably in ppm/K."""
+
+ALUMINIUM_EXPANSION = 23e-6
+"""Thermal expansion coefficient of aluminium, of which most rings are made, 1/K."""
+
 MIN_BACK_VOLUME = 1.0
 """Smallest volume behind a film, mm^3. Smaller values are probably in m^3."""
 
@@ -89,6 +95,9 @@ class Film:
         back_volume: Volume of the closed cavity behind the film, mm^3; None if the back is vented.
         static_pressure: Pressure on the film without contact, MPa, positive in the direction of the push. With a closed
             cavity, this is the pressure on the flat film.
+        expansion: Thermal expansion coefficients of the film along its axes 1 and 2, 1/K; None if the temperature does
+            not change the pretension.
+        ring_expansion: Thermal expansion coefficient of the ring, 1/K.
     """
 
     radius: float
@@ -105,6 +114,16 @@ class Film:
     coat: Coat | None = None
     back_volume: float | None = None
     static_pressure: float = 0.0
+    expansion: tuple[float, float] | None = None
+    ring_expansion: float = ALUMINIUM_EXPANSION
+
+    @property
+    def expands_evenly(self) -> bool:
+        """Whether a change of the temperature changes the pretension equally in all directions."""
+        if self.expansion is None:
+            return True
+        along, across = self.expansion
+        return along == across and self.young_ratio == 1.0
 
     @property
     def has_back_pressure(self) -> bool:
@@ -151,6 +170,12 @@ class Film:
             )
         if not abs(self.oval) <= MAX_OVAL:
             raise SensorError(f"film oval: expected a share up to {MAX_OVAL:g}, got {self.oval}")
+        for expansion in (*(self.expansion or ()), self.ring_expansion):
+            if not abs(expansion) <= MAX_EXPANSION:
+                raise SensorError(
+                    f"film expansion: expected at most {1e6 * MAX_EXPANSION:g} ppm/K in size, got "
+                    f"{1e6 * expansion:.6g} ppm/K"
+                )
         if self.back_volume is not None and not MIN_BACK_VOLUME <= self.back_volume < math.inf:
             raise SensorError(
                 f"film back volume: expected at least {MIN_BACK_VOLUME:g} mm^3, got {self.back_volume:.6g} mm^3; leave "

@@ -23,12 +23,15 @@ from isocharge.common.structs import (
     read_toml,
 )
 from isocharge.common.toml_text import to_toml
-from isocharge.simulate.sensor.film import Film, Piezo, Surface
+from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, Film, Piezo, Surface
 from isocharge.simulate.sensor.sensor import Calibration, Corners, Electrode, Readout, Sensor
 from isocharge.simulate.sensor.size_check import tidy
 
 MAX_COORDINATE_mm = 1e6
 """Largest absolute value of a coordinate, mm."""
+
+PPM = 1e6
+"""Parts per million in one."""
 
 PASCAL_PER_MPA = 1e6
 """Pascal per megapascal."""
@@ -59,6 +62,8 @@ class FilmTable(Settings, frozen=True):
     oval_axis_deg: Finite = 0.0
     back_volume_mm3: Positive | None = None
     static_pressure_Pa: Finite = 0.0
+    expansion_ppm_per_K: Finite | Annotated[list[Finite], Meta(min_length=2, max_length=2)] | None = None
+    ring_expansion_ppm_per_K: Finite = PPM * ALUMINIUM_EXPANSION
 
 
 class PiezoTable(Settings, frozen=True):
@@ -228,7 +233,7 @@ def film_to_dict(film: Film) -> dict[str, Any]:
     tension = [tidy(value) for value in (mean + difference, mean - difference, shear)]
     ratio = np.sqrt(film.young_ratio)
     young_GPa = [tidy(film.young * 1e-3 * ratio), tidy(film.young * 1e-3 / ratio)]
-    optional = {
+    optional: dict[str, Any] = {
         "shear_GPa": None if film.shear is None else tidy(film.shear * 1e-3),
         "axis_deg": tidy(float(np.rad2deg(film.axis))),
         "oval": tidy(film.oval),
@@ -236,6 +241,9 @@ def film_to_dict(film: Film) -> dict[str, Any]:
         "back_volume_mm3": None if film.back_volume is None else tidy(film.back_volume),
         "static_pressure_Pa": tidy(film.static_pressure * PASCAL_PER_MPA),
     }
+    if film.expansion is not None:
+        optional["expansion_ppm_per_K"] = [tidy(PPM * coefficient) for coefficient in film.expansion]
+        optional["ring_expansion_ppm_per_K"] = tidy(PPM * film.ring_expansion)
     return {
         "radius_mm": tidy(film.radius),
         "thickness_um": tidy(film.thickness * 1e3),
@@ -359,7 +367,20 @@ def _film(table: FilmTable) -> Film:
         oval_axis=float(np.deg2rad(table.oval_axis_deg)),
         back_volume=table.back_volume_mm3,
         static_pressure=table.static_pressure_Pa / PASCAL_PER_MPA,
+        expansion=_expansion(table),
+        ring_expansion=table.ring_expansion_ppm_per_K / PPM,
     )
+
+
+def _expansion(table: FilmTable) -> tuple[float, float] | None:
+    """Return the expansion coefficients of the film along its axes, 1/K; None if the section has none."""
+    coefficients = table.expansion_ppm_per_K
+    if coefficients is None:
+        return None
+    if isinstance(coefficients, list):
+        along, across = coefficients
+        return along / PPM, across / PPM
+    return coefficients / PPM, coefficients / PPM
 
 
 def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:

@@ -1,0 +1,64 @@
+"""Change of the pretension with the temperatures of the film and of its ring.
+
+A film that is clamped in a ring cannot expand. If the film becomes warmer by dT and its ring by dR, the elastic strain
+along each axis of the film changes by
+
+    strain_i = ring_expansion * dR - expansion_i * dT,
+
+and the pretension by the stress of this strain, with the plane-stress stiffness of the film. A drawn film expands more
+across the drawn direction than along it, and its tension changes accordingly. A thin film follows the temperature of
+the air within seconds, and a ring within many minutes.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.simulate.mechanics.scaling import orthotropic_moduli
+from isocharge.simulate.mechanics.stress import rotate_stress, stress
+from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.sensor import Sensor
+
+
+def tension_change(film: Film, film_K: float, ring_K: float) -> Array:
+    """Compute the change of the pretension by changes of the temperatures.
+
+    Args:
+        film: The film. If it has no expansion coefficients, the result is zero.
+        film_K: Change of the temperature of the film, K.
+        ring_K: Change of the temperature of the ring, K.
+
+    Returns:
+        (T11, T22, T12) along x and y, shape (3,), MPa.
+    """
+    if film.expansion is None:
+        return np.zeros(3)
+    expansion_1, expansion_2 = film.expansion
+    ring_strain = film.ring_expansion * ring_K
+    strain = np.array([ring_strain - expansion_1 * film_K, ring_strain - expansion_2 * film_K, 0.0])
+    in_film_axes = film.young * stress(strain, film.poisson, orthotropic_moduli(film))
+    return rotate_stress(in_film_axes, film.axis)
+
+
+def warmed(sensor: Sensor, film_K: float, ring_K: float = 0.0) -> Sensor:
+    """Return the sensor with the pretension at other temperatures of the film and of its ring.
+
+    Args:
+        sensor: The sensor as described.
+        film_K: Temperature of the film less that for which the sensor is described, K.
+        ring_K: Temperature of the ring less that for which the sensor is described, K.
+
+    Raises:
+        SensorError: If the film becomes so slack that it is outside the range of the simulator.
+    """
+    film = sensor.film
+    if film.expansion is None:
+        return sensor
+    tension_11, tension_22, tension_12 = tension_change(film, film_K, ring_K).tolist()
+    pretension = film.pretension + 0.5 * (tension_11 + tension_22)
+    if film.expands_evenly:
+        return replace(sensor, film=replace(film, pretension=pretension))
+    difference, shear = film.deviator
+    deviator = (difference + 0.5 * (tension_11 - tension_22), shear + tension_12)
+    return replace(sensor, film=replace(film, pretension=pretension, deviator=deviator))
