@@ -56,7 +56,7 @@ def point_command(
         typer.Option(
             "--temperature",
             metavar="K",
-            help="Temperature step of the film, K: its charge is added, and it changes the pretension if the sensor file "
+            help="Temperature step of the film, K. Its charge is added. It changes the pretension if the sensor file "
             "has expansion coefficients.",
         ),
     ] = 0.0,
