@@ -130,15 +130,26 @@ class Coating:
         return normal_x, normal_y
 
     def _laminate(self, points: Complexes) -> "_Laminate":
-        """Compute the laminate at each point; see the module for the formulas."""
+        """Compute the laminate of bare and coated film at each point, with the formulas of the module's docstring.
+
+        Args:
+            points: Film points x + iy, any shape, in film radii.
+
+        Returns:
+            Volume share and stiffness of each phase, and its strain for a unit mean strain. Phase i has i layers of the
+            coat.
+        """
         # `_shares` counts the area under at least so many layers; the differences are the areas under exactly so many.
         shares = -np.diff(self._shares(points), prepend=1.0, append=0.0)
+
+        # The matrix N converts the jump of the displacement derivative across the edge into a jump of the strain.
         normal_x, normal_y = self._normal(points)
-        normal = np.zeros((*points.shape, 1, 3, 2))  # N: maps a displacement jump across the edge to a strain
+        normal = np.zeros((*points.shape, 1, 3, 2))
         normal[..., 0, 0, 0] = normal_x
         normal[..., 0, 2, 1] = normal_x
         normal[..., 0, 1, 1] = normal_y
         normal[..., 0, 2, 0] = normal_y
+
         n_layers = np.arange(len(self.layers) + 1)
         stiffness = self.bare + n_layers[:, None, None] * self.added
         traction = normal.swapaxes(-1, -2) @ stiffness  # N^T C_i

@@ -101,7 +101,7 @@ def lagrange_values(nodes: Array, weights: Array, points: Array) -> Array:
         points: Points of evaluation, shape (m,).
 
     Returns:
-        Value of each polynomial points each point, shape (m, n). Each row adds up to one.
+        Value of each polynomial at each point, shape (m, n). Each row adds up to one.
     """
     difference = points[:, None] - nodes[None, :]
     point_on_node, node_index = np.nonzero(np.abs(difference) < MIN_DIFFERENCE)

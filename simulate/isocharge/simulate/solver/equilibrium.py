@@ -97,9 +97,11 @@ def deflection(equilibrium: Equilibrium, points: Array) -> Array:
     """
     mesh = equilibrium.mesh
     element, xi, eta, _ = _locate(equilibrium, points)
-    values = tensor_values(mesh.resolution.order, xi, eta)
-    scaled = np.einsum("pn,pn->p", values, equilibrium.field[mesh.template.nodes[element], 2])
-    return np.asarray(equilibrium.film.radius * np.sqrt(equilibrium.groups.amplitude2) * scaled)
+    basis_values = tensor_values(mesh.resolution.order, xi, eta)  # shape (n, n_local)
+    nodal_deflection = equilibrium.field[mesh.template.nodes[element], 2]
+    scaled_deflection = (basis_values * nodal_deflection).sum(axis=1)
+    unit = equilibrium.film.radius * np.sqrt(equilibrium.groups.amplitude2)
+    return np.asarray(unit * scaled_deflection)
 
 
 def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "middle") -> Array:
@@ -171,6 +173,9 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
 
     The smallest stress is that of the mid-surface. If the theory includes bending, the largest stress is that of the
     mid-surface and of both outer surfaces.
+
+    Args:
+        equilibrium: The solved press.
 
     Returns:
         Smallest and largest stress, MPa, tension positive.

@@ -116,7 +116,13 @@ def _errors_sentence(metadata: ModelMetadata) -> str:
 
 
 def _measured_presses_words(metadata: ModelMetadata) -> str:
-    """Return on which measured presses the errors were measured; empty if the presses were simulated."""
+    """Return the part of a sentence that describes the presses on which the errors were measured.
+
+    It is empty if the presses were simulated.
+
+    Args:
+        metadata: Metadata of the model.
+    """
     press_count = metadata.errors.get("measured_presses")
     if not press_count:
         return ""

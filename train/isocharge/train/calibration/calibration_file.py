@@ -134,13 +134,13 @@ def _temperature_table(posterior: FilmPosterior) -> dict[str, Any] | None:
     warming = posterior.warming
     if warming is None:
         return None
-    unit = PASCAL_FACTOR
-    stored_covariance = posterior.joint if posterior.imperfect else posterior.covariance
-    std = np.sqrt(np.diag(stored_covariance))
-    correlations = _over_std(warming.covariance[: std.size], warming.std * std)
+    film_covariance = posterior.joint if posterior.imperfect else posterior.covariance
+    film_std = np.sqrt(np.diag(film_covariance))
+    covariance_with_film = warming.covariance[: film_std.size]
+    correlations = _over_std(covariance_with_film, warming.std * film_std)
     return {
         "at_C": warming.at_C,
-        "pretension_per_K": {"value": unit * warming.MPa_per_K, "std": unit * warming.std},
+        "pretension_per_K": {"value": PASCAL_FACTOR * warming.MPa_per_K, "std": PASCAL_FACTOR * warming.std},
         "correlations": np.round(correlations, 6).tolist(),
     }
 
@@ -391,10 +391,17 @@ def _numbers(path: Path, key: str, rows: list[list[Correlation]], may_be_null: B
 
 
 def _possible(path: Path, correlations: Array) -> Array:
-    """Return correlations without the negative eigenvalues that rounding leaves.
+    """Return a matrix of correlations without the small negative eigenvalues that are caused by rounding.
+
+    Args:
+        path: The file, for the error message.
+        correlations: Symmetric matrix, shape (n, n).
+
+    Returns:
+        The nearest positive semidefinite matrix, shape (n, n).
 
     Raises:
-        PressError: If they have larger negative eigenvalues: then no unknowns have these correlations.
+        PressError: If an eigenvalue is too negative for rounding, so that the matrix cannot contain correlations.
     """
     eigenvalues, vectors = np.linalg.eigh(correlations)
     if eigenvalues[0] < -EIGENVALUE_TOLERANCE:

@@ -13,6 +13,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.common.files import new_folder, refuse_existing, write_whole
 from isocharge.serve.live.device import ANY_BOARD, Device
 from isocharge.serve.model.model_folder import load_model
+from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.signal_chain.hum import MIN_SQUARED_STEP
 from isocharge.train.export_c.c_text import c_comment, c_double, c_doubles, source_text
 from isocharge.train.export_c.model_source import model_header, model_source, self_test
@@ -40,18 +41,7 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
             that does not exist in C.
     """
     chain = device.chain(electrodes)
-    if chain.tare is not None and not 1 <= chain.tare.frames <= MAX_TARE_FRAMES:
-        raise DeviceError(
-            f"{device.where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES} for a signal chain in "
-            f"C, which holds them all, got {chain.tare.frames}"
-        )
-    has_pyroelectric_charges = isinstance(chain.pyro, np.ndarray)
-    if chain.memory is not None or has_pyroelectric_charges:
-        key = "common_mode.pC_per_K" if has_pyroelectric_charges else "memory"
-        raise DeviceError(
-            f"{device.where}: {key}: a signal chain in C does not know it; "
-            "remove it from the device file, or run `isocharge serve stream` on a host"
-        )
+    _check_exists_in_c(device.where, chain)
     numbers = {
         "ZERO": c_doubles(np.zeros(len(electrodes)) if chain.zero is None else chain.zero),
         "GAIN_PC": c_doubles(np.ones(len(electrodes)) if chain.gain_pC is None else chain.gain_pC),
@@ -76,6 +66,31 @@ def device_header(device: Device, electrodes: tuple[str, ...]) -> str:
             numbers[f"{prefix}_{c_name}"] = _number(value)
     lines = "\n".join(f"#define ISOCHARGE_{name} {text}" for name, text in numbers.items())
     return source_text("isocharge_device.h", board=c_comment(device.name), lines=lines)
+
+
+def _check_exists_in_c(where: str, chain: Chain) -> None:
+    """Raise an error if a signal chain cannot be exported to C.
+
+    Args:
+        where: Path of the device file, for the error messages.
+        chain: The signal chain.
+
+    Raises:
+        DeviceError: If the tare is too long for the memory of the C program, or the chain has a stage that does not
+            exist in C.
+    """
+    if chain.tare is not None and not 1 <= chain.tare.frames <= MAX_TARE_FRAMES:
+        raise DeviceError(
+            f"{where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES} for a signal chain in C, which "
+            f"stores all frames of the tare, got {chain.tare.frames}"
+        )
+    has_pyroelectric_charges = isinstance(chain.pyro, np.ndarray)
+    if chain.memory is not None or has_pyroelectric_charges:
+        key = "common_mode.pC_per_K" if has_pyroelectric_charges else "memory"
+        raise DeviceError(
+            f"{where}: {key}: this stage does not exist in the signal chain in C; remove it from the device file, or "
+            "run `isocharge serve stream` on a host"
+        )
 
 
 def _number(value: Any) -> str:

@@ -176,11 +176,11 @@ def _model(about: dict[str, Any], arrays: Mapping[str, np.ndarray], sha256: str)
     probe = Circle(_converted(about["probe_radius"], 1.0 / FILE_UNITS["probe_radius"]))
     prior = FilmPrior(sensor_from_dict(about["sensor"]), probe, FilmSpread(**spread))
     noise = about["noise"]
-    low, high = about["force_range_N"]
+    min_force, max_force = about["force_range_N"]
     activation = ACTIVATIONS[about.get("activation", TANH.name)]
     model = FilmsModel(
         family=FilmFamily.from_arrays(_within(arrays, "family")),
-        scaling=FilmScaling(prior, Domain(float(about["radius_mm"]), (float(low), float(high)))),
+        scaling=FilmScaling(prior, Domain(float(about["radius_mm"]), (float(min_force), float(max_force)))),
         mean=arrays["mean"],
         whitening=arrays["whitening"],
         contact=_unpacked(_within(arrays, "contact"), activation),

@@ -57,6 +57,7 @@ def evaluate(fitted: Fitted, presses: LabelledPresses | Dataset | None = None, *
     if not test.measured and isinstance(fitted.noise, NoiseModel):
         return simulated_errors(fitted.predict, test, fitted.noise, seed)
 
+    # Measured presses: the estimates of the cross-validation are used, because the network was trained on the presses.
     if presses is None and fitted.cross_validated is not None:
         contact, std, _ = fitted.cross_validated
     else:

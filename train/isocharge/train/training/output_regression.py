@@ -39,12 +39,13 @@ class Regression:
 
 
 def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, contact: Array) -> FoldedNetwork:
-    """Return a network that answers `charge` as the given network answers `equivalent`.
+    """Adapt a network to charges that differ from those of its training.
 
-    A linear map between the features of both charges is folded into the first layer, and the last layer learns what
-    remains. The standard deviations are then fitted to the errors of the new network by maximising the Gaussian
-    likelihood with Fisher's scoring (McCullagh and Nelder 1989, 2.5), which is a regression on the squares of
-    error / standard deviation.
+    The new network estimates from `charge` the contacts that the given network estimates from `equivalent`. A linear
+    map from the features of `charge` to those of `equivalent` is included in the first layer, and the last layer is
+    fitted to the remaining differences. The standard deviations are then fitted to the errors of the new network by
+    maximising the Gaussian likelihood with Fisher's scoring (McCullagh and Nelder 1989, 2.5), which is a regression on
+    the squares of error / standard deviation.
 
     Args:
         network: The given network.
@@ -52,6 +53,9 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, c
         equivalent: Charges of the same contacts on the film for which the given network was trained, shape (n,
             n_electrode), pC.
         contact: True contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        The new network.
     """
     features = network.features.evaluate(charge)
     equivalent_features = network.features.evaluate(equivalent)
