@@ -13,7 +13,8 @@ from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Triangulation, 
 from isocharge.simulate.contours.field_contours import ContourField
 from isocharge.simulate.plots.film import draw_electrodes, frame_film
 
-sensor, force = load_sensor("three-25um-biaxial"), 0.7
+sensor = load_sensor("three-25um-biaxial")
+force = 0.7
 charge_map = ChargeSpline.of(ForwardMap.build(sensor, Circle(1.0), radius=9.0, force_range=(0.5, 1.0)))
 touch = np.array([[2.0, -3.0, force]])
 charge = charge_map.charges(touch)

@@ -16,7 +16,8 @@ from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, fr
 
 centres = {"A": (9.0, 0.0), "B": (0.0, 9.0), "C": (-9.0, 0.0), "D": (0.0, -9.0)}
 squares = tuple(Electrode.of_square(name, centre, 3.0) for name, centre in centres.items())
-sensor, noise = replace(load_sensor("four-25um-biaxial"), name="mine", electrodes=squares), noise_model("reference")
+sensor = replace(load_sensor("four-25um-biaxial"), name="mine", electrodes=squares)
+noise = noise_model("reference")
 forward_map = ForwardMap.build(sensor, Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
 
 distance, angle = np.meshgrid(np.linspace(0.0, 8.0, 17), np.linspace(0.0, 2.0 * np.pi, 73))

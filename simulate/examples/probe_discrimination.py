@@ -13,7 +13,9 @@ import numpy as np
 from isocharge.simulate import ChargeSpline, Circle, Domain, ForwardMap, Sweep, load_sensor, noise_model, parse_probe
 from isocharge.simulate.identifiability.nearest_contact import nearest_contact
 
-sensor, noise, force = load_sensor("four-25um-uniaxial"), noise_model("reference"), 1.0
+sensor = load_sensor("four-25um-uniaxial")
+noise = noise_model("reference")
+force = 1.0
 domain = Domain(6.0, (force / 1.3, force * 1.3))  # another probe needs another force
 circle = ChargeSpline.of(ForwardMap.build(sensor, Circle(1.0), domain.radius, domain.force_range))
 contact = Sweep(domain.radius, (force, force), samples=1000).contacts()

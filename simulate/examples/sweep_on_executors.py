@@ -9,7 +9,9 @@ from isocharge.simulate import Circle, Sweep, dask_workers, load_sensor, read_da
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1])
-    sensor, probes, sweep = load_sensor("three-25um-biaxial"), (Circle(1.0),), Sweep(radius=4.0, samples=2000, seed=1)
+    sensor = load_sensor("three-25um-biaxial")
+    probes = (Circle(1.0),)
+    sweep = Sweep(radius=4.0, samples=2000, seed=1)
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         dataset = read_dataset(run_sweep(folder / "pool", sensor, probes, sweep, executor=pool))
     print(f"{len(dataset.samples)} presses, charges up to {dataset.samples.charge_pC.max():.0f} pC")

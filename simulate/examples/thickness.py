@@ -11,7 +11,8 @@ import matplotlib.pyplot as plt
 
 from isocharge.simulate import Circle, load_sensor, press, touch_charge
 
-sensor, pretensions = load_sensor("three-25um-biaxial"), (0.0, 0.5, 1.0, 2.0, 4.0)
+sensor = load_sensor("three-25um-biaxial")
+pretensions = (0.0, 0.5, 1.0, 2.0, 4.0)
 print("thickness, mm   pretension, MPa   charge of A, pC")
 for thickness in (0.025, 0.05, 0.11):
     charges = []

@@ -63,7 +63,8 @@ def plate_stiffness(film: Film) -> float:
 
 def test_schwerin_point_load():
     """w = k (1 - (r/a)^(2/3)), N_r = 3 F / (4 pi k) (r/a)^(-2/3), N_theta = N_r / 3, away from a small probe."""
-    film, force = replace(SLACK, poisson=1.0 / 3.0), TINY
+    film = replace(SLACK, poisson=1.0 / 3.0)
+    force = TINY
     solved = press(
         film, Circle(0.02), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=Resolution(6, 8, 10))
     )
@@ -151,13 +152,15 @@ def test_plate_under_a_disk(at, radius):
 def test_taut_plate_under_a_centred_disk(tension_MPa):
     """D lap lap w - N lap w = q: logarithm, parabola and modified Bessel functions, joined at the footprint's edge."""
     film = replace(SLACK, thickness=0.3, pretension=tension_MPa)
-    tension, c = film.pretension * film.thickness, 0.1
+    tension = film.pretension * film.thickness
+    c = 0.1
     k = film.radius * np.sqrt(tension / plate_stiffness(film))
 
     def ladder(r: float) -> tuple[np.ndarray, np.ndarray]:
         """Value and three derivatives of 1, I0, then of 1, ln, I0, K0 (scaled to one at r = c or r = 1)."""
         grow, fall = (np.array([k**n * derivative(0, k * r, n) for n in range(4)]) for derivative in (ivp, kvp))
-        one, log = np.array([1.0, 0, 0, 0]), np.array([np.log(r), 1 / r, -1 / r**2, 2 / r**3])
+        one = np.array([1.0, 0, 0, 0])
+        log = np.array([np.log(r), 1 / r, -1 / r**2, 2 / r**3])
         return (
             np.stack([one, grow / iv(0, k * c)], axis=1),
             np.stack([one, log, grow / iv(0, k), fall / kv(0, k * c)], axis=1),
@@ -188,7 +191,8 @@ def charge_of_a(radius: float, stress: Callable[[float], tuple[float, float]]) -
     """Charge of electrode A of "four-25um-uniaxial", pC, from (s_r, s_theta), MPa, at r / a, by scipy's integral."""
 
     def density(y: float, x: float) -> float:
-        r, c2 = np.hypot(x, y), x**2 / (x**2 + y**2)
+        r = np.hypot(x, y)
+        c2 = x**2 / (x**2 + y**2)
         radial, hoop = stress(r / radius)
         return 20.0 * (radial * c2 + hoop * (1 - c2)) + 2.0 * (radial * (1 - c2) + hoop * c2)
 
@@ -201,7 +205,8 @@ def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float
     Solves for (u, phi = r S_r (1 + A^2 u'), w) in the scaled variables of mechanics.energy, load one. Radial balance is
     phi' = S_theta (1 + A^2 u / r), vertical balance r S_r w' = - min(1, (r / R)^2) / 2 pi.
     """
-    plane, start = 1.0 / (1.0 - poisson**2), 1e-4
+    plane = 1.0 / (1.0 - poisson**2)
+    start = 1e-4
 
     def fields(r: np.ndarray, u: np.ndarray, phi: np.ndarray) -> tuple[np.ndarray, ...]:
         """u', w', S_r, S_theta: one scalar equation per radius, by Newton from von Karman's answer."""
@@ -265,7 +270,9 @@ def test_axisymmetric_membrane(share, force, poisson, tension):
 def test_hencky():
     """A probe over the whole film is a uniform dead pressure q: N_r(0) = b0 / 4 (q^2 a^2 E h)^(1/3) with
     b0 = 1.7244 at Poisson 0.3 (Hencky 1915; digits of Fichter 1997)."""
-    film, force, radius = replace(SLACK, poisson=0.3), 1e-6, 0.9999 * SLACK.radius
+    film = replace(SLACK, poisson=0.3)
+    force = 1e-6
+    radius = 0.9999 * SLACK.radius
     solved = press(film, Circle(radius), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=REFINED))
     pressure = force / (np.pi * radius**2)
     expected = 1.7244 / 4.0 * np.cbrt(pressure**2 * film.radius**2 * film.young * film.thickness)
@@ -275,7 +282,8 @@ def test_hencky():
 
 def test_charge_of_a_centred_press_is_the_integral_of_the_boundary_value_problem():
     """The output itself: electrode A integrated over from scipy's stresses, no code of ours but the solve."""
-    sensor, force = load_sensor("four-25um-uniaxial"), 1.0
+    sensor = load_sensor("four-25um-uniaxial")
+    force = 1.0
     amplitude2 = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
     solved = press(sensor.film, Circle(1.0), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=REFINED))
     at = np.linspace(8.4, 11.7, 40) / 45.0

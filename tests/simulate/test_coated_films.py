@@ -17,7 +17,9 @@ from isocharge.simulate.solver.load_case import place_coated
 SENSOR = load_sensor("four-25um-biaxial")
 TAUT = replace(SENSOR, film=replace(SENSOR.film, pretension=1.0))
 INK = replace(TAUT, coating=0.3 * TAUT.film.young * TAUT.film.thickness)
-PROBE, AT, FORCE = Circle(1.0), (3.0, -2.0), 0.5
+PROBE = Circle(1.0)
+AT = (3.0, -2.0)
+FORCE = 0.5
 
 
 @pytest.mark.slow
@@ -30,12 +32,15 @@ def test_charges_of_stiffer_electrodes_agree_with_another_code():
 @pytest.mark.parametrize("stiffening", [0.3, 3.0])
 def test_strain_of_a_film_with_a_round_coat_is_the_closed_form(stiffening):
     """A pressure 1 - r^2 in the plane: u = r^3 / (4 K) + A r + B / r with K inside the coat and outside (Lame)."""
-    film, b, nu = SENSOR.film, 6.0 / 45.0, SENSOR.film.poisson
+    film = SENSOR.film
+    b = 6.0 / 45.0
+    nu = SENSOR.film.poisson
     corner = 6.0 * np.exp(2j * np.pi * np.arange(96) / 96)
     disk = tuple(zip(corner.real.tolist(), corner.imag.tolist(), strict=True))
     film = replace(film, coat=Coat(stiffening * film.young * film.thickness, ((disk,),)))
     mesh = place_coated(film, PROBE, (0.0, 0.0), Resolution(4, 8, 4, 0), 0.02)
-    geometry, (xi, eta, _) = mesh.geometry, gauss_reference_square(5)
+    geometry = mesh.geometry
+    xi, eta, _ = gauss_reference_square(5)
     pressure = geometry.weights * (1.0 - np.abs(mesh.points @ tensor_values(4, xi, eta).T) ** 2)
     force = np.einsum("ep,epan->ena", pressure, geometry.gradient)
     pressed = np.stack([*(geometry.gather(force[..., axis]) for axis in (0, 1)), 0.0 * geometry.load], axis=1)

@@ -72,7 +72,8 @@ def refined(film: Film, probe: Probe, theory: Theory, order: int, times: int) ->
     return press(film, probe, (6.0, 3.0), 1.0, SolveSettings(theory=theory, resolution=resolution, layer=0.1))
 
 
-SMALL, ROUND = Polygon.rectangle(2.0, 1.0, 0.5), Circle(1.0)
+SMALL = Polygon.rectangle(2.0, 1.0, 0.5)
+ROUND = Circle(1.0)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,9 @@ from isocharge.simulate import (
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
 SENSOR = load_sensor("four-25um-biaxial")
-PROBE, AT, FORCE = Circle(1.0), (3.0, -2.0), 0.5
+PROBE = Circle(1.0)
+AT = (3.0, -2.0)
+FORCE = 0.5
 ALL = Film(45.0, 0.025, 3000.0, 0.34, 1.0, (0.33, 0.2), young_ratio=1.2, axis=0.4, oval=0.02, oval_axis=-0.7)
 SLACK = Film(45.0, 0.025, 3000.0, 0.34, -0.3, shear=1000.0)
 
@@ -40,8 +42,11 @@ def test_charges_of_imperfect_films_agree_with_scikit_fem(film, expected):
 
 def test_an_oval_film_that_is_tauter_along_it_sinks_as_a_round_one_stretched():
     """With T1 / T2 as the squares of the half axes, Green's function of the disk holds in scaled coordinates."""
-    e, taut, turn = 0.02, 2.0, 0.4
-    half, mean = 2.0 * e * taut, (1.0 + e**2) * taut
+    e = 0.02
+    taut = 2.0
+    turn = 0.4
+    half = 2.0 * e * taut
+    mean = (1.0 + e**2) * taut
     deviator = (half * np.cos(2.0 * turn), half * np.sin(2.0 * turn))
     film = replace(SENSOR.film, pretension=mean, deviator=deviator, oval=e, oval_axis=turn)
     solved = press(film, Circle(0.1), (9.0, -5.0), 1e-6, SolveSettings(theory=Theory(True, False, True)))
@@ -51,7 +56,8 @@ def test_an_oval_film_that_is_tauter_along_it_sinks_as_a_round_one_stretched():
         return along.real / (1.0 + e) + 1j * along.imag / (1.0 - e)
 
     points = np.array([[-10.0, 3.0], [15.0, 12.0], [0.0, 20.0], [-30.0, -10.0]])
-    z, source = scaled(points), scaled((9.0, -5.0))
+    z = scaled(points)
+    source = scaled((9.0, -5.0))
     green = np.log(np.abs((1.0 - z * np.conj(source)) / (z - source)))
     expected = 1e-6 / (2.0 * np.pi * film.thickness * taut * (1.0 - e**2)) * green
     np.testing.assert_allclose(deflection(solved, points), expected, rtol=3.0 * e**2)

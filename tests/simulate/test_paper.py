@@ -32,7 +32,8 @@ def test_numbers_are_those_of_closed_forms(folder):
     numbers = json.loads((folder / "paper.json").read_text("utf-8"))
     assert numbers["Fig. 1"]["error_mm"] < 1e-12
     assert numbers["Fig. 3"]["sides_mm"] == pytest.approx([300**0.5] * 3, rel=1e-6)
-    thin, thick = numbers["Eq. 4"]["films"][0], numbers["Eq. 4"]["films"][-2]
+    thin = numbers["Eq. 4"]["films"][0]
+    thick = numbers["Eq. 4"]["films"][-2]
     assert [*thin["exponent"].values()] == pytest.approx([2 / 3] * 4, abs=0.01)
     assert thin["misfit"] < 0.02
     assert thick["thickness_um"] == 1000.0

@@ -54,7 +54,8 @@ class ReferenceCase:
         return replace(load_sensor(f"{layout}-25um-{kind}"), film=self.film, readout=readout)
 
     def __str__(self) -> str:
-        film, (x, y) = self.film, self.at
+        film = self.film
+        x, y = self.at
         turn = f"@{np.rad2deg(self.probe.angle):.0f}" if self.probe.angle else ""
         scene = f"{film.thickness * 1e3:.0f}um-{film.pretension:g}MPa-{self.probe.notation}{turn}"
         return f"{scene}-at({x:.0f},{y:.0f})-{self.force:g}N"
@@ -121,7 +122,8 @@ def test_charges_and_deflection(case):
     The second solver states its errors relative to the press's largest charge. The estimated error is a bound for the
     worst charge, beyond what the reference itself may be off.
     """
-    solved, worst = solve(case.film, case.probe, case.at, case.force), 0.0
+    solved = solve(case.film, case.probe, case.at, case.force)
+    worst = 0.0
     assert len(case.charges) in (4, 8)
     for key, expected in case.charges.items():
         sensor = case.sensor(key)

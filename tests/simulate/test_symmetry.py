@@ -17,7 +17,8 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.solver.error_estimate import estimated_error
 
-RECTANGLE, TRIANGLE = Polygon.rectangle(4.0, 2.0, 0.4), Polygon.triangle(4.0, 0.4)
+RECTANGLE = Polygon.rectangle(4.0, 2.0, 0.4)
+TRIANGLE = Polygon.triangle(4.0, 0.4)
 PROBES = {"circle": Circle(1.0), "rectangle": RECTANGLE, "triangle": TRIANGLE}
 FILMS = {"25 um": {}, "taut 110 um": {"thickness": 0.11, "pretension": 1.0}}
 
@@ -65,7 +66,8 @@ def test_quarter_turn_of_an_uniaxial_film_swaps_the_coefficients(probe):
 
 def test_rotation_of_press_and_layout_keeps_the_charges(probe):
     """Any angle, with polygonal electrodes that turn along; biaxial, so that the film's axes do not show."""
-    sensor, angle = sensor_of("four-25um-biaxial"), -2.5
+    sensor = sensor_of("four-25um-biaxial")
+    angle = -2.5
     still = tuple(replace(e, square=False) for e in sensor.electrodes)
     c, s = np.cos(angle), np.sin(angle)
     along = tuple(replace(e, corners=tuple((c * x - s * y, s * x + c * y) for x, y in e.corners)) for e in still)
@@ -78,7 +80,8 @@ def test_rotation_of_press_and_layout_keeps_the_charges(probe):
 @pytest.mark.parametrize("film", FILMS)
 def test_mirrored_press_has_mirrored_charges(probe, film):
     """About the y axis."""
-    sensor, order = sensor_of("three-25um-uniaxial", film), [0, 2, 1]
+    sensor = sensor_of("three-25um-uniaxial", film)
+    order = [0, 2, 1]
     second = charges(sensor, mirrored(probe), (-AT[0], AT[1]))
     np.testing.assert_allclose(second, charges(sensor, probe, AT)[order], rtol=2e-5)
 

@@ -18,8 +18,10 @@ from isocharge.simulate import Circle, load_sensor, noise_model
 from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.data.presses import draw_contacts
 
-problem, noise = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0)), noise_model("reference")
-rng, pretension = np.random.default_rng(5), problem.prior.names.index("pretension")
+problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))
+noise = noise_model("reference")
+rng = np.random.default_rng(5)
+pretension = problem.prior.names.index("pretension")
 film = problem.prior.draw(rng, 1)[0]
 film[pretension] = 1.0  # MPa
 warm = np.where(np.arange(film.size) == pretension, film + 0.35, film)

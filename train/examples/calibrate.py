@@ -18,7 +18,8 @@ from isocharge.simulate import Circle, load_sensor
 from isocharge.simulate.plots.film import draw_electrodes, frame_film
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
 
-sensor, presses = load_sensor("four-25um-biaxial"), read_presses(Path(sys.argv[0]).parent / "presses.csv")
+sensor = load_sensor("four-25um-biaxial")
+presses = read_presses(Path(sys.argv[0]).parent / "presses.csv")
 result = calibrate(presses, CalibrationProblem.of(sensor, Circle(1.0)))
 print(f"{len(presses)} presses: {result.film[0].film.pretension:.2f} MPa of pretension")
 print(f"left by not knowing the film: {result.error_left.position_mm:.2f} mm, {result.error_left.force_percent:.1f} %")

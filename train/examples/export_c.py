@@ -23,11 +23,13 @@ sensor = load_sensor("four-25um-biaxial")
 charge = noise_model("reference").add(ForwardMap.build(sensor, Circle(1.0)).charges(contact), np.random.default_rng(0))
 for name in ("four-25um-biaxial", "four-25um-biaxial-student"):
     with tempfile.TemporaryDirectory() as temporary:
-        folder, library = export_c(find_model(name), Path(temporary) / "c"), Path(temporary) / "model.so"
+        folder = export_c(find_model(name), Path(temporary) / "c")
+        library = Path(temporary) / "model.so"
         compiler = ("cc", "-std=c99", "-O2", "-shared", "-fPIC", "-o", library)
         subprocess.run([*compiler, folder / "isocharge_model.c", "-lm"], check=True)
         predict = ctypes.CDLL(str(library)).isocharge_predict
-    answer, answers = (ctypes.c_float * 7)(), []
+    answer = (ctypes.c_float * 7)()
+    answers = []
     for row in charge.tolist():
         predict((ctypes.c_float * 4)(*row), answer)
         answers.append(answer[:2])

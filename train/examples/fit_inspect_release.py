@@ -16,7 +16,8 @@ from isocharge.serve import Predictor
 from isocharge.simulate import Circle, Sweep, load_sensor, noise_model, read_dataset, run_sweep
 from isocharge.train import FitConfig, TrainingConfig, evaluate, fit, release
 
-sensor, noise = load_sensor("three-25um-biaxial"), noise_model("reference")
+sensor = load_sensor("three-25um-biaxial")
+noise = noise_model("reference")
 with tempfile.TemporaryDirectory() as temporary:
     folder = Path(temporary)
     presses = read_dataset(run_sweep(folder / "presses", sensor, (Circle(1.0),), Sweep(samples=6000)))

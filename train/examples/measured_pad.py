@@ -21,7 +21,8 @@ from isocharge.train import fit_presses, release
 presses = read_presses(Path(sys.argv[0]).resolve().parents[2] / "tests" / "data" / "tactile_fsi.csv")
 number = np.unique(presses.contact[:, :2], axis=0, return_inverse=True)[1].ravel()  # of its place
 unseen = np.random.default_rng(0).permutation(number.max() + 1)[number] % 5 == 0
-known, tested = presses[~unseen], presses[unseen]
+known = presses[~unseen]
+tested = presses[unseen]
 with tempfile.TemporaryDirectory() as temporary:
     model = release(fit_presses(known, "pad"), Path(temporary) / "pad")
     answers = Predictor(model.folder).predict_batch(tested.charge_pC)

@@ -27,7 +27,8 @@ def presses(samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return contact, noise_model("reference").add(charge_map.charges(contact), np.random.default_rng(seed))
 
 
-(known, known_charge), (contact, charge) = presses(20_000, 1), presses(1000, 2)
+known, known_charge = presses(20_000, 1)
+contact, charge = presses(1000, 2)
 nearest = KNeighborsRegressor(1).fit(np.log(known_charge), known[:, :2])
 polynomial = make_pipeline(StandardScaler(), PolynomialFeatures(9), Ridge(1e-2)).fit(np.log(known_charge), known[:, :2])
 answers = {

@@ -22,7 +22,8 @@ CONTOUR_PC = 650.0
 ELEMENTS = (13_000, 14_000)
 """Triangles of a mesh, least and most."""
 
-LINEAR_N, LINEAR_MPA = 0.5, 40.0
+LINEAR_N = 0.5
+LINEAR_MPA = 40.0
 """Force up to which charge is called linear, and stress up to which PVDF is."""
 
 FIG_8_DEG = (140.0, 240.0)
@@ -30,7 +31,9 @@ FIG_8_DEG = (140.0, 240.0)
 
 # What it leaves open
 
-TRIANGLE, RECTANGLE, CIRCLE = Polygon.triangle(4.0), Polygon.rectangle(4.0, 2.0), Circle(1.0)
+TRIANGLE = Polygon.triangle(4.0)
+RECTANGLE = Polygon.rectangle(4.0, 2.0)
+CIRCLE = Circle(1.0)
 
 OTHERS = (Polygon.triangle(2.0), Polygon.triangle(6.0), CIRCLE, RECTANGLE)
 """Probes to show what the size and the shape change."""

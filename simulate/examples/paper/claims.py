@@ -13,7 +13,9 @@ from isocharge.simulate.contours.charge_curves import Mapping
 from isocharge.simulate.forward.readout import thermal_charge
 from isocharge.simulate.solver.equilibrium import principal_stress
 
-D33, PYRO, KELVIN = -30.0, -30.0, 0.1
+D33 = -30.0
+PYRO = -30.0
+KELVIN = 0.1
 """d33 (pC/N) and pyroelectric coefficient (pC/(mm^2 K)) of PVDF with d31 > 0, and a step (K) that a finger makes."""
 
 
@@ -21,7 +23,8 @@ def claims(solves: Solves, accuracy: Accuracy) -> Entry:
     """What the text says without a figure."""
     edges, of_edges = _edges(solves)
     pressure, of_pressure = _d33(solves)
-    sensor, largest = solves.choices.sensor("three"), principal_stress(solves.shown)[1]
+    sensor = solves.choices.sensor("three")
+    largest = principal_stress(solves.shown)[1]
     warm = thermal_charge(replace(sensor, piezo=replace(sensor.piezo, pyro=PYRO)), KELVIN)[0]
     pyro = Row(
         "pyroelectric charge",
@@ -54,7 +57,9 @@ def _edges(solves: Solves) -> tuple[Row, dict[str, object]]:
         for readout in ("edge", "area")
     )
     change = 100.0 * np.abs(edge / area - 1.0)
-    middle, most, worst = np.median(change), np.percentile(change, 95), change.max()
+    middle = np.median(change)
+    most = np.percentile(change, 95)
+    worst = change.max()
     row = Row(
         "edge averages (eq. 3) give the charge",
         "\"precise\"",
@@ -67,7 +72,8 @@ def _edges(solves: Solves) -> tuple[Row, dict[str, object]]:
 
 def _d33(solves: Solves) -> tuple[Row, dict[str, object]]:
     """The contact pressure where the probe covers part of B."""
-    sensor, whole = solves.choices.sensor("three"), -0.5 * D33 * FORCE
+    sensor = solves.choices.sensor("three")
+    whole = -0.5 * D33 * FORCE
     points = Mapping.lines(sensor, "A", length=solves.choices.length).points.reshape(-1, 2)
     extra = contact_charges(solves, sensor, points, D33)
     share = extra / solves.charges("triangle", sensor, points)
@@ -123,8 +129,10 @@ def _known(accuracy: Accuracy) -> Row:
 
 def what_choices_change(solves: Solves, accuracy: Accuracy) -> Entry:
     """Sizes that the paper does not give."""
-    rows, numbers = [], {}
-    film, piezo = solves.choices.sensor("three").film, solves.choices.sensor("three").piezo
+    rows = []
+    numbers = {}
+    film = solves.choices.sensor("three").film
+    piezo = solves.choices.sensor("three").piezo
     ours = {
         "E": f"{film.young * 1e-3:g} GPa",
         "nu": f"{film.poisson:g}",
@@ -132,7 +140,8 @@ def what_choices_change(solves: Solves, accuracy: Accuracy) -> Entry:
         "pretension": "0 MPa",
     }
     for name, errors in accuracy.mistaken.items():
-        (kind, _, value), changes = name.partition(" "), solves.changes(name)
+        kind, _, value = name.partition(" ")
+        changes = solves.changes(name)
         position = f"{errors.percentile(50):.3f} mm" if errors.found_mm.size else "no contours met"
         change = (
             f"charges by {100 * np.median(changes):+.1f} % at the median, at most {100 * np.abs(changes).max():.1f} %; "

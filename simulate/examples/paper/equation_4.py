@@ -137,8 +137,10 @@ def eq_4(solves: Solves) -> Entry:
 def _rows_of_press(solves: Solves, thick: list[ChargeForce]) -> list[Row]:
     """Where eq. 4's press was, and how large its charges are."""
     ((x, y), factor), pC = solves.eq_4, [sum(cubic) for cubic in CUBICS]
-    thick_pC, most = thick[0].at_1_N, max(film.at_1_N for film in thick)
-    angle, away = np.rad2deg(np.arctan2(y + 10.0, x)), np.hypot(x, y + 10.0)
+    thick_pC = thick[0].at_1_N
+    most = max(film.at_1_N for film in thick)
+    angle = np.rad2deg(np.arctan2(y + 10.0, x))
+    away = np.hypot(x, y + 10.0)
     return [
         Row(
             "where eq. 4's press was",
@@ -163,7 +165,9 @@ def _rows_of_press(solves: Solves, thick: list[ChargeForce]) -> list[Row]:
 
 def _rows_of_cubic(films: list[list[ChargeForce]]) -> list[Row]:
     """Which film has the shape of eq. 4."""
-    thin, thick, cubic = films[0][0], films[-1], _coefficients(np.array(CUBICS[0]) / sum(CUBICS[0]))
+    thin = films[0][0]
+    thick = films[-1]
+    cubic = _coefficients(np.array(CUBICS[0]) / sum(CUBICS[0]))
     nearest, best_thick = (
         sorted(some, key=lambda film: film.misfit) for some in ([film for row in films for film in row], thick)
     )
@@ -254,7 +258,8 @@ def _draw_exponents(axes: Any, films: list[list[ChargeForce]]) -> None:
     axes.semilogx(FINE, [taut.exponent(f) for f in FINE], "--", color=FELT, label=taut.name)
     for level in (2.0 / 3.0, 1.0, 2.0):
         axes.axhline(level, color=INK, lw=0.6, ls=":")
-    title, place = "local exponent, no pretension (one with)", {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
+    title = "local exponent, no pretension (one with)"
+    place = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
     finish_axes(axes, "force, N", "d(ln charge) / d(ln force)", title, **place)
 
 

@@ -19,7 +19,8 @@ from isocharge.simulate.contours.graphical_method import DrawnContour, DrawnTria
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, finish_axes, new_axes
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 
-LEVELS, AREA = 8, 11.5
+LEVELS = 8
+AREA = 11.5
 """Number of contours of each electrode in Fig. 11, and their largest distance from the centre, mm: the far side of the
 electrodes."""
 
@@ -29,7 +30,9 @@ AROUND = 0.6
 
 def fig_9(solves: Solves, accuracy: Accuracy) -> Entry:
     """Contours from the field, under a triangle."""
-    sensor, at, reach = solves.choices.sensor("three"), solves.choices.shown, BEYOND * solves.choices.radius
+    sensor = solves.choices.sensor("three")
+    at = solves.choices.shown
+    reach = BEYOND * solves.choices.radius
     charges = solves.charges("triangle", sensor, np.array([at]))[0]
     spline = ChargeSpline.of(solves.forward_map("triangle", sensor), reach, solves.choices.spacing)
     field = ContourField(spline, FORCE)
@@ -56,10 +59,12 @@ def fig_9(solves: Solves, accuracy: Accuracy) -> Entry:
 
 def fig_10(solves: Solves, accuracy: Accuracy) -> Entry:
     """The paper's graphical method, and how its 0.122 mm compares."""
-    sensor, at = solves.choices.sensor("three"), solves.choices.shown
+    sensor = solves.choices.sensor("three")
+    at = solves.choices.shown
     triangulation = DrawnTriangulation(solves.scheme("triangle", sensor), solves.choices.degree)
     charge = solves.charges("triangle", sensor, np.array([at]))
-    contours, fix = [c for c in triangulation.contours(charge[0]) if c is not None], triangulation.locate(charge)
+    contours = [c for c in triangulation.contours(charge[0]) if c is not None]
+    fix = triangulation.locate(charge)
     error_mm = float(np.hypot(*(fix.contact[0, :2] - at)))
     figure, (whole, near, distribution) = new_axes(16.5, 5.6, columns=3)
     for axes in (whole, near):

@@ -62,7 +62,8 @@ def fig_6(solves: Solves) -> Entry:
     whole = solves.choices.sensor("three", readout="area")
     area, _ = curves_of(solves, "triangle", whole, "A", FROM_A_DEG["three"])
     example, distance = _example(solves, at, smooth)
-    apart, change = 100.0 * _spread(at), 100.0 * np.abs(at.own_charge / area.own_charge - 1.0).max(axis=0)
+    apart = 100.0 * _spread(at)
+    change = 100.0 * np.abs(at.own_charge / area.own_charge - 1.0).max(axis=0)
     rows = [
         example,
         Row(
@@ -114,7 +115,8 @@ def _spread(curves: Curves) -> Array:
 
 def fig_8(solves: Solves) -> Entry:
     """Rectangle, biaxial, from B; which line is uppermost."""
-    sensor, printed_length = solves.choices.sensor("three"), solves.choices.printed_length
+    sensor = solves.choices.sensor("three")
+    printed_length = solves.choices.printed_length
     curves, smooth = curves_of(solves, "rectangle", sensor, "B", FIG_8_DEG)
     circle, _ = curves_of(solves, "circle", sensor, "B", FIG_8_DEG)
     printed, _ = curves_of(solves, "rectangle", solves.choices.as_printed(), "B", FIG_8_DEG, printed_length)
@@ -164,14 +166,16 @@ def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
     figure, (left, right) = new_axes(12.0, 5.2, columns=2)
     draw_curves(left, curves, smooth)
     left.set_title("Fig. 8: rectangular probe, biaxial film, 1 N")
-    others, mean = {"color": PRESSED, "lw": 0.7}, smooth.own_charge.mean(axis=0)
+    others = {"color": PRESSED, "lw": 0.7}
+    mean = smooth.own_charge.mean(axis=0)
     styles = {190.0: others | {"label": "the others"}} | {
         named: {"color": colour, "lw": 2.4, "label": f"{named:.0f}°"}
         for named, colour in zip(FIG_8_DEG, COLOURS, strict=False)
     }
     for angle, charge in zip(np.rad2deg(curves.mapping.angle).round(6).tolist(), smooth.own_charge, strict=True):
         right.plot(smooth.mapping.distance, 100.0 * (charge / mean - 1.0), **styles.get(angle, others))
-    ratio, title = "charge over the mean of the lines, %", "the same, against the mean of the lines"
+    ratio = "charge over the mean of the lines, %"
+    title = "the same, against the mean of the lines"
     finish_axes(right, "distance from the centre of B, mm", ratio, title)
     return figure
 
@@ -208,7 +212,8 @@ def _best_ratio(solves: Solves) -> tuple[float, float]:
 def fig_12(solves: Solves) -> Entry:
     """Triangle, uniaxial, from A, beside biaxial."""
     figure, pair = new_axes(12.0, 5.2, columns=2)
-    numbers, rows = {}, []
+    numbers = {}
+    rows = []
     for axes, (layout, degrees) in zip(pair, FROM_A_DEG.items(), strict=True):
         uniaxial, smooth = curves_of(solves, "triangle", solves.choices.sensor(layout, "uniaxial"), "A", degrees)
         biaxial, _ = curves_of(solves, "triangle", solves.choices.sensor(layout), "A", degrees)

@@ -26,7 +26,8 @@ TOUCHED = 1e-3
 
 def fig_1(solves: Solves) -> Entry:
     """The principle: three distances."""
-    sensor, at = solves.choices.sensor("three"), np.array(solves.choices.shown)
+    sensor = solves.choices.sensor("three")
+    at = np.array(solves.choices.shown)
     centres = np.array([e.centre for e in sensor.electrodes])
     distance = np.linalg.norm(centres - at, axis=1)
     meeting = trilaterate(centres, distance)
@@ -73,7 +74,8 @@ def fig_2(solves: Solves) -> Entry:
     draw_electrodes(axes, sensor, highlight="A")
     axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title="Fig. 2: mapping scheme")
     figure.legend(fontsize=8, loc="outside lower center", ncols=2)
-    step, angle_step = float(np.diff(mapping.distance)[0]), float(np.rad2deg(np.diff(mapping.angle)[0]))
+    step = float(np.diff(mapping.distance)[0])
+    angle_step = float(np.rad2deg(np.diff(mapping.angle)[0]))
     length = f"{mapping.distance[-1]:g} mm"
     return Entry(
         "Fig. 2",
@@ -88,7 +90,8 @@ def fig_2(solves: Solves) -> Entry:
 
 def fig_3(solves: Solves) -> Entry:
     """The layout with three sensing elements, and as the text has it."""
-    sensor, printed = solves.choices.sensor("three"), solves.choices.as_printed()
+    sensor = solves.choices.sensor("three")
+    printed = solves.choices.as_printed()
     figure, (left, right) = new_axes(11.0, 5.6, columns=2)
     for axes, shown, title in ((left, sensor, "Fig. 3: layout, equilateral"), (right, printed, "as the text has it")):
         draw_electrodes(axes, shown)
@@ -97,7 +100,8 @@ def fig_3(solves: Solves) -> Entry:
         axes.plot(*corners.T, color=FELT, lw=0.8, label="between the centres")
         axes.set(xlim=(-47, 47), ylim=(-47, 47), aspect="equal", xlabel="x (drawn), mm", ylabel="y, mm", title=title)
     left.legend(fontsize=8, loc="lower left")
-    (sides, equal, directions), (printed_sides, unequal, _) = _triangle(sensor), _triangle(printed)
+    sides, equal, directions = _triangle(sensor)
+    printed_sides, unequal, _ = _triangle(printed)
     why = "60° and 120° are the directions from A to B and C; from the centre they give no equilateral triangle"
     return Entry(
         "Fig. 3",
@@ -122,7 +126,8 @@ def _triangle(sensor: Sensor) -> tuple[list[float], str, str]:
 
 def scheme(solves: Solves, heading: str, electrode: str, degrees: tuple[float, float]) -> Entry:
     """Figs. 4 and 7: the lines from an electrode between two angles."""
-    sensor, (first, last) = solves.choices.sensor("three"), np.deg2rad(degrees)
+    sensor = solves.choices.sensor("three")
+    first, last = np.deg2rad(degrees)
     mapping = Mapping.lines(sensor, electrode, (first, last), length=solves.choices.length)
     figure, axes = new_axes(6.8, 6.8)
     draw_mapping(axes, mapping)
@@ -175,7 +180,8 @@ def fig_5(solves: Solves) -> Entry:
     errors.set_xticks(unknowns, [f"{n:,}" for n in unknowns])
     errors.minorticks_off()
     finish_axes(errors, "unknowns", "worst charge against the finest mesh, %", "error against mesh")
-    enough, mesh = int(np.argmax(error < 1e-3)), solves.shown.mesh
+    enough = int(np.argmax(error < 1e-3))
+    mesh = solves.shown.mesh
     rows = [
         Row(
             "elements",
@@ -210,8 +216,10 @@ def fig_5(solves: Solves) -> Entry:
 
 def _draw_mesh(axes: Any, shown: Equilibrium) -> None:
     """Edges of the elements, and the probe."""
-    along, one = np.linspace(-1.0, 1.0, 13), np.ones(13)
-    xi, eta = np.concatenate([along, one, -along, -one]), np.concatenate([-one, along, one, -along])
+    along = np.linspace(-1.0, 1.0, 13)
+    one = np.ones(13)
+    xi = np.concatenate([along, one, -along, -one])
+    eta = np.concatenate([-one, along, one, -along])
     turned = shown.film.radius * np.exp(1j * np.angle(complex(*shown.at)))
     z = shown.mesh.points @ tensor_values(shown.mesh.resolution.order, xi, eta).T * turned
     axes.add_collection(LineCollection(list(np.stack([z.real, z.imag], axis=-1)), colors=INK, linewidths=0.5))

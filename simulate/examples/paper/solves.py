@@ -81,7 +81,8 @@ def solve_mesh(
     sensor: Sensor, probe: Probe, at: tuple[float, float], mesh: tuple[int, int, int, int]
 ) -> tuple[Array, int, float]:
     """One press on one mesh: charges, unknowns and CPU seconds."""
-    began, theory = process_time(), Theory(stretching=True, bending=True, pretensioned=False)
+    began = process_time()
+    theory = Theory(stretching=True, bending=True, pretensioned=False)
     solved = press(sensor.film, probe, at, FORCE, SolveSettings(theory=theory, resolution=Resolution(*mesh)))
     return touch_charge(sensor, solved), 3 * solved.mesh.template.n_node, process_time() - began
 
@@ -147,7 +148,9 @@ def sample(choices: Choices) -> Array:
 
 def solve_all(choices: Choices, executor: Executor | None) -> Solves:
     """Solve everything."""
-    sensor, maps, variants = choices.sensor("three"), _map_jobs(choices), _variant_jobs(choices)
+    sensor = choices.sensor("three")
+    maps = _map_jobs(choices)
+    variants = _variant_jobs(choices)
     meshes = [partial(solve_mesh, sensor, choices.triangle, choices.shown, mesh) for mesh in (*MESHES, FINEST)]
     solved = iter(run_all([*maps.values(), *variants.values(), *meshes], "solving", executor))
     forward_maps = {name: next(solved) for name in maps}
@@ -192,7 +195,8 @@ def _map_jobs(choices: Choices) -> dict[str, Job]:
 
 def _variant_jobs(choices: Choices) -> dict[str, Job]:
     """Presses with another probe or film than our choice, by name; at the same places, 1 N, paper's readout."""
-    sensor, places = choices.sensor("three"), [(float(x), float(y)) for x, y in sample(choices)]
+    sensor = choices.sensor("three")
+    places = [(float(x), float(y)) for x, y in sample(choices)]
 
     def presses(film: Film, probe: Probe) -> Job:
         return partial(solve_presses, replace(sensor, film=film), probe, places, [FORCE] * len(places))

@@ -87,7 +87,9 @@ class Accuracy:
     @classmethod
     def of(cls, solves: Solves, executor: Executor | None) -> "Accuracy":
         """Triangulate."""
-        choices, places, noise = solves.choices, solves.places, noise_model("reference")
+        choices = solves.choices
+        places = solves.places
+        noise = noise_model("reference")
         sensors = {layout: choices.sensor(layout) for layout in LAYOUTS}
         clean = {layout: solves.charges("triangle", sensor, places) for layout, sensor in sensors.items()}
         noisy = {layout: noise.add(charge, np.random.default_rng(SEED)) for layout, charge in clean.items()}

@@ -51,7 +51,8 @@ def test_draw_contour_of_an_unreached_charge_is_none():
 
 def test_contours_cross_at_the_crossings_of_circles():
     """In the press and in its mirror image in the line through both electrodes, once each."""
-    sensor, z = LAYOUTS["three"], 1.0 + 2.0j
+    sensor = LAYOUTS["three"]
+    z = 1.0 + 2.0j
     charges = zip("AB", charges_of(sensor, np.array([z.real]), np.array([z.imag]))[0], strict=False)
     one, other = (draw_contour(curves_of(sensor, name), float(charge), degree=3) for name, charge in charges)
     a, b = (complex(*electrode.centre) for electrode in sensor.electrodes[:2])
@@ -62,7 +63,8 @@ def test_contours_cross_at_the_crossings_of_circles():
 def test_graphical_method_locates_presses(layout):
     sensor, curves = layout
     rng = np.random.default_rng(1)
-    r, angle = 7.0 * np.sqrt(rng.random(20)), 2.0 * np.pi * rng.random(20)
+    r = 7.0 * np.sqrt(rng.random(20))
+    angle = 2.0 * np.pi * rng.random(20)
     x, y = r * np.cos(angle), r * np.sin(angle)
     fix = DrawnTriangulation(curves, degree=3).locate(charges_of(sensor, x, y))
     error = np.hypot(fix.contact[:, 0] - x, fix.contact[:, 1] - y)[fix.found]
@@ -75,7 +77,8 @@ def test_graphical_method_reports_the_status_of_presses_without_a_position(layou
     sensor, curves = layout
     charge = charges_of(sensor, np.array([1.0]), np.array([2.0]))
     drawn = DrawnTriangulation(curves, degree=3)
-    too_large, apart = drawn.locate(10.0 * charge), drawn.locate(1.2 * charge)
+    too_large = drawn.locate(10.0 * charge)
+    apart = drawn.locate(1.2 * charge)
     assert [*too_large.status, *apart.status] == [Meeting.no_contour, Meeting.apart]
     assert np.isnan([too_large.contact[0, :2], apart.contact[0, :2]]).all()
 

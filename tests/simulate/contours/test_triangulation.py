@@ -23,7 +23,8 @@ from isocharge.simulate.contours.candidates import NODE_SPACING, SeedGrid
 from isocharge.simulate.contours.fix import Meeting
 from kept import kept
 
-RADIUS, FORCES = 8.0, (0.2, 2.0)
+RADIUS = 8.0
+FORCES = (0.2, 2.0)
 QUICK = SolveSettings(theory=Theory(stretching=True, bending=False, pretensioned=False), resolution=Resolution(4, 8, 4))
 LAYOUTS = {name: load_sensor(f"{name}-25um-biaxial") for name in ("three", "four")}
 CENTRES = {name: np.array([electrode.centre for electrode in sensor.electrodes]) for name, sensor in LAYOUTS.items()}
@@ -47,13 +48,15 @@ def errors(fix, contact: np.ndarray) -> np.ndarray:
 def draw(count: int, seed: int, radius: float = 7.0, forces: tuple[float, float] = FORCES) -> np.ndarray:
     """Contacts, shape (count, 3)."""
     rng = np.random.default_rng(seed)
-    r, angle = radius * np.sqrt(rng.random(count)), 2.0 * np.pi * rng.random(count)
+    r = radius * np.sqrt(rng.random(count))
+    angle = 2.0 * np.pi * rng.random(count)
     return np.stack([r * np.cos(angle), r * np.sin(angle), np.exp(rng.uniform(*np.log(forces), count))], axis=1)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_triangulation_of_circular_contours_finds_the_position(layout):
-    charge_map, contact = round_map(CENTRES[layout]), draw(300, seed=1)
+    charge_map = round_map(CENTRES[layout])
+    contact = draw(300, seed=1)
     fix = Triangulation(charge_map).locate(charge_map.charges(contact), contact[:, 2])
     assert fix.found.mean() > 0.98  # two contours touch on the line between their electrodes
     assert errors(fix, contact).max() < 1e-3
@@ -63,8 +66,10 @@ def test_triangulation_of_circular_contours_finds_the_position(layout):
 def test_seed_grid_estimates_the_distance_from_contours():
     """Charges (10 + x) F and (10 + y) F, whose contours are parallel to the axes."""
     plane = FunctionMap(lambda c: (10.0 + c[:, :2]) * c[:, 2:], ("A", "B"), Domain(5.0, (0.5, 2.0)))
-    grid, at = SeedGrid.of(plane), draw(200, seed=2, radius=5.0, forces=(0.5, 2.0))
-    charge, away = plane.charges(at), np.linalg.norm(at[:, None, :2] - grid.position, axis=2)
+    grid = SeedGrid.of(plane)
+    at = draw(200, seed=2, radius=5.0, forces=(0.5, 2.0))
+    charge = plane.charges(at)
+    away = np.linalg.norm(at[:, None, :2] - grid.position, axis=2)
     assert away.min(axis=1).max() < 0.75 * NODE_SPACING
     np.testing.assert_allclose(grid.distance(charge, at[:, 2:]), np.sqrt(0.5) * away, atol=0.02)
     force = np.clip(charge.sum(axis=1)[:, None] / (20.0 + grid.position.sum(axis=1)), 0.5, 2.0)
@@ -76,7 +81,8 @@ def test_seed_grid_estimates_the_distance_from_contours():
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_locate_with_force_finds_position_and_force(layout):
-    charge_map, contact = round_map(CENTRES[layout]), draw(200, seed=4)
+    charge_map = round_map(CENTRES[layout])
+    contact = draw(200, seed=4)
     fix = Triangulation(charge_map).locate_with_force(charge_map.charges(contact))
     assert fix.found.mean() > 0.95
     assert np.median(errors(fix, contact)) < 1e-4

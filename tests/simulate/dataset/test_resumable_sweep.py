@@ -74,7 +74,10 @@ def stopped(tmp_path) -> Path:
 
 @pytest.mark.parametrize(("phase", "count"), [("solving", 3), ("pressing", 0), ("pressing", 60)])
 def test_stopped_run_is_resumed_with_the_same_bytes(tmp_path, whole, phase, count):
-    target, first, second, reports = tmp_path / "presses", Counting(), Counting(), []
+    target = tmp_path / "presses"
+    first = Counting()
+    second = Counting()
+    reports = []
     sweep_until(target, phase, count, executor=first)
     assert [path.name for path in tmp_path.iterdir()] == ["presses.part"]
     with listening(lambda title, done, _total, _note: reports.append(done) if title == "pressing" else None):

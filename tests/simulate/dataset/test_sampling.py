@@ -48,7 +48,8 @@ def test_presses_are_uniform_over_the_disk_and_in_the_logarithm_of_the_force(sam
     """The square of the distance and the angle are uniform, and independent of each other."""
     x, y, force = Sweep(samples=4000, seed=1, force_range=(0.05, 2.0), sampling=sampling).contacts().T
     assert stats.kstest(np.log(force), "uniform", args=(np.log(0.05), np.log(40.0))).pvalue > 0.05
-    squared, angle = (x**2 + y**2) / 64.0, np.arctan2(y, x)
+    squared = (x**2 + y**2) / 64.0
+    angle = np.arctan2(y, x)
     assert stats.kstest(squared, "uniform").pvalue > 0.05
     assert stats.kstest(angle, "uniform", args=(-np.pi, 2 * np.pi)).pvalue > 0.05
     assert stats.chisquare(np.histogram2d(squared, angle, bins=(8, 8))[0].ravel()).pvalue > 0.05
@@ -83,7 +84,8 @@ def test_grid_has_every_force_and_rotation_at_every_position():
     for number, probe in enumerate(PROBES):
         mine = presses[np.flatnonzero(presses.probe == number)]
         places = np.unique(mine.contact[:, :2], axis=0)
-        forces, rotations = np.unique(mine.contact[:, 2]), np.unique(mine.rotation)
+        forces = np.unique(mine.contact[:, 2])
+        rotations = np.unique(mine.rotation)
         assert len(np.unique(np.column_stack([mine.contact, mine.rotation]), axis=0)) == len(mine)
         assert len(places) * forces.size * rotations.size == len(mine)
         np.testing.assert_allclose(np.diff(np.log(forces)), np.log(40.0) / (forces.size - 1))

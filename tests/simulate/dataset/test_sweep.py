@@ -108,7 +108,8 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path):
         sweep = Sweep(samples=999, orientation=orientation)
         read = read_dataset(write_sweep(tmp_path / orientation, [Spy(probe) for probe in probes], sweep)).samples
         assert read.probe.tolist() == ["rectangle:4.0x2.0", "triangle:4.0", "circle:1.0"] * 333
-        own, whole = read.charge_pC[:, 2], read.orientation_deg
+        own = read.charge_pC[:, 2]
+        whole = read.orientation_deg
         np.testing.assert_allclose((whole - own - np.tile([30.0, -30.0, 0.0], 333) + 180.0) % 360.0, 180.0, atol=1e-6)
         assert (whole >= 0.0).all()
         assert (whole < 360.0).all()

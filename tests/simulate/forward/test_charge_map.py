@@ -36,7 +36,8 @@ def charge_map(request) -> ChargeMap:
 
 def contacts(domain: Domain, count: int = 60, share: float = 0.97) -> np.ndarray:
     """Evenly over the disk, and over the forces in the logarithm."""
-    at, unit = share * sunflower(count), np.linspace(-share, share, count)
+    at = share * sunflower(count)
+    unit = np.linspace(-share, share, count)
     return domain.to_contact(np.stack([at.real, at.imag, unit], axis=1))
 
 
@@ -48,10 +49,12 @@ def test_maps_implement_the_charge_map_protocol(charge_map):
     a membrane would leave 5e-3.
     """
     contact = contacts(charge_map.domain, share=0.7)
-    charge, slope = charge_map.charges(contact), charge_map.derivatives(contact)
+    charge = charge_map.charges(contact)
+    slope = charge_map.derivatives(contact)
     assert slope.shape == (*charge.shape, 3) == (60, len(charge_map.electrodes), 3)
     for axis, step in enumerate((0.02, 0.02, 1e-3)):
-        ahead, behind = contact.copy(), contact.copy()
+        ahead = contact.copy()
+        behind = contact.copy()
         ahead[:, axis] = contact[:, axis] + step if axis < 2 else contact[:, 2] * np.exp(step)
         behind[:, axis] = contact[:, axis] - step if axis < 2 else contact[:, 2] * np.exp(-step)
         expected = (charge_map.charges(ahead) - charge_map.charges(behind)) / (2.0 * step)
@@ -60,8 +63,10 @@ def test_maps_implement_the_charge_map_protocol(charge_map):
 
 @pytest.mark.parametrize("charge_map", CHECKED, indirect=True)
 def test_contacts_outside_the_domain_raise_error_with_the_limits(charge_map):
-    radius, (low, high) = charge_map.domain.radius, charge_map.domain.force_range
-    inside, limits = [0.0, 0.0, low], rf"at most {radius:g} mm from the centre and {low:g} to {high:g} N"
+    radius = charge_map.domain.radius
+    low, high = charge_map.domain.force_range
+    inside = [0.0, 0.0, low]
+    limits = rf"at most {radius:g} mm from the centre and {low:g} to {high:g} N"
     for outside in ([1.01 * radius, 0.0, low], [0.0, 0.0, 1.01 * high], [0.0, 0.0, 0.99 * low], [np.nan, 0.0, low]):
         for ask in (charge_map.charges, charge_map.derivatives):
             with pytest.raises(SceneError, match=rf"^press 1 at .* outside the .* {limits}"):

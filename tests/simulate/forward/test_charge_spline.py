@@ -33,7 +33,8 @@ def test_spline_includes_the_charge_of_contact_pressure(near_map):
     Their slope has a kink where the footprint's edge meets an electrode's corner: of them knots that are 0.5 mm apart
     leave 1.1 %, and 0.25 mm apart 0.2 %.
     """
-    sensor, contact = near_map.sensor, spread(100)
+    sensor = near_map.sensor
+    contact = spread(100)
     pressed = replace(near_map, sensor=replace(sensor, piezo=replace(sensor.piezo, d33=-30.0)))
     with_d33, without = (kept(ChargeSpline.of, each, spacing=0.5).charges(contact) for each in (pressed, near_map))
     extra = pressed.charges(contact) - near_map.charges(contact)

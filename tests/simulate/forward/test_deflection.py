@@ -12,7 +12,8 @@ from isocharge.common.errors import InputError
 from isocharge.simulate import Circle, deflection, load_sensor, press
 from isocharge.simulate.forward.deflection import deflection_field
 
-FILM, PROBE = load_sensor("three-25um-biaxial").film, Circle(1.0)
+FILM = load_sensor("three-25um-biaxial").film
+PROBE = Circle(1.0)
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +23,8 @@ def field():
 
 def interpolated(field, x_mm, y_mm, distance_mm, force_N):
     """Deflection under a press on the x axis, as the docstring of the file says."""
-    p, r = distance_mm / 45.0, 1.0 / 45.0
+    p = distance_mm / 45.0
+    r = 1.0 / 45.0
     c = math.tanh(0.5 * (math.atanh(p + r) + math.atanh(p - r)))
     place = (x_mm + 1j * y_mm) / 45.0
     z = (place - c) / (1.0 - c * place)

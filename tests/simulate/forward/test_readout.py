@@ -27,7 +27,9 @@ from isocharge.simulate.forward.readout import (
     thermal_charge,
 )
 
-AREA, D31, D32 = 9.0, 20.0, 2.0
+AREA = 9.0
+D31 = 20.0
+D32 = 2.0
 TRIANGLE = Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0)))
 
 
@@ -228,8 +230,13 @@ def test_signs_of_tension_pressure_and_warming_follow_the_thickness():
 
     Tension s in both directions thins by 2 nu s / E, pressure p on a free film by p / (2 E), warming thickens by a dT.
     """
-    polarization, young, poisson, expansion = 0.18e6, 3000.0, 0.34, 1.5e-4  # pC/mm^2, MPa, -, 1/K
-    d31, d33, pyro = polarization * poisson / young, -polarization / young, -polarization * expansion
+    polarization = 0.18e6  # pC/mm^2
+    young = 3000.0  # MPa
+    poisson = 0.34
+    expansion = 1.5e-4  # 1/K
+    d31 = polarization * poisson / young
+    d33 = -polarization / young
+    pyro = -polarization * expansion
     sensor = load_sensor("three-25um-biaxial")
     sensor = replace(sensor, piezo=Piezo(d31, d31, d33, pyro))
     assert (round(d31, 1), round(d33), round(pyro)) == (20.4, -60, -27)  # PVDF: 20 to 23, -33, -27 to -30

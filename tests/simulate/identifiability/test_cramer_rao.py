@@ -27,7 +27,8 @@ CONTACT = np.array([[1.0, -2.0, 0.3], [4.0, 3.0, 1.5]])
 
 def test_information_of_a_reading_agrees_with_numerical_integration():
     """Fisher's information is the mean square of the likelihood's slope; with a large gain sigma informs, too."""
-    model, charge = NoiseModel("wild", 1.0, 0.4), 3.0
+    model = NoiseModel("wild", 1.0, 0.4)
+    charge = 3.0
 
     def slope_squared(reading):
         step = 1e-3
@@ -41,7 +42,8 @@ def test_information_of_a_reading_agrees_with_numerical_integration():
 
 
 def test_linear_charges_give_the_covariance_of_least_squares():
-    jacobian, white = np.random.default_rng(0).normal(size=(5, 4, 3)), 2.0
+    jacobian = np.random.default_rng(0).normal(size=(5, 4, 3))
+    white = 2.0
     limits = cramer_rao(np.zeros((5, 4)), jacobian, NoiseModel("white", white, 0.0))
     for each, covariance in zip(jacobian, limits.covariance, strict=True):
         np.testing.assert_allclose(covariance, white**2 * np.linalg.inv(each.T @ each), rtol=1e-8)
@@ -53,7 +55,8 @@ def test_linear_charges_give_the_covariance_of_least_squares():
 def test_nuisances_are_equivalent_to_correlated_noise():
     """Unknowns with a prior, marginalised, are correlated noise: covariance diag(1/i) + N N' (Woodbury)."""
     rng = np.random.default_rng(3)
-    charge, jacobian = rng.uniform(100.0, 1000.0, (20, 5)), rng.normal(size=(20, 5, 3)) * [100.0, 100.0, 1000.0]
+    charge = rng.uniform(100.0, 1000.0, (20, 5))
+    jacobian = rng.normal(size=(20, 5, 3)) * [100.0, 100.0, 1000.0]
     nuisance = 10.0 * rng.normal(size=(20, 5, 2))
     limits = cramer_rao(charge, jacobian, REFERENCE, nuisance)
     for i in range(20):

@@ -114,13 +114,15 @@ def test_find_folds_finds_nothing_without_a_fold_line():
 
 def test_find_folds_finds_a_fold_smaller_than_the_rings():
     """The slope of the first charge is negative within 0.1 mm of a point amid places that are 0.2 mm apart."""
-    at, width = 1.5 * np.array([np.cos(np.pi * 0.225), np.sin(np.pi * 0.225)]), 0.1
+    at = 1.5 * np.array([np.cos(np.pi * 0.225), np.sin(np.pi * 0.225)])
+    width = 0.1
 
     def pocket(x, y):
         bump = np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2.0 * width**2))
         return x - 2.0 * (x - at[0]) * bump
 
-    model, rings = shaped_charges(pocket, lambda _, y: y), Rings.spread(5.0, 25, 40)
+    model = shaped_charges(pocket, lambda _, y: y)
+    rings = Rings.spread(5.0, 25, 40)
     scaled = rings.per_ring(scaled_derivatives(model, rings.contacts(1.0), REFERENCE))
     assert not has_reversed_orientation(scaled[:-1], scaled[1:]).any()
     assert not has_reversed_orientation(scaled, np.roll(scaled, -1, axis=1)).any()
@@ -131,7 +133,8 @@ def test_find_folds_finds_a_fold_smaller_than_the_rings():
 
 def test_working_area_ends_at_a_large_error_between_the_rings():
     """Within 0.03 mm of a point between the rings' places the first charge hardly changes: 20 times the error."""
-    at, width = 3.025 * np.array([np.cos(np.pi / 180.0), np.sin(np.pi / 180.0)]), 0.03
+    at = 3.025 * np.array([np.cos(np.pi / 180.0), np.sin(np.pi / 180.0)])
+    width = 0.03
 
     def flat(x, y):
         return x - 0.95 * (x - at[0]) * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2.0 * width**2))
@@ -171,7 +174,8 @@ def test_find_folds_finds_nothing_in_a_sharply_bent_map():
 
 def test_find_folds_finds_nothing_beside_an_electrode(film):
     """Rings 0.3 mm apart seem to turn over beside it, 1.7 mm from the centre; ten times finer ones do not."""
-    force, charges = 0.05, ChargeSpline.of(squares(film, *INNER), 4.0)
+    force = 0.05
+    charges = ChargeSpline.of(squares(film, *INNER), 4.0)
     for count, seems in ((13, True), (130, False)):
         rings = Rings.spread(4.0, count, 60)
         scaled = rings.per_ring(scaled_derivatives(charges, rings.contacts(force), REFERENCE))

@@ -49,7 +49,8 @@ def test_identification_to_dict_can_be_written_as_json(identification):
 
 def test_determined_share_agrees_with_random_positions(film, identification):
     """Of 2,000 places drawn at random, those where the limits at all three forces are within the allowed error."""
-    strict, rng = replace(identification.area, error=0.1), np.random.default_rng(0)
+    strict = replace(identification.area, error=0.1)
+    rng = np.random.default_rng(0)
     found = replace(identification, area=strict)
     at = 5.0 * np.sqrt(rng.random(2000)) * np.exp(2j * np.pi * rng.random(2000))
     contacts = (np.column_stack([at.real, at.imag, np.full(2000, force)]) for force in (0.05, 1.0, 2.0))

@@ -19,5 +19,6 @@ def sensor():
 @pytest.fixture(scope="session")
 def tables(sensor):
     """Tables of two sensors that have the same film, by the name of the sensor."""
-    table, uniaxial = kept(ChargeTable.solve, sensor, Circle(1.0), 1.0, RADIUS), load_sensor("four-25um-uniaxial")
+    table = kept(ChargeTable.solve, sensor, Circle(1.0), 1.0, RADIUS)
+    uniaxial = load_sensor("four-25um-uniaxial")
     return {sensor.name: table, uniaxial.name: replace(table, piezo=(uniaxial.piezo.d31, uniaxial.piezo.d32))}

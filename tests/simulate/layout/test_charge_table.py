@@ -18,7 +18,8 @@ radius are less exact, because they cross the kink of the stress under the probe
 @pytest.mark.parametrize(("name", "at"), [("four-25um-biaxial", (0.7, 0.2)), ("four-25um-uniaxial", (-1.3, 3.1))])
 def test_rows_are_the_charges_of_solved_presses_and_their_derivatives(tables, name, at):
     rows = tables[name].rows(np.array([at]), CENTRES, 3.0, (TRIANGLE,))[0]
-    sensor, settings = load_sensor(name), SolveSettings(theory=theory_for(load_sensor(name), Circle(1.0), (1.0, 1.0)))
+    sensor = load_sensor(name)
+    settings = SolveSettings(theory=theory_for(load_sensor(name), Circle(1.0), (1.0, 1.0)))
     squares = tuple(Electrode.of_square(*named, 3.0) for named in zip("ABC", CENTRES.tolist(), strict=True))
 
     def charge(x=0.0, y=0.0, log=0.0, radius=0.0, pretension=0.0):

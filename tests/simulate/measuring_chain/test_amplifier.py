@@ -8,7 +8,8 @@ import pytest
 from isocharge.common.errors import InputError
 from isocharge.simulate import Amplifier, load_amplifier, noise_model
 
-CLEAN, RATE = noise_model("clean"), 200.0
+CLEAN = noise_model("clean")
+RATE = 200.0
 
 
 def measure(amplifier, charge, seed=0, rate=RATE, blocks=1):

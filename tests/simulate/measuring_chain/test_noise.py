@@ -12,14 +12,16 @@ from isocharge.simulate.measuring_chain.noise_file import AMPLIFIER_LEVELS
 @pytest.mark.parametrize(("charge", "sigma"), [(0.0, 1.0), (500.0, np.sqrt(2.0)), (3000.0, 6.0827625)])
 def test_sigma_of_the_reference_level(charge, sigma):
     """(1 pC)^2 + (0.002 Q)^2; the sign of the charge does not matter."""
-    model, charges = noise_model("reference"), np.array([charge, -charge])
+    model = noise_model("reference")
+    charges = np.array([charge, -charge])
     np.testing.assert_allclose(model.sigma(charges), sigma, rtol=1e-7)
     np.testing.assert_allclose(model.variance(charges), sigma**2, rtol=1e-7)
 
 
 @pytest.mark.parametrize("charge", [0.0, 848.0, -2000.0])
 def test_added_noise_is_gaussian_with_sigma(charge):
-    model, rng = noise_model("reference"), np.random.default_rng(0)
+    model = noise_model("reference")
+    rng = np.random.default_rng(0)
     drawn = (model.add(np.full(20_000, charge), rng) - charge) / model.sigma(np.array(charge))
     assert stats.kstest(drawn, "norm").pvalue > 0.01
 

@@ -31,7 +31,8 @@ def test_lowest_frequency_of_a_clamped_plate(mesh_of, probe):
     """lap lap W = k^4 W with J0(k) I1(k) + I0(k) J1(k) = 0, k = 3.1962 (Rayleigh 1894, art. 221)."""
     k = brentq(lambda k: jv(0, k) * iv(1, k) + iv(0, k) * jv(1, k), 3.0, 3.4)
     mesh = mesh_of(probe, (0.3, 0.0), Resolution(4, 8, 4))
-    geometry, inside = mesh.geometry, np.flatnonzero(mesh.inside)
+    geometry = mesh.geometry
+    inside = np.flatnonzero(mesh.inside)
     mass = geometry.gather(geometry.mass)
     unit = np.eye(mesh.template.n_node)[:, inside]
     plate = np.stack([geometry.gather(Bending(geometry, 1.0).forces(column)) for column in unit.T], axis=1)[inside]

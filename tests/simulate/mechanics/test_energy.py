@@ -27,7 +27,8 @@ def elastic(request, mesh) -> ElasticFilm:
 
 def condensed(mesh, matrix: np.ndarray) -> np.ndarray:
     """The whole matrix over (U1, U2, W) alone: the Schur complement of the carried Laplacian; (3 n_node, 3 n_node)."""
-    n_node, size = mesh.template.n_node, 3 * mesh.template.n_node
+    n_node = mesh.template.n_node
+    size = 3 * mesh.template.n_node
     whole = assembled(mesh.template, matrix).reshape(n_node, -1, n_node, matrix.shape[2])
     first = whole[:, :3, :, :3].reshape(size, size)
     if matrix.shape[2] == 3:
@@ -37,7 +38,8 @@ def condensed(mesh, matrix: np.ndarray) -> np.ndarray:
 
 
 def test_residual_is_the_gradient_of_the_energy(elastic, mesh):
-    field, direction = mesh.random_field(0), mesh.random_field(100)
+    field = mesh.random_field(0)
+    direction = mesh.random_field(100)
     slope = sum(share * elastic.energy(field + step * direction) for step, share in STENCIL)
     scale = sum(abs(share * elastic.energy(field + step * direction)) for step, share in STENCIL)
     assert np.sum(elastic.residual(field) * direction) == pytest.approx(slope, abs=1e-12 * scale)
@@ -45,7 +47,8 @@ def test_residual_is_the_gradient_of_the_energy(elastic, mesh):
 
 def test_tangent_is_the_derivative_of_the_residual(elastic, mesh):
     """With bending, the derivative is that of the matrix in which the fourth unknown is condensed."""
-    field, direction = mesh.random_field(0), mesh.random_field(100)
+    field = mesh.random_field(0)
+    direction = mesh.random_field(100)
     slope = sum(share * elastic.residual(field + step * direction) for step, share in STENCIL)
     tangent = elastic.tangent(field)
     np.testing.assert_allclose(tangent, tangent.transpose(0, 3, 4, 1, 2), atol=1e-12 * np.abs(tangent).max())

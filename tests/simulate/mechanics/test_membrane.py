@@ -27,7 +27,9 @@ def green(slope: np.ndarray, amplitude2: float) -> np.ndarray:
 @pytest.mark.parametrize("poisson", [0.0, 0.34, 0.49])
 def test_stress_solves_the_plane_stress_compliance(poisson):
     """Return the strain for a stress and Young's modulus 1 (Hooke's law)."""
-    e11, e22, shear = 0.3, -0.2, 0.5
+    e11 = 0.3
+    e22 = -0.2
+    shear = 0.5
     s11, s22, s12 = stress(np.array([e11, e22, shear]), poisson)
     np.testing.assert_allclose([s11 - poisson * s22, s22 - poisson * s11, 2 * (1 + poisson) * s12], [e11, e22, shear])
 
@@ -67,9 +69,12 @@ def test_rigid_motion_has_no_energy(mesh, motion, amplitude2):
 @pytest.mark.parametrize("tension", [0.0, 0.5])
 def test_patch_of_uniform_strain_is_exact(mesh, tension):
     """A linear field has the energy of Hooke's law, and out-of-balance forces on the boundary of the mesh only."""
-    gradient, scene = np.array([[0.3, -0.1, 0.4], [0.2, 0.1, -0.6]]), groups(0.2, tension)
-    membrane, field = Membrane(mesh.geometry, scene), mesh.points @ gradient
-    e, nu = green(gradient, scene.amplitude2), scene.poisson
+    gradient = np.array([[0.3, -0.1, 0.4], [0.2, 0.1, -0.6]])
+    scene = groups(0.2, tension)
+    membrane = Membrane(mesh.geometry, scene)
+    field = mesh.points @ gradient
+    e = green(gradient, scene.amplitude2)
+    nu = scene.poisson
     density = 0.5 / (1 - nu**2) * ((1 - nu) * np.sum(e * e) + nu * np.trace(e) ** 2)
     density += tension * (np.trace(e) - gradient[0, 0] - gradient[1, 1])
     assert membrane.energy(field) == pytest.approx(density * mesh.geometry.weights.sum(), rel=1e-11)

@@ -17,7 +17,8 @@ from isocharge.simulate.mechanics.theory import (
     theory_for,
 )
 
-PROBE, AT = Circle(1.0), (3.0, -2.0)
+PROBE = Circle(1.0)
+AT = (3.0, -2.0)
 
 
 def thick(film: Film, thickness: float, pretension: float = 0.0) -> Film:
@@ -78,7 +79,8 @@ def test_choose_theory_gives_the_fewest_terms(film, thickness, pretension, force
 def test_chosen_theory_is_accurate_or_the_full_theory(thickness, pretension, force, accuracy):
     """A higher accuracy never removes a term."""
     film = Film(45.0, thickness, 3000.0, 0.34, pretension)
-    theory, finer = choose_theory(film, PROBE, force, accuracy), choose_theory(film, PROBE, force, 0.1 * accuracy)
+    theory = choose_theory(film, PROBE, force, accuracy)
+    finer = choose_theory(film, PROBE, force, 0.1 * accuracy)
     assert theory.name.endswith("+ bending") or modelling_error(film, PROBE, force, theory) <= accuracy
     assert modelling_error(film, PROBE, force, finer) <= modelling_error(film, PROBE, force, theory)
     assert modelling_error(film, PROBE, force, Theory(True, True, pretension > 0.0)) == 0.0
@@ -119,7 +121,8 @@ def draw(rng: np.random.Generator) -> tuple[Film, Circle | Polygon, tuple[float,
     def between(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
-    thickness, pretension = between(0.005, 2.0), 0.0 if rng.random() < 0.5 else between(0.1, 20.0)
+    thickness = between(0.005, 2.0)
+    pretension = 0.0 if rng.random() < 0.5 else between(0.1, 20.0)
     film = Film(45.0, thickness, 3000.0, float(rng.uniform(0.0, 0.49)), pretension)
     size = between(0.3, 5.0)
     probe = Circle(size) if rng.random() < 0.7 else Polygon.rectangle(2.0 * size, size, float(rng.uniform(0.0, 3.0)))
@@ -144,6 +147,7 @@ def test_modelling_error_is_an_upper_bound_of_the_difference_of_theories():
             sensor = replace(load_sensor("three-25um-uniaxial"), film=film)
             full = press(film, probe, at, force, SolveSettings(theory=Theory(True, True, film.pretension > 0.0)))
             same_mesh = SolveSettings(theory=theory, resolution=full.mesh.resolution, layer=full.mesh.layer)
-            exact, charge = touch_charge(sensor, full), touch_charge(sensor, press(film, probe, at, force, same_mesh))
+            exact = touch_charge(sensor, full)
+            charge = touch_charge(sensor, press(film, probe, at, force, same_mesh))
             error = float(np.abs(charge - exact).max() / np.abs(exact).max())
             assert error <= bound + 0.01 * accuracy, (theory.name, error, bound, scene)

@@ -25,7 +25,8 @@ COMMON = settings(derandomize=True, deadline=None, max_examples=15)
 def probes(draw) -> Probe:
     """Circles, ellipses, rectangles, triangles and other convex polygons, rotated by any angle."""
     kind = draw(st.sampled_from(["circle", "ellipse", "rectangle", "triangle", "polygon"]))
-    size, angle = RADIUS * 10.0 ** draw(st.floats(-3.0, -0.7)), draw(st.floats(0.0, 2.0 * np.pi))
+    size = RADIUS * 10.0 ** draw(st.floats(-3.0, -0.7))
+    angle = draw(st.floats(0.0, 2.0 * np.pi))
     if kind == "circle":
         return Circle(size)
     if kind == "ellipse":
@@ -42,8 +43,10 @@ def probes(draw) -> Probe:
 @st.composite
 def presses(draw) -> tuple[Probe, tuple[float, float], Resolution, float]:
     """Generate accepted presses up to the rim: probe, position, resolution and layer."""
-    probe, layer = draw(probes()), 10.0 ** draw(st.floats(-3.0, -1.0))
-    share, angle = draw(st.one_of(st.floats(0.0, 0.97), st.floats(0.9, 0.999))), draw(st.floats(-np.pi, np.pi))
+    probe = draw(probes())
+    layer = 10.0 ** draw(st.floats(-3.0, -1.0))
+    share = draw(st.one_of(st.floats(0.0, 0.97), st.floats(0.9, 0.999)))
+    angle = draw(st.floats(-np.pi, np.pi))
     distance = share * (RADIUS - probe.reach)
     at = (distance * np.cos(angle), distance * np.sin(angle))
     try:
@@ -57,7 +60,8 @@ def presses(draw) -> tuple[Probe, tuple[float, float], Resolution, float]:
 def exact_points(placement: Placement, mesh: Template, xi: np.ndarray, eta: np.ndarray) -> np.ndarray:
     """Film points of the same local coordinates in every element, shape (n_element, n)."""
     other = copy.copy(mesh)
-    other.xi, other.eta = xi, eta
+    other.xi = xi
+    other.eta = eta
     return placement.element_points(other)
 
 
@@ -70,7 +74,8 @@ def found_again(placement: Placement, mesh: Template, film: np.ndarray) -> np.nd
 
 def accuracy(film: np.ndarray, placement: Placement) -> np.ndarray:
     """1e-9 of the size of the elements nearby: those of a small probe are small, those at a near rim too."""
-    (distance,), room = np.abs(film[None] - placement.corners.mean()), 1.0 - np.abs(placement.corners).max()
+    (distance,) = np.abs(film[None] - placement.corners.mean())
+    room = 1.0 - np.abs(placement.corners).max()
     return 1e-9 * np.minimum(1.0, np.maximum(distance, 1e-3 * room) + np.ptp(np.abs(placement.corners)) + 1e-3)
 
 
@@ -79,7 +84,8 @@ def accuracy(film: np.ndarray, placement: Placement) -> np.ndarray:
 def test_locate_is_the_inverse_of_the_element_map(scene, seed):
     """The points lie all over the film, on the rim, at the nodes and on the edge of the footprint."""
     probe, at, resolution, layer = scene
-    placement, mesh = place(FILM, probe, at, resolution, layer).placement, template_for(probe, resolution)
+    placement = place(FILM, probe, at, resolution, layer).placement
+    mesh = template_for(probe, resolution)
     rng = np.random.default_rng(seed)
     disk = np.sqrt(rng.random(120)) * np.exp(2j * np.pi * rng.random(120))
     near = placement.corners.mean() + 3.0 * probe.reach / RADIUS * disk[:100]
@@ -107,7 +113,8 @@ def test_accepted_presses_have_no_folded_elements(scene):
 def test_footprint_elements_have_the_area_centroid_and_load_of_the_probe(scene):
     """Area, centroid and load are exact for polygons, and accurate to the mesh error for curved probes."""
     probe, at, resolution, layer = scene
-    mesh, distance = template_for(probe, resolution), float(np.hypot(*at)) / RADIUS
+    mesh = template_for(probe, resolution)
+    distance = float(np.hypot(*at)) / RADIUS
     placed = place(FILM, probe, at, resolution, layer)
     geometry = placed.geometry
     exact = 1e-9 if isinstance(probe, Polygon) else 1e-4
@@ -131,7 +138,8 @@ def test_load_is_uniform_over_a_polygon(probe, distance):
     resolution = Resolution(4, 8, 3)
     mesh = template_for(probe, resolution)
     placed = place(FILM, probe, (distance * RADIUS, 0.0), resolution, 0.05)
-    load, about = placed.geometry.load, placed.node_points - distance
+    load = placed.geometry.load
+    about = placed.node_points - distance
     outline = probe.outline / RADIUS
     (x, y), (u, v) = (np.stack([z.real, z.imag]) for z in (outline, np.roll(outline, -1)))
     cross = (x * v - u * y) / (12.0 * probe.area / RADIUS**2)

@@ -63,8 +63,10 @@ def test_refined_template_locates_points_in_split_elements():
     low = np.vstack([[(-1, -1), (0, -1), (-1, 0), (0, 0), (0.5, 0)], np.full((base.n_element - 1, 2), -1.0)])
     size = np.vstack([np.ones((3, 2)), [(0.5, 1.0)] * 2, np.full((base.n_element - 1, 2), 2.0)])
     parent = np.concatenate([np.zeros(5, dtype=int), np.arange(1, base.n_element)])
-    rng, refined = np.random.default_rng(0), RefinedTemplate(base, parent, low, size)
-    of_base, at = rng.integers(3, size=300), rng.uniform(-1.0, 1.0, (2, 300))
+    rng = np.random.default_rng(0)
+    refined = RefinedTemplate(base, parent, low, size)
+    of_base = rng.integers(3, size=300)
+    at = rng.uniform(-1.0, 1.0, (2, 300))
     element, *local = refined.within(of_base, *at)
     np.testing.assert_array_equal(parent[element], of_base)
     assert np.abs(local).max() <= 1.0

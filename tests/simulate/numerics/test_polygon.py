@@ -48,7 +48,8 @@ def test_area_and_centroid_add_up(z):
 @given(a=convex(), b=convex())
 @COMMON
 def test_shared_area_is_symmetric_bounded_and_additive(a, b):
-    common, tiny = shared_area(a, b), 1e-9 * (area_of(corners_of(a)) + area_of(corners_of(b)))
+    common = shared_area(a, b)
+    tiny = 1e-9 * (area_of(corners_of(a)) + area_of(corners_of(b)))
     assert common == pytest.approx(shared_area(b, a), abs=tiny)
     assert -tiny <= common <= min(area_of(corners_of(a)), area_of(corners_of(b))) + tiny
     assert sum(shared_area(part, b) for part in halves(a)) == pytest.approx(common, abs=tiny)
@@ -62,7 +63,8 @@ def test_shared_area_is_symmetric_bounded_and_additive(a, b):
 @given(a=convex(), x=st.floats(-2, 2), y=st.floats(-2, 2), radius=st.floats(1e-3, 3.0))
 @COMMON
 def test_area_in_a_disk_is_bounded_and_additive_and_a_polygons_limit(a, x, y, radius):
-    centre, most = complex(x, y), min(area_of(corners_of(a)), np.pi * radius**2)
+    centre = complex(x, y)
+    most = min(area_of(corners_of(a)), np.pi * radius**2)
     common = area_in_disk(a, centre, radius)
     assert -1e-9 * most <= common <= most * (1.0 + 1e-9)
     split = sum(area_in_disk(part, centre, radius) for part in halves(a))

@@ -11,7 +11,8 @@ from isocharge.simulate.plots.film import draw_charge_map, draw_electrodes, draw
 
 
 def test_draw_electrodes_draws_front_and_back_at_their_positions():
-    pad, back = Electrode.of_square("A", (5.0, 0.0), 3.0), ((0.0, -9.0), (9.0, -9.0), (9.0, 9.0))
+    pad = Electrode.of_square("A", (5.0, 0.0), 3.0)
+    back = ((0.0, -9.0), (9.0, -9.0), (9.0, 9.0))
     electrode = replace(pad.with_trace(((5.0, 0.0), (9.0, 0.0)), 0.5), back=(back,))
     sensor = replace(load_sensor("three-25um-biaxial"), electrodes=(electrode,))
     axes = Figure().subplots()
@@ -32,7 +33,8 @@ def test_draw_charge_map_covers_the_whole_disk():
 
 
 def test_draw_probe_draws_the_footprint_at_its_position():
-    axes, triangle = Figure().subplots(), Polygon.triangle(3.0, 0.3)
+    axes = Figure().subplots()
+    triangle = Polygon.triangle(3.0, 0.3)
     draw_probe(axes, triangle, (2.0, -1.0))
     np.testing.assert_allclose(axes.patches[0].get_xy()[:-1] @ [1.0, 1.0j], 2.0 - 1.0j + triangle.outline)
 

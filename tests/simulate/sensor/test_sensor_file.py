@@ -128,7 +128,8 @@ def test_optional_keys_have_defaults():
 
 def test_traces_and_back_metal_are_read():
     """A trace is written as a polygon."""
-    pad, back = ((8.0, 0.0), (12.0, 0.0), (10.0, 4.0)), (((0.0, -9.0), (9.0, -9.0), (9.0, 9.0), (0.0, 9.0)),)
+    pad = ((8.0, 0.0), (12.0, 0.0), (10.0, 4.0))
+    back = (((0.0, -9.0), (9.0, -9.0), (9.0, 9.0), (0.0, 9.0)),)
     table = {"polygon_mm": pad, "trace_mm": [[10, 0], [10, -5]], "width_mm": 0.5, "back_mm": back}
     (electrode,) = sensor_from_dict(whole() | {"readout": "area", "electrodes": {"A": table}}).electrodes
     trace = ((9.75, 0.0), (9.75, -5.0), (10.25, -5.0), (10.25, 0.0))

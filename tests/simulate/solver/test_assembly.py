@@ -44,7 +44,8 @@ def random_matrices(mesh: Template, components: int, seed: int) -> np.ndarray:
 @pytest.mark.parametrize(("resolution", "probe"), SMALL, ids=str)
 def test_sparse_solution_equals_dense_solution(resolution, probe, components):
     mesh = template_for(probe, resolution)
-    matrix, right = random_matrices(mesh, components, 1), np.random.default_rng(1).standard_normal((mesh.n_node, 3))
+    matrix = random_matrices(mesh, components, 1)
+    right = np.random.default_rng(1).standard_normal((mesh.n_node, 3))
     solution = Assembly(mesh, components).factor(matrix).solve(right)
     np.testing.assert_allclose(solution, dense_solution(mesh, matrix, right), atol=1e-12)
     assert not solution[mesh.on_rim].any()
@@ -55,7 +56,8 @@ def test_sparse_solution_with_the_tangent_of_a_film_equals_dense_solution(mesh, 
     """Badly scaled and, with bending, indefinite: a matrix that is factorised without pivoting."""
     elastic = ElasticFilm(mesh.geometry, DimensionlessGroups(0.01, 1.0, 5.0 if bending == 0.0 else 0.0, bending, 0.34))
     field = 0.01 * mesh.random_field(1)
-    matrix, right = elastic.tangent(field, 0.0 if bending == 0.0 else 1.0), -elastic.residual(field)
+    matrix = elastic.tangent(field, 0.0 if bending == 0.0 else 1.0)
+    right = -elastic.residual(field)
     solution = Assembly(mesh.template, elastic.components).factor(matrix).solve(right)
     expected = dense_solution(mesh.template, matrix, right)
     np.testing.assert_allclose(solution, expected, atol=1e-8 * np.abs(expected).max())

@@ -94,7 +94,10 @@ def test_vertical_forces_balance_round_the_probe(film):
 
     Independent of the solver's own residual: stress and deflection are read as a user reads them.
     """
-    probe, at, radius, step = Polygon.rectangle(4.0, 2.0, 0.3), (6.0, -5.0), 5.0, 1e-3
+    probe = Polygon.rectangle(4.0, 2.0, 0.3)
+    at = (6.0, -5.0)
+    radius = 5.0
+    step = 1e-3
     solved = press(film, probe, at, 1.0, SolveSettings(theory=MEMBRANE, resolution=Resolution(6, 8, 6)))
     angle = 2.0 * np.pi * np.arange(64) / 64
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -135,14 +138,16 @@ def test_principal_stress_is_that_of_the_points(film):
     smallest, largest = principal_stress(solved)
     for surface in ("middle", "top", "bottom"):
         s11, s22, s12 = touch_stress(solved, points, surface).T
-        mean, radius = 0.5 * (s11 + s22), np.hypot(0.5 * (s11 - s22), s12)
+        mean = 0.5 * (s11 + s22)
+        radius = np.hypot(0.5 * (s11 - s22), s12)
         assert (mean + radius).max() <= largest * 1.02
         assert surface != "middle" or (mean - radius).min() >= smallest - 0.02 * largest
 
 
 def test_press_reaches_the_required_accuracy(film):
     """A higher accuracy needs a finer mesh."""
-    sensor, scene = load_sensor("four-25um-uniaxial"), (film, Circle(1.0), (9.0, 1.0), 1.0)
+    sensor = load_sensor("four-25um-uniaxial")
+    scene = (film, Circle(1.0), (9.0, 1.0), 1.0)
     exact = touch_charge(sensor, press(*scene, SolveSettings(theory=FULL, resolution=Resolution(8, 8, 7, 2))))
     sizes = []
     for accuracy in (1e-3, 5e-4):
@@ -154,7 +159,8 @@ def test_press_reaches_the_required_accuracy(film):
 
 def test_error_estimates_of_singular_cases(film):
     """The highest modes contain round-off only, or the theory cannot describe the film."""
-    taut, linear = replace(film, pretension=10.0), Theory(stretching=False, bending=False, pretensioned=True)
+    taut = replace(film, pretension=10.0)
+    linear = Theory(stretching=False, bending=False, pretensioned=True)
     settings = SolveSettings(theory=linear, resolution=Resolution(12, 8, 3))
     assert 0.0 <= mesh_error(press(taut, Circle(0.9 * film.radius), (0.0, 0.0), 1e-3, settings)) < 1e-4
     thick = press(replace(film, thickness=1.0), Circle(1.0), (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE))

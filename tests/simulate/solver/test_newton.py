@@ -69,7 +69,8 @@ def test_starting_equilibrium_saves_newton_steps(film, probe):
 def test_starting_equilibrium_on_another_mesh_is_not_used(film):
     scene = film, Circle(1.0), (5.0, 0.0), 1.0
     coarse = press(*scene, SolveSettings(resolution=Resolution(3, 8, 4)))
-    other, cold = press(film, PROBES["rectangle"], (5.0, 0.0), 1.0), press(*scene)
+    other = press(film, PROBES["rectangle"], (5.0, 0.0), 1.0)
+    cold = press(*scene)
     for start in (coarse, other):
         solved = press(*scene, SolveSettings(resolution=cold.mesh.resolution), start=start)
         np.testing.assert_array_equal(solved.field, cold.field)
@@ -114,7 +115,8 @@ def test_wrinkling_film_raises_solve_error(film, monkeypatch):
 def test_linear_solve_is_refined_and_reports_the_correction(film, monkeypatch, factor, converges):
     """A linear solver with a wrong scale is corrected if the corrections converge, and reported as failed otherwise."""
     scene = replace(film, thickness=2.0, pretension=1.0), Circle(1.0), (5.0, 0.0), 1e-3
-    exact, solve = press(*scene), Factor.solve
+    exact = press(*scene)
+    solve = Factor.solve
     assert exact.iterations == 2
     monkeypatch.setattr(Factor, "solve", lambda self, right: factor * solve(self, right))
     if converges:

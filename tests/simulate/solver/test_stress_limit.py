@@ -10,7 +10,8 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, load_sensor, press
 from isocharge.simulate.solver.stress_limit import force_within_stress, largest_stress, stress_caution
 
-FILM, TIP = load_sensor("four-25um-biaxial").film, Circle(1.0)
+FILM = load_sensor("four-25um-biaxial").film
+TIP = Circle(1.0)
 
 
 def test_stress_of_a_slack_membrane_grows_with_the_force_to_two_thirds():
@@ -21,8 +22,10 @@ def test_stress_of_a_slack_membrane_grows_with_the_force_to_two_thirds():
 
 def test_stress_of_a_plate():
     """6 M / h^2, M = F (1 + nu) / (4 pi) (ln(a / R) + R^2 / (4 a^2)) at the middle (Timoshenko 1959, art. 19)."""
-    plate, radius = replace(FILM, thickness=2.0, pretension=0.0), 5.0
-    a, nu = plate.radius, plate.poisson
+    plate = replace(FILM, thickness=2.0, pretension=0.0)
+    radius = 5.0
+    a = plate.radius
+    nu = plate.poisson
     moment = (1.0 + nu) / (4.0 * np.pi) * (np.log(a / radius) + radius**2 / (4.0 * a**2))
     assert largest_stress(plate, Circle(radius), 1.0) == pytest.approx(6.0 * moment / 2.0**2, rel=0.01)
 

@@ -37,7 +37,9 @@ def outer(film, force: float, c: float, r: float) -> tuple[float, float]:
     w = F / (16 pi D) (a^2 - r^2 - 2 r^2 ln(a / r) - c^2 (ln(a / r) - (1 - (r / a)^2) / 2)) from Michell's function and
     its mean over the disk; curvatures w'' and w' / r; touched side: s = E h / 2 (1 - nu^2) (w'' + nu w' / r).
     """
-    a, h, nu = film.radius, film.thickness, film.poisson
+    a = film.radius
+    h = film.thickness
+    nu = film.poisson
     k = force / (16.0 * np.pi * film.young * h**3 / (12.0 * (1.0 - nu**2)))
     log = np.log(a / r)
     slope = k * (-4.0 * r * log + c**2 / r - c**2 * r / a**2)
@@ -58,7 +60,8 @@ def test_bending_stress_outside_the_footprint(thick, share):
     for r in (1.5 * c, 0.6 * thick.radius, 0.99 * thick.radius):
         points = r * np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), np.sqrt([0.5, 0.5])])
         radial, hoop = outer(thick, FORCE, c, r)
-        mean, half = 0.5 * (radial + hoop), 0.5 * (radial - hoop)
+        mean = 0.5 * (radial + hoop)
+        half = 0.5 * (radial - hoop)
         expected = [(radial, hoop, 0.0), (hoop, radial, 0.0), (radial, hoop, 0.0), (mean, mean, half)]
         scale = max(abs(radial), abs(hoop))
         np.testing.assert_allclose(surface_stress(solved, "top", points), expected, atol=2e-3 * scale)
@@ -86,7 +89,8 @@ def test_bending_stress_has_opposite_signs_at_both_surfaces(thick):
 
 def test_charge_of_a_surface_is_the_integral_of_its_stress(thick):
     """The charge of a small electrode is A (d31 s11 + d32 s22) with the stress at its surface."""
-    probe, corner = Circle(2.0), np.array([(12.0, 0.0), (12.1, 0.0), (12.1, 0.1), (12.0, 0.1)])
+    probe = Circle(2.0)
+    corner = np.array([(12.0, 0.0), (12.1, 0.0), (12.1, 0.1), (12.0, 0.1)])
     sensor = replace(load_sensor("four-25um-uniaxial"), film=thick)
     sensor = replace(sensor, electrodes=(Electrode("A", tuple((float(x), float(y)) for x, y in corner)),))
     solved = press(thick, probe, (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))

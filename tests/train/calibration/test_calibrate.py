@@ -36,8 +36,10 @@ def fit(problem, presses):
 
 def test_derivatives_are_those_of_the_charges(layout):
     """Every column against central differences of the forward map of a film built from its parameters."""
-    charges, rng = layout.charges, np.random.default_rng(3)
-    parameters, at = layout.prior.draw(rng, 1)[0], draw_contacts(rng, layout.domain.within(7.0), 6)
+    charges = layout.charges
+    rng = np.random.default_rng(3)
+    parameters = layout.prior.draw(rng, 1)[0]
+    at = draw_contacts(rng, layout.domain.within(7.0), 6)
     by_contact = charges.by_contact(parameters, at)
     by_parameter = charges.by_parameter(parameters, at, by_contact)
     size = np.abs(charges.charges(parameters, at)).max(axis=1)[:, None]
@@ -56,10 +58,13 @@ def test_derivatives_are_those_of_the_charges(layout):
     ids=["modes", "traces"],
 )
 def test_derivatives_contain_what_a_parameter_does_to_the_rest(problem, names, besides):
-    charges, rng = problem.charges, np.random.default_rng(4)
-    film, at = problem.before.parameters, draw_contacts(rng, problem.domain.within(7.0), 6)
+    charges = problem.charges
+    rng = np.random.default_rng(4)
+    film = problem.before.parameters
+    at = draw_contacts(rng, problem.domain.within(7.0), 6)
     unknowns = np.pad(np.append(film, besides), (0, charges.n_coefficient - len(besides)))
-    size, found = charges.charges(unknowns, at), charges.by_parameter(unknowns, at, charges.by_contact(unknowns, at))
+    size = charges.charges(unknowns, at)
+    found = charges.by_parameter(unknowns, at, charges.by_contact(unknowns, at))
     for number, name in enumerate(names):
         change = np.pad(0.01 * np.diag(charges.prior.std)[number], (0, charges.n_coefficient))
         expected = (charges.charges(unknowns + change, at) - charges.charges(unknowns - change, at)) / 0.02
@@ -70,12 +75,16 @@ def test_derivatives_contain_what_a_parameter_does_to_the_rest(problem, names, b
 def test_it_is_the_minimum_of_the_joint_problem(count, seed, problem, monkeypatch):
     """SciPy over parameters and contacts together, with differences for derivatives, finds the same film."""
     monkeypatch.setattr(hypotheses, "hypotheses", lambda: [hypotheses.Hypothesis()])
-    charges, prior = problem.charges, problem.prior
+    charges = problem.charges
+    prior = problem.prior
     truth, presses = rig(problem, count, seed=seed)
-    data, ours, n = data_of(problem, presses), fit(problem, presses), len(presses)
+    data = data_of(problem, presses)
+    ours = fit(problem, presses)
+    n = len(presses)
 
     def residual(unknown):
-        parameters, contact = unknown[: truth.size] * prior.std, unknown[truth.size :].reshape(n, 3)
+        parameters = unknown[: truth.size] * prior.std
+        contact = unknown[truth.size :].reshape(n, 3)
         by_charge = data.weight * (charges.charges(parameters, with_force(contact)) - data.charge)
         by_rig = data.contact_weight * (contact - data.contact)
         return np.concatenate([by_charge.ravel(), by_rig.ravel(), (parameters - prior.mean) / prior.std])
@@ -159,8 +168,11 @@ def test_scatter_of_forces_is_noise_along_one_direction_of_each_press():
 @pytest.mark.parametrize(("pretension", "force"), [(0.8, 0.2), (1.6, 0.1)])
 def test_an_uneven_tension_acts_as_a_lower_one(problem, pretension, force):
     """To second order on all charges alike: against full solves, where first order gives nothing."""
-    charges, at = problem.charges, np.array([[2.0, 1.0, force]])
-    parameters, solved, known = np.append(pretension, problem.prior.mean[1:]), [], []
+    charges = problem.charges
+    at = np.array([[2.0, 1.0, force]])
+    parameters = np.append(pretension, problem.prior.mean[1:])
+    solved = []
+    known = []
     sensor, probe = problem.prior.film(parameters)
     for share in (0.0, 0.4, -0.4):
         uneven = replace(sensor, film=replace(sensor.film, deviator=(0.0, share * pretension)))
@@ -184,7 +196,8 @@ def error_of(network, problem, truth, change=lambda _, charge: charge):
 
     To charges with the same noise, which are changed for the first alone.
     """
-    at, rng = draw_contacts(np.random.default_rng(8), problem.domain.within(6.0), 400), np.random.default_rng(9)
+    at = draw_contacts(np.random.default_rng(8), problem.domain.within(6.0), 400)
+    rng = np.random.default_rng(9)
     charge = problem.noise.add(problem.charges.charges(truth, at), rng)
     apart = network.predict(change(at, charge))[0] - problem.films.fold(truth).predict(charge)[0]
     return float(np.sqrt((apart[:, :2] ** 2).sum(axis=1).mean()))
@@ -216,7 +229,8 @@ def test_imperfections_of_a_film_are_taken_for_what_they_are(problem):
 
 def test_what_no_parameter_describes_is_corrected_and_its_error_is_said(problem):
     truth, result = on_a_film(problem, bent, 20, seed=41)
-    corrected, plain = result.fitted, problem.films.fold(result.posterior.parameters)
+    corrected = result.fitted
+    plain = problem.films.fold(result.posterior.parameters)
     assert 0.5 < result.error_left.position_mm / error_of(corrected, problem, truth, bent) < 2.0
     at = draw_contacts(np.random.default_rng(3), problem.domain.within(6.0), 200)
     charge = bent(at, problem.charges.charges(truth, at))
@@ -271,7 +285,8 @@ def test_a_leak_at_random_is_said_and_widens_the_force(problem):
 @pytest.mark.first_cases(1)
 def test_errors_are_as_large_as_they_say(layout):
     """Over films, the deviations of the parameters in their own covariance add up to a chi-squared."""
-    total, count = 0.0, 0
+    total = 0.0
+    count = 0
     for seed in range(3):
         truth, presses = rig(layout, 8, seed=100 + seed)
         posterior = fit(layout, presses)
@@ -394,8 +409,10 @@ def test_presses_that_cannot_be_are_refused_with_the_reason(problem, name):
 
 def test_proposed_presses_tell_more_than_random_ones(problem):
     """Of a film that may be imperfect, beyond those of the prior."""
-    proposed, film = next_presses(problem, 8), problem.expected
-    sensitivity, nothing = ContactSensitivity.at(problem, film.unknowns), np.eye(len(film.joint))
+    proposed = next_presses(problem, 8)
+    film = problem.expected
+    sensitivity = ContactSensitivity.at(problem, film.unknowns)
+    nothing = np.eye(len(film.joint))
 
     def left(at):
         told = information_of(problem, film.unknowns, at).sum(axis=0) @ film.joint
@@ -410,7 +427,8 @@ def test_proposed_presses_tell_more_than_random_ones(problem):
 
 def test_proposed_presses_leave_no_dent(problem):
     """Without a limit the hardest would be 1.65 N."""
-    film, most = problem.sensor.film, {}
+    film = problem.sensor.film
+    most = {}
     for limit in (45.0, 20.0, np.inf):
         presses = next_presses(replace(problem, stress_limit=limit), 2)
         most[limit] = max(press.force_N for press in presses)
@@ -450,7 +468,8 @@ def test_a_pretension_is_followed_by_little(warmed, count, known, within_mpa):
     at[:, np.isfinite(known)] = np.array(known)[np.isfinite(known)]
     charge = problem.noise.add(problem.charges.charges(truth, at), rng)
     at[:, np.isnan(known)] = np.nan
-    before, result = problem.earlier, calibrate(presses_of(problem, at, charge), problem)
+    before = problem.earlier
+    result = calibrate(presses_of(problem, at, charge), problem)
     std = np.sqrt(result.posterior.covariance[0, 0]) * problem.prior.std[0]
     assert abs(before.parameters[0] - truth[0]) > 0.25
     assert abs(result.posterior.parameters[0] - truth[0]) < min(within_mpa, 3.0 * std)
@@ -465,7 +484,9 @@ def test_three_electrodes_follow_no_touches():
 
 def test_a_network_is_chosen_by_layout_and_not_by_name():
     table = sensor_to_dict(load_sensor("four-25um-biaxial"))
-    table["name"], table["film"]["young_GPa"], table["film"]["pretension_MPa"] = "ours", 2.7, 1.0
+    table["name"] = "ours"
+    table["film"]["young_GPa"] = 2.7
+    table["film"]["pretension_MPa"] = 1.0
     ours = CalibrationProblem.of(sensor_from_dict(table), Circle(1.0))
     described = dict(zip(ours.prior.names, ours.before.parameters, strict=True))
     assert described["young"] == pytest.approx(np.log(2.7 / 3.0))
@@ -497,9 +518,11 @@ def test_electrodes_with_traces_are_read_by_the_network_of_their_pads(problem):
 def test_traces_that_are_not_described_are_found_by_their_charge(problem):
     """Of 0.5 and 0.3 mm, askew, by direct solves of a film that has them."""
     rng = np.random.default_rng(5)
-    (sensor, probe), at = problem.prior.film(problem.prior.draw(rng, 1)[0]), draw_contacts(rng, problem.domain, 22)
+    sensor, probe = problem.prior.film(problem.prior.draw(rng, 1)[0])
+    at = draw_contacts(rng, problem.domain, 22)
     a, b, c, d = sensor.electrodes
-    a, c = a.with_trace((a.centre, (38.0, 14.0)), 0.5), c.with_trace((c.centre, (-40.0, -2.0)), 0.3)
+    a = a.with_trace((a.centre, (38.0, 14.0)), 0.5)
+    c = c.with_trace((c.centre, (-40.0, -2.0)), 0.3)
     film = replace(sensor, electrodes=(a, b, c, d))
     charge = np.array([touch_charge(film, press(film.film, probe, (x, y), force)) for x, y, force in at])
     result = calibrate(presses_of(problem, at[:16], problem.noise.add(charge[:16], rng)), problem)

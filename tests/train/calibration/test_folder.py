@@ -32,7 +32,8 @@ def film(tmp_path_factory, problem):
 def test_the_model_is_right_about_the_film(film, problem):
     """On fresh charges, solved for this film and not by the family, with the model that a user opens."""
     truth, result, folder = film
-    domain, rng = Domain(5.0, (0.3, 1.0)), np.random.default_rng(1)
+    domain = Domain(5.0, (0.3, 1.0))
+    rng = np.random.default_rng(1)
     forward_map = kept(ForwardMap.build, *problem.prior.film(truth), domain.radius, domain.force_range)
     at = draw_contacts(rng, domain, 400)
     charge = problem.noise.add(forward_map.charges(at), rng)
@@ -64,7 +65,8 @@ def test_every_file_is_there_and_reads_back(film, problem):
 
 def test_what_is_read_is_what_was_written_but_for_drift(film, problem):
     _, result, folder = film
-    earlier, expected = read_earlier(folder, problem), result.posterior.drifted(problem.prior)
+    earlier = read_earlier(folder, problem)
+    expected = result.posterior.drifted(problem.prior)
     np.testing.assert_allclose(earlier.parameters, expected.parameters, rtol=1e-12)
     np.testing.assert_allclose(earlier.covariance, expected.covariance, atol=2e-6)  # correlations have six digits
 
@@ -72,7 +74,8 @@ def test_what_is_read_is_what_was_written_but_for_drift(film, problem):
 def test_deviations_cover_what_is_left_of_the_film(film, problem):
     """At each contact that which is left there, beside the noise; the network follows that within some percent."""
     _, result, folder = film
-    contact, left = result.sensitivity.contact, result.sensitivity.contact_covariance(result.posterior.joint)
+    contact = result.sensitivity.contact
+    left = result.sensitivity.contact_covariance(result.posterior.joint)
     charge = problem.charges.charges(result.posterior.unknowns, contact)
     plain = problem.films.fold(result.posterior.parameters).predict(charge)[1]
     ratio = Predictor(folder).predict_batch(charge).x_std_mm / np.hypot(plain[:, 0], np.sqrt(left[:, 0, 0]))
@@ -115,7 +118,8 @@ def test_the_next_calibration_is_the_next_version_and_what_lies_above_is_repaire
 ):
     """Killed between the version and the files above it: nothing above, a draft, or the files of an older version."""
     _, result, folder = film
-    presses, killed = folder.parent / "presses.csv", tmp_path / "mine"
+    presses = folder.parent / "presses.csv"
+    killed = tmp_path / "mine"
     shutil.copytree(folder / "1", killed / "1")
     (killed / ".0a1b2c3d.draft").mkdir()
     (killed / "calibration.json").write_text("of an older version")

@@ -15,7 +15,8 @@ class Bench:
 
     def __init__(self, problem, plan, count=0, **options):
         """Go on with the first `count` presses of a plan."""
-        self.problem, self.rng = problem, np.random.default_rng(5)
+        self.problem = problem
+        self.rng = np.random.default_rng(5)
         self.parameters = problem.prior.draw(self.rng, 1)[0]
         self.saved: list[MeasuredPresses] = []
         contact = np.array([press.contact for press in plan[:count]])
@@ -43,7 +44,8 @@ def test_presses_make_a_film_known_as_well_as_their_plan_says(problem, plan):
     """The plan is linearised at the described film; the errors are those of the contacts on the film that was drawn."""
     bench = Bench(problem, plan)
     bench.press(3)
-    result, session = bench.session.result, bench.session
+    result = bench.session.result
+    session = bench.session
     assert result.error_left.position_mm < 2.0 * plan[2].position_mm
     unit = (result.posterior.parameters - bench.parameters) / problem.prior.std
     assert (
@@ -72,7 +74,8 @@ def test_every_change_is_saved_before_anything_is_computed(problem, plan):
 
 def test_undo_takes_back_the_last_press_or_any(problem, plan):
     bench = Bench(problem, plan, 3)
-    session, (first, _, third) = bench.session, bench.session.presses.charge_pC
+    session = bench.session
+    first, _, third = bench.session.presses.charge_pC
     assert session.undo(2) == 2
     np.testing.assert_array_equal(session.presses.charge_pC, [first, third])
     assert session.undo() == 2
@@ -87,7 +90,8 @@ def test_undo_takes_back_the_last_press_or_any(problem, plan):
 
 
 def test_a_place_that_is_skipped_is_not_proposed_again(problem, plan):
-    bench, skipped = Bench(problem, plan), []
+    bench = Bench(problem, plan)
+    skipped = []
     for _ in range(2):
         proposed = bench.session.proposed
         assert all(np.hypot(proposed.x_mm - x, proposed.y_mm - y) > 1.0 for x, y in skipped)
@@ -121,7 +125,8 @@ def test_a_press_that_cannot_be_is_refused_and_nothing_is_taken(problem, plan, c
 
 def test_presses_of_unknown_place_or_force_are_taken(problem, plan):
     """Dead weights, place unknown; and a stage without a load cell."""
-    bench, (x, y, force) = Bench(problem, plan, 2), plan[2].contact
+    bench = Bench(problem, plan, 2)
+    x, y, force = plan[2].contact
     for contact in ([np.nan, np.nan, force], [x, y, np.nan]):
         bench.session.take(bench.charge(plan[2].contact), np.array(contact))
     assert bench.session.result.posterior.bad.tolist() == [False] * 4
@@ -147,7 +152,8 @@ NAN = float("nan")
     ],
 )
 def test_answers(text, reply, details):
-    answer, expected = read_answer(text), {"contact": "as proposed", "number": "last"} | details
+    answer = read_answer(text)
+    expected = {"contact": "as proposed", "number": "last"} | details
     assert (answer.reply, answer.number) == (reply, expected["number"])
     np.testing.assert_array_equal(answer.contact, expected["contact"])
 

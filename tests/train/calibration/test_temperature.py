@@ -28,7 +28,8 @@ DAY = np.random.default_rng(2).permutation(np.linspace(20.0, 23.0, 12))
 
 def charges_at(contacts, pretensions):
     """By a direct solve for each press."""
-    sensor, solved = load_sensor("four-25um-biaxial"), []
+    sensor = load_sensor("four-25um-biaxial")
+    solved = []
     for (x, y, force), pretension in zip(contacts, pretensions, strict=True):
         film = replace(sensor.film, pretension=pretension)
         solved.append(touch_charge(replace(sensor, film=film), press(film, Circle(1.0), (x, y), force)))
@@ -37,7 +38,8 @@ def charges_at(contacts, pretensions):
 
 def pressed(problem, seed, temperature_C):
     """Presses on the film of 1.1 MPa at 21.5 C, as a rig reads them."""
-    rng, count = np.random.default_rng(seed), len(temperature_C)
+    rng = np.random.default_rng(seed)
+    count = len(temperature_C)
     contact = draw_contacts(rng, problem.domain.within(7.5), count)
     charge = problem.noise.add(kept(charges_at, contact, 1.1 - PER_K * (temperature_C - 21.5)), rng)
     contact[:, :2] += 0.1 * rng.standard_normal((count, 2))
@@ -67,7 +69,8 @@ def test_what_a_kelvin_does_is_learned_and_said(day):
 
 def test_the_film_at_another_temperature(day, tmp_path, command):
     _, out, _ = command(*CALIBRATE, "--from", written(day, tmp_path), "--temperature", "20.5", "--json")
-    table, known = json.loads(out), day.posterior.warming
+    table = json.loads(out)
+    known = day.posterior.warming
     change = 1e-6 * table["parameters"]["pretension"]["value"] - day.posterior.parameters[0]
     assert change == pytest.approx(-known.MPa_per_K * (known.at_C - 20.5))
     assert table["temperature"]["at_C"] == 20.5
@@ -85,7 +88,8 @@ def test_there_and_back_is_the_same_film(day, tmp_path, problem):
 
 def test_a_pretension_drifts_less_where_both_temperatures_are_known(day, problem):
     """By the thermometer's error alone, and by a degree or two unless what a kelvin does is known, too."""
-    before, unknown = day.posterior, replace(day.posterior, warming=None)
+    before = day.posterior
+    unknown = replace(day.posterior, warming=None)
     after = [
         estimate.drifted(problem.prior, knows_temperature=knows) for estimate in (before, unknown) for knows in (1, 0)
     ]

@@ -24,14 +24,16 @@ DOMAIN = Domain(8.0, (0.05, 2.0))
 
 
 def test_charges_agree_with_the_simulator(trained, film):
-    field, contact = trained.split.field, draw_contacts(np.random.default_rng(8), DOMAIN, 500)
+    field = trained.split.field
+    contact = draw_contacts(np.random.default_rng(8), DOMAIN, 500)
     error = np.abs(field.charges(contact) / film.charges(contact) - 1.0)
     assert np.median(error) < 2e-4
     assert np.sqrt(np.mean(error**2)) < 2.0 * field.error
 
 
 def test_the_derivatives_are_those_of_the_charges(trained):
-    field, inner = trained.split.field, Domain(7.0, (0.06, 1.9))  # the series ends at its domain's ends
+    field = trained.split.field  # the series ends at its domain's ends
+    inner = Domain(7.0, (0.06, 1.9))
     contact = draw_contacts(np.random.default_rng(3), inner, 200)
     expected = differences(field.charges, contact, steps=(1e-3, 1e-3, 1e-4))
     assert np.allclose(field.derivatives(contact), expected, rtol=1e-4, atol=1e-2)
@@ -51,7 +53,8 @@ REFERENCE = noise_model("reference")
 
 
 def field_of(charges, noise=0.0):
-    rng, domain = np.random.default_rng(0), Domain(8.0, (0.05, 2.0))
+    rng = np.random.default_rng(0)
+    domain = Domain(8.0, (0.05, 2.0))
     contact = draw_contacts(rng, domain, 3000)
     charge = charges(*contact.T)
     presses = LabelledPresses(contact, charge * np.exp(noise * rng.standard_normal(charge.shape)))
@@ -99,7 +102,8 @@ def test_noisy_charges_show_a_fold_but_not_for_certain(fold, seen):
 
 def crossing(x, y, force):
     """ln Q along a nodal cubic (u^2, u^3 - a^2 u): x = 3 mm and x = -3 mm have the same charges, and nothing folds."""
-    u, v = 0.1 * x, 0.1 * y
+    u = 0.1 * x
+    v = 0.1 * y
     return 1e4 * force[:, None] ** 0.7 * np.exp(np.stack([0 * u, u**2, u * (u**2 - 0.09), v], axis=1))
 
 

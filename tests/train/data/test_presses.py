@@ -36,7 +36,8 @@ def test_no_position_is_on_both_sides_and_the_seed_alone_decides(dataset):
 def test_the_domain_is_what_the_manifest_says_or_the_samples_show(dataset):
     assert domain_of(dataset) == Domain(8.0, (0.05, 2.0))
     samples = dataset.samples
-    reach, forces = np.hypot(samples.x_mm, samples.y_mm).max(), (samples.force_N.min(), samples.force_N.max())
+    reach = np.hypot(samples.x_mm, samples.y_mm).max()
+    forces = (samples.force_N.min(), samples.force_N.max())
     assert domain_of(replace(dataset, manifest={})) == Domain(reach, forces)
     with pytest.raises(DatasetError, match="do not hold the samples"):
         domain_of(replace(dataset, manifest={"ranges": {"radius_mm": 5.0}}))
@@ -126,7 +127,8 @@ def test_a_simulated_dataset_is_not_measured(dataset, sensor):
 
 
 def test_unknown_places_and_charges_do_not_count(sensor):
-    contact, charge = contacts(55, 3), np.ones((55, 3))
+    contact = contacts(55, 3)
+    charge = np.ones((55, 3))
     contact[0, 2] = charge[1, 0] = np.nan
     assert len(dataset_of(presses(contact, charge), sensor, Circle(1.0)).samples) == 53
     contact[2:7, :2] = np.nan

@@ -48,16 +48,20 @@ class Exported:
         n = len(values)
         values, t_s, dt_s = (np.ascontiguousarray(given, dtype=float) for given in (values, t_s, dt_s))
         marks = [np.zeros(n, np.int32) if given is None else np.int32(given) for given in (limited, tare)]
-        charge, base = np.empty_like(values), np.empty_like(values)
-        contact, flags = np.empty(n, np.int32), np.empty(n, np.uint32)
+        charge = np.empty_like(values)
+        base = np.empty_like(values)
+        contact = np.empty(n, np.int32)
+        flags = np.empty(n, np.uint32)
         arrays = [values, t_s, dt_s, *marks]
         self.library.bridge_chain(*map(_of, arrays), n, *map(_of, (charge, base, contact, flags)))
         return charge, base, contact, flags
 
     def frames(self, data):
         """Frames in bytes as (seq, t_us, flags, values), and the counters."""
-        counts, most = (ctypes.c_ulong * 4)(), len(data) // 12 + 1
-        head, values = np.empty((most, 4), np.uint32), np.empty((most, 255), np.float32)
+        counts = (ctypes.c_ulong * 4)()
+        most = len(data) // 12 + 1
+        head = np.empty((most, 4), np.uint32)
+        values = np.empty((most, 255), np.float32)
         n = self.library.bridge_frames(data, len(data), counts, _of(head), _of(values))
         frames = [
             (int(row[0]), int(row[1]), int(row[3]), tuple(numbers[: row[2]].tolist()))
@@ -67,14 +71,16 @@ class Exported:
 
     def encode(self, seq, t_us, flags, values):
         """The bytes of a frame."""
-        charges, data = np.array(values, dtype=np.float32), ctypes.create_string_buffer(2000)
+        charges = np.array(values, dtype=np.float32)
+        data = ctypes.create_string_buffer(2000)
         size = self.library.bridge_encode(seq, ctypes.c_uint32(t_us), len(values), flags, _of(charges), data)
         return data.raw[:size]
 
     def clock(self, t_us):
         """Clock and steps, s."""
         ticks = np.array(t_us, dtype=np.uint32)
-        t_s, dt_s = np.empty(len(ticks)), np.empty(len(ticks))
+        t_s = np.empty(len(ticks))
+        dt_s = np.empty(len(ticks))
         self.library.bridge_clock(_of(ticks), len(ticks), _of(t_s), _of(dt_s))
         return t_s, dt_s
 

@@ -48,7 +48,8 @@ def recording(board, seed, electrodes=4, seconds=20.0):
         Values, shape (n, electrodes), times and steps, shape (n,), s, and marks of limited frames and of new tares.
     """
     rng = np.random.default_rng(seed)
-    n, rate_Hz = int(200 * seconds), 200.0
+    n = int(200 * seconds)
+    rate_Hz = 200.0
     dt_s = rng.uniform(0.5, 1.5, n) / rate_Hz
     dt_s[rng.random(n) < 0.01] *= 20.0  # frames were lost
     dt_s[0] = 0.0
@@ -97,10 +98,12 @@ def misfit():
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_states_and_charges_are_ours_frame_by_frame(board, build, misfit):
-    exported, chain = build("four-25um-biaxial", device(board)), device(board).chain(("A", "B", "C", "D"))
+    exported = build("four-25um-biaxial", device(board))
+    chain = device(board).chain(("A", "B", "C", "D"))
     for seed in range(2):
         frames = recording(board, seed)
-        mine, theirs = ours(chain, *frames, misfit), exported.chain(*frames)
+        mine = ours(chain, *frames, misfit)
+        theirs = exported.chain(*frames)
         warming = chain.thermal is not None  # estimated with the network, so its rounding stands in it
         np.testing.assert_array_equal(theirs[2], mine[2])
         np.testing.assert_array_equal(theirs[3] & (127 - WARMING), mine[3] & (127 - WARMING))

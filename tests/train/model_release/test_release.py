@@ -185,7 +185,8 @@ def test_intervals_contain_the_stated_fraction_of_the_coordinates(truth, predict
     deviation = np.abs(contact - truth.contact) / std
     assert np.all(np.abs(np.mean(deviation < 1.0, axis=0) - 0.68) < 0.025)
     assert np.all(np.abs(np.mean(deviation < 1.96, axis=0) - 0.95) < 0.012)
-    radius, force = np.hypot(*truth.contact[:, :2].T), truth.contact[:, 2]
+    radius = np.hypot(*truth.contact[:, :2].T)
+    force = truth.contact[:, 2]
     tolerance = 0.06 if predictor.metadata.name.endswith("-student") else 0.04  # students have too few hidden units
     for key in (radius, force):
         for rows in np.array_split(np.argsort(key), 3):
@@ -200,7 +201,8 @@ def whitened(truth, predictor):
     found = np.stack(predictor.predict_batch(rows.noisy(REFERENCE, seed=8)), axis=1).astype(float)
     error = rows.contact - found[:, :3]
     error[:, 2] = found[:, 2] * np.log(rows.contact[:, 2] / found[:, 2])
-    one, (xy, xf, yf) = np.ones(len(found)), found[:, 7:].T
+    one = np.ones(len(found))
+    xy, xf, yf = found[:, 7:].T
     factor = np.linalg.cholesky(np.moveaxis(np.array([[one, xy, xf], [xy, one, yf], [xf, yf, one]]), 2, 0))
     return rows.contact, np.linalg.solve(factor, (error / found[:, 3:6])[..., np.newaxis])[..., 0]
 
@@ -219,8 +221,10 @@ def test_ellipses_and_ellipsoids_contain_the_stated_fraction_of_the_contacts(whi
 
 def test_the_joint_posterior_passes_a_rank_test(whitened):
     """Simulation-based calibration (Talts et al. 2018): ranks of the truth among 99 draws, along random directions."""
-    rng, (_, errors) = np.random.default_rng(9), whitened
-    direction, draws = rng.standard_normal(errors.shape), rng.standard_normal((99, *errors.shape))
+    rng = np.random.default_rng(9)
+    _, errors = whitened
+    direction = rng.standard_normal(errors.shape)
+    draws = rng.standard_normal((99, *errors.shape))
     ranks = np.sum(np.sum(draws * direction, axis=2) < np.sum(errors * direction, axis=1), axis=0)
     np.testing.assert_allclose(np.bincount(ranks // 10, minlength=10) / len(ranks), 0.1, atol=0.01)
 

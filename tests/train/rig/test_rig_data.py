@@ -16,7 +16,8 @@ from kept import kept
 TINY = FitConfig(
     NetworkConfig((32, 32), (8, 8)), TrainingConfig(steps=400, misfit_steps=5, misfit_charges=1_000, batch=256)
 )
-DESCRIBED, PROBE = load_sensor("four-25um-biaxial"), Circle(1.0)
+DESCRIBED = load_sensor("four-25um-biaxial")
+PROBE = Circle(1.0)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -40,14 +41,16 @@ def test_the_errors_are_what_serve_check_says_of_presses_that_nobody_trained_on(
     seen, held = (read_presses(model.folder / name) for name in ("presses.csv", "held_out.csv"))
     assert held == presses[held_out(presses.contact)]
     assert seen == presses[~held_out(presses.contact)]
-    check, errors = check_presses(Predictor(model.folder), held), model.metadata.errors
+    check = check_presses(Predictor(model.folder), held)
+    errors = model.metadata.errors
     assert errors["measured_presses"] == len(held) == check.compared >= 10
     said = [errors[name] for name in ("position_rms_mm", "position_median_mm", "force_rms_percent")]
     assert said == pytest.approx([check.position_mm.rms, check.position_mm.median, check.force_percent.rms], rel=1e-3)
 
 
 def test_card_and_metadata_say_that_it_was_fitted_to_measurements(model):
-    card, errors = (model.folder / "card.md").read_text("utf-8"), model.metadata.errors
+    card = (model.folder / "card.md").read_text("utf-8")
+    errors = model.metadata.errors
     assert f"## Errors on {errors['measured_presses']:.0f} measured presses that training never saw" in card
     assert "places of the presses are known to 0.05 mm and the forces to 0.5 %" in card
     measurement = model.metadata.made_with["measured"]

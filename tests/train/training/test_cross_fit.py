@@ -84,7 +84,8 @@ def test_errors_are_those_of_the_least_variance(alone, fresh):
 
 
 def test_errors_and_intervals_hold_for_presses_at_other_places(alone, fresh):
-    stated, true = evaluate(alone), evaluate(alone, fresh)
+    stated = evaluate(alone)
+    true = evaluate(alone, fresh)
     assert stated["position_rms_mm"] == pytest.approx(true["position_rms_mm"], rel=0.08)
     assert true["coverage_68"] == pytest.approx(0.683, abs=0.04)
     assert true["coverage_95"] == pytest.approx(0.95, abs=0.02)
@@ -103,12 +104,14 @@ def test_the_released_model_is_served_and_checked(alone, fresh, tmp_path, comman
     write_presses(tmp_path / "pad.csv", l_shaped())
     assert command("train", "fit", tmp_path / "pad.csv", "-o", tmp_path / "pad")[0] == 0
     folder = tmp_path / "pad" / "1"
-    predictor, presses = Predictor(folder), measured(fresh.contact[:200], fresh.charge[:200])
+    predictor = Predictor(folder)
+    presses = measured(fresh.contact[:200], fresh.charge[:200])
     np.testing.assert_allclose(predictor.predict(fresh.charge[0])[:3], alone.predict(fresh.charge[:1])[0][0], rtol=1e-3)
     assert check_presses(predictor, presses).fits
     assert predictor.metadata.sensor == {"name": "pad", "electrodes": ["Q1", "Q2", "Q3", "Q4"]}
     assert read_presses(folder / "presses.csv") == l_shaped()
-    card, errors = (folder / "card.md").read_text(), predictor.metadata.errors
+    card = (folder / "card.md").read_text()
+    errors = predictor.metadata.errors
     assert f"```bash\n{predictor.metadata.made_with['command']}\n```" in card
     assert {"| fitted to | 1200 presses at 1200 places, in `presses.csv` |", "| probes | unknown |"} <= {
         *card.splitlines()
@@ -153,7 +156,8 @@ def test_an_area_that_begins_at_the_origin_holds_its_own_presses():
 def test_the_domain_of_a_released_pad_is_its_area(long_pad):
     """Not the largest disk about the origin in it, which has 2 mm here."""
     about = Predictor(long_pad).metadata
-    domain, trained = model_domain(about), kept(made_off_the_origin).domain
+    domain = model_domain(about)
+    trained = kept(made_off_the_origin).domain
     assert domain == trained
     contact = presses_off_the_origin(900, 7).contact
     assert domain.contains(contact).all()

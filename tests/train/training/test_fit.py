@@ -111,7 +111,8 @@ def weights(dataset, config, **options):
 @pytest.mark.usefixtures("split_once")
 def test_a_seed_gives_the_same_network_and_leaves_the_callers_state_alone(dataset):
     torch.manual_seed(5)
-    before, threads = torch.get_rng_state(), torch.get_num_threads()
+    before = torch.get_rng_state()
+    threads = torch.get_num_threads()
     first, again = (weights(dataset, settings()) for _ in range(2))
     assert torch.equal(before, torch.get_rng_state())
     assert torch.get_num_threads() == threads
@@ -137,8 +138,11 @@ def test_coverage_where_the_truth_is_known(sensor):
     """Charges whose logarithms are linear in the contact, noise in proportion: the posterior is Gaussian, its width
     known, but at the edge."""
     rng = np.random.default_rng(0)
-    count, radius, noise = 6_000, 8.0, NoiseModel("loud", 1.0, 0.02)
-    reach, angle = radius * np.sqrt(rng.uniform(size=count)), rng.uniform(-np.pi, np.pi, count)
+    count = 6_000
+    radius = 8.0
+    noise = NoiseModel("loud", 1.0, 0.02)
+    reach = radius * np.sqrt(rng.uniform(size=count))
+    angle = rng.uniform(-np.pi, np.pi, count)
     force = np.exp(rng.uniform(np.log(0.05), np.log(2.0), count))
     contact = np.stack([reach * np.cos(angle), reach * np.sin(angle), np.log(force)], axis=1)
     slope = np.array([[0.0, -0.1, 0.7], [0.1, 0.05, 0.7], [-0.1, 0.05, 0.7]])
@@ -237,7 +241,8 @@ def test_a_killed_training_continues_only_with_its_own_presses_and_settings(data
     ):
         with pytest.raises(OutputExists, match=message), resume_parts(tmp_path / "it", changed):
             pass
-    whole, calls = weights(dataset, LONGER), []
+    whole = weights(dataset, LONGER)
+    calls = []
     monkeypatch.setattr("isocharge.train.training.fit.draw_misfit_examples", pytest.fail)
     with listening(lambda *call: calls.append(call)), resume_parts(tmp_path / "it", identity) as run:
         assert torch.equal(weights(dataset, LONGER, run=run), whole)

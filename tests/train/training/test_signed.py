@@ -15,7 +15,8 @@ from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.rig.corrected_film import correct_film
 from kept import kept
 
-RADIUS, FORCES = 1.5, (0.1, 0.3)
+RADIUS = 1.5
+FORCES = (0.1, 0.3)
 QUICK = FitConfig(
     network=NetworkConfig(hidden=(32, 32), misfit_hidden=(24, 24)),
     training=TrainingConfig(steps=400, misfit_steps=600, misfit_charges=4_000, batch=256),
@@ -59,7 +60,8 @@ def test_presses_with_negative_charges_are_located_as_well_as_others(film, fitte
 def test_its_model_is_served_and_its_misfit_sees_what_is_below_zero(fitted, tmp_path):
     """Four charges, three unknowns: 1 % of good presses exceed 2.58, the half-normal distribution's."""
     model = release(fitted, tmp_path / "models" / "taut")
-    predictor, charge = Predictor(model.folder), fitted.test.noisy(fitted.noise, 2)
+    predictor = Predictor(model.folder)
+    charge = fitted.test.noisy(fitted.noise, 2)
     np.testing.assert_allclose(predictor.predict(charge[0])[:3], fitted.predict(charge[:1])[0][0], rtol=1e-3, atol=1e-3)
     assert np.quantile(fitted.predict(charge)[2], 0.99) == pytest.approx(2.58, abs=0.6)
     lower = charge[charge[:, 1] < 0.0] - [0.0, 15.0, 0.0, 0.0]
