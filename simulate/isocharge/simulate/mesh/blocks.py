@@ -196,7 +196,15 @@ class Blocks:
         ]
 
     def rotated(self, fold: int, folds: int) -> Integers:
-        """Return the element that takes the place of each element after fold / folds of a full turn of the probe."""
+        """Return the numbers of the elements after a rotation of the probe by a part of a full turn.
+
+        Args:
+            fold: Number of parts by which the probe is rotated.
+            folds: Number of parts of a full turn.
+
+        Returns:
+            Number of the element that takes the place of each element, shape (n_element,).
+        """
         shift = fold * self.n_corner // folds
         quads = np.arange(self.n_quad).reshape(self.n_meshed, -1)
         sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)

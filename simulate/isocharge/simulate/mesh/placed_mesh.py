@@ -71,6 +71,9 @@ class Geometry:
             points: Film points of the nodes of every element, shape (n_element, n_local), in film radii.
             pressure: Function that returns the pressure at film points (in film radii), in any unit. None if the
                 pressure is uniform over the footprint.
+
+        Returns:
+            The integration rules.
         """
         rule = _quadrature(template.resolution.order)
         gradient, determinant = _film_gradient(rule.derivatives[:, None], points)
@@ -238,6 +241,9 @@ def place(
         layer: Width of the thin rings at the rim, in film radii.
         whole: Whether to mesh the whole film although film and footprint are symmetric, as a load that is not symmetric
             requires.
+
+    Returns:
+        The mesh, which is rotated so that the press lies on the positive x axis.
     """
     template = template_for(probe, resolution, whole=whole or not film.is_axisymmetric)
     x, y = at
@@ -254,6 +260,9 @@ def to_oval(points: Complexes, oval: complex) -> Complexes:
     Args:
         points: Points x + iy, any shape, in film radii.
         oval: e exp(2 i alpha) of the clamp; see `PlacedMesh`.
+
+    Returns:
+        Points of the oval film, same shape, in film radii.
     """
     if oval == 0.0:
         return points
@@ -270,6 +279,9 @@ def from_oval(points: Complexes, oval: complex) -> Complexes:
     Args:
         points: Points x + iy, any shape, in film radii.
         oval: e exp(2 i alpha) of the clamp; see `PlacedMesh`.
+
+    Returns:
+        Points of the circular film, same shape, in film radii.
     """
     if oval == 0.0:
         return points

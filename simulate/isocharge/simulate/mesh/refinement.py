@@ -262,6 +262,9 @@ def refine(mesh: PlacedMesh, lines: Complexes, finest: float) -> PlacedMesh:
         lines: Points on the lines at distances below half of `finest`, rotated with the press, shape (n,), in film
             radii.
         finest: Longest side of an element on a line, in film radii.
+
+    Returns:
+        The mesh with split elements.
     """
     base = mesh.template
     parent = np.arange(base.n_element)

@@ -162,7 +162,12 @@ def tensor_values(order: int, xi: Array, eta: Array) -> Array:
 
 
 def tensor_basis(order: int, xi: Array, eta: Array) -> tuple[Array, Array]:
-    """Evaluate the tensor-product basis and its derivatives; see `tensor_values` for the arguments.
+    """Evaluate the tensor-product basis and its derivatives at points of the reference element.
+
+    Args:
+        order: Order of the elements.
+        xi: First local coordinate of the points, shape (n,).
+        eta: Second local coordinate of the points, shape (n,).
 
     Returns:
         Values, shape (n, (order + 1)^2), and derivatives with respect to xi and eta, shape (2, n, (order + 1)^2).

@@ -34,7 +34,14 @@ FORCE_COLOURS = ("#8fb8de", "#3a7ca5", INK)
 
 
 def identification_picture(identification: Identification) -> Figure:
-    """Draw the maps for the smallest and the largest force, and the error as a function of the distance."""
+    """Draw the maps for the smallest and the largest force, and the error as a function of the distance.
+
+    Args:
+        identification: The identification.
+
+    Returns:
+        Figure with two maps and the errors against the distance.
+    """
     figure = new_figure(16.0, 5.2)
     weak, strong, curves = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
     for axes, limit_map in ((weak, identification.maps[0]), (strong, identification.maps[-1])):
@@ -81,7 +88,12 @@ def draw_limit_map(axes: Any, identification: Identification, limit_map: LimitMa
 
 
 def _draw_distance(axes: Any, identification: Identification) -> None:
-    """Draw the median and the largest error of every ring against its distance from the centre."""
+    """Draw the median and the largest error of every ring against its distance from the centre.
+
+    Args:
+        axes: Axes of matplotlib.
+        identification: The identification, which contains a map for each force.
+    """
     area = identification.area
     colours = FORCE_COLOURS[len(FORCE_COLOURS) - len(identification.maps) :]
     for limit_map, colour in zip(identification.maps, colours, strict=True):
@@ -109,7 +121,14 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
 
 
 def error_maps_picture(design: Design) -> Figure:
-    """Draw the errors with the nuisances of the case as colours, for the initial and the new layout."""
+    """Draw the position errors with the nuisances of the case as colours, for the initial and the new layout.
+
+    Args:
+        design: Result of the design.
+
+    Returns:
+        Figure with one map for each layout.
+    """
     case = design.case
     layouts = [(design.sensor, design.after)]
     if design.before:

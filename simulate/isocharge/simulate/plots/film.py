@@ -67,7 +67,14 @@ def draw_working_area(axes: Any, radius: float, label: str = "") -> None:
 
 
 def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> None:
-    """Scale and label axes in mm so that they show all electrodes and a circle of `radius` (mm) about the centre."""
+    """Scale and label axes in mm so that they show all electrodes and a circle about the centre.
+
+    Args:
+        axes: Axes of matplotlib.
+        sensor: Sensor whose electrodes are shown.
+        radius: Radius of the circle, mm.
+        title: Title of the axes.
+    """
     corners = np.concatenate([polygon for electrode in sensor.electrodes for polygon in electrode.front])
     outermost = float(np.hypot(*sensor.calibration.place(corners).T).max())
     half_width = max(radius, outermost) + 0.7
@@ -109,7 +116,12 @@ def draw_charge_map(axes: Any, charge_map: ChargeMap, number: int, force: float 
 
 
 def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
-    """Draw the deflection of the complete film as shades."""
+    """Draw the deflection of the complete film as shades.
+
+    Args:
+        axes: Axes of matplotlib.
+        equilibrium: The solved press.
+    """
     radius = equilibrium.film.radius
     x, y = _polar_grid(DRAWN_RADIUS * radius, 240, 361)
     depth = deflection(equilibrium, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
@@ -120,7 +132,12 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
 
 
 def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
-    """Draw the deflection on a section through the probe and the centre of the film, with a stretched vertical axis."""
+    """Draw the deflection on a section through the probe and the centre of the film. The vertical axis is stretched.
+
+    Args:
+        axes: Axes of matplotlib.
+        equilibrium: The solved press.
+    """
     distance_along_section = np.linspace(-DRAWN_RADIUS, DRAWN_RADIUS, 801) * equilibrium.film.radius
     x, y = equilibrium.at
     distance = hypot(x, y)

@@ -130,6 +130,9 @@ class FilmParameter:
             described: Physical value of the described film.
             parameter: Value of the parameter.
             factor: Exponential of the parameter, which the caller computes for all parameters together.
+
+        Returns:
+            The physical value, in the unit of `described`.
         """
         if self.form == "logarithm":
             return described * factor
@@ -319,6 +322,9 @@ class FilmPrior:
 
         Args:
             parameters: Parameters, shape (n_parameter,).
+
+        Returns:
+            The sensor, and the probe with its radius.
 
         Raises:
             SensorError: If no such sensor can exist, because electrodes lie off the film or the pretension is invalid.

@@ -46,6 +46,9 @@ def parse_probe(text: str) -> Probe:
     Args:
         text: Notation such as "rectangle:4.0x2.0@30"; the module's docstring lists the others.
 
+    Returns:
+        The probe.
+
     Raises:
         SceneError: If the text is not the notation of a probe, or no such footprint can exist.
     """

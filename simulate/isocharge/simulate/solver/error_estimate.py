@@ -101,7 +101,14 @@ def decay(mesh: PlacedMesh, slope: Array) -> float:
 
 
 def mesh_error(equilibrium: Equilibrium) -> float:
-    """Estimate the relative error of a charge by the mesh, from a second mesh or from element shapes and modes."""
+    """Estimate the relative error of a charge by the mesh, from a second mesh or from element shapes and modes.
+
+    Args:
+        equilibrium: The solved press.
+
+    Returns:
+        Relative error, at least `MIN_ERROR`.
+    """
     if equilibrium.proven_error is not None:
         return max(MIN_ERROR, equilibrium.proven_error)
     mesh = equilibrium.mesh

@@ -285,6 +285,9 @@ def _choose_layer(film: Film, force: float, probe: Probe, settings: SolveSetting
         probe: The probe.
         settings: Settings of the solver.
         start: Mesh of the starting equilibrium; None if there is none.
+
+    Returns:
+        Width of the thin rings, in film radii.
     """
     layer = layer_for(film, force)
     if start is None or not MIN_LAYER_REUSE < start.layer / layer < MAX_LAYER_REUSE:

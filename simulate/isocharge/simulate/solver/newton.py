@@ -133,6 +133,9 @@ def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
     Args:
         elastic: The discrete film.
         assembly: Linear solver for its mesh.
+
+    Returns:
+        The result, which has not converged if the linear system is nearly singular.
     """
     flat_field = np.zeros((assembly.free.shape[0], 3))
     factor = assembly.factor(elastic.tangent(flat_field))
@@ -301,6 +304,9 @@ def _chord_steps(iterate: _Iterate, factor: TangentFactor, before: float, tolera
         factor: Factorised tangent of this step.
         before: Relative residual before this step.
         tolerance: Relative residual at which the solve has converged.
+
+    Returns:
+        The last iterate that reduced the residual well.
     """
     if iterate.relative > CHORD_START * before:
         return iterate

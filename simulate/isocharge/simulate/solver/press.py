@@ -225,7 +225,13 @@ def _static_start(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
 
 
 def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
-    """Return the discrete film for the press with another force (N). The side force changes in proportion."""
+    """Return the discrete film for a press with another force. The side force changes in proportion.
+
+    Args:
+        case: The press.
+        geometry: Integration rules of the elements.
+        force: The other force, N.
+    """
     angle = float(np.arctan2(case.at[1], case.at[0]))
     share = force / case.force
     side_x, side_y = case.side_force
@@ -344,7 +350,12 @@ def resampled(field: Array, before: Template, after: Template) -> Array:
 
 
 def _failure_reason(solved: Equilibrium, tolerance: float) -> str:
-    """Return the error message of a failed solve."""
+    """Return the error message of a failed solve.
+
+    Args:
+        solved: Result of the failed solve.
+        tolerance: Relative residual that was expected.
+    """
     x, y = solved.at
     smallest_stress, _ = principal_stress(solved)
     message = (

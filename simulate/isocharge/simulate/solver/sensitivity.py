@@ -203,13 +203,16 @@ def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface:
 
 
 def _stress_change(solved: Equilibrium, field: StressField, solve: Callable[[Array], Array], surface: Surface) -> Array:
-    """Compute the change of the scaled stress by one field, shape (n_element, n_local, 3).
+    """Compute the change of the scaled stress at the nodes by one field.
 
     Args:
         solved: The solved press.
         field: The field.
         solve: Function that solves K x = b for a vector b at the nodes, shape (n_node, 3).
         surface: Surface in the thickness.
+
+    Returns:
+        Change per unit of the imperfection, shape (n_element, n_local, 3).
     """
     above = field.change(solved, STEP)
     below = field.change(solved, -STEP)

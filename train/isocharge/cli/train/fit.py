@@ -316,6 +316,11 @@ def calibration_problem(rig: Rig, models: Path | None) -> CalibrationProblem | N
 def refuse_training_options(config: Path | None, version: int, radius: str) -> None:
     """Refuse options that have no meaning if the film is calibrated, because no network is trained then.
 
+    Args:
+        config: File with training settings; None if the option was not given.
+        version: Version of the model; 1 if the option was not given.
+        radius: Radius of the working area; the default text if the option was not given.
+
     Raises:
         InputError: If one of the options is given.
     """

@@ -167,7 +167,14 @@ def press_command(
 def _open_session(
     press_file: PressFile, problem: CalibrationProblem, until: float, stds: dict[str, float]
 ) -> PressSession:
-    """Return a session that continues with the presses of the file, if it has any."""
+    """Return a session that continues with the presses of the file, if it has any.
+
+    Args:
+        press_file: File of the presses.
+        problem: The calibration.
+        until: Position error at which the session ends, mm.
+        stds: Standard deviations of the stated positions and forces.
+    """
     presses = press_file.read(position_std_mm=stds["position_std_mm"], force_std=stds["force_std"])
     if presses is not None:
         say(f"{press_file.path} has {len(presses)} presses; the session continues with them (--fresh deletes them)")
@@ -183,7 +190,12 @@ def _check_list(contacts: Array, session: PressSession, name: str) -> None:
 
 @contextmanager
 def _open_events(port: SensorPort, problem: CalibrationProblem) -> Iterator[PressEvents]:
-    """Open the port, and yield its readings and the lines of the keyboard."""
+    """Open the port of the board, and yield its readings and the lines that are typed.
+
+    Args:
+        port: Port, device file and keyboard.
+        problem: The calibration, which names the electrodes.
+    """
     board = load_device(port.device)
     if board.common_mode is not None:
         say(

@@ -249,7 +249,12 @@ class Dialogue:
         return False
 
     def _take(self, press: SteadyPress, contact: Array) -> bool:
-        """Add a press to the session, and return whether the session accepts it."""
+        """Add a press to the session, and return whether the session accepts it.
+
+        Args:
+            press: The steady press.
+            contact: Contact (x, y, F) of the press, shape (3,), mm and N.
+        """
         try:
             self._session.take(press.charge_pC, contact)
         except PressError as error:
@@ -265,7 +270,12 @@ class Dialogue:
 
 
 def _count_rows_made(session: PressSession, contacts: Array) -> int:
-    """Return the number of rows of a list up to the last press of the session."""
+    """Return the number of rows of a list of contacts up to the last press of the session.
+
+    Args:
+        session: The session.
+        contacts: Contacts of the list, shape (n_row, 3), mm and N.
+    """
     if not len(session):
         return 0
     last_contact = session.presses.contact[-1]

@@ -63,6 +63,9 @@ class PressEvents:
     def next(self) -> WatchResult | str:
         """Wait for the next reading or typed line. Readings from before the last call of `arm` are discarded.
 
+        Returns:
+            Result of the watch for a reading, or the typed line.
+
         Raises:
             SessionEnd: If the port or the input has ended.
             IsochargeError: If the port fails.

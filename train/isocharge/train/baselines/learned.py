@@ -139,6 +139,9 @@ class SubsetProcess(BaseEstimator, RegressorMixin):  # type: ignore[misc]
         Args:
             values: Inputs, shape (n, n_input).
             target: Targets, shape (n, n_target).
+
+        Returns:
+            This estimator.
         """
         rows = np.random.default_rng(self.seed).permutation(len(values))[: self.points]
         kernel_rows = rows[: self.kernel_points]

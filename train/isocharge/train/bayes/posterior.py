@@ -222,7 +222,7 @@ class Posterior:
 
     @cached_property
     def _roots(self) -> _RootCells:
-        """The first cells."""
+        """Cells of the coarsest division, with the charges at their centres and the largest slopes within each cell."""
         cells = Cells.roots(self.radius)
         points = (cells.centre[:, None] + _grid(3, 0.5 * cells.side)).reshape(-1, 2)
         slopes = self.charges.scaled_gradients(onto_disk(points, self.radius))

@@ -239,7 +239,15 @@ class FilmCharges:
     def _computed_mode_charges(
         self, modes: ModeMap, forward_map: ForwardMap, parameters: Array, contact: Array, charge: Array
     ) -> ModeCharges:
-        """Compute the effects of the modes on the charges of presses; the arguments are those of `_mode_charges`."""
+        """Compute the effects of the modes on the charges of presses.
+
+        Args:
+            modes: The modes of the film.
+            forward_map: Forward map of the film.
+            parameters: Parameters of the film, shape (n_parameter,).
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges of these contacts without modes, shape (n, n_electrode), pC.
+        """
         sensor = forward_map.sensor
         fields = replace(modes.fields, sensor=sensor) if modes.fields is not None else None
         mode_jacobian = replace(modes, film=forward_map, fields=fields).mode_jacobian(contact)
@@ -487,7 +495,15 @@ class FilmCharges:
 
 
 def _force_derivative(film: ForwardMap, contact: Array) -> Array:
-    """Compute the derivatives of the charges of a forward map with respect to ln F, shape (n, n_electrode), pC."""
+    """Compute the derivatives of the charges of a forward map with respect to ln F.
+
+    Args:
+        film: Forward map of the film.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Shape (n, n_electrode), pC.
+    """
     log_force_step = CONTACT_STEPS[2]
     force_factor = np.array([1.0, 1.0, np.exp(log_force_step)])
     charge_above = film.charges(contact * force_factor)

@@ -69,6 +69,9 @@ class ChannelNoise:
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
             unit: Contacts in unit coordinates, shape (n, 3).
+
+        Returns:
+            White noise and noise of the gain of each channel.
         """
         planes = LocalPlanes.through(unit, charge)
         fits = [_variance(*columns) for columns in zip(planes.value.T, planes.residual.T, strict=True)]
@@ -141,6 +144,9 @@ class LocalPlanes:
         Args:
             unit: Contacts in unit coordinates, shape (n, 3).
             values: Values at the contacts, such as charges, shape (n, k).
+
+        Returns:
+            The planes, one for each press.
         """
         distance, neighbours = cKDTree(unit).query(unit, NEIGHBOURS + 1)
         neighbours = neighbours[:, 1:]  # the nearest point is the press itself

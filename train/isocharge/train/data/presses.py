@@ -239,6 +239,11 @@ def _before(contact: Array) -> Integers:
 def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Dataset:
     """Return measured presses as a dataset, without presses whose place, force or charges are unknown.
 
+    Args:
+        presses: The measured presses.
+        sensor: Sensor on which the presses were made.
+        probe: Probe with which the presses were made.
+
     Raises:
         PressError: If fewer than `FEWEST_MEASURED` remain.
     """

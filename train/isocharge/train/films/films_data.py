@@ -64,7 +64,11 @@ class FilmPresses:
         return len(self.parameters)
 
     def charge(self) -> Array:
-        """Compute the charges of the films without noise, shape (n_film, n_press, n_electrode), pC."""
+        """Compute the charges of the films without noise.
+
+        Returns:
+            Charges, shape (n_film, n_press, n_electrode), pC.
+        """
         d31_factor = np.exp(self.parameters[:, D31])
         d32_factor = np.exp(self.parameters[:, D32])
         d33_factor = np.ones(len(self))
@@ -93,6 +97,9 @@ def draw_film_presses(
         presses: Number of presses on each film.
         seed: Seed of films and presses.
         executor: Executor of the tasks; None for this process.
+
+    Returns:
+        Contacts, and the charges of each film in parts; see `FilmPresses`.
 
     Raises:
         DatasetError: If too many charges are not positive.

@@ -227,7 +227,12 @@ def _packed(part: str, weights: Mapping[str, Array]) -> dict[str, np.ndarray]:
 
 
 def _unpacked(packed: Mapping[str, np.ndarray], activation: Activation) -> ConditionalWeights:
-    """Return the weights of a network from integers and scales by their names in its part of the file."""
+    """Convert rounded weights of a file into the weights of a network. This is the inverse of `_packed`.
+
+    Args:
+        packed: Integers and scales by their names in the part of the file.
+        activation: Activation of the hidden layers.
+    """
     names = [name for name in packed if not name.endswith(".scale")]
     for name in names:
         if max(packed[name].shape, default=1) > MAX_LAYER_WIDTH:

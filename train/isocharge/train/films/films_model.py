@@ -53,7 +53,14 @@ class ConditionalWeights:
     activation: Activation = TANH
 
     def perceptron(self, context: Array) -> Perceptron[Array]:
-        """Compute the perceptron of one film from its context, shape (n_context,)."""
+        """Compute the perceptron of one film.
+
+        Args:
+            context: Numbers that describe the film, shape (n_context,).
+
+        Returns:
+            The perceptron, whose weights are mixed from the matrices of all films.
+        """
         context_layers = [self._linear(f"context.{name}") for name in CONTEXT_LAYERS]
         psi = evaluate_hidden_layers(context_layers, self.activation, context)
         n_layer = sum(name.startswith("constant.") for name in self.arrays)
@@ -211,6 +218,9 @@ class FilmsModel:
 
         Args:
             parameters: Parameters of the film, as in `FilmPrior`, shape (n_parameter,).
+
+        Returns:
+            The network of the film.
 
         Raises:
             InputError: If there are not as many finite parameters as the prior names.

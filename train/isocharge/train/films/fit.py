@@ -133,6 +133,9 @@ def fit_films(
         executor: Executor for solves, presses and searches; None for this process.
         run: Saves the state, so that an interrupted training can be continued.
 
+    Returns:
+        The model, from which the network of each film is computed.
+
     Raises:
         InputError: If the noise model is unknown.
         SceneError, SolveError: If some presses cannot exist or cannot be solved.
@@ -269,7 +272,12 @@ class _ContactTraining:
         return len(self.presses) - self.config.watched
 
     def loss(self, step: int, random: torch.Generator) -> Tensor:
-        """Return the loss of a random batch, in which d31, d32 and the gains of the films are drawn again."""
+        """Return the loss of a random batch, in which d31, d32 and the gains of the films are drawn again.
+
+        Args:
+            step: Number of the step.
+            random: Random number generator.
+        """
         config = self.config
         n_press = self.presses.contact.shape[1]
         films = torch.randint(self.n_train, (config.batch_films,), generator=random).numpy()
@@ -298,6 +306,9 @@ class _ContactTraining:
             press_rows: Numbers of the presses on each film, shape (n_film, n_row).
             parameters: Parameters of these films, shape (n_film, n_parameter).
             random: Generator of the noise.
+
+        Returns:
+            Estimated and true contacts of all presses of the batch.
         """
         film_column = films[:, None]
         contact = self.presses.contact[film_column, press_rows]
@@ -377,7 +388,16 @@ class _MisfitTraining:
         noise: NoiseModel,
         config: FilmsConfig,
     ) -> None:
-        """Compute the inputs and targets of the examples; the arguments are those of `misfit_stage`."""
+        """Compute the inputs and targets of the examples.
+
+        Args:
+            network: The network.
+            inputs: Inputs of the network.
+            examples: Charges of every kind and their residuals.
+            good: Good presses and the projections that compute their residuals.
+            noise: Noise of good presses.
+            config: Sizes of the batches.
+        """
         self.network = network
         self.inputs = inputs
         self.good = good
@@ -392,7 +412,12 @@ class _MisfitTraining:
         self.n_train = n_example_film - max(1, round(MISFIT_VALIDATION_FRACTION * n_example_film))
 
     def loss(self, _: int, random: torch.Generator) -> Tensor:
-        """Return the weighted sum of both losses for a random batch."""
+        """Return the weighted sum of both losses for a random batch.
+
+        Args:
+            _: Number of the step, which has no influence.
+            random: Random number generator.
+        """
         n_film = self.config.batch_films // 2
         n_press = self.config.batch_presses
         n_charge = self.example_inputs.shape[1]

@@ -105,7 +105,12 @@ def _golden_charges(exact: OutputFunction, presses: LabelledPresses, noise: Nois
 
 
 def _check_finite(session: ort.InferenceSession, n_electrode: int) -> None:
-    """Check that the outputs are finite for the largest and smallest charges, where the network extrapolates."""
+    """Check that the outputs are finite for the largest and smallest charges, for which the network extrapolates.
+
+    Args:
+        session: The exported graph.
+        n_electrode: Number of charges.
+    """
     random = np.random.default_rng(4)
     charges = random.choice([-LARGEST, LOWEST_CHARGE, LARGEST], (N_COMPARED, n_electrode)).astype(np.float32)
     for name, rows in run(session, charges).items():

@@ -243,7 +243,12 @@ def _network_of(graph: onnx.GraphProto, where: str) -> FoldedNetwork:
 
 
 def _activation_of(operators: Sequence[str], where: str) -> Activation:
-    """Return the activation of the hidden layers, which follows the first linear layer."""
+    """Return the activation of the hidden layers, which follows the first linear layer.
+
+    Args:
+        operators: Operators of the nodes, in order.
+        where: Beginning of the error message.
+    """
     by_operator = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
     first_layer = operators.index("Gemm") if "Gemm" in operators else len(operators)
     following = operators[first_layer + 1 : first_layer + 2]
@@ -279,7 +284,13 @@ def _take_features(constants: Iterator[Array], *, is_signed: bool) -> ChargeFeat
 
 
 def _check_shapes(features: ChargeFeatures, perceptron: Perceptron[Array], where: str) -> None:
-    """Refuse constants whose shapes do not fit each other."""
+    """Raise an error if the shapes of constants do not fit each other.
+
+    Args:
+        features: Limits, typical charges and means of the features.
+        perceptron: Weights and biases of the layers.
+        where: Beginning of the error messages.
+    """
     n_electrode = features.n_electrode
     bounds = [features.low_pC, features.high_pC]
     expected_bounds: list[tuple[int, ...]] = [(), ()]

@@ -252,6 +252,9 @@ class ErrorBounds:
             noisy_charge: Charges of the first m test presses with noise, for the Bayes limit, shape (m, n_electrode),
                 pC.
             executor: Executor of the integrals of the Bayes limit; None to compute them in this process.
+
+        Returns:
+            Cramer-Rao limits of all presses, and posterior means of the first m presses.
         """
         posterior_mean = None
         if len(case.probes) == 1 and not case.is_rotated:

@@ -117,6 +117,9 @@ class DatasetEvaluation:
             students: Version folders of small models; models of other sensors are ignored.
             settings: Settings of the report.
 
+        Returns:
+            The evaluation, which has not started yet.
+
         Raises:
             DatasetError: If the methods cannot be fitted to the dataset.
             ModelError: If the model is for another sensor or for a smaller range of forces than the dataset.
@@ -206,7 +209,16 @@ class DatasetEvaluation:
     def _errors_by_force(
         self, fitted_by_name: Mapping[str, FittedMethod], limits: ErrorBounds, test: LabelledPresses
     ) -> dict[str, Any]:
-        """Return the position errors of the Bayes limit, the released model and the studied methods by force."""
+        """Compute the position errors of several methods and of the Bayes limit in bins of the force.
+
+        Args:
+            fitted_by_name: Fitted methods by name.
+            limits: Theoretical limits of the errors.
+            test: The test presses.
+
+        Returns:
+            Errors by the name of the method; see `studies.errors_by_force`.
+        """
         estimates = {}
         if limits.posterior_mean is not None:
             estimates[BAYES] = limits.posterior_mean

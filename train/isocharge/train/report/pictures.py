@@ -63,6 +63,9 @@ def cost_plot(records: Sequence[MethodRecord], cost: Cost, limits: Mapping[str, 
         cost: Name of the cost.
         limits: Theoretical limits of the position error, mm, by name. A limit is drawn as a horizontal line. It is left
             out if it is larger than all errors, as the limit for unbiased estimators can be.
+
+    Returns:
+        Figure with logarithmic axes and the Pareto front.
     """
     figure, axes = new_axes(10.5, 6.0)
     answering = [record for record in records if record.errors.position_rms_mm]
@@ -142,6 +145,9 @@ def error_maps(sensor: Sensor, domain: Domain, draws: NoiseDraws) -> Figure:
         sensor: The sensor, whose electrodes are drawn.
         domain: The working area, whose edge is drawn.
         draws: Estimates of the released model under several noise draws.
+
+    Returns:
+        Figure with both maps.
     """
     figure = new_figure(11.5, 5.0)
     force_error_percent = 100.0 * (draws.estimate[:, 2] / draws.truth[:, 2] - 1.0)
@@ -168,6 +174,9 @@ def error_lines(x: Sequence[float], lines: Mapping[str, Sequence[float | None]],
         x: Values on the horizontal axis.
         lines: Position errors at these values, mm, by the name of the method or limit; None for no value.
         x_label: Label of the horizontal axis, with its unit.
+
+    Returns:
+        Figure with logarithmic axes.
     """
     figure, axes = new_axes(8.0, 5.0)
     for name, errors_mm in lines.items():
@@ -187,6 +196,9 @@ def coverage_plot(record: Mapping[str, Any]) -> Figure:
 
     Args:
         record: Result of `studies.coverage_by_level`.
+
+    Returns:
+        Figure with one curve for x, y and the force.
     """
     figure, axes = new_axes(6.5, 4.4)
     level_percent = 100.0 * np.array(record["levels"])

@@ -60,9 +60,13 @@ def simulated_presses_for(model: ModelMetadata, dataset: Dataset) -> Dataset:
 
 
 def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
-    """Raise ModelError if the model was trained for another sensor than the sensor of the dataset.
+    """Raise an error if a model was trained for another sensor than the sensor of a dataset.
 
     The names of the two sensors may differ.
+
+    Args:
+        model: Metadata of the model.
+        dataset: The dataset.
     """
     expected = sensor_to_dict(dataset.sensor)
     given = dict(model.sensor)

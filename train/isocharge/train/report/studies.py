@@ -59,6 +59,9 @@ class NoiseDraws:
             clean: The test presses without noise.
             case: The case, with noise and seed.
             draw_count: Number of noise draws for each press.
+
+        Returns:
+            The estimates of all draws, one after the other.
         """
         first_seed = case.seed + NOISE_DRAWS_SEED
         noisy_charges = [clean.noisy(case.noise, first_seed + draw) for draw in range(draw_count)]
@@ -99,7 +102,15 @@ def errors_by_force(
 
 
 def _rms_in_bins(errors: Array, bin_index: Integers) -> list[float | None]:
-    """Return the root mean square of the finite errors in each force bin; None for a bin without finite errors."""
+    """Return the root mean square of the finite errors in each force bin.
+
+    Args:
+        errors: Errors of the presses, shape (n,), mm.
+        bin_index: Index of the force bin of each press, shape (n,).
+
+    Returns:
+        Errors, mm; None for a bin without finite errors.
+    """
     values: list[float | None] = []
     for index in range(FORCE_BINS):
         errors_in_bin = errors[(bin_index == index) & np.isfinite(errors)]

@@ -63,6 +63,9 @@ def correct_film(presses: MeasuredPresses, forward_map: ForwardMap, domain: Doma
         forward_map: Forward map, which is solved a little beyond the presses.
         domain: Contacts for which the film is needed.
         noise: Noise of the charges.
+
+    Returns:
+        The forward map with a smooth correction, and the scatter of the presses about it.
     """
     residuals = Residuals.of(presses, forward_map, noise)
     correction = fit_correction(residuals)

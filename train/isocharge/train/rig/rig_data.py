@@ -138,6 +138,9 @@ def _draw_dataset(film: CorrectedFilm, count: int, seed: int) -> Dataset:
         film: Corrected film.
         count: Number of presses.
         seed: Seed of the presses.
+
+    Returns:
+        The dataset, whose charges have no noise.
     """
     contact = draw_contacts(np.random.default_rng(seed), film.domain, count)
     charge = film.charges(contact)

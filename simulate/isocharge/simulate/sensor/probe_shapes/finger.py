@@ -53,6 +53,10 @@ class Finger(RoundProbe):
 
         The pressure exceeds the share t of its peak within a disk of radius a sqrt(1 - t^2). The force on the polygon
         is the integral over t of the area that the polygon has in common with this disk.
+
+        Args:
+            corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
+            at: Position of the centroid of the footprint as x + iy, mm.
         """
         nodes, weights = np.polynomial.legendre.leggauss(PRESSURE_LEVELS)
         level = 0.5 * (nodes + 1.0)
