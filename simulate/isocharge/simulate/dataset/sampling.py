@@ -85,6 +85,11 @@ class Sweep:
     sampling: Sampling = "sobol"
 
     def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            SceneError: If a value is not allowed.
+        """
         if not 0.0 < self.radius < np.inf:
             raise SceneError(f"radius: expected a positive number of mm, got {self.radius:g}")
         if not 1 <= self.samples <= MAX_SAMPLES:

@@ -177,6 +177,11 @@ class DesignCase:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        """Check that the electrodes can be placed.
+
+        Raises:
+            InputError: If a value is not allowed, or the kept electrodes are not part of the sensor.
+        """
         if not MIN_ELECTRODES <= self.electrodes <= MAX_ELECTRODES:
             raise InputError(
                 f"electrodes: expected {MIN_ELECTRODES} to {MAX_ELECTRODES}, got {self.electrodes}; x, y and the force "

@@ -169,6 +169,7 @@ class Measurement:
     _touch_charge: Array = field(init=False)
 
     def __post_init__(self) -> None:
+        """Draw the temperatures at the beginning, and set the charges to their stationary values."""
         first, second = self.amplifier.temperature_rms * self.rng.standard_normal(2)
         variance_ratio = self._variance_ratio
         correlation = math.sqrt(variance_ratio)  # between the stationary temperatures of the film and the air

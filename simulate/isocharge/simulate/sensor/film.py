@@ -147,6 +147,11 @@ class Film:
         return not self.is_anisotropic and self.oval == 0.0 and self.coat is None
 
     def __post_init__(self) -> None:
+        """Check the properties of the film.
+
+        Raises:
+            SensorError: If a property is outside the range for which the solver was tested.
+        """
         check_length("film radius", self.radius, MIN_RADIUS, SensorError)
         check_length("film thickness", self.thickness, MIN_THICKNESS, SensorError)
         check_stress("film young", self.young, MIN_YOUNG, MAX_YOUNG, SensorError)
@@ -220,6 +225,11 @@ class Piezo:
     d12: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the coefficients.
+
+        Raises:
+            SensorError: If a coefficient is too large or too small to be meant in pC/N, or if the film gives no charge.
+        """
         for name, coefficient in vars(self).items():
             if not abs(coefficient) <= MAX_PIEZO:
                 raise SensorError(f"piezo {name}: expected a number up to {MAX_PIEZO:g} in size, got {coefficient}")

@@ -187,12 +187,18 @@ class ProbeRadiusParameter(FilmParameter):
         return min(prior.spread.probe_radius, 0.3 * prior.probe.radius)
 
     def bounds(self, prior: "FilmPrior") -> tuple[float, float]:
-        """Return the usual bounds, limited by `MIN_PROBE_RADIUS_FACTOR` and `MAX_PROBE_RADIUS_FACTOR`."""
-        low, high = super().bounds(prior)
+        """Return the bounds of the difference from the described radius.
+
+        The radius is between `MIN_PROBE_RADIUS_FACTOR` and `MAX_PROBE_RADIUS_FACTOR` times the described radius.
+
+        Args:
+            prior: Distribution of the films, which contains the described probe.
+        """
+        lower, upper = super().bounds(prior)
         radius = prior.probe.radius
-        smallest = (MIN_PROBE_RADIUS_FACTOR - 1.0) * radius
-        largest = (MAX_PROBE_RADIUS_FACTOR - 1.0) * radius
-        return max(low, smallest), min(high, largest)
+        smallest_difference = (MIN_PROBE_RADIUS_FACTOR - 1.0) * radius
+        largest_difference = (MAX_PROBE_RADIUS_FACTOR - 1.0) * radius
+        return max(lower, smallest_difference), min(upper, largest_difference)
 
 
 PARAMETERS = (
@@ -234,6 +240,11 @@ class FilmPrior:
     spread: FilmSpread = FilmSpread()
 
     def __post_init__(self) -> None:
+        """Check that the electrodes of all films of the distribution lie on the film.
+
+        Raises:
+            SensorError: If an electrode may lie over the rim.
+        """
         sensor = self.sensor
         max_shift = float(np.hypot(MAX_DEVIATION, MAX_DEVIATION)) * self.spread.shift
         for electrode in sensor.electrodes:

@@ -266,6 +266,11 @@ class Sensor:
     coating: float = 0.0
 
     def __post_init__(self) -> None:
+        """Check the names, the gains and the positions of the electrodes.
+
+        Raises:
+            SensorError: If a value is not allowed, or an electrode overlaps another one or the rim.
+        """
         object.__setattr__(self, "electrodes", _as_tuples(self.electrodes))
         for value, options in ((self.readout, get_args(Readout)), (self.surface, get_args(Surface))):
             if value not in options:

@@ -114,6 +114,11 @@ class SensorTable(Settings, frozen=True):
     calibration: CalibrationTable = CalibrationTable()
 
     def __post_init__(self) -> None:
+        """Check the section `electrodes`, whose keys the format does not declare.
+
+        Raises:
+            WrongKey: If a value has the wrong type, or a key is missing.
+        """
         for name, value in self.electrodes.items():
             if name not in (SIDE, COATING) and isinstance(value, float):
                 raise WrongKey(f"electrodes.{name}", "[x, y] in mm or a table", value)
@@ -227,12 +232,16 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
 
 
 def film_to_dict(film: Film) -> dict[str, Any]:
-    """Return the section `film` of a sensor file."""
-    difference, shear = film.deviator
-    mean = film.pretension
-    tension = [tidy(value) for value in (mean + difference, mean - difference, shear)]
-    ratio = np.sqrt(film.young_ratio)
-    young_GPa = [tidy(film.young * 1e-3 * ratio), tidy(film.young * 1e-3 / ratio)]
+    """Return the section `film` of a sensor file. This is the inverse of `_film`.
+
+    Young's modulus and the pretension are one number if they do not depend on the direction, and lists otherwise.
+    """
+    half_difference, shear_tension = film.deviator
+    mean_tension = film.pretension
+    tension_components = (mean_tension + half_difference, mean_tension - half_difference, shear_tension)
+    tension_MPa = [tidy(component) for component in tension_components]
+    root = np.sqrt(film.young_ratio)
+    young_GPa = [tidy(film.young * 1e-3 * root), tidy(film.young * 1e-3 / root)]
     optional: dict[str, Any] = {
         "shear_GPa": None if film.shear is None else tidy(film.shear * 1e-3),
         "axis_deg": tidy(float(np.rad2deg(film.axis))),
@@ -249,7 +258,7 @@ def film_to_dict(film: Film) -> dict[str, Any]:
         "thickness_um": tidy(film.thickness * 1e3),
         "young_GPa": tidy(film.young * 1e-3) if film.young_ratio == 1.0 else young_GPa,
         "poisson": film.poisson,
-        "pretension_MPa": tension if any(film.deviator) else tidy(mean),
+        "pretension_MPa": tension_MPa if any(film.deviator) else tidy(mean_tension),
         **{name: value for name, value in optional.items() if value},
     }
 

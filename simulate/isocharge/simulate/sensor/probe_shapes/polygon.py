@@ -60,6 +60,11 @@ class Polygon(Probe):
     )
 
     def __post_init__(self) -> None:
+        """Check that the corners form a convex polygon about the origin.
+
+        Raises:
+            SceneError: If the corners do not, or if the polygon is too small.
+        """
         corners = np.array(self.corners, dtype=float)
         is_table = corners.ndim == 2 and corners.shape[1:] == (2,)
         if not is_table or not 3 <= len(corners) <= MAX_CORNERS or not np.isfinite(corners).all():
