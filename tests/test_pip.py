@@ -100,6 +100,14 @@ def test_nothing_heavy_came_along(base, tmp_path):
     assert not names & {"torch", "scipy", "scikit-learn", "onnx", "matplotlib"}
 
 
+def test_the_size_of_the_base_install_is_as_stated(base):
+    """Without the compiled modules, which are a tenth of the stated size."""
+    page = (ROOT / "serve/docs/getting_started.md").read_text("utf-8")
+    stated_MB = float(re.search(r"^\| none \|.*\| (\d+) MB \|$", page, re.MULTILINE)[1])
+    size_MB = sum(path.stat().st_size for path in base.parent.rglob("*") if path.is_file()) / 2**20
+    assert 0.7 * stated_MB < size_MB < 1.05 * stated_MB
+
+
 def test_predict_works_from_any_folder(base, tmp_path):
     assert predicted(base, tmp_path) == pytest.approx([3.0, -2.0, 1.0], abs=0.06)
 

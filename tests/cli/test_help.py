@@ -1,5 +1,6 @@
 """Help: each option says what it is, with unit and default; each example is one that the command accepts."""
 
+import os
 import re
 import shlex
 import subprocess
@@ -48,3 +49,15 @@ def test_help_above_the_commands_imports_none(words):
     )
     done = subprocess.run([sys.executable, "-c", code, " ".join(words)], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == ""
+
+
+def test_the_help_takes_at_most_a_quarter_of_a_second():
+    """Processor time of the fastest of three runs, because the machine may be busy."""
+    times_s = []
+    for _ in range(3):
+        process = subprocess.Popen([sys.executable, "-m", "isocharge.cli", "--help"], stdout=subprocess.DEVNULL)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        assert process.returncode == 0
+        times_s.append(usage.ru_utime + usage.ru_stime)
+    assert min(times_s) <= 0.25
