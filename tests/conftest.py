@@ -66,10 +66,10 @@ def command(monkeypatch, capsys):
 def refused(command):
     """Run `isocharge ...`, which must refuse: an exit code, nothing on stdout, and the reason, lines joined."""
 
-    def run(*words, said, code=2):
+    def run(*words, message, code=2):
         got, out, err = command(*words)
         assert (got, out, "Traceback" in err) == (code, "", False), err
-        assert said in " ".join(err.split())
+        assert message in " ".join(err.split())
 
     return run
 

@@ -109,11 +109,11 @@ def test_what_does_not_fit_is_named(board, message):
 
 
 def test_the_table_itself_is_named_without_a_path():
-    for table, where, said in (
+    for table, where, expected in (
         ({}, "mine.toml", "mine.toml: key 'board' is missing"),
         (3, "", "expected a table, got 3"),
     ):
-        with pytest.raises(SensorError, match=f"^{said}$"):
+        with pytest.raises(SensorError, match=f"^{expected}$"):
             convert(table, File, where, SensorError)
 
 
@@ -148,6 +148,6 @@ JSON = partial(read_json, what="a list", error=DeviceError, kind=list)
 )
 def test_files_that_are_none(tmp_path, read, content, message):
     (tmp_path / "board").write_bytes(content)
-    for path, said in ((tmp_path / "board", message), (tmp_path, "cannot be read")):
-        with pytest.raises(DeviceError, match=rf"^{path}: {said}"):
+    for path, expected in ((tmp_path / "board", message), (tmp_path, "cannot be read")):
+        with pytest.raises(DeviceError, match=rf"^{path}: {expected}"):
             read(path)

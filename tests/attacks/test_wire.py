@@ -54,9 +54,9 @@ class Server:
         code = self.process.wait(30)
         self.process.stdout.close()
         self.errors.seek(0)
-        said = self.errors.read()
+        message = self.errors.read()
         self.errors.close()
-        assert (code, "Traceback" in said) == (0, False), said
+        assert (code, "Traceback" in message) == (0, False), message
 
 
 @pytest.fixture(scope="module")

@@ -76,15 +76,15 @@ def test_a_sweep_as_a_table_for_other_programs(command, refused, tmp_path, monke
     assert columns["x_mm"] == samples.x_mm.tolist()
     assert np.column_stack([columns[name] for name in "ABC"]).tolist() == samples.charge_pC.tolist()
     two = "--probe", "circle:1.0", "--probe", "circle:2.0"
-    refused(*SMALL, *two, "-o", tmp_path / "c.csv", said="a table of presses has one probe")
-    refused(*SMALL, "-o", tmp_path / "a.csv", said="the dataset that belongs beside", code=1)
+    refused(*SMALL, *two, "-o", tmp_path / "c.csv", message="a table of presses has one probe")
+    refused(*SMALL, "-o", tmp_path / "a.csv", message="the dataset that belongs beside", code=1)
     many = "--samples", "1000001"
     refused(
-        *SMALL, *many, "-o", tmp_path / "d.csv", said="a table has at most 1,000,000 presses, got --samples 1000001"
+        *SMALL, *many, "-o", tmp_path / "d.csv", message="a table has at most 1,000,000 presses, got --samples 1000001"
     )
-    refused(*SMALL, "-o", ".", said="is already there", code=1)
+    refused(*SMALL, "-o", ".", message="is already there", code=1)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    refused(*SMALL, "-o", tmp_path / "b.parquet", said="pip install 'isocharge[parquet]'", code=1)
+    refused(*SMALL, "-o", tmp_path / "b.parquet", message="pip install 'isocharge[parquet]'", code=1)
     assert {path.name for path in tmp_path.iterdir()} == {"a", "a.parquet"}  # said before anything is pressed
 
 
@@ -179,17 +179,17 @@ def test_a_thick_film(command, tmp_path):
     answer, _ = point(command, path, "--at", "3,-2")
     assert answer["charge_pC"]["A"] == pytest.approx(3.7150435, rel=1e-3)
     assert (answer["theory"], answer["warnings"]) == ("nonlinear membrane + bending", [])
-    answer, said = point(command, path, "--theory", "nonlinear membrane")
+    answer, message = point(command, path, "--theory", "nonlinear membrane")
     assert answer["estimated_error"] is None
-    assert "caution: a nonlinear membrane does not describe this film at all" in said
+    assert "caution: a nonlinear membrane does not describe this film at all" in message
 
 
 def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
     path = sensor_file(tmp_path)
     path.write_text(re.sub(r"pyro_uC_per_m2_K = [0-9.]+", "pyro_uC_per_m2_K = -30.0", path.read_text()))
-    cold, said = point(command, path, "--force", 2.0)
+    cold, message = point(command, path, "--force", 2.0)
     warm, _ = point(command, path, "--force", 2.0, "--temperature", 0.1)
-    assert "caution: the film is stressed to" in said
+    assert "caution: the film is stressed to" in message
     assert warm["charge_pC"]["B"] - cold["charge_pC"]["B"] == pytest.approx(-27.0)
 
 
@@ -252,8 +252,8 @@ BAD = [
     (("simulate", "sweep", SENSOR, "--probe", "cube:1", "-o", "OUT"), 2, "SceneError: probe 'cube:1'"),
     (("train", "fit", "-o", "OUT"), 2, "InputError: expected either a DATASET folder or --sensor"),
     *(
-        (("train", "fit", *words.split(), "--films", "-o", "OUT"), 2, said)
-        for words, said in [
+        (("train", "fit", *words.split(), "--films", "-o", "OUT"), 2, message)
+        for words, message in [
             ("", "expected either a DATASET folder or --sensor"),
             ("presses", "--films: expected --sensor SENSOR alone, got presses"),
             ("--sensor four-25um-biaxial --radius auto", "--films: expected --radius in mm, got auto"),
@@ -281,8 +281,8 @@ BAD = [
         "expected a number of mm or 'auto', got 'all'",
     ),
     *(
-        (("simulate", "design", SENSOR, "--electrodes", *words.split(), "--radius", "8", "-o", "OUT"), 2, said)
-        for words, said in [
+        (("simulate", "design", SENSOR, "--electrodes", *words.split(), "--radius", "8", "-o", "OUT"), 2, message)
+        for words, message in [
             ("2", "three unknowns"),
             ("8 --side 30", "do not fit"),
             ("3 --goal best", "expected 'worst', 'rms' or a CSV file"),
@@ -299,8 +299,8 @@ BAD = [
         "a film is followed from a model that `isocharge train calibrate` made",
     ),
     *(
-        (("train", "fit", *words.split(), "-o", "OUT"), 2, said)
-        for words, said in [
+        (("train", "fit", *words.split(), "-o", "OUT"), 2, message)
+        for words, message in [
             (f"{__file__} --radius 5", "--radius: belongs to --sensor"),
             (f"{__file__} --sensor {SENSOR} --radius auto", "--radius: expected a number of mm with measured presses"),
             (f"{__file__} --sensor {SENSOR} --probe circle:1 --probe circle:2", "--probe: expected the one probe that"),
@@ -344,7 +344,7 @@ BAD = [
 )
 def test_bad_input_is_one_clear_line_and_leaves_nothing(refused, tmp_path, monkeypatch, words, code, message):
     monkeypatch.chdir(tmp_path)
-    refused(*words, said=message, code=code)
+    refused(*words, message=message, code=code)
     assert list(Path().iterdir()) == []
 
 
@@ -371,9 +371,9 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     assert [len(shown), *shown[0]] == [4]  # each half second; presses come after a second
     np.testing.assert_allclose(*np.split(np.array([row for row in shown if row], float), 2, axis=1), atol=0.5)
     model = load_model(out / "models" / SENSOR / "1")
-    said = np.array(re.findall(r"(\d+\.\d+) (?:mm|%)", table), float)
+    printed_errors = np.array(re.findall(r"(\d+\.\d+) (?:mm|%)", table), float)
     card = ("position_median_mm", "position_p95_mm") * 2 + ("force_median_percent", "force_rms_percent")
-    ratios = said / [model.metadata.errors[key] for key in card]
+    ratios = printed_errors / [model.metadata.errors[key] for key in card]
     assert np.all(np.abs(np.log(ratios)) < [0.15, 0.15, 0.9, 0.9, 0.15, 0.15])
     size, seconds = re.search(r"(\d+) KiB", table)[1], re.findall(r"(?:simulate|train|serve|show) (\d+\.\d)", table)
     assert (model.folder / "model.onnx").stat().st_size == pytest.approx(1024 * int(size), abs=512)
@@ -381,5 +381,5 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     (pressed, felt), (points, median, _) = ([*figures[0].axes[k].lines] for k in (2, -1))
     assert (pressed.get_label(), felt.get_label(), (out / "presses").is_dir()) == ("pressed", "estimated", True)
     apart = [points.get_ydata(), np.hypot(*(np.array(pressed.get_data()) - felt.get_data()))]
-    np.testing.assert_allclose([*map(np.median, apart)], said[[0, 2]], atol=1e-3)
+    np.testing.assert_allclose([*map(np.median, apart)], printed_errors[[0, 2]], atol=1e-3)
     assert np.all(np.diff(median.get_xdata()) > 0.0)

@@ -21,9 +21,9 @@ def refuses(refused, tmp_path, monkeypatch):
     """Check that a command refuses a file, and that nothing but the file is left."""
     monkeypatch.chdir(tmp_path)
 
-    def check(name, data, said, suffix="csv"):
+    def check(name, data, message, suffix="csv"):
         (tmp_path / f"p.{suffix}").write_bytes(data)
-        refused(*COMMANDS[name], f"p.{suffix}", said=said)
+        refused(*COMMANDS[name], f"p.{suffix}", message=message)
         assert [path.name for path in tmp_path.iterdir()] == [f"p.{suffix}"]
 
     return check

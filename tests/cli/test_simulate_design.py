@@ -40,8 +40,8 @@ def test_a_design_is_a_folder_that_other_commands_read(command, tmp_path, monkey
     solved = {path: path.stat().st_mtime_ns for path in (draft / "parts").glob("*.npy")}
     assert len(solved) == 2
     code, out, err = command(*words)
-    said = "all 3 leads go straight to the rim", "caution: 1 N under circle:1.0 stress the film to 49 MPa"
-    assert (code, all(words in err for words in said)) == (0, True), err
+    messages = "all 3 leads go straight to the rim", "caution: 1 N under circle:1.0 stress the film to 49 MPa"
+    assert (code, all(words in err for words in messages)) == (0, True), err
     assert sorted(path.name for path in folder.iterdir()) == FILES
     assert not draft.exists()
     numbers = json.loads((folder / "design.json").read_text())

@@ -24,4 +24,4 @@ def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_pa
     assert imread(tmp_path / "out" / "mirror.png").std() > 0.1
     assert picture.shape[0] > 400
     assert picture.std() > 0.1
-    refused(*UNIAXIAL, "-o", tmp_path / "out", said="already there", code=1)  # before anything is solved
+    refused(*UNIAXIAL, "-o", tmp_path / "out", message="already there", code=1)  # before anything is solved

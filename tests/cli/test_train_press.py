@@ -104,20 +104,20 @@ def test_enter_takes_a_press_as_proposed(capsys):
     assert session.taken[:2] == [(0.0, 0.0, 1.0), (1.5, 2.0, 0.9)]
     assert np.isnan(session.taken[2][:2]).all()
     assert taken == [1, 2, 3]
-    said = capsys.readouterr().err
-    assert "\n1. Press 1.00 N at (0.0, 0.0) mm and hold." in said
-    assert "hold it, 0.3 s: A 400.0, B 400.0, C 400.0, D 400.0 pC" in said
-    assert ("0.8 s" in said, "hold it, 1.4 s" in said) == (False, True)  # one line a second
-    assert re.findall(r": A (\S+),", said) == ["400.0"] * 2 + ["500.0"] * 3
-    assert said.count("so much is known") == 3
-    assert said.endswith("With --until 0 the same command takes more presses.\n")
+    message = capsys.readouterr().err
+    assert "\n1. Press 1.00 N at (0.0, 0.0) mm and hold." in message
+    assert "hold it, 0.3 s: A 400.0, B 400.0, C 400.0, D 400.0 pC" in message
+    assert ("0.8 s" in message, "hold it, 1.4 s" in message) == (False, True)  # one line a second
+    assert re.findall(r": A (\S+),", message) == ["400.0"] * 2 + ["500.0"] * 3
+    assert message.count("so much is known") == 3
+    assert message.endswith("With --until 0 the same command takes more presses.\n")
 
 
 FIRST, SECOND, THIRD = ((float(x), 0.0, 1.0) for x in range(3))
 
 
 @pytest.mark.parametrize(
-    ("events", "taken", "said"),
+    ("events", "taken", "message"),
     [
         ([STEADY, "", "q"], [FIRST], "so much is known"),
         ([STEADY, "q"], [], ""),
@@ -130,9 +130,9 @@ FIRST, SECOND, THIRD = ((float(x), 0.0, 1.0) for x in range(3))
         (["", STEADY, "q"], [], "press first"),
     ],
 )
-def test_what_is_typed_is_done(events, taken, said, capsys):
+def test_what_is_typed_is_done(events, taken, message, capsys):
     assert dialogue(*events)[0].taken == taken
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_press_that_is_refused_is_asked_for_again(capsys):
@@ -151,10 +151,10 @@ LIST = np.array([[1.0, 1.0, 0.5], [2.0, 2.0, 0.5], [3.0, 3.0, np.nan]])
 def test_presses_of_a_machine_are_those_of_its_list(capsys):
     session, script, _ = dialogue(TARED, STEADY, refused("it moves"), HELD, STEADY, contacts=LIST)
     np.testing.assert_array_equal(session.taken, LIST[[0, 2]])
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     assert script.armed == 0
-    assert said.index("Let the machine begin") < said.index("1. 0.50 N")
-    assert "row 2 is left out: it moves" in said
+    assert message.index("Let the machine begin") < message.index("1. 0.50 N")
+    assert "row 2 is left out: it moves" in message
 
 
 def test_a_port_that_goes_away_under_a_machine_ends_the_session():
@@ -304,7 +304,7 @@ def test_presses_of_another_probe_or_sensor_are_not_continued(problem, film, pla
 def test_a_file_with_further_columns_is_not_overwritten(refused, desk):
     text = "x_mm,y_mm,force_N,A,B,C,D,comment\n1,1,1,500,500,500,500,mine\n"
     (desk / "presses.csv").write_text(text)
-    refused(*PRESS, "--port", "some.bin", "--yes", said="got further columns: comment")
+    refused(*PRESS, "--port", "some.bin", "--yes", message="got further columns: comment")
     assert (desk / "presses.csv").read_text() == text
 
 
@@ -326,7 +326,7 @@ def test_bad_input_is_refused_before_the_first_press(refused, desk, words, messa
     (desk / "noise.bin").write_bytes(bytes(range(256)) * 100)
     before = sorted(desk.iterdir())
     is_port_or_output = bool({"noise.bin", "-o"} & {*words})
-    refused(*PRESS, *words, said=message, code=1 if is_port_or_output else 2)
+    refused(*PRESS, *words, message=message, code=1 if is_port_or_output else 2)
     assert sorted(desk.iterdir()) == before
 
 
@@ -346,5 +346,5 @@ CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial", "-o", "film"
 )
 def test_calibrate_refuses_bad_input_before_it_writes(refused, desk, words, message):
     (desk / "metres.csv").write_text("x_mm,y_mm,force_N,A,B,C,D\n0.001,0,1,9,8,7,6\n0,0.002,1,9,8,7,6\n")
-    refused(*CALIBRATE, *words, said=message)
+    refused(*CALIBRATE, *words, message=message)
     assert not (desk / "film").exists()

@@ -51,7 +51,7 @@ def test_durations_are_those_of_the_clock():
     assert timed.calls == 9 * 1000  # nine of ten rounds, 7 ms each
 
 
-def test_ways_predict_what_the_model_does():
+def test_contenders_compute_the_contacts_of_the_model():
     folder = find_model("three-25um-biaxial")
     model, predictor = load_model(folder), Predictor(folder)
     charges = press_charges(predictor, model.golden.charge_pC, seed=3)

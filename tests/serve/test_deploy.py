@@ -62,12 +62,12 @@ def assert_golden(address):
                     assert (np.abs(answer.as_numpy(name) - expected) <= share * allowed).all(), (path, name)
 
 
-def test_our_answers_are_golden_for_a_stock_client(start_http):
+def test_stock_client_receives_the_golden_outputs(start_http):
     assert_golden(start_http(Handler(open_model_store(MODELS))).url.removeprefix("http://").split(":"))
 
 
 @pytest.mark.slow
-def test_triton_serves_the_models_as_they_stand(monkeypatch):
+def test_triton_serves_the_released_models(monkeypatch):
     """The stock tritonserver, the folder of models untouched, the same golden answers."""
     if not (ENVIRONMENTS / "triton/done").exists():
         pytest.skip(f"no environment {ENVIRONMENTS}/triton: tests/benchmarks/bench_http.py makes it")
@@ -151,7 +151,7 @@ def verified(unit):
         ["isocharge-stream.service"],
     ],
 )
-def test_systemd_finds_nothing_wrong_with_a_unit(tmp_path, names):
+def test_systemd_analyze_accepts_the_units(tmp_path, names):
     unit = installed_unit(tmp_path, names)
     assert verified(unit) == (0, "")
     last = tmp_path / names[-1]
@@ -243,7 +243,7 @@ def test_every_image_is_pinned():
         assert re.fullmatch(r"[\w./-]+:[\w.-]+@sha256:[0-9a-f]{64}", image), image
 
 
-def test_nobody_logs_in_to_grafana_with_a_default_password():
+def test_grafana_has_no_default_password():
     services = yaml.safe_load((DEPLOY / "monitoring/compose.yaml").read_text())["services"]
     environment = services["grafana"]["environment"]
     assert environment["GF_SECURITY_DISABLE_INITIAL_ADMIN_CREATION"] == "true"

@@ -39,7 +39,7 @@ def is_slow(example):
     return Path(example.page).name in SLOW and example.language == "sh"
 
 
-def test_frame_example():
+def test_frame_of_the_documentation_is_read():
     before, after = (
         bytes.fromhex(line) for line in re.search(r"```text\n(.*?)\n```", PAGES["frames.md"], re.DOTALL)[1].split("\n")
     )
@@ -53,7 +53,7 @@ def desks(tmp_path_factory):
     return {page: tmp_path_factory.mktemp("desk") for page in EXAMPLE_PAGES}
 
 
-def test_an_example_does_what_it_says(page_example, desks, installed, start_http, run_example, run_commands):
+def test_examples_of_the_pages_run(page_example, desks, installed, start_http, run_example, run_commands):
     """In the order of the page, in the install that it names; Python prints what the comments say."""
     text, folder, environment = (
         page_example.text.replace("--link film", "--link film --force-max 0.05"),  # one force: solved sooner

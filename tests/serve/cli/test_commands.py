@@ -30,7 +30,7 @@ def records_of(text):
     return [json.loads(line) for line in text.splitlines()]
 
 
-def test_predict_to_csv(presses, models, run):
+def test_predict_writes_contacts_as_csv(presses, models, run):
     result = run("predict", "linear", presses, "--models", models)
     lines = result.stdout.splitlines()
     assert lines[0] == "x_mm,y_mm,force_N,x_std_mm,y_std_mm,force_std_N,misfit,flags"
@@ -81,7 +81,7 @@ def test_check_of_a_film_that_does_not_fit_and_of_too_few_presses(measured, mode
     assert (code, "too few presses to say" in out) == (1, True)
 
 
-def test_check_takes_the_rig_s_uncertainty(measured, models, command):
+def test_check_options_position_std_and_force_std(measured, models, command):
     words = ["serve", "check", "linear", measured(scale=0.97), "--models", models, "--json"]
     assert [command(*words, "--force-std", share)[0] for share in (0.01, 0.05)] == [1, 0]
     values = json.loads(command(*words, "--position-std", "0.4", "--force-std", "0.05")[1])
@@ -109,7 +109,7 @@ def test_check_of_many_presses_shows_the_worst(measured, models, command):
 
 
 @pytest.mark.parametrize(
-    ("text", "words", "said"),
+    ("text", "words", "message"),
     [
         ("x_mm,y_mm,A,B\n1,2,3,4\n", [], "missing: 'C'"),
         ("x_mm,y_mm,A,B,C\n", [], "expected one press or more"),
@@ -117,13 +117,13 @@ def test_check_of_many_presses_shows_the_worst(measured, models, command):
         ("force_N,A,B,C\n1,2,3,4\n", ["--position-std", "nan"], "position_std_mm: expected"),
     ],
 )
-def test_check_refuses_with_the_reason(tmp_path, models, refused, text, words, said):
+def test_check_refuses_with_the_reason(tmp_path, models, refused, text, words, message):
     path = tmp_path / "measured.csv"
     path.write_text(text)
-    refused("serve", "check", "linear", path, "--models", models, *words, said=said)
+    refused("serve", "check", "linear", path, "--models", models, *words, message=message)
 
 
-def test_stream_follows_a_port(board, models, run):
+def test_stream_writes_a_record_for_each_frame_of_a_port(board, models, run):
     result = run("stream", "linear", "--port", board.url, "--count", 500, "--models", models)
     records = records_of(result.stdout)
     assert [record["seq"] - records[0]["seq"] for record in records] == list(range(500))
@@ -138,7 +138,7 @@ def test_stream_follows_a_port(board, models, run):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stream_ends_cleanly_when_told_to(board_until, models, run, number):
+def test_stream_ends_cleanly_at_sigint_and_sigterm(board_until, models, run, number):
     with board_until(400, lambda: interrupt(number)) as board:
         result = run("stream", "linear", "--port", board.url, "--models", models)
     assert len(records_of(result.stdout)) > 0
@@ -166,7 +166,7 @@ def test_stream_to_csv_and_udp(frames, models, run):
     assert float(rows[-1]["charge_pC.A"]) == pytest.approx(datagrams[-1]["charge_pC"]["A"], abs=1e-6)
 
 
-def test_stream_of_nothing_ends_in_time(models, run):
+def test_stream_option_seconds_ends_a_silent_port(models, run):
     """Also where no record ever comes."""
     silent = PseudoPort()
     result = run("stream", "linear", "--port", silent.url, "--seconds", 0.2, "--models", models)
@@ -188,7 +188,7 @@ def test_stream_keeps_the_policy_the_name_and_the_limit_of_the_tare(board, model
 
 
 @pytest.mark.parametrize("name", ["", "a\nb", "x" * 101])
-def test_a_name_that_is_none(models, run, name):
+def test_option_name_refuses_empty_long_and_unprintable_names(models, run, name):
     with pytest.raises(InputError, match="--name: expected 1 to 100 printable characters"):
         run("stream", "linear", "--port", "p", "--models", models, "--name", name)
 
@@ -205,7 +205,7 @@ def test_a_recording_that_was_killed_is_readable(board, models, start, tmp_path,
     assert replayed[:1000] == lines[: len(replayed)]
 
 
-def test_a_new_tare_is_asked_for_by_a_signal(models, run):
+def test_sigusr1_requests_a_new_tare(models, run):
     rest = lambda level, count: [(level, level + 1.0, level + 2.0)] * count  # noqa: E731
     asked = (interrupt(signal.SIGUSR1) for _ in range(1))
     rows = chain(rest(0.0, 400), filter(None, asked), rest(5.0, 400))
@@ -238,7 +238,7 @@ def test_doctor_as_json_waits_for_its_port(resting, run, tmp_path):
     assert [round(channel["offset_pC"], 3) for channel in found["channels"]] == [5.0, -6.0, 7.0]
 
 
-def test_doctor_fails_where_nothing_is_recognised(command):
+def test_doctor_exit_code_if_no_frames_are_recognised(command):
     silent = PseudoPort()
     code, out, err = command("serve", "doctor", "--port", silent.url, "--seconds", 0.5)
     silent.close()
@@ -255,7 +255,7 @@ def test_doctor_lists_the_ports_and_what_they_send(resting, run, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["--pc-per-unit", "much"], "--pc-per-unit: expected a number like 0.0457, or A=0.0457,B=-0.0457, got 'much'"),
         (["--pc-per-unit", "A=1,B"], "--pc-per-unit: expected a number"),
@@ -264,8 +264,8 @@ def test_doctor_lists_the_ports_and_what_they_send(resting, run, monkeypatch):
         (["--write", "/proc/none/board.toml"], "--write /proc/none/board.toml: cannot be written"),
     ],
 )
-def test_doctor_refuses_with_the_reason(resting, run, words, said):
-    with resting() as sensor, pytest.raises(InputError, match=re.escape(said)):
+def test_doctor_refuses_with_the_reason(resting, run, words, message):
+    with resting() as sensor, pytest.raises(InputError, match=re.escape(message)):
         run("doctor", "--port", sensor.url, "--seconds", 0.5, *words)
 
 
@@ -282,7 +282,7 @@ def bash(script, **environment):
 
 
 @pytest.mark.parametrize("words", ["predict linear {presses}", "stream linear --port {frames} --record {record}"])
-def test_a_closed_stdout_is_told(models, presses, frames, tmp_path, words):
+def test_closed_stdout_is_reported(models, presses, frames, tmp_path, words):
     """And no file that is opened later gets its place."""
     record = tmp_path / "touch.rec"
     words = words.format(presses=presses, frames=frames, record=record)
@@ -292,19 +292,19 @@ def test_a_closed_stdout_is_told(models, presses, frames, tmp_path, words):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ("predict linear - --models {models} <&-", "stdin: empty"),
         ("http --models {models} --port 0", "token: expected printable ASCII"),
     ],
 )
-def test_what_is_empty_is_refused(models, words, said):
+def test_empty_stdin_and_empty_token_are_refused(models, words, message):
     """Also a token of the environment: whoever sets it means to have one."""
     done = bash(f"{ISOCHARGE} serve {words.format(models=models)}", ISOCHARGE_TOKEN="")
-    assert (done.returncode, said in done.stderr) == (2, True)
+    assert (done.returncode, message in done.stderr) == (2, True)
 
 
-def test_a_closed_stderr_changes_nothing(models, presses):
+def test_stream_continues_with_closed_stderr(models, presses):
     done = bash(f"{ISOCHARGE} serve predict linear {presses} --models {models} 2>&-")
     assert (done.returncode, done.stdout.count("\n")) == (0, 3)
 
@@ -330,7 +330,7 @@ def test_a_slow_reader_stops_neither_chain_nor_recording(models, film, tmp_path,
     assert lines[-1]["seq"] == recorded[-1]  # the newest are there, the oldest are not
 
 
-def test_a_reader_who_never_reads_does_not_keep_the_stream(models, board, start):
+def test_stream_ends_if_its_stdout_is_never_read(models, board, start):
     process = start("stream", "linear", "--port", board.url, "--models", models, "--seconds", 1)
     assert process.wait(60) == 0
     assert "records not written, the oldest" in process.stderr.read()
@@ -346,7 +346,7 @@ def test_a_file_waits_for_a_slow_reader(models, frames):
 def test_a_recording_as_a_port_names_replay(recorded, models, refused, reader):
     path, _ = recorded
     words = ["stream", "linear", "--models", models] if reader == "stream" else ["doctor"]
-    refused("serve", *words, "--port", path, said=f"got a recording; play it with: isocharge serve replay {path}")
+    refused("serve", *words, "--port", path, message=f"got a recording; play it with: isocharge serve replay {path}")
 
 
 def test_a_board_that_is_not_recognised_names_the_doctor(models, command):

@@ -32,7 +32,7 @@ def ask(url, method="POST", path="/v2/models/linear/infer", body=BODY):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_serves_until_told_to_stop(start, number):
+def test_server_answers_until_sigterm(start, number):
     process = start("--port", 0, "--grpc-port", 0)
     url, grpc_url = process.stdout.readline().strip(), process.stdout.readline().strip()
     assert ask(url)[0] == 200
@@ -44,7 +44,7 @@ def test_serves_until_told_to_stop(start, number):
     assert (process.returncode, out, err) == (0, "", "serving linear/1; Ctrl-C stops\n")
 
 
-def test_killed_and_started_again(start):
+def test_killed_server_can_be_started_again_on_the_same_port(start):
     """On the same port, with a connection that was open when it was killed."""
     process = start("--port", 0)
     url = process.stdout.readline().strip()
@@ -58,7 +58,7 @@ def test_killed_and_started_again(start):
     assert ask(url)[0] == 200
 
 
-def test_bad_starts(command, models, tmp_path):
+def test_http_command_refuses_wrong_options_and_models(command, models, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "damaged").mkdir()
     shutil.copytree(models / "linear", tmp_path / "damaged/linear")
@@ -81,12 +81,12 @@ def test_bad_starts(command, models, tmp_path):
             (tmp_path / "none", (), 2, f"ModelError: {tmp_path}/none: expected a folder of models"),
             (tmp_path / "damaged", (), 2, "ModelError: no model can be served: "),
         ]
-        for folder, words, code, said in cases:
+        for folder, words, code, message in cases:
             got, out, error = command("serve", "http", "--models", folder, *words)
-            assert (got, out, error[: len(said)]) == (code, "", said)
+            assert (got, out, error[: len(message)]) == (code, "", message)
 
 
-def test_a_log_that_nobody_reads_holds_up_no_request(start):
+def test_full_log_pipe_delays_no_request(start):
     """The pipe of stderr takes some 64 KiB; then lines wait, and are not waited for."""
     process = start("--port", 0, "--log", "json")
     address = process.stdout.readline().strip().removeprefix("http://")
@@ -103,13 +103,13 @@ def test_a_log_that_nobody_reads_holds_up_no_request(start):
     assert process.wait(timeout=20) == 0
 
 
-def test_the_token_is_in_no_line_of_the_log(start, film, tmp_path):
+def test_log_never_contains_the_token(start, film, tmp_path):
     """Not even where a folder that is refused has its name."""
     (film.write(tmp_path, name="sesame") / "golden.json").unlink()
     film.write(tmp_path)
     process = start("--port", 0, "--log", "json", "--token", "sesame", folder=tmp_path)
     assert process.stdout.readline()
     process.terminate()
-    said = process.communicate(timeout=20)[1]
-    assert "[secret]" in said
-    assert "sesame" not in said
+    stderr = process.communicate(timeout=20)[1]
+    assert "[secret]" in stderr
+    assert "sesame" not in stderr

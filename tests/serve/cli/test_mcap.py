@@ -100,11 +100,14 @@ def bands_of(figure):
     return {band.get_label(): np.concatenate([path.vertices for path in band.get_paths()]) for band in bands}
 
 
-def test_a_recording_is_drawn(command, recorded, models, tmp_path, figures):
+def test_plot_draws_a_recording(command, recorded, models, tmp_path, figures):
     picture, (path, _) = tmp_path / "touch.png", recorded
     code, out, err = command("serve", "plot", path, "--models", models, "-o", picture)
-    said = f"drawn in {picture}: 300 records", "drawn without electrodes"  # the sensor of this model has none
-    assert (code, out, all(words in err for words in said)) == (0, "", True), err
+    expected_messages = (
+        f"drawn in {picture}: 300 records",
+        "drawn without electrodes",
+    )  # the sensor of this model has none
+    assert (code, out, all(words in err for words in expected_messages)) == (0, "", True), err
     pixels = imread(picture)
     assert pixels.shape[0] > 900
     assert pixels.std() > 0.1
@@ -150,7 +153,7 @@ def test_plot_of_a_long_recording_shows_every_peak(command, recorded, models, tm
     assert charge.max() == max(r["charge_pC"]["C"] for r in records if r["charge_pC"])
 
 
-def test_the_film_of_a_released_model_and_none(command, recorded, tmp_path, figures):
+def test_plot_draws_the_film_of_a_released_model_and_omits_an_unknown_film(command, recorded, tmp_path, figures):
     words = ("serve", "plot", recorded[0], "-o")
     code, _, err = command(*words, tmp_path / "touch.svg", "--model", "four-25um-biaxial")
     assert (code, "without" in err) == (0, False)
@@ -159,7 +162,7 @@ def test_the_film_of_a_released_model_and_none(command, recorded, tmp_path, figu
     assert (code, "drawn without the film, whose model is not to be had: no model 'linear/1'" in err) == (0, True)
 
 
-def test_nothing_touched(command, models, tmp_path):
+def test_plot_of_a_recording_without_a_touch(command, models, tmp_path):
     path, rest = tmp_path / "rest.rec", {"x_mm": None, "y_mm": None, "force_N": 0.0}
     rest |= dict.fromkeys(("x_std_mm", "y_std_mm", "force_std_N", "misfit", "charge_pC", "charge_raw_pC"))
     with Recorder(path, "linear/1", "every", {}) as recorder:
@@ -168,24 +171,24 @@ def test_nothing_touched(command, models, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("lines", "said"),
+    ("lines", "message"),
     [
         ([], "expected at least one record, got none"),
         (['{"timestamp": 1.0}'], "line 2: damaged .*key 'x_mm' is missing"),
         (["nonsense", "{}"], "line 2: damaged"),
     ],
 )
-def test_what_cannot_be_drawn(command, tmp_path, lines, said):
+def test_plot_refuses_empty_and_damaged_recordings(command, tmp_path, lines, message):
     path, picture = tmp_path / "touch.rec", tmp_path / "touch.png"
     with Recorder(path, "linear/1", "every", {}):
         pass
     path.write_text(path.read_text() + "".join(f"{line}\n" for line in lines))
     code, _, err = command("serve", "plot", path, "-o", picture)
     assert (code, picture.exists()) == (2, False)
-    assert re.search(said, err)
+    assert re.search(message, err)
 
 
-def test_lines_break_where_nothing_came(command, recorded, models, tmp_path, figures):
+def test_plot_breaks_lines_at_gaps_of_the_recording(command, recorded, models, tmp_path, figures):
     """An hour without records is no straight line."""
     path, _ = recorded
     lines = path.read_text().splitlines()

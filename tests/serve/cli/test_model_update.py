@@ -54,19 +54,19 @@ def test_a_new_version_serves_without_losing_a_frame(film, make_film, repository
     """After bad ones, of which each is refused while the old one serves on."""
     folder = repository / "linear"
 
-    def refused(tapping, said):
+    def refused(tapping, message):
         interrupt(signal.SIGHUP)
         yield from until(tapping, lambda: "linear/1 serves on, because the new model is refused" in caplog.text)
-        assert said in caplog.text
+        assert message in caplog.text
         caplog.clear()
 
     def rows():
         tapping = taps(film)
         yield from islice(tapping, 400)
-        for said, spoil in BAD.items():
+        for message, spoil in BAD.items():
             film.write(repository, version=2)
             spoil(folder)
-            yield from refused(tapping, said)
+            yield from refused(tapping, message)
             shutil.rmtree(folder, ignore_errors=True)
         make_film(4).write(repository, version=2)
         yield from refused(tapping, "expected the electrodes ('A', 'B', 'C') of linear/1, got ('A', 'B', 'C', ")
@@ -107,8 +107,8 @@ def test_closing_the_terminal_still_ends_the_stream(film, repository):
             preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
         )
         os.close(slave)
-        said = b""
-        while b"tared" not in said:
-            said += os.read(master, 4096)
+        terminal_output = b""
+        while b"tared" not in terminal_output:
+            terminal_output += os.read(master, 4096)
         os.close(master)
         assert process.wait(60) == 0

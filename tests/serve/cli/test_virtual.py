@@ -87,7 +87,7 @@ def test_random_presses_come_after_a_second_of_rest(played, asked):
     assert asked == [(*DESCRIBED, 8.0, (0.05, 0.5))]
 
 
-def test_the_film_rests_as_long_as_it_is_told(played):
+def test_virtual_option_rest_delays_the_first_press(played):
     """A second of rest more, which is the begin of the random presses."""
     values, _ = played(300, "--noise", "clean", "--rest", 1.5)
     total = values.sum(axis=1)
@@ -96,7 +96,7 @@ def test_the_film_rests_as_long_as_it_is_told(played):
 
 
 @pytest.mark.parametrize("frames", ["binary", "teleplot"])
-def test_a_film_of_a_seed_plays_its_charges_and_does_not_tell_it(played, tmp_path, frames):
+def test_virtual_option_film_plays_a_random_film_without_printing_it(played, tmp_path, frames):
     """A script: half a second without touch, then one press that is held."""
     script = tmp_path / "held.toml"
     script.write_text("presses = [[0, 0, 0, 0], [0.5, 0, 0, 0], [0.501, 1, 2, 0.5], [2, 1, 2, 0.5]]\n")
@@ -125,7 +125,7 @@ def test_described_frames_with_the_faults_of_a_script(played, tmp_path):
     assert unplugged >= 1
 
 
-def test_a_film_is_solved_as_far_as_it_is_pressed(tmp_path, run, asked):
+def test_virtual_solves_the_film_only_up_to_the_scripted_distance(tmp_path, run, asked):
     (tmp_path / "far.toml").write_text("presses = [[0, 0, 0, 0], [1, 0, 0, 0], [2, 5, 12, 1], [4, 5, 12, 0]]\n")
     for words in ((), ("--radius", 15), ("--script", tmp_path / "far.toml")):
         with suppress(SceneError):  # the small map does not reach so far
@@ -148,7 +148,7 @@ def test_random_presses_stay_below_the_yield_point_of_the_film_by_default(run, a
     assert 0.05 < played_scripts[0].force_N.max() <= 0.8
 
 
-def test_a_script_may_press_harder_than_the_random_presses(run, asked, tmp_path):
+def test_virtual_script_may_exceed_the_force_of_random_presses(run, asked, tmp_path):
     script = tmp_path / "hard.toml"
     script.write_text("presses = [[0, 0, 0, 0], [1, 0, 0, 0], [2, 1, 1, 1.5], [4, 1, 1, 0]]\n")
     with suppress(SceneError):  # the small map has a smaller range of forces
@@ -156,14 +156,14 @@ def test_a_script_may_press_harder_than_the_random_presses(run, asked, tmp_path)
     assert asked[0][-1] == pytest.approx((0.05, 1.5), rel=1e-3)
 
 
-def test_below_the_map_charges_are_those_of_a_membrane():
+def test_charges_below_the_smallest_force_follow_the_power_law_of_a_membrane():
     """An eighth of its smallest force is a quarter of the charge: force to the 2/3."""
     linear = SimpleNamespace(domain=Domain(3.0, (0.2, 1.0)), charges=lambda contact: 100.0 * contact[:, 2:])
     charges = virtual_sensor.film_charges(linear)
     assert charges(np.array([[1.0, 2.0, 0.025], [1.0, 2.0, 0.5]])) == pytest.approx(np.array([[5.0], [50.0]]))
 
 
-def test_a_seed_is_one_draw(run, asked):
+def test_virtual_film_with_the_same_seed_is_the_same(run, asked):
     """The same film for the same seed, another for another, the described without one."""
     for words in ((), ("--film", 3), ("--film", 3, "--seed", 8), ("--film", 4)):
         run("virtual", "four-25um-biaxial", "--probe", "circle:1.5", "--seconds", 0, *words)
@@ -175,7 +175,7 @@ def test_a_seed_is_one_draw(run, asked):
 
 
 @pytest.mark.parametrize(
-    ("words", "error", "said"),
+    ("words", "error", "message"),
     [
         (f"{SENSOR} --seconds 0 --link TMP/film", OutputExists, "film is already there"),
         (f"{SENSOR} --seconds 0 --link TMP/no/film", InputError, "the link cannot be made"),
@@ -184,10 +184,10 @@ def test_a_seed_is_one_draw(run, asked):
         (f"{SENSOR} --device TMP/plain.toml", InputError, "expected a file with described frames"),
     ],
 )
-def test_what_is_refused(run, asked, tmp_path, words, error, said):
+def test_virtual_refuses_wrong_options(run, asked, tmp_path, words, error, message):
     (tmp_path / "film").write_text("mine")
     (tmp_path / "plain.toml").touch()
-    with pytest.raises(error, match=said):
+    with pytest.raises(error, match=message):
         run("virtual", *words.replace("TMP", str(tmp_path)).split())
     assert len(asked) <= 1
     assert (tmp_path / "film").read_text() == "mine"

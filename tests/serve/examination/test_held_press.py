@@ -33,7 +33,7 @@ def still(t):
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3, 20.0])
 @pytest.mark.parametrize(
-    ("law", "drift", "sections", "said"),
+    ("law", "drift", "sections", "message"),
     [
         (still, 0.0, {}, "keeps its charge for 13 s"),
         (lambda t: np.exp(-t / 10.0), 0.0, {"leak": {"tau_s": 10.0}}, r"leaks: \[leak\] tau_s"),
@@ -59,11 +59,11 @@ def still(t):
         (lambda t: 1.0 + 0.1 * np.sin(t), 0.0, {}, "by no law that is clear"),
     ],
 )
-def test_held_press_finds_leak_creep_or_drift(law, drift, sections, said, scale):
+def test_held_press_finds_leak_creep_or_drift(law, drift, sections, message, scale):
     held = find_held_press(board(law, drift, scale=scale), T_S)
     assert held.begin_s == pytest.approx(5.0, abs=0.2)
     assert held.sections == {name: pytest.approx(keys, rel=0.15) for name, keys in sections.items()}
-    assert re.search(said, held.description)
+    assert re.search(message, held.description)
 
 
 @pytest.mark.parametrize("until_s", [0.0, 7.0])

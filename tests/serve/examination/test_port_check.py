@@ -81,7 +81,7 @@ def test_check_of_a_channel_without_a_number():
 
 
 @pytest.mark.parametrize(
-    ("board", "said"),
+    ("board", "message"),
     [
         (charges(), "3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')"),
         (charges(hum=9.0), "[hum] frequency_Hz = 50 (device file): channel 1 hums by 9 pC"),
@@ -95,8 +95,8 @@ def test_check_of_a_channel_without_a_number():
         (lambda k: f"{1e-3 * (k % 7):.4f};{1.65 + 1e-3 * (k % 5):.4f}\n".encode(), "feedback capacitance"),
     ],
 )
-def test_check_reports_missing_settings(board, said):
-    assert said in missing(examine_received(received(board), electrodes=FOUR))
+def test_check_reports_missing_settings(board, message):
+    assert message in missing(examine_received(received(board), electrodes=FOUR))
 
 
 def test_missing_clock_is_reported_only_with_leak():

@@ -43,20 +43,20 @@ def modbus_crc(data):
     return struct.pack("<H", crc)
 
 
-def test_robotiq():
+def test_frames_of_a_robotiq_sensor():
     data = bytes.fromhex("20 4E") + struct.pack("<6h", 1234, -567, 89, 1000, -2000, 3)
     (frame,) = SyncParser(LAYOUTS["robotiq_ft300"]).feed(data + modbus_crc(data))
     assert frame.values == pytest.approx((12.34, -5.67, 0.89, 1.0, -2.0, 0.003))
     assert (frame.names, frame.seq, frame.t_us) == (("Fx", "Fy", "Fz", "Mx", "My", "Mz"), None, None)
 
 
-def test_optoforce():
+def test_frames_of_an_optoforce_sensor():
     data = bytes((170, 7, 8, 10)) + struct.pack(">HHhhh", 65535, 0, 100, -200, 16037)
     (frame,) = SyncParser(LAYOUTS["optoforce_omd"]).feed(data + struct.pack(">H", sum(data) & 0xFFFF))
     assert (frame.seq, frame.values) == (65535, (100.0, -200.0, 16037.0))
 
 
-def test_bota():
+def test_frames_of_a_bota_force_sensor():
     body = struct.pack("<H6fIf", 0, 1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 123456, 23.5)
     reflected = int(f"{binary_crc_of_reflected(body):016b}"[::-1], 2) ^ 0xFFFF
     (frame,) = SyncParser(LAYOUTS["bota_sensone"]).feed(b"\xaa" + body + struct.pack("<H", reflected))
@@ -80,7 +80,7 @@ def encoded(name, counts):
 
 @settings(derandomize=True)
 @given(st.sampled_from(sorted(LAYOUTS)), COUNTS, st.data())
-def test_every_flipped_bit_is_noticed(name, counts, data):
+def test_every_flipped_bit_is_detected_by_the_checksum(name, counts, data):
     good = encoded(name, counts)
     at, bit = data.draw(st.integers(0, len(good) - 1)), data.draw(st.integers(0, 7))
     if name == "bota_sensone" and at == 0:
@@ -105,7 +105,7 @@ def test_every_byte_is_a_part_of_a_frame_or_counted_as_dropped(parts, step):
 
 @pytest.mark.parametrize("name", ["seq", "t_s"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_number_or_clock_that_is_no_number_costs_its_frame_only(name, value):
+def test_counter_or_clock_that_is_nan_drops_only_its_frame(name, value):
     """Without a checksum nothing else tells that the line was damaged."""
     fields = f'fields = [{{name = "{name}", type = "f32"}}, {{name = "A", type = "f32"}}]'
     described = layout(f'sync = "20 4E"\nlength = 10\n{fields}')
@@ -133,7 +133,7 @@ fields = [{{name = "A", type = "i24"}}, {{name = "B", type = "u24", scale = 0.5}
     st.integers(-(1 << 23), (1 << 23) - 1),
     st.sampled_from(["little", "big"]),
 )
-def test_three_bytes(a, b, c, order):
+def test_numbers_of_three_bytes(a, b, c, order):
     """Packed by int.to_bytes and crcmod; the checksum skips the sync and has a byte order of its own."""
     described = layout(TRIPLES.format(order=order))
     body = a.to_bytes(3, order, signed=True) + b.to_bytes(3, order) + c.to_bytes(3, order, signed=True)
@@ -156,7 +156,7 @@ def stuffed(framing, **others):
         ("hdlc", lambda data: b"~" + data.replace(b"}", b"}]").replace(b"~", b"}^") + b"~"),
     ],
 )
-def test_stuffed_frames(framing, stuff):
+def test_cobs_slip_and_hdlc_frames_are_read(framing, stuff):
     """A damaged one costs itself; a piece of another length is no frame; chunks do not matter."""
     datas = [struct.pack("<Bf", k, 0.1 * k) for k in range(256)]
     sent = [stuff(data + struct.pack("<I", binascii.crc32(data))) for data in datas]
@@ -192,7 +192,7 @@ fields = [{name = "seq", type = "u8"}, {type = "pad", value = "02"}, {name = "A"
     assert described.encode(Frame(1, 0, (16.0,))) == bytes.fromhex("7E 01 02 10 00")
 
 
-def test_check_of_given_parameters():
+def test_checksum_described_by_its_crc_parameters():
     """CRC-16/GENIBUS by its parameters, against crcmod."""
     check = {"width": 16, "polynomial": "1021", "start": "FFFF", "final": "FFFF"}
     fields = [{"name": "A", "type": "u8"}]
@@ -255,8 +255,8 @@ WRONG = [
     ),
     ("length = 16", "length = 16\nchecksum_from = -1", r"checksum_from: expected a whole number from 0, got -1"),
     *(
-        ('"crc-16/modbus"', f"{{{check}}}", said)
-        for check, said in [
+        ('"crc-16/modbus"', f"{{{check}}}", message)
+        for check, message in [
             ('width = 12, polynomial = "1021"', r"checksum\.width: expected one of 8, 16, 24, 32"),
             ('width = 16, polynomial = "11021"', r"checksum\.polynomial: expected a number of 16 bits in hexadecimal"),
             ('width = 16, polynomial = "x"', r"checksum\.polynomial: expected a number in hexadecimal"),
@@ -267,14 +267,14 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("good", "bad", "said"), WRONG)
-def test_wrong_descriptions(good, bad, said):
-    with pytest.raises(DeviceError, match=rf"^device\.toml: (unknown key |key )?\'?frames\.{said}"):
+@pytest.mark.parametrize(("good", "bad", "message"), WRONG)
+def test_wrong_frame_descriptions_are_refused(good, bad, message):
+    with pytest.raises(DeviceError, match=rf"^device\.toml: (unknown key |key )?\'?frames\.{message}"):
         layout(ROBOTIQ.replace(good, bad, 1))
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [
         ("[]", r"fields: expected one or more that are channels, got \[\]"),
         ('[{name = "seq", type = "u8"}]', r"fields: expected one or more that are channels, got \['seq'\]"),
@@ -282,6 +282,6 @@ def test_wrong_descriptions(good, bad, said):
         ("[3]", r"fields\[0\]: expected a table, got 3"),
     ],
 )
-def test_fields_that_make_no_frame(fields, said):
-    with pytest.raises(DeviceError, match=said):
+def test_device_file_with_wrong_fields_is_refused(fields, message):
+    with pytest.raises(DeviceError, match=message):
         layout(f'sync = "55"\nlength = 2\nfields = {fields}')

@@ -177,7 +177,7 @@ def test_planted_fault_is_caught(name):
 
 
 @every_format
-def test_unfinished_frame_is_forgotten_with_its_connection(name):
+def test_reset_drops_an_unfinished_frame(name):
     """The first half of one frame and the second half of another make no frame."""
     form, frame = FORMATS[name], Frame(1, 2, (100.0,) * 3)
     parser = form.parser()
@@ -228,7 +228,7 @@ def test_sequence_gaps_repeats_and_restarts(numbers, modulus, counts, flags):
     assert (gaps.lost, gaps.repeated, gaps.restarts) == counts
 
 
-def test_a_new_connection_is_no_gap():
+def test_reset_counts_no_gap():
     gaps = SequenceGaps()
     gaps.update(5)
     gaps.reset()

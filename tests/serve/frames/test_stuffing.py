@@ -35,7 +35,7 @@ EXAMPLES = [
 
 
 @pytest.mark.parametrize(("name", "data", "stuffed"), EXAMPLES)
-def test_documented_examples(name, data, stuffed):
+def test_cobs_examples_of_the_documentation(name, data, stuffed):
     assert STUFFINGS[name].decode(bytes.fromhex(stuffed)) == bytes.fromhex(data)
 
 
@@ -99,7 +99,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("name", CHECKSUMS)
-def test_every_checksum_is_that_of_its_name(name):
+def test_named_checksums_have_the_check_values_of_the_catalogue(name):
     compute = CHECKSUMS[name].compute
     if name in CATALOGUE:
         assert compute(b"123456789") == CATALOGUE[name]
@@ -113,7 +113,7 @@ def piece(body):
     return cobs.encode(body + struct.pack("<H", binascii.crc_hqx(body, 0xFFFF))) + b"\0"
 
 
-def test_layout_of_a_frame():
+def test_binary_frame_has_the_documented_layout():
     """Against the layout of the design, packed by hand."""
     body = bytes([1]) + struct.pack("<H", 0x1234) + struct.pack("<I", 0x89ABCDEF) + bytes([3, 1])
     frame = Frame(seq=0x1234, t_us=0x89ABCDEF, values=(1.0, -2.5, 848.25), flags=1)
@@ -121,7 +121,7 @@ def test_layout_of_a_frame():
 
 
 @pytest.mark.parametrize("n", [0, 1, 60, 61, 62, 255])
-def test_round_trip_of_any_number_of_charges(n):
+def test_binary_frames_round_trip(n):
     frame = Frame(0x0101, 0x01010101, struct.unpack("<f", b"long") * n, flags=1)  # no zeros
     assert len(encode_frame(frame)) <= MAX_STUFFED_LENGTH + 1
     assert BinaryParser().feed(encode_frame(frame)) == [frame]

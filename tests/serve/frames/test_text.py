@@ -37,7 +37,7 @@ def test_documented_teleplot_lines(text, names, values):
 
 
 @pytest.mark.parametrize("text", [">myValue:hello|t", ">trajectory:12.3:45.67|xy", "", "  \r", "# a comment: 12"])
-def test_lines_that_say_nothing(text):
+def test_blank_and_comment_lines_are_no_readings(text):
     assert parse_line(text.encode()).notation is Notation.nothing
 
 
@@ -111,7 +111,7 @@ def test_header_that_comes_again_after_a_reset():
     assert [frame.values for frame in frames] == [(1, 2), (3, 4), (5, 6), (7, 8)]
 
 
-def test_columns_are_named_from_outside():
+def test_columns_are_named_by_the_device_file():
     frames = feed("7,12.5,801", "8,13.5,801", "9,14.5,801", parser=TextParser(("seq", "t_ms", "A")))
     assert frames[1] == Frame(8, 13500, (801.0,), names=("A",))
 
@@ -149,7 +149,7 @@ FRAMES = st.builds(
 
 @settings(derandomize=True)
 @given(FRAMES, st.sampled_from(sorted(TEXT_FORMATS)))
-def test_round_trip(frame, notation):
+def test_text_lines_round_trip_in_every_notation(frame, notation):
     data = b"\n" + encode_text(frame, notation) * 3
     got = TextParser().feed(data)
     assert len(got) == 3
@@ -159,7 +159,7 @@ def test_round_trip(frame, notation):
         assert (got[-1].seq, got[-1].t_us) == (frame.seq, frame.t_us)
 
 
-def test_what_is_never_recognised_is_not_gathered_for_ever():
+def test_unrecognised_lines_use_bounded_memory():
     parser = TextParser()
     parser.feed(b"8" * 100_000 + b"\n")
     for k in range(3000):
@@ -217,7 +217,7 @@ def test_clock_in_text_that_wraps(name, unit, modulus):
     np.testing.assert_allclose(np.diff(times), 5000.0 if name != "t_us" else 5 * unit, atol=1.1)
 
 
-def test_clock_in_text_that_begins_anew_has_not_wrapped():
+def test_clock_in_text_that_restarts_has_not_wrapped():
     parser, clock = TextParser(), DeviceClock()
     for k in [*range(1000, 1200), *range(20)]:
         for frame in feed(f"t_ms:{5 * k},A:1", parser=parser):
@@ -228,7 +228,7 @@ def test_clock_in_text_that_begins_anew_has_not_wrapped():
 @pytest.mark.parametrize(
     ("begin", "end", "restarts"), [*((m - 20, m, 0) for m in (100, 256, 1000, 65536)), (290, 301, 1)]
 )
-def test_number_in_text_that_wraps_or_begins_anew(begin, end, restarts):
+def test_frame_counter_in_text_that_wraps_or_restarts(begin, end, restarts):
     parser, gaps = TextParser(), SequenceGaps()
     for k in [*range(begin, end), *range(20)]:
         for frame in feed(f"seq:{k},A:1", parser=parser):

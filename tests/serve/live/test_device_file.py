@@ -115,12 +115,12 @@ def test_volts_on_a_feedback_capacitance(device):
     assert device(text).gain.charge_pC("C", np.array([1651.0])) == pytest.approx(-0.5)
 
 
-def test_other_names_of_number_and_clock(device):
+def test_device_file_renames_frame_counter_and_clock(device):
     parser = device('[frames]\nformat = "text"\nseq = "n"\nt_ms = "up"\n').parser()
     assert parser.feed(b'\n{"n": 3, "up": 12, "A": 1}\n' * 3)[-1] == Frame(3, 12000, (1.0,), names=("A",))
 
 
-def test_request_of_a_board(device):
+def test_device_file_with_a_request(device):
     assert device("[frames]\n").request is None
     asked = device('[frames]\nrequest = "3F 0A"\nrequest_Hz = 50\necho = true\n').request
     assert (asked.data, asked.rate_Hz, asked.echo) == (b"?\n", 50.0, True)
@@ -169,13 +169,13 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("text", "said"), WRONG)
-def test_device_file_that_is_refused(device, text, said):
-    with pytest.raises(DeviceError, match=rf"device\.toml: .*{said}"):
+@pytest.mark.parametrize(("text", "message"), WRONG)
+def test_device_file_that_is_refused(device, text, message):
+    with pytest.raises(DeviceError, match=rf"device\.toml: .*{message}"):
         device(text)
 
 
-def test_table_stays_as_it_came(device):
+def test_table_of_a_device_is_unchanged(device):
     """Recordings hold it; it makes the same device again."""
     board = device(FULL)
     assert device_from_table(board.table, board.where) == board
@@ -225,7 +225,7 @@ def test_channel_of_each_electrode(names, channels, picked):
 
 
 @pytest.mark.parametrize(
-    ("names", "channels", "said"),
+    ("names", "channels", "message"),
     [
         (("x", "y"), {}, r"\[channels\] A = "),
         (("x", "y", "z"), {"A": "zz"}, r'^board\.toml: \[channels\] A = "zz": no channel .* have x, y, z, or 1 to'),
@@ -233,13 +233,13 @@ def test_channel_of_each_electrode(names, channels, picked):
         *(((), {"A": name}, "no channel is called that") for name in ("1.0", "99999", "²")),
     ],
 )
-def test_channels_that_are_none(names, channels, said):
+def test_unknown_channels_are_refused(names, channels, message):
     picker = ChannelPicker(ELECTRODES, {"A": "1", "B": "2", "C": "3"} | channels if channels else {}, "m", "board.toml")
-    with pytest.raises(ChargeError, match=said):
+    with pytest.raises(ChargeError, match=message):
         picker.pick(Frame(0, 0, (1.0, 2.0, 3.0)[: len(names) or 3], names=names))
 
 
-def test_a_board_that_rests_elsewhere_is_told_its_offset():
+def test_tare_error_states_the_offset_for_the_device_file():
     stream = ReadingStream(ELECTRODES, device_from_table({"tare": {"frames": 5, "patience": 10}}, "board.toml"))
     data = b"".join(encode_frame(Frame(k, 5000 * k, (2048.0, 2050.5, 2047.0))) for k in range(20))
     with pytest.raises(TareError, match=r"\[gain\] offset = \{A = 2048, B = 2050.5, C = 2047\}"):

@@ -12,7 +12,7 @@ from isocharge.serve.network.http import HttpServer
 
 
 @pytest.mark.parametrize("token", ["", " a", "a\n", "a\r\nb: c", "schlüssel", "100%"])
-def test_tokens_that_no_header_or_address_carries(token):
+def test_invalid_tokens_are_refused(token):
     with pytest.raises(InputError, match="printable ASCII"):
         Token(token)
 
@@ -26,7 +26,7 @@ def test_tls_files_that_cannot_be_used(handler, tls_files, certificate, key):
         HttpServer(handler, Address(), tls=tls)
 
 
-def test_a_unix_socket(handler, start_http, tmp_path):
+def test_server_on_a_unix_socket(handler, start_http, tmp_path):
     path = tmp_path / "touch.sock"
     assert start_http(handler, uds=path).url == f"unix:{path}"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -50,11 +50,11 @@ def test_a_socket_left_by_a_killed_server_is_taken_over(handler, start_http, tmp
     assert answer_of(path).startswith(b"HTTP/1.1 200")
 
 
-def test_places_that_are_taken(handler, start_http, tmp_path):
+def test_addresses_in_use_or_impossible_are_refused(handler, start_http, tmp_path):
     start_http(handler, uds=tmp_path / "touch.sock")
     (tmp_path / "file").write_text("mine")
     host, port = start_http(handler).url.removeprefix("http://").split(":")
-    for address, said in [
+    for address, message in [
         (Address(host, int(port)), f"cannot listen on 127.0.0.1:{port}: another program listens there"),
         (Address(uds=tmp_path / "touch.sock"), "another server listens there"),
         (Address(uds=tmp_path / "file"), "found a file; choose another path"),
@@ -63,24 +63,24 @@ def test_places_that_are_taken(handler, start_http, tmp_path):
         (Address("192.0.2.1"), "this machine has no such address"),
         (Address("no.such.host.invalid"), "cannot listen on no.such.host.invalid:0: "),
     ]:
-        with pytest.raises(ListenError, match=said):
+        with pytest.raises(ListenError, match=message):
             address.listen(1)
     assert (tmp_path / "file").read_text() == "mine"
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
-def test_other_machines_need_a_token(host):
+def test_address_of_other_machines_needs_a_token(host):
     with pytest.raises(InputError, match=f"{host} lets other machines in: give --token TOKEN"):
         check_exposure(Address(host), has_token=False)
     check_exposure(Address(host), has_token=True)
 
 
 @pytest.mark.parametrize("address", [Address(), Address("127.0.0.2"), Address("::1"), Address("localhost")])
-def test_this_machine_needs_none(address):
+def test_loopback_address_needs_no_token(address):
     check_exposure(address, has_token=False)
 
 
-def test_a_file_in_the_place_of_the_socket_stays(handler, tmp_path):
+def test_unix_socket_does_not_replace_a_file(handler, tmp_path):
     path = tmp_path / "touch.sock"
     server = HttpServer(handler, Address(uds=path))
     path.unlink()
@@ -89,7 +89,7 @@ def test_a_file_in_the_place_of_the_socket_stays(handler, tmp_path):
     assert path.read_text() == "mine"
 
 
-def test_another_server_s_socket_stays(handler, tmp_path):
+def test_unix_socket_of_another_server_is_not_replaced(handler, tmp_path):
     path = tmp_path / "touch.sock"
     first = HttpServer(handler, Address(uds=path))
     path.rename(tmp_path / "old.sock")  # so that the new one cannot get its number
@@ -101,14 +101,14 @@ def test_another_server_s_socket_stays(handler, tmp_path):
 
 
 @pytest.mark.timeout(20)
-def test_a_certificate_that_is_a_pipe(tmp_path):
+def test_certificate_that_is_a_pipe_is_refused(tmp_path):
     os.mkfifo(tmp_path / "cert.pem")
     with pytest.raises(InputError, match="not a regular file"):
         Tls(tmp_path / "cert.pem").context()
 
 
 @pytest.mark.parametrize("scheme", ["Bearer", "bearer", "BEARER", "bEaReR"])
-def test_the_scheme_has_no_case(scheme):
+def test_scheme_of_the_token_is_case_insensitive(scheme):
     token = Token("sesame")
     token.check(f"{scheme} sesame".encode())
     token.check(f"{scheme}  sesame".encode())
@@ -118,6 +118,6 @@ def test_the_scheme_has_no_case(scheme):
 
 
 @pytest.mark.parametrize("header", [b"sesame", b"Basic sesame", b"Bearersesame", b"Bearer", b" Bearer sesame", b""])
-def test_other_schemes_do_not_count(header):
+def test_token_without_the_bearer_scheme_is_refused(header):
     with pytest.raises(TokenError, match="`Authorization: Bearer TOKEN`"):
         Token("sesame").check(header)

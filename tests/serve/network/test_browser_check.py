@@ -71,7 +71,7 @@ def test_pages_of_other_sites_are_refused(headers, header):
             BrowserCheck().check(method, headers_of(**headers))
 
 
-def test_a_link_on_another_site_may_lead_here():
+def test_link_on_another_site_is_accepted():
     link = headers_of(
         host="127.0.0.1:8000", sec_fetch_site="cross-site", sec_fetch_mode="navigate", sec_fetch_dest="document"
     )

@@ -86,7 +86,7 @@ def test_clients_cannot_invent_series(handler):
     assert sum(count for key, count in requests.items() if ("route", "/metrics") not in key) == 1500
 
 
-def test_the_histogram_is_that_of_the_durations():
+def test_latency_histogram_counts_the_durations():
     """Against numpy's counting of the same durations."""
     rng, counters = np.random.default_rng(1), Statistics()
     stages = np.round(np.exp(rng.uniform(np.log(1e3), np.log(2e7), (2000, 3)))).astype(int)
@@ -152,7 +152,7 @@ def test_metrics_list_loaded_and_refused_versions(film, tmp_path):
     assert value(samples, "model_info", model="linear", version="2", **facts) == 1
 
 
-def test_metrics_are_behind_the_token(store):
+def test_metrics_need_the_token(store):
     handler = Handler(store, token=Token("yes"))
     for headers, status in (([], 401), ([(b"authorization", b"Bearer no")], 401), (BEARER, 200)):
         answer = handler.answer("GET", "/metrics", headers, b"")
@@ -165,15 +165,15 @@ def test_metrics_are_behind_the_token(store):
 BEARER = [(b"authorization", b"Bearer yes")]
 
 
-def test_health_says_why_not(film, tmp_path):
+def test_health_ready_states_the_reason(film, tmp_path):
     """To everybody, so in numbers; the body is the protocol's. The index has the reasons for those who may know."""
     film.write(tmp_path)
     (film.write(tmp_path, version=2) / "golden.json").unlink()
     handler = Handler(open_model_store(tmp_path), token=Token("yes"))
     assert handler.answer("GET", "/v2/health/ready", [], b"").body == b'{"ready":true}'
     handler.answer("POST", "/v2/repository/models/linear/unload", BEARER, b"")
-    status, _, said, _ = handler.answer("GET", "/v2/health/ready", [], b"")
-    assert (status, "(versions refused: 0, unloaded: 1)" in json.loads(said)["error"]) == (400, True)
+    status, _, body, _ = handler.answer("GET", "/v2/health/ready", [], b"")
+    assert (status, "(versions refused: 0, unloaded: 1)" in json.loads(body)["error"]) == (400, True)
     (tmp_path / "linear/1/golden.json").unlink()
     handler.answer("POST", "/v2/repository/models/linear/load", BEARER, b"")
     assert b"(versions refused: 2, unloaded: 0)" in handler.answer("GET", "/v2/health/ready", [], b"").body

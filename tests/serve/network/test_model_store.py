@@ -93,14 +93,14 @@ FAULTS = {
 
 @pytest.mark.parametrize("how", FAULTS)
 @pytest.mark.timeout(60)
-def test_a_broken_version_takes_no_other_with_it(film, store, folder, how):
+def test_broken_version_leaves_other_versions_available(film, store, folder, how):
     """While it is loaded, its old files serve on; at the start, the others serve."""
-    spoil, said = FAULTS[how]
+    spoil, message = FAULTS[how]
     film.write(folder.parent, name="other")
     before = store.get("linear")
     spoil(folder / "2")
     for _ in range(2):
-        with pytest.raises(ModelError, match=said):
+        with pytest.raises(ModelError, match=message):
             store.load("linear")
         assert store.get("linear") is store.get("linear", "2") is before
     assert [(row["state"], row["reason"] != "") for row in store.version_states()] == [
@@ -111,7 +111,7 @@ def test_a_broken_version_takes_no_other_with_it(film, store, folder, how):
     store = open_model_store(folder.parent)
     assert states(store) == [("linear", "1", "READY"), ("linear", "2", "UNAVAILABLE"), ("other", "1", "READY")]
     assert store.get("linear").version == "1"
-    for name, reason in (("linear", f"; .*{said}"), ("other", "$")):
+    for name, reason in (("linear", f"; .*{message}"), ("other", "$")):
         with pytest.raises(ModelNotFound, match=rf"'{name}/2' is not found; serving: linear/1, other/1{reason}"):
             store.get(name, "2")
 
@@ -127,7 +127,7 @@ def test_a_model_in_another_ones_folder_is_refused(film, tmp_path):
     assert "expected the model other/1" in copied_model
 
 
-def test_folders_without_a_sound_model(film, tmp_path):
+def test_folders_without_a_valid_model_are_refused(film, tmp_path):
     (tmp_path / "models/linear").mkdir(parents=True)
     with pytest.raises(ModelError, match=r"models: expected models, <name>/<version>/model.onnx, found none"):
         open_model_store(tmp_path / "models")
@@ -136,7 +136,7 @@ def test_folders_without_a_sound_model(film, tmp_path):
         open_model_store(tmp_path)
 
 
-def test_versions_and_models_that_come_and_go(film, store, folder):
+def test_load_and_unload_add_and_remove_versions(film, store, folder):
     film.write(folder.parent, version=3)
     film.write(folder.parent, name="later")
     assert ("later", "", "UNAVAILABLE") in states(store)
@@ -154,13 +154,13 @@ def test_versions_and_models_that_come_and_go(film, store, folder):
 
 
 @pytest.mark.parametrize("name", ["", "..", "linear/1", "../models/linear", "/"])
-def test_a_name_is_no_path(store, name):
+def test_model_name_is_not_taken_as_a_path(store, name):
     for call in (store.get, store.load, store.unload):
         with pytest.raises(ModelNotFound):
             call(name)
 
 
-def test_names_that_no_model_has(film, tmp_path):
+def test_model_name_with_html_is_refused_and_escaped(film, tmp_path):
     """They would stand in pages and messages: the model is refused, and its folder's name escaped."""
     film.write(tmp_path)
     name = '"><svg onload=alert(1)>'
@@ -201,7 +201,7 @@ def bearer(token=SECRET):
     return [(b"authorization", f"Bearer {token}".encode())]
 
 
-def test_a_request_is_one_line(app, lines):
+def test_log_has_one_line_for_each_request(app, lines):
     app.answer("POST", "/v2/models/linear/infer", bearer(), BODY, ("127.0.0.1", 5000))
     (line,) = map(json.loads, lines)
     assert set(line) == NAMES
@@ -230,7 +230,7 @@ def test_a_request_is_one_line(app, lines):
         (FORGED, bearer(), BODY, (404, None, "UnknownPath")),
     ],
 )
-def test_a_refused_request_says_the_kind_of_error(app, lines, path, headers, body, expected):
+def test_log_line_of_a_refused_request_has_the_error_type(app, lines, path, headers, body, expected):
     app.answer("POST", path, headers, body)
     (line,) = map(json.loads, lines)
     assert (line["status"], line["model"], line["error"]) == expected
@@ -242,7 +242,7 @@ any_bytes = st.binary(max_size=60) | any_text.map(lambda text: text.encode("utf-
 
 @settings(max_examples=60, deadline=None)
 @given(any_text, any_text, st.lists(st.tuples(any_bytes, any_bytes)), any_bytes, st.booleans())
-def test_no_client_can_forge_a_line_or_plant_a_secret(released, method, path, headers, body, knows):
+def test_client_cannot_forge_a_log_line_or_log_a_secret(released, method, path, headers, body, knows):
     lines = []
     handler = Handler(released, None, Traffic(RequestLog(lines.append, secret=SECRET)), Token(SECRET))
     handler.answer(method, path, [*headers, *bearer()] if knows else headers, body, ("::1", 1))
@@ -255,7 +255,7 @@ def test_no_client_can_forge_a_line_or_plant_a_secret(released, method, path, he
     assert content["route"] in {"unknown", *(route.paths[0] for route in ROUTES)}
 
 
-def test_messages_of_loggers_are_lines_too(lines):
+def test_log_has_the_messages_of_python_loggers(lines):
     """With tracebacks, line feeds, halves of surrogates, secrets, and far too much text."""
     log = RequestLog(lines.append, secret=SECRET)
     logger = logging.Logger("isocharge.test")
@@ -275,7 +275,7 @@ def test_messages_of_loggers_are_lines_too(lines):
     assert not any("sesame" in line for line in lines)
 
 
-def test_calls_of_grpc_are_lines(store, lines):
+def test_log_has_a_line_for_each_grpc_call(store, lines):
     """About no model, about one by its name and version, without a tensor, and without the token."""
     app = Handler(store, None, Traffic(RequestLog(lines.append, secret=SECRET)), Token(SECRET))
     told, forged = ([("authorization", value)] for value in (f"Bearer {SECRET}", FORGED.replace("\n", " ")))
@@ -289,8 +289,8 @@ def test_calls_of_grpc_are_lines(store, lines):
         for metadata in (told, forged):
             with pytest.raises(grpc.RpcError):
                 ask["ModelInfer"](b"\x0a\x06linear", metadata=metadata, timeout=20)
-    said = [(line["route"], line["status"], line["model"], line["error"]) for line in map(json.loads, lines)]
-    assert said == [
+    logged = [(line["route"], line["status"], line["model"], line["error"]) for line in map(json.loads, lines)]
+    assert logged == [
         ("ServerReady", "OK", None, None),
         ("ModelReady", "OK", "linear/1", None),
         ("ModelInfer", "INVALID_ARGUMENT", "linear/2", "RequestError"),
@@ -301,7 +301,7 @@ def test_calls_of_grpc_are_lines(store, lines):
     assert not any("sesame" in line for line in lines)
 
 
-def test_what_could_not_be_read_is_a_line_too(app, lines, start_http):
+def test_log_has_a_line_for_an_unreadable_request(app, lines, start_http):
     """Over a real socket: rubbish, then a request of which headers are too long."""
     place = start_http(app).url.removeprefix("http://").split(":")
     for sent in (b"rubbish\r\n\r\n", b"GET / HTTP/1.1\r\nx: " + b"a" * 20_000 + b"\r\n\r\n"):
@@ -309,12 +309,12 @@ def test_what_could_not_be_read_is_a_line_too(app, lines, start_http):
             connection.sendall(sent)
             while connection.recv(1 << 16):
                 pass
-    said = [(line["route"], line["status"], line["client"][:10]) for line in map(json.loads, lines)]
-    assert said == [("none", 400, "127.0.0.1:"), ("none", 431, "127.0.0.1:")]
+    logged = [(line["route"], line["status"], line["client"][:10]) for line in map(json.loads, lines)]
+    assert logged == [("none", 400, "127.0.0.1:"), ("none", 431, "127.0.0.1:")]
     assert not any("rubbish" in line for line in lines)
 
 
-def test_a_half_copied_version_does_not_end_the_version_that_it_replaces(film, store, folder, tmp_path):
+def test_half_copied_version_keeps_the_loaded_version(film, store, folder, tmp_path):
     """The old version folders are gone when the new one is loaded, and the new one is not complete yet."""
     served = store.get("linear")
     film.write(tmp_path / "new", version=3)
@@ -331,7 +331,7 @@ def test_a_half_copied_version_does_not_end_the_version_that_it_replaces(film, s
     assert labels(store) == ["linear/3"]  # now the versions whose folders are gone end
 
 
-def test_a_model_folder_without_versions_ends_nothing(store, folder, monkeypatch):
+def test_model_folder_without_versions_keeps_the_loaded_versions(store, folder, monkeypatch):
     served = store.get("linear")
     monkeypatch.setattr(store, "_folders", lambda: {"linear": folder})  # found before its versions were moved away
     shutil.rmtree(folder / "1")

@@ -52,19 +52,19 @@ def expected(tmp_path, values):
     return {"contact": columns[:, :3], "contact_std": columns[:, 3:6], "misfit": columns[:, 6:7]}
 
 
-def test_infer_with_defaults(client, module, film, tmp_path):
+def test_tritonclient_infer_with_defaults(client, module, film, tmp_path):
     values = charges(film)
     answer = client.infer("linear", [tensor(module, values)], request_id="press 7")
     for name, rows in expected(tmp_path, values).items():
         np.testing.assert_array_equal(answer.as_numpy(name), rows)
-    said = plain(answer.get_response())
-    assert said["id"] == "press 7"
-    assert said.get("model_version", said.get("modelVersion")) == "2"
+    response = plain(answer.get_response())
+    assert response["id"] == "press 7"
+    assert response.get("model_version", response.get("modelVersion")) == "2"
 
 
 @pytest.mark.parametrize("n", [1, 5])
 @pytest.mark.parametrize("binary", [True, False])
-def test_flags_on_request(client, module, tmp_path, n, binary):
+def test_tritonclient_output_flags(client, module, tmp_path, n, binary):
     """As in process, beside an output; the charges of a press far outside, and of one that no press gives."""
     values = np.resize(np.float32([[800.0, 10.0, 10.0], [-3.0, 900.0, 900.0], [800.0, 800.0, 800.0]]), (n, 3))
     if module is tritonclient.grpc:
@@ -80,7 +80,7 @@ def test_flags_on_request(client, module, tmp_path, n, binary):
     np.testing.assert_array_equal(answer.as_numpy("contact"), expected(tmp_path, values)["contact"])
 
 
-def test_index_unload_load(client, module, film):
+def test_tritonclient_repository_index_unload_and_load(client, module, film):
     def index():
         rows = plain(client.get_model_repository_index())
         return [(r["name"], r["version"], r["state"]) for r in (rows["models"] if isinstance(rows, dict) else rows)]
@@ -98,20 +98,20 @@ def test_index_unload_load(client, module, film):
     client.infer("linear", [tensor(module, charges(film))])
 
 
-def test_load_takes_no_configuration(client):
+def test_tritonclient_load_refuses_a_configuration(client):
     with pytest.raises(InferenceServerException, match="put the files into the model's folder"):
         client.load_model("linear", config="{}")
 
 
-def test_configuration(client):
-    said = plain(client.get_model_config("linear"))
-    config = said.get("config", said)
+def test_tritonclient_model_config(client):
+    response = plain(client.get_model_config("linear"))
+    config = response.get("config", response)
     assert config.get("max_batch_size", config.get("maxBatchSize")) == 4096
     assert config["input"][0]["name"] == "charge_pC"
     assert [output["name"] for output in config["output"]] == ["contact", "contact_std", "misfit"]
 
 
-def test_statistics(client, module, film):
+def test_tritonclient_statistics(client, module, film):
     for n in (1, 4):
         client.infer("linear", [tensor(module, charges(film, n))])
     with pytest.raises(InferenceServerException):
@@ -130,7 +130,7 @@ def test_statistics(client, module, film):
     assert len(plain(client.get_inference_statistics()).popitem()[1]) == 2
 
 
-def test_a_stream_of_requests(handler, film, tmp_path):
+def test_tritonclient_stream_infer(handler, film, tmp_path):
     values, answers = charges(film), []
     with grpc_server(handler, "127.0.0.1", 0) as url:
         client = tritonclient.grpc.InferenceServerClient(url.removeprefix("grpc://"))

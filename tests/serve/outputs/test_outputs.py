@@ -30,7 +30,7 @@ def test_csv_has_the_fields_of_a_record(contract, record):
 
 
 @pytest.mark.parametrize("name", ["mine, left hand", 'the "good" one', "two\nlines", "cr\rlf", " blank "])
-def test_csv_takes_any_name(name, record):
+def test_csv_quotes_electrode_names(name, record):
     """Electrodes too may have any name."""
     electrodes = ("A", name)
     charges = {"A": 1.0, name: 2.0}
@@ -59,7 +59,7 @@ def test_contacts_and_films_that_are_followed_are_the_last_columns(record):
     assert (row["tracked.x_mm"], row["event"], row["film.pretension_std_MPa"]) == ("", "", "0.050000")
 
 
-def test_the_end_waits_for_a_consumer_that_takes_its_time():
+def test_close_waits_for_a_slow_consumer():
     """It takes longer for all lines than it may take for one."""
     written = []
     with WriterQueue(lambda line: written.append(time.sleep(0.4) or line)) as queue:
@@ -68,7 +68,7 @@ def test_the_end_waits_for_a_consumer_that_takes_its_time():
     assert (written, queue.lost) == (list("abcd"), 0)
 
 
-def test_datagrams_to_nobody_are_dropped(record):
+def test_datagrams_without_a_receiver_are_dropped(record):
     """A refused datagram shows up as an error of the next one: it is dropped, and later ones arrive all the same."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))

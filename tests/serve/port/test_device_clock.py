@@ -17,7 +17,7 @@ def follow(t_us, arrived_s, modulus=MODULUS):
     return clock, times
 
 
-def test_clock_unwraps():
+def test_device_clock_unwraps():
     t_us = np.arange(2**32 - 50_000, 2**32 + 50_000, 1000)
     clock, times = follow(t_us, START_S + t_us * 1e-6)
     assert ([time.device_us for time in times], clock.restarts) == (t_us.tolist(), 0)
@@ -55,7 +55,7 @@ def test_clock_of_a_device_that_jumps_ahead():
     assert (clock.restarts, max(time.step_s for time in times)) == (1, pytest.approx(1e-3))
 
 
-def test_times_never_fall():
+def test_times_never_decrease():
     """However late chunks of one to eight readings are; and from a restart of the device on neither."""
     rng, clock, host_s = np.random.default_rng(0), DeviceClock(), []
     begins = np.cumsum(rng.integers(1, 9, 3000))

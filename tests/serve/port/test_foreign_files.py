@@ -49,7 +49,7 @@ def test_a_foreign_file_as_a_port_names_the_command_that_reads_it(name, make, tm
         pass
 
 
-def test_records_as_a_port(tmp_path, predictor):
+def test_records_given_as_a_port_are_refused(tmp_path, predictor):
     stream = TouchStream(predictor)
     lines = b"".join(encode_text(Frame(number, None, (1.0, 2.0, 3.0)), "pairs") for number in range(3))
     record = next(iter(stream.feed(Chunk(lines, 0.0, 0))))
@@ -60,7 +60,7 @@ def test_records_as_a_port(tmp_path, predictor):
         pass
 
 
-def test_a_recording_on_stdin(tmp_path):
+def test_recording_on_stdin_is_refused(tmp_path):
     recording(tmp_path / "touch.rec")
     with (tmp_path / "touch.rec").open("rb") as file, pytest.raises(InputError, match="got a recording"):
         next(iter(FileSource(file.fileno(), "-")))

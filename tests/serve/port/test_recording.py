@@ -29,7 +29,7 @@ def test_events_are_those_that_were_recorded(recorded):
     assert [len(event.latencies_us) for event in events] == [0, 1, 0, 2, 3, 4]
 
 
-def test_clock_of_a_replay_stands_where_it_stood(recorded):
+def test_clock_of_a_replay_repeats_the_recorded_latencies(recorded):
     clock = RecordedClock()
     clock.set(list(Recording(recorded).events())[3])
     assert [clock(), clock(), clock()] == [2000, 2000 + 10_000, 2000]
@@ -52,7 +52,7 @@ def test_recorder_overwrites_nothing(tmp_path):
     assert path.read_text() == "mine"
 
 
-def test_recorder_needs_its_folder(tmp_path):
+def test_recorder_in_a_missing_folder_is_refused(tmp_path):
     with pytest.raises(OutputError, match="cannot be written"), Recorder(tmp_path / "no" / "x", "m/1", "every", {}):
         pass
 
@@ -77,7 +77,7 @@ HEADER = '"model": "m/1", "policy": "every", "device": {}'
         f'{{"isocharge_recording": [], {HEADER}}}',
     ],
 )
-def test_a_file_that_is_no_recording(tmp_path, first):
+def test_file_that_is_no_recording_is_refused(tmp_path, first):
     path = tmp_path / "touch.rec"
     if first is not None:
         path.write_text(f"{first}\n")
@@ -90,7 +90,7 @@ PATHS = ["/any/path", "../x", "models/m/1", "m/../../x", "m", "m/1\n", "file://m
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_path_in_the_place_of_the_model_is_refused(tmp_path, path):
+def test_recording_whose_model_is_a_path_is_refused(tmp_path, path):
     recording = tmp_path / "touch.rec"
     header = {"isocharge_recording": 1, "model": path, "policy": "every", "device": {}}
     recording.write_text(json.dumps(header) + "\n")
@@ -99,14 +99,14 @@ def test_path_in_the_place_of_the_model_is_refused(tmp_path, path):
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_path_in_the_place_of_the_next_model_is_refused(recorded, path):
+def test_recording_whose_next_model_is_a_path_is_refused(recorded, path):
     with recorded.open("a") as file:
         file.write(json.dumps({"use": path}) + "\n")
     with pytest.raises(RecordingError, match="use: expected the label NAME/VERSION of a model"):
         list(Recording(recorded).events())
 
 
-def test_recording_of_another_version(tmp_path):
+def test_recording_of_another_version_is_refused(tmp_path):
     path = tmp_path / "touch.rec"
     path.write_text(f'{{"isocharge_recording": 9, {HEADER}}}\n')
     with pytest.raises(RecordingError, match=r"version 9 is not supported \(this version reads 1\)"):
@@ -141,7 +141,7 @@ def test_a_damaged_line_is_named(recorded, line):
     assert len(str(caught.value)) < 600
 
 
-def test_moments_come_in_their_order_and_records_as_they_were_written(tmp_path):
+def test_events_and_records_are_read_in_their_order(tmp_path):
     path = tmp_path / "touch.rec"
     with Recorder(path, "m/1", "latest", {}, name="left") as recorder:
         recorder.chunk(CHUNKS[0], ['{"timestamp": 5.0, "latency_us": 7.0, "x_mm": 2.5}'])

@@ -50,7 +50,7 @@ def test_chunk_has_the_bytes_unchanged_and_the_time_of_arrival(board):
 
 
 @pytest.mark.parametrize(
-    ("url", "said"),
+    ("url", "message"),
     [
         ("/dev/ttyNone", "there is no such port: plug the board in"),
         ("/dev/null", r"cannot be opened at 115200 baud .*check the cable"),
@@ -62,14 +62,14 @@ def test_chunk_has_the_bytes_unchanged_and_the_time_of_arrival(board):
         ),
     ],
 )
-def test_port_that_cannot_be_opened(url, said):
-    with pytest.raises(PortError, match=f"^{url}: {said}") as caught, Port(url):
+def test_port_that_cannot_be_opened_is_refused(url, message):
+    with pytest.raises(PortError, match=f"^{url}: {message}") as caught, Port(url):
         pass
     assert ("baud" in str(caught.value)) == (url == "/dev/null")
 
 
 @pytest.mark.parametrize("make", [Port, open_source])
-def test_a_port_is_waited_for(board, tmp_path, make):
+def test_option_wait_waits_for_a_port(board, tmp_path, make):
     link = tmp_path / "film"
     plugging = threading.Timer(0.3, link.symlink_to, (board.url,))
     plugging.start()
@@ -78,24 +78,24 @@ def test_a_port_is_waited_for(board, tmp_path, make):
     plugging.join()
 
 
-def test_port_that_another_program_holds(board):
+def test_port_opened_by_another_program_is_refused(board):
     with Port(board.url), pytest.raises(PortError, match=r"lock.*no other program has it open"), Port(board.url):
         pass
 
 
-def test_port_that_is_silent(board):
+def test_silent_port_is_lost_after_the_timeout(board):
     with Port(board.url, silence_s=0.05) as port:
         assert port.read(0.01) is None
         with pytest.raises(PortLost, match=r"no data for 0.05 s; check that"):
             next(iter(port))
 
 
-def test_port_that_is_not_open(board):
+def test_reading_a_port_that_is_not_open_is_an_error(board):
     with pytest.raises(PortError, match="not open"):
         next(iter(Port(board.url)))
 
 
-def test_port_that_vanishes():
+def test_unplugged_port_raises_port_lost():
     board = PseudoPort()
     with Port(board.url) as port:
         board.close()
@@ -118,7 +118,7 @@ def server():
 
 
 @pytest.mark.parametrize("scheme", ["socket", "tcp"])
-def test_socket_gives_all_that_is_there_until_it_is_closed(server, scheme):
+def test_socket_returns_all_bytes_until_it_is_closed(server, scheme):
     with Port(f"{scheme}://127.0.0.1:{server.getsockname()[1]}", silence_s=5.0) as port:
         with server.accept()[0] as client:
             client.sendall(b"x" * 1000)
@@ -162,7 +162,7 @@ def test_outage_is_measured_and_logged_once(tmp_path, caplog):
     assert (port.outages, len(caplog.records)) == (1, 1)
 
 
-def test_source_is_stdin(monkeypatch):
+def test_source_of_a_dash_is_stdin(monkeypatch):
     reader, writer = os.pipe()
     os.write(writer, b"hello")
     os.close(writer)
@@ -172,7 +172,7 @@ def test_source_is_stdin(monkeypatch):
             assert [chunk.data for chunk in source] == [b"hello"]
 
 
-def test_file_that_may_not_be_read(tmp_path, monkeypatch):
+def test_file_without_read_permission_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "frames.bin"
     path.write_bytes(b"x")
     monkeypatch.setattr("pathlib.Path.open", lambda *_, **__: (_ for _ in ()).throw(PermissionError(13, "not yours")))
@@ -216,14 +216,14 @@ def test_datagrams_are_chunks(address, sent, chunks):
     assert received(address, *sent) == [*chunks]
 
 
-def test_an_empty_datagram_is_no_silence(address):
+def test_empty_datagram_is_ignored(address):
     assert received(address, b"\x01", b"", b"\x02") == [b"\x01", b"\x02"]
     with Port(f"udp://127.0.0.1:{address[1]}", silence_s=0.05) as port, socket.socket(type=socket.SOCK_DGRAM) as board:
         board.sendto(b"", address)
         assert port.read(0.01) is None
 
 
-def test_an_address_that_is_taken(address):
+def test_udp_address_in_use_is_refused(address):
     with Port(f"udp://127.0.0.1:{address[1]}"), pytest.raises(PortError, match="in use"):
         Port(f"udp://127.0.0.1:{address[1]}").__enter__()
 
@@ -271,7 +271,7 @@ def test_a_request_without_an_answer_is_repeated():
 
 @settings(derandomize=True)
 @given(st.binary(min_size=1, max_size=8), st.binary(max_size=20), st.lists(st.integers(0, 28), max_size=5))
-def test_the_echo_is_taken_out_however_it_is_cut(request_bytes, answer, cuts):
+def test_echo_is_removed_however_it_is_split(request_bytes, answer, cuts):
     requester = Requester(Request(request_bytes, echo=True))
     requester.next_request()
     stream = request_bytes + answer
@@ -284,13 +284,13 @@ def test_the_echo_is_taken_out_however_it_is_cut(request_bytes, answer, cuts):
     ("request_bytes", "echo", "answer", "share"),
     [(b"\x01\x04\x00", True, b"\x02\x04\x00\x10", 0.0), (b"?", False, b"?1\n", 1.0)],
 )
-def test_an_echo_is_counted_and_stays_where_it_is_not_expected(request_bytes, echo, answer, share):
+def test_unexpected_echo_is_counted_and_not_removed(request_bytes, echo, answer, share):
     requester = Requester(Request(request_bytes, echo=echo))
     requester.next_request()
     assert (requester.remove_echo(answer), requester.echo_share) == (answer, share)
 
 
-def test_a_port_asks():
+def test_request_is_sent_for_each_frame():
     """A pseudo-terminal that answers each request with a line of its own, echo first."""
     board, reader = os.openpty()
     tty.setraw(reader)

@@ -28,7 +28,7 @@ def write(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("header", "said"),
+    ("header", "message"),
     [
         (
             "x_mm,y_mm,force_N,a,b,c",
@@ -53,8 +53,8 @@ def write(tmp_path):
         ("x_mm,y_mm,Force_STD,A,B,C", "column 'Force_STD' differs from column 'force_std' only by case"),
     ],
 )
-def test_a_header_in_other_words_names_the_column_to_rename(write, header, said):
-    with pytest.raises(PressError, match=said) as caught:
+def test_similar_header_names_the_column_to_rename(write, header, message):
+    with pytest.raises(PressError, match=message) as caught:
         read_presses(write(f"{header}\n{ROW}"), NAMES)
     assert "expected a header with x_mm, y_mm, force_N and the electrodes" in str(caught.value)
     assert len(str(caught.value)) < 1000
@@ -76,7 +76,7 @@ def test_other_columns_are_ignored(write, header):
     assert presses.charge_pC.tolist() == [[4.0, 5.0, 6.0]]
 
 
-def test_a_header_with_a_very_long_name_takes_no_time(write):
+def test_header_with_a_very_long_name_is_checked_fast(write):
     name = "x" + " " * 30_000 + "]"
     before = time.process_time()
     with pytest.raises(PressError, match="missing: 'A'"):
@@ -106,7 +106,7 @@ TEXT = f"# Größe\nx_mm,y_mm,force_N,A,B,C\n{ROW}"
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "message"),
     [
         (TEXT.encode("utf-16"), r"presses\.csv: the file is UTF-16: save it as UTF-8, as with: iconv -f UTF-16 -t"),
         (b"\xfe\xff" + TEXT.encode("utf-16-be"), "the file is UTF-16"),
@@ -123,8 +123,8 @@ TEXT = f"# Größe\nx_mm,y_mm,force_N,A,B,C\n{ROW}"
     ],
 )
 @pytest.mark.parametrize("read", [read_presses, read_charge_file])
-def test_other_encodings(write, read, data, said):
-    with pytest.raises((PressError, ChargeError), match=said):
+def test_headers_in_other_encodings_are_refused(write, read, data, message):
+    with pytest.raises((PressError, ChargeError), match=message):
         read(write(data), NAMES)
 
 

@@ -29,7 +29,7 @@ def read(tmp_path):
     return read
 
 
-def test_every_column_arrives(read):
+def test_all_columns_of_a_press_file_are_read(read):
     presses = read(f"{HEADER},position_std_mm,force_std\n1,-2,0.5,10,20,30,0.05,0.003\n")
     assert (presses.contact.tolist(), presses.charge_pC.tolist()) == ([[1.0, -2.0, 0.5]], [[10.0, 20.0, 30.0]])
     assert (presses.position_std_mm.tolist(), presses.force_std.tolist()) == ([0.05], [0.003])
@@ -81,21 +81,21 @@ def test_a_list_of_presses_for_a_machine(tmp_path):
         read_press_list(tmp_path / "list.csv")
 
 
-def test_unknown_values(read):
+def test_empty_cells_are_unknown_values(read):
     presses = read(f"{HEADER}\n,,0.5,10,20,30\n1,2,,10,,30\n,,,10,20,30\n")
     nan = np.nan
     np.testing.assert_array_equal(presses.contact, [[nan, nan, 0.5], [1, 2, nan], [nan, nan, nan]])
     np.testing.assert_array_equal(presses.charge_pC[1], [10, nan, 30])
 
 
-def test_uncertainty_is_the_caller_s_where_the_file_has_none(read):
+def test_default_uncertainty_fills_empty_cells(read):
     presses = read(f"{HEADER},force_std\n1,2,3,4,5,6,0.003\n1,2,3,4,5,6,\n", position_std_mm=0.3, force_std=0.02)
     assert (presses.position_std_mm.tolist(), presses.force_std.tolist()) == ([0.3, 0.3], [0.003, 0.02])
     plain = read(f"{HEADER}\n1,2,3,4,5,6\n")
     assert (plain.position_std_mm.tolist(), plain.force_std.tolist()) == ([0.1], [0.01])
 
 
-def test_rows(read):
+def test_selection_of_presses_by_index_and_mask(read):
     presses = read("force_N,A,B,C,d\n" + "".join(f"{n},1,2,3,\n" for n in (1, 2, 3)))
     last = presses[2]
     assert (len(last), last.lines, last.contact[0, 2], last.ignored) == (1, (4,), 3.0, ("d",))
@@ -105,7 +105,7 @@ def test_rows(read):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", r"presses\.csv: empty; expected a header with x_mm, y_mm, force_N and the electrodes \('A', 'B', 'C'\)"),
         (HEADER, "expected one press or more below the header, got none"),
@@ -134,14 +134,14 @@ def test_rows(read):
         (f'{HEADER}\n1,2,"0,5",4,5,6\n', "column 'force_N': .*got '0,5'; write a decimal point"),
     ],
 )
-def test_presses_that_are_refused(read, text, said):
-    with pytest.raises(PressError, match=said) as caught:
+def test_wrong_press_files_are_refused(read, text, message):
+    with pytest.raises(PressError, match=message) as caught:
         read(text)
     assert "presses.csv" in str(caught.value)
     assert len(str(caught.value)) < 600
 
 
-def test_too_many_presses(monkeypatch, read):
+def test_press_file_with_too_many_presses_is_refused(monkeypatch, read):
     monkeypatch.setattr(measured_presses, "MOST_ROWS", 3)
     assert len(read(HEADER + "\n1,2,3,4,5,6" * 3)) == 3
     with pytest.raises(PressError, match="expected at most 3 presses, got more; split the file"):
@@ -171,18 +171,18 @@ def test_electrodes_that_cannot_be_columns(names):
 
 
 @pytest.mark.parametrize("name", ["nowhere.csv", "."])
-def test_no_file(tmp_path, name):
+def test_missing_press_file_is_refused(tmp_path, name):
     with pytest.raises(PressError, match=r"cannot be read .*expected a CSV file of presses"):
         read_presses(tmp_path / name, NAMES)
 
 
-def test_rows_in_words():
+def test_row_words_of_a_message():
     assert row_words([3], "line") == "line 3"
     assert row_words([3, 5], "row") == "rows 3, 5"
     assert row_words(range(1, 6), "line", most=3) == "lines 1, 2, 3 and 2 more"
 
 
-def test_shapes_that_disagree():
+def test_arrays_of_different_lengths_are_refused():
     ones = np.ones(2)
     with pytest.raises(PressError, match=r"charge_pC: expected an array of shape \(2, 3\), got \(2, 2\)"):
         MeasuredPresses(np.ones((2, 3)), np.ones((2, 2)), ones, 0.1 * ones, NAMES, (1, 2))
@@ -222,7 +222,7 @@ def some_presses(draw):
 @pytest.mark.parametrize("suffix", ["csv", "parquet", "PARQUET"])
 @given(presses=some_presses())
 @settings(derandomize=True, max_examples=60)
-def test_what_is_written_is_read(suffix, presses, tmp_path_factory):
+def test_written_presses_are_read_back(suffix, presses, tmp_path_factory):
     """With the names of the electrodes, and with every other column as an electrode."""
     path = tmp_path_factory.getbasetemp() / f"written.{suffix}"
     write_presses(path, presses)

@@ -65,7 +65,7 @@ def expected(tmp_path):
     ],
     ids=str,
 )
-def test_other_settings_of_the_writer(write, expected, options):
+def test_parquet_of_other_compressions_and_page_sizes_is_read(write, expected, options):
     path = write({"note": ["a\n,b", "", None]}, **options)
     presses = read_presses(path, NAMES)
     assert presses == expected
@@ -130,7 +130,7 @@ def test_a_column_of_nulls_is_empty(write):
 
 
 @pytest.mark.parametrize(
-    ("column", "said"),
+    ("column", "message"),
     [
         (["1", "2", "3"], r"column 'B': expected numbers \(a charge in pC\), got a column of type string; convert it"),
         ([True, False, True], "column 'B': .* got a column of type bool"),
@@ -145,13 +145,13 @@ def test_a_column_of_nulls_is_empty(write):
         ([1.0, 1e39, 3.0], r"row 2, column 'B': expected a charge in pC, got 1e\+39"),
     ],
 )
-def test_a_column_of_another_type_is_refused(write, column, said):
-    with pytest.raises(PressError, match=rf"p\.parquet, {said}"):
+def test_a_column_of_another_type_is_refused(write, column, message):
+    with pytest.raises(PressError, match=rf"p\.parquet, {message}"):
         read_presses(write({"B": column}), NAMES)
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"force_N": [0.5, 0.0, 1.0]}, "row 2, column 'force_N': expected a positive force in N.*got 0$"),
         ({"x_mm": [1.0, None, None]}, "row 2: expected both x_mm and y_mm, or two empty cells"),
@@ -159,24 +159,24 @@ def test_a_column_of_another_type_is_refused(write, column, said):
         ({"force_std": [0.1, 2.0, 0.1]}, "row 2, column 'force_std': expected a positive share .*got 2$"),
     ],
 )
-def test_impossible_presses(write, changes, said):
-    with pytest.raises(PressError, match=rf"p\.parquet, {said}"):
+def test_impossible_presses_in_parquet_are_refused(write, changes, message):
+    with pytest.raises(PressError, match=rf"p\.parquet, {message}"):
         read_presses(write(changes), NAMES)
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    ("names", "message"),
     [
         (["x_mm", "y_mm", "force_N", "A", "B", "D"], r"got the header .*; missing: 'C'"),
         (["x_mm", "A", "force_N", "A", "B", "C"], r"got the header .*; repeated: 'A'"),
     ],
 )
-def test_headers(write, names, said):
-    with pytest.raises(PressError, match=said):
+def test_wrong_parquet_headers_are_refused(write, names, message):
+    with pytest.raises(PressError, match=message):
         read_presses(write(names=names), NAMES)
 
 
-def test_names_with_points_are_no_paths(write, expected):
+def test_column_names_with_points_are_read(write, expected):
     """`Q`, `Q.1` and a structure that has a column `1` are three columns."""
     names = ["x_mm", "y_mm", "force_N", "Q", "Q.1", "Q.1.a"]
     presses = read_presses(write(names=names))
@@ -222,7 +222,7 @@ def test_long_text_that_is_repeated_is_not_decoded(tmp_path):
     assert pool.max_memory() < 10e6
 
 
-def test_more_rows_than_are_accepted(tmp_path, monkeypatch):
+def test_parquet_with_too_many_rows_is_refused(tmp_path, monkeypatch):
     """They are counted in the metadata."""
     one = pyarrow.array(np.ones(1_000_001))
     write_table(pyarrow.table(dict.fromkeys(("force_N", *NAMES), one)), tmp_path / "long.parquet")
@@ -237,7 +237,7 @@ def test_more_rows_than_are_accepted(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("counted", [2, 4])
-def test_metadata_that_counts_other_rows(write, monkeypatch, counted):
+def test_parquet_metadata_with_a_wrong_row_count_are_refused(write, monkeypatch, counted):
     path = write(row_group_size=2)
     metadata = SimpleNamespace(num_rows=counted, num_row_groups=2, schema=read_metadata(path).schema)
     monkeypatch.setattr(ParquetFile, "metadata", metadata)
@@ -253,7 +253,7 @@ def test_columns_are_decoded_in_batches(write, expected, monkeypatch, rows_per_b
     assert read_presses(write(row_group_size=2), NAMES) == expected
 
 
-def test_a_file_without_rows(write):
+def test_parquet_file_without_rows_is_refused(write):
     with pytest.raises(PressError, match=r"expected one press or more below the header, got none"):
         read_presses(write({name: pyarrow.array([], pyarrow.float64()) for name in COLUMNS}), NAMES)
 
@@ -262,7 +262,7 @@ def test_a_file_without_rows(write):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (None, r"cannot be read \(No such file or directory\); expected a Parquet file"),
         (b"", "not a Parquet file"),
@@ -272,10 +272,10 @@ def test_a_file_without_rows(write):
     ],
 )
 @pytest.mark.parametrize("read", [read_presses, read_charge_file])
-def test_files_that_are_not_parquet(read, content, said, tmp_path):
+def test_files_that_are_not_parquet_are_refused(read, content, message, tmp_path):
     if content is not None:
         (tmp_path / "p.parquet").write_bytes(content)
-    with pytest.raises((PressError, ChargeError), match=said) as caught:
+    with pytest.raises((PressError, ChargeError), match=message) as caught:
         read(tmp_path / "p.parquet", NAMES)
     assert str(caught.value).startswith(str(tmp_path / "p.parquet"))
 

@@ -37,7 +37,7 @@ def test_charges_are_the_same_from_every_kind_of_csv(text):
     np.testing.assert_array_equal(read(text), [[1, 2, 3], [4, 5, 6.5]])
 
 
-def test_further_columns_are_ignored_with_a_word():
+def test_further_columns_are_ignored_with_a_message():
     words = []
     text = io.StringIO("x_mm,A,B,,C,x_mm\nhere,1,2,?,3,\n")
     np.testing.assert_array_equal(read_charges(text, NAMES, "presses.csv", words.append), [[1, 2, 3]])
@@ -45,7 +45,7 @@ def test_further_columns_are_ignored_with_a_word():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (",".join(f"column {i}" for i in range(2000)), "expected at most 1,000 columns, got 2,000"),
         ("A" * 200_000, "line 1: not CSV text .field larger"),
@@ -53,8 +53,8 @@ def test_further_columns_are_ignored_with_a_word():
         ("A,B,C\n" + ",".join("1" * 20_000), "line 2: expected 3 cells"),
     ],
 )
-def test_a_message_stays_short(text, said):
-    with pytest.raises(ChargeError, match=said) as caught:
+def test_message_about_a_wrong_table_is_short(text, message):
+    with pytest.raises(ChargeError, match=message) as caught:
         read(text)
     assert len(str(caught.value)) < 600
 
@@ -67,12 +67,12 @@ def test_ten_of_many_missing_columns_are_named():
         read_charges(io.StringIO("Q0,Q1,Q2\n1,2,3\n"), names, "presses.csv")
 
 
-def test_charges_of_a_header_alone():
+def test_table_with_only_a_header_has_no_presses():
     assert read("A,B,C\n").shape == (0, 3)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", r"presses.csv: empty; expected a header with one column for each of the electrodes \('A', 'B', 'C'\)"),
         ("\n\n", "empty"),
@@ -93,8 +93,8 @@ def test_charges_of_a_header_alone():
         ("A,B,C\n1,2,3,4\n", "line 2: expected 3 cells as in the header, got 4"),
     ],
 )
-def test_charges_that_are_refused(text, said):
-    with pytest.raises(ChargeError, match=said):
+def test_wrong_charge_tables_are_refused(text, message):
+    with pytest.raises(ChargeError, match=message):
         read(text)
 
 
@@ -109,7 +109,7 @@ def test_contacts_as_csv_with_flags(film, predictor):
     assert [row[:-1] for row in rows] == [[f"{value:.6f}" for value in row] for row in np.column_stack(contacts[:7])]
 
 
-def test_contacts_as_records(film, predictor):
+def test_table_records_of_charges(film, predictor):
     charges = film.charge_pC([1.0, 9.0], [0.5, 0.0], [1.0, 0.25])
     first, second = (json.loads(record.to_json()) for record in table_records(charges, predictor))
     assert (first["x_mm"], first["contact"], first["flags"]) == (pytest.approx(1.0, abs=2e-6), True, [])
@@ -160,7 +160,7 @@ def test_record_is_one_line_of_plain_values(record):
     assert (expected | {"timestamp": 1763600000.123457}).items() <= got.items()
 
 
-def test_record_never_holds_nan(record):
+def test_record_never_contains_nan(record):
     with pytest.raises(ValueError, match="not JSON compliant"):
         record(misfit=float("nan")).to_json()
 
@@ -191,7 +191,7 @@ def test_inside_polygon_of_a_notched_square():
         ({"force_N": 55_088.0, "misfit": 826.0}, ("outside", "beyond", "misfit")),
     ],
 )
-def test_flags_of_a_contact(film, changes, flags):
+def test_flags_outside_beyond_misfit_and_stress(film, changes, flags):
     assert Validity.of(film.metadata()).flags(GOOD._replace(**changes)) == flags
 
 
@@ -211,7 +211,7 @@ def test_a_press_that_dents_the_film_is_flagged(film):
 
 
 @pytest.mark.parametrize("name", ["three-25um-biaxial", "four-25um-uniaxial"])
-def test_no_absurd_charge_goes_without_a_flag(name):
+def test_absurd_charges_are_always_flagged(name):
     """Charges of any size and sign: none that no press can give passes as one."""
     predictor, rng = Predictor(name), np.random.default_rng(0)
     size = (20_000, len(predictor.metadata.electrodes))

@@ -40,7 +40,7 @@ def undo(output_pC, rule=None, every=1, tau_s=TAU_S):
     return np.array(charges), np.array(contact)
 
 
-def test_held_press_stays():
+def test_held_press_keeps_its_charge_despite_the_leak():
     output = integrator(pressed((3.0, 8.0, 400.0)))
     assert output[2150] < 20.0  # what the amplifier still shows at the end of the press
     got, contact = undo(output)
@@ -67,14 +67,14 @@ def test_two_presses_in_a_row_do_not_spoil_each_other():
     assert np.count_nonzero(np.diff(contact.astype(int)) == 1) == 2
 
 
-def test_lost_frames_cost_little():
+def test_lost_frames_hardly_change_the_charge():
     """Every second frame lost while pressed: the step is twice as long, and a is taken for it."""
     got, _ = undo(integrator(pressed((3.0, 8.0, 400.0))), every=2)
     np.testing.assert_allclose(got[1000, 0], 400.0, atol=3.0)
 
 
 @pytest.mark.parametrize("error", [0.005, 0.05])
-def test_error_of_tau_costs_as_much_as_theory_says(error):
+def test_error_of_tau_has_the_theoretical_effect(error):
     """q' = q (1 + (tau / tau' - 1)(1 - exp(-t / tau))) in the limit of small steps, for a step held for t."""
     got, _ = undo(integrator(pressed((3.0, 8.0, 400.0))), tau_s=TAU_S * (1 + error))
     expected = 400.0 * (1 + (1 / (1 + error) - 1) * (1 - np.exp(-7.0 / TAU_S)))

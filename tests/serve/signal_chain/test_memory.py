@@ -50,7 +50,7 @@ def pressed(t, begin, end):
 
 
 @pytest.mark.parametrize("tau_s", [None, 10.0])
-def test_its_own_series_is_undone_exactly(tau_s):
+def test_memory_of_the_prony_series_is_removed_exactly(tau_s):
     """Filters of scipy make what film and leaky amplifier show of a charge that varies and is let go for a moment."""
     t = times(30.0)
     touch = (pressed(t, 5.0, 20.0) | pressed(t, 20.05, 25.0)) * (1.0 + 0.3 * np.sin(t))
@@ -76,7 +76,7 @@ def test_a_minute_of_creep_and_cooling_leaves_half_a_percent():
 
 
 @pytest.mark.parametrize("wrong", [(0.8, 0.8), (1.2, 1.2), (0.8, 1.2), (1.2, 0.8)])
-def test_what_is_known_to_a_fifth_is_said_and_learned_from_the_first_release(wrong):
+def test_creep_known_to_20_percent_is_learned_from_the_first_release(wrong):
     t = times(105.0)
     table = {"memory": {"creep": CREEP * wrong[0], "thermoelastic": STEP * wrong[1]}}
     got, contact, doubt = undo(np.outer(shown(t, (5.0, 65.0), (75.0, 100.0)), SHAPE), table)
@@ -108,7 +108,7 @@ def bayes(wrong, after_s):
     return np.sqrt(np.einsum("ni,ij,nj->n", held * scales, covariance, held * scales))
 
 
-def test_a_hand_over_the_film_is_no_touch_and_a_press_under_it_is_what_it_is():
+def test_hand_over_the_film_is_no_touch_and_does_not_change_a_press():
     """Newton's law of cooling: 2 K, which come and go within a second; electrodes unalike, one of the other sign."""
     t, per_K = times(50.0), np.array([-270.0, -200.0, 120.0])
     air = 2.0 * np.clip(np.minimum(t - 10.0, 35.0 - t), 0.0, 1.0)
@@ -143,7 +143,7 @@ def test_warmth_that_comes_during_a_press_is_taken_from_it_by_the_fourth_electro
     assert not contact[t > 30.5].any()
 
 
-def test_a_doubt_widens_contact_and_its_correlations():
+def test_uncertain_memory_increases_standard_deviations_and_correlations():
     """The covariance of two independent errors is the sum of theirs."""
     one = Contact(1.0, 2.0, 0.5, 0.1, 0.2, 0.01, 0.3, 0.5, -0.2, 0.1)
     shift = np.array([0.05, -0.1, 0.03])
@@ -160,7 +160,7 @@ def test_a_doubt_widens_contact_and_its_correlations():
     ("moved", "again"),
     [((0.2, -0.2, 0.02), 0.0), ((0.4, 0.0, 0.0), 1.0), ((0.0, -0.4, 0.0), 1.0), ((0.0, 0.0, 0.03), 1.0)],
 )
-def test_a_second_answer_is_asked_for_again_once_the_contact_has_moved(moved, again):
+def test_second_prediction_is_repeated_after_the_contact_has_moved(moved, again):
     """A model whose answer grows in proportion to what is not known: half a unit moves it by half of where it was."""
     told, first = Sensitivity(0.1), np.array([2.0, 1.0, 0.5])
     for at in (first, first + moved):
@@ -168,7 +168,7 @@ def test_a_second_answer_is_asked_for_again_once_the_contact_has_moved(moved, ag
     np.testing.assert_allclose(shift, 0.5 * (first + again * np.array(moved)), rtol=1e-12)
 
 
-def test_records_say_it(film, predictor):
+def test_records_have_the_standard_deviations_of_an_uncertain_memory(film, predictor):
     """With a film known to a fifth, the deviation of the force is that of charges which are all wrong together."""
     press = film.charge_pC(np.full(1, 2.0), np.full(1, -3.0), np.full(1, 0.5))[0]
     frames = [*np.zeros((10, 3)), *np.outer(law(times(1.0)), press)]
@@ -192,7 +192,7 @@ def test_records_say_it(film, predictor):
     assert (records[30].x_std_mm, records[30].y_std_mm) == pytest.approx(stds)
 
 
-def test_charges_of_warming_count_in_their_mean():
+def test_warming_charges_are_relative_to_their_mean():
     board = device_from_table({"common_mode": {"pC_per_K": {"A": 2.0, "B": -6.0, "C": 3.0, "D": 1.0}}}, "b")
     np.testing.assert_allclose(board.chain((*NAMES, "D")).pyro, np.array([2.0, -6.0, 3.0, 1.0]) / 3.0)
 
@@ -205,6 +205,6 @@ def test_charges_of_warming_are_for_each_electrode(per_K):
 
 
 @pytest.mark.parametrize("table", [MEMORY, {"common_mode": {"pC_per_K": {"A": 1.0, "B": 1.0, "C": 1.0, "D": -1.0}}}])
-def test_what_c_does_not_know_is_refused_there(table):
+def test_export_to_c_refuses_stages_that_c_does_not_have(table):
     with pytest.raises(DeviceError, match="does not exist in the signal chain in C"):
         device_header(device_from_table(table, "b"), (*NAMES, "D"))

@@ -115,7 +115,7 @@ def wait_for(page, expression, timeout_s=40.0):
         page.wait_for_timeout(20)
 
 
-def test_numbers_tare_pause_record_and_marker(start_stream, open_page, tmp_path):
+def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(start_stream, open_page, tmp_path):
     start_stream()
     page = open_page()
     wait_for(page, "isocharge.page.film.drawnKind === 'contact'")

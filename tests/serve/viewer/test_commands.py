@@ -62,7 +62,7 @@ def touched(rows, _):
     return ((rows["flags"] & CONTACT_BIT) != 0).sum() > 10
 
 
-def test_a_press_is_on_the_page_where_it_is_and_the_stream_goes_on_without_it(board, start):
+def test_live_page_shows_a_press_and_the_stream_continues_without_the_page(board, start):
     process, url = start("stream", "linear", "--port", board.url, "--output", "none")
     rows, state = follow(url, lambda rows, state: touched(rows, state) and state.get("rate_Hz"))
     contacts = rows[(rows["flags"] & CONTACT_BIT) != 0]
@@ -83,7 +83,7 @@ def test_a_press_is_on_the_page_where_it_is_and_the_stream_goes_on_without_it(bo
     assert (process.returncode, "Traceback" in err) == (0, False)
 
 
-def test_the_rate_is_that_of_the_board_however_fast_a_recording_is_read(predictor, record, monkeypatch, capsys):
+def test_displayed_frame_rate_is_that_of_the_board_in_a_fast_replay(predictor, record, monkeypatch, capsys):
     """Unknown until time has passed between two frames."""
     monkeypatch.setattr(live_page_module, "STATE_INTERVAL_S", -1.0)
     told = []
@@ -98,7 +98,7 @@ def test_the_rate_is_that_of_the_board_however_fast_a_recording_is_read(predicto
     assert capsys.readouterr().err == ""  # the page is there
 
 
-def test_a_replay_is_sought_and_played_fast(film, models, start, command, tmp_path):
+def test_replay_page_seeks_and_plays_at_another_speed(film, models, start, command, tmp_path):
     """Ctrl-C is the only end of such a replay: its MCAP file is whole before."""
     path, mcap = tmp_path / "touch.rec", tmp_path / "touch.mcap"
     rows = [encode_frame(Frame(k, 5000 * k, tuple(row))) for k, row in enumerate(islice(taps(film), 600))]
@@ -130,5 +130,5 @@ def test_a_replay_is_sought_and_played_fast(film, models, start, command, tmp_pa
         ("1" * 5000, "expected PORT or HOST:PORT"),
     ],
 )
-def test_addresses_that_no_page_may_have(models, refused, live, message):
-    refused("serve", "stream", "linear", "--models", models, "--port", "x", "--live", live, said=message)
+def test_wrong_addresses_of_the_live_page_are_refused(models, refused, live, message):
+    refused("serve", "stream", "linear", "--models", models, "--port", "x", "--live", live, message=message)

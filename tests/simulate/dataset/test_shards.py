@@ -183,8 +183,8 @@ DAMAGE = {
         for text in ("", "[]", "{}", "\xff", "[" * 100_000, '{"format_version": 1' + "0" * 5000)
     },
     **{
-        name: (lambda folder, change=change: edit(folder, change), rf"manifest\.json: .*{said}")
-        for name, (change, said) in MANIFESTS.items()
+        name: (lambda folder, change=change: edit(folder, change), rf"manifest\.json: .*{message}")
+        for name, (change, message) in MANIFESTS.items()
     },
     "a shard is missing": (
         lambda folder: (folder / "shard-00001.npz").unlink(),
@@ -201,7 +201,7 @@ DAMAGE = {
         ),
         "the file is missing",
     ),
-    **{name: (spoil, rf"shard-00000\.npz: .*{said}") for name, (spoil, said) in COLUMNS_OF.items()},
+    **{name: (spoil, rf"shard-00000\.npz: .*{message}") for name, (spoil, message) in COLUMNS_OF.items()},
     **{
         f"shard: {name}": (
             lambda folder, make=make: write_shard(folder, make()),

@@ -126,7 +126,7 @@ def test_amplifier_file_changes_the_given_values(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("tau = 1", "unknown key 'tau'; did you mean 'tau_s'"),
         ("tau_s = 0", "tau_s: expected a positive number or inf, got 0"),
@@ -142,10 +142,10 @@ def test_amplifier_file_changes_the_given_values(tmp_path):
         ("tau_s", "not a TOML file"),
     ],
 )
-def test_wrong_amplifier_file_raises_input_error(tmp_path, text, said):
+def test_wrong_amplifier_file_raises_input_error(tmp_path, text, message):
     path = tmp_path / "mine.toml"
     path.write_text(text)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         load_amplifier(str(path))
 
 

@@ -226,11 +226,11 @@ def test_sensor_with_one_electrode_logs_a_warning(tmp_path, command, caplog):
     path = tmp_path / "mine.toml"
     path.write_text(WHOLE.replace("B = [8.660254, 5.0]\n", ""))
     load_sensor(path)
-    (said,) = caplog.messages
-    assert said.startswith(f"{path}: one electrode: its charge can be computed")
+    (message,) = caplog.messages
+    assert message.startswith(f"{path}: one electrode: its charge can be computed")
     code, out, err = command("simulate", "point", path, "--at", "1,2", "--json")
     assert (code, json.loads(out)["status"]) == (0, "converged")
-    assert said in err
+    assert message in err
 
 
 @pytest.mark.timeout(20)

@@ -248,7 +248,9 @@ def test_a_turned_stage_is_named(problem):
     cos, sin = np.cos(angle), np.sin(angle)
     turned = presses.contact @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     cautions = calibrate(presses_of(problem, turned, presses.charge_pC), problem).cautions
-    assert any(re.search(r"difference from the sensor file: rotation; .* axes of the stage", said) for said in cautions)
+    assert any(
+        re.search(r"difference from the sensor file: rotation; .* axes of the stage", message) for message in cautions
+    )
 
 
 @pytest.mark.parametrize(

@@ -96,4 +96,4 @@ def test_fit_with_a_sensor_is_the_same_as_calibrate(problem, session, command, r
     answers = [Predictor(tmp_path / folder / "film").predict_batch(presses.charge_pC).x_mm for folder in "ab"]
     np.testing.assert_array_equal(*answers)
     options = ["-o", tmp_path / "c", "--version", 2]
-    refused("train", "fit", *words, *options, said="--version: each calibration is the next")
+    refused("train", "fit", *words, *options, message="--version: each calibration is the next")

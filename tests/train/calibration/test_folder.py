@@ -127,7 +127,7 @@ def test_the_next_calibration_is_the_next_version_and_what_lies_above_is_repaire
     with calibration_folder(killed, problem):
         assert (killed / "sensor.toml").read_bytes() == (killed / "1" / "sensor.toml").read_bytes()
         assert (killed / "calibration.json").read_bytes() == (killed / "1" / "calibration.json").read_bytes()
-        refused(*CALIBRATE, presses, "-o", killed, said="another process is at work", code=1)
+        refused(*CALIBRATE, presses, "-o", killed, message="another process is at work", code=1)
     assert not list(killed.glob(".*"))
     assert command(*CALIBRATE, presses, "-o", killed)[0] == 0
     assert (killed / "calibration.json").read_bytes() == (killed / "2" / "calibration.json").read_bytes()
@@ -142,7 +142,7 @@ def test_a_folder_is_checked_before_anything_is_read(film, tmp_path, refused):
         ("my film", "model name 'my film'"),
         ("copy", "names the model 'mine', its folder is 'copy'"),
     ):
-        refused(*CALIBRATE, tmp_path / "none.csv", "-o", tmp_path / name, said=message)
+        refused(*CALIBRATE, tmp_path / "none.csv", "-o", tmp_path / name, message=message)
 
 
 def test_presses_are_proposed_before_the_first(command):

@@ -49,7 +49,7 @@ def test_command_writes_the_folder_once(command, refused, tmp_path):
     assert (code, out, "isocharge_model.c" in err) == (0, "", True)
     assert "#define ISOCHARGE_LEAK_TAU_S {10.0, 10.0, 10.0}" in (tmp_path / "c" / "isocharge_device.h").read_text()
     assert "Written by `isocharge train export-c three-25um-biaxial --" in (tmp_path / "c" / "README.md").read_text()
-    refused(*words, said="is already there and is not overwritten", code=1)
+    refused(*words, message="is already there and is not overwritten", code=1)
 
 
 def test_no_folder_is_left_of_what_cannot_be_written(refused, tmp_path):
@@ -65,7 +65,7 @@ def test_no_folder_is_left_of_what_cannot_be_written(refused, tmp_path):
         (("three-25um-biaxial", "--device", tmp_path / "board.toml"), "one for each of the electrodes"),
         (("three-25um-biaxial", "--device", tmp_path / "missing.toml"), "cannot be read"),
     ]:
-        refused("train", "export-c", *words, "-o", tmp_path / "c", said=message)
+        refused("train", "export-c", *words, "-o", tmp_path / "c", message=message)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["board.toml", "damaged"]
 
 

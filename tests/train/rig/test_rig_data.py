@@ -44,8 +44,10 @@ def test_the_errors_are_what_serve_check_says_of_presses_that_nobody_trained_on(
     check = check_presses(Predictor(model.folder), held)
     errors = model.metadata.errors
     assert errors["measured_presses"] == len(held) == check.compared >= 10
-    said = [errors[name] for name in ("position_rms_mm", "position_median_mm", "force_rms_percent")]
-    assert said == pytest.approx([check.position_mm.rms, check.position_mm.median, check.force_percent.rms], rel=1e-3)
+    message = [errors[name] for name in ("position_rms_mm", "position_median_mm", "force_rms_percent")]
+    assert message == pytest.approx(
+        [check.position_mm.rms, check.position_mm.median, check.force_percent.rms], rel=1e-3
+    )
 
 
 def test_card_and_metadata_say_that_it_was_fitted_to_measurements(model):

@@ -116,9 +116,9 @@ def test_the_released_model_is_served_and_checked(alone, fresh, tmp_path, comman
     assert {"| fitted to | 1200 presses at 1200 places, in `presses.csv` |", "| probes | unknown |"} <= {
         *card.splitlines()
     }
-    said = re.findall(r"(?:\| \S+ and|intervals \|) (\S+) %", card)
+    message = re.findall(r"(?:\| \S+ and|intervals \|) (\S+) %", card)
     expected = [*alone.noise.gain, errors["coverage_68"], errors["coverage_95"]]
-    np.testing.assert_allclose(np.array(said, float), 100.0 * np.array(expected), rtol=1e-2)
+    np.testing.assert_allclose(np.array(message, float), 100.0 * np.array(expected), rtol=1e-2)
 
 
 def presses_off_the_origin(count, seed):
@@ -338,7 +338,7 @@ def test_a_faulty_file_leaves_no_folder(refused, tmp_path):
     write_presses(tmp_path / "pad.csv", presses)
     refused(
         *("train", "fit", tmp_path / "pad.csv", "-o", tmp_path / "pad"),
-        said="channels 'Q1', 'Q2': expected charges that are linearly independent",
+        message="channels 'Q1', 'Q2': expected charges that are linearly independent",
     )
     assert not (tmp_path / "pad").exists()
 

@@ -58,7 +58,7 @@ def tensor(charges, datatype="FP32", **fields):
 
 
 @pytest.mark.parametrize("datatype", ["FP32", "FP64"])
-def test_numbers_that_are_not_raw(serve, film, predictor, datatype):
+def test_charges_as_fp32_contents(serve, film, predictor, datatype):
     answer = call(serve()(), "ModelInfer", model_name="linear", id="7", inputs=[tensor(film.golden_pC(), datatype)])
     contact, std, misfit = answer.outputs
     assert (answer.id, list(answer.raw_output_contents)) == ("7", [])
@@ -69,7 +69,7 @@ def test_numbers_that_are_not_raw(serve, film, predictor, datatype):
         np.testing.assert_array_equal(got, expected[:, columns])
 
 
-def test_flags_that_are_not_raw(serve):
+def test_flags_as_bytes_contents(serve):
     far = tensor([[-3.0, 900.0, 900.0], [800.0, 800.0, 800.0]])
     (flags,) = call(serve()(), "ModelInfer", model_name="linear", inputs=[far], outputs=[{"name": "flags"}]).outputs
     first, second = flags.contents.bytes_contents
@@ -77,7 +77,7 @@ def test_flags_that_are_not_raw(serve):
 
 
 @pytest.mark.parametrize(
-    ("fields", "status", "said"),
+    ("fields", "status", "message"),
     [
         ({"inputs": []}, "INVALID_ARGUMENT", "expected a list with one tensor"),
         ({"inputs": [tensor([[1.0, 2.0]])]}, "INVALID_ARGUMENT", r"expected the shape \[n, 3\]"),
@@ -108,19 +108,19 @@ def test_flags_that_are_not_raw(serve):
         ({"model_version": "9"}, "NOT_FOUND", "'linear/9' is not found"),
     ],
 )
-def test_bad_requests_are_refused_with_the_reason(serve, fields, status, said):
-    with pytest.raises(grpc.RpcError, match=said) as caught:
+def test_bad_requests_are_refused_with_the_reason(serve, fields, status, message):
+    with pytest.raises(grpc.RpcError, match=message) as caught:
         call(serve()(), "ModelInfer", **{"model_name": "linear", **fields})
     assert caught.value.code() is grpc.StatusCode[status]
 
 
-def test_a_message_beyond_the_limit(serve):
+def test_message_above_the_size_limit_is_refused(serve):
     with pytest.raises(grpc.RpcError) as caught:
         call(serve(body_bytes=1000)(), "ModelInfer", model_name="linear", raw_input_contents=[bytes(2000)])
     assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
 
 
-def test_a_token(serve):
+def test_calls_need_the_token(serve):
     ask = partial(call, serve(token=Token("open sesame"))())
     assert all((ask("ServerLive").live, ask("ServerReady").ready))
     assert ask("ModelMetadata", metadata=[("authorization", "Bearer open sesame")], name="linear").name == "linear"
@@ -130,7 +130,7 @@ def test_a_token(serve):
         assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
 
 
-def test_tls(handler, authority, tls_files):
+def test_server_with_tls(handler, authority, tls_files):
     trusted = grpc.ssl_channel_credentials(authority.cert_pem.bytes())
     with (
         grpc_server(handler, "127.0.0.1", 0, tls=Tls(tls_files / "both.pem")) as url,
@@ -194,7 +194,7 @@ def refusal(call):
     return caught.value.code().name
 
 
-def test_no_token_no_stream(serve, silent_call):
+def test_stream_without_a_token_is_refused(serve, silent_call):
     """The token is in the metadata: no message need come for a refusal."""
     connect = serve(token=Token("sesame"))
     channel = connect()
@@ -212,7 +212,7 @@ def test_silent_calls_are_closed(serve, silent_call, name, messages):
     assert refusal(call) == "DEADLINE_EXCEEDED"
 
 
-def test_a_connection_that_says_nothing_is_closed(store):
+def test_silent_connection_is_closed(store):
     """Within the time for headers, not gRPC's own two minutes."""
     with grpc_server(Handler(store, ServerLimits(header_seconds=0.1)), "127.0.0.1", 0) as url:
         host, port = url.removeprefix("grpc://").split(":")
@@ -221,7 +221,7 @@ def test_a_connection_that_says_nothing_is_closed(store):
                 pass
 
 
-def test_whoever_waits_longest_gives_its_place(serve, silent_call):
+def test_new_call_replaces_the_call_that_waits_longest(serve, silent_call):
     connect = serve(connections=5)
     silent, busy = connect(), connect()
     calls = [silent_call(silent, "ModelStreamInfer") for _ in range(5)]
@@ -234,7 +234,7 @@ def test_whoever_waits_longest_gives_its_place(serve, silent_call):
     assert not all(call.done() for call in calls)
 
 
-def test_messages_that_are_none(serve, silent_call):
+def test_bytes_that_are_no_message_are_refused(serve, silent_call):
     """The client's mistake, not the server's."""
     channel = serve()()
     assert refusal(silent_call(channel, "ModelInfer", [b"\xff\xff\xff"])) == "INVALID_ARGUMENT"

@@ -112,7 +112,7 @@ def test_a_request_in_one_piece_is_answered_as_byte_by_byte(connect, requests, p
 
 @given(requests=st.lists(REQUESTS, min_size=1, max_size=6), cuts=st.lists(st.integers(1, 120), max_size=30))
 @settings(max_examples=60, deadline=None)
-def test_pieces_that_begin_and_end_anywhere(connect, requests, cuts):
+def test_requests_split_at_any_byte_are_answered(connect, requests, cuts):
     data = b"".join(each for each in requests for _ in range(2))
     pieces, rest = [], data
     for size in cuts:
@@ -154,7 +154,7 @@ def test_trailers_are_not_headers(connect):
     ids=["trailers", "one trailer", "chunk extension"],
 )
 @pytest.mark.parametrize("piece", [1, 100, 4096])
-def test_what_goes_with_a_body_is_bounded_as_headers(connect, endless, piece):
+def test_trailers_and_chunk_extensions_have_the_limit_of_headers(connect, endless, piece):
     sent, closed = answers(connect, [endless[at : at + piece] for at in range(0, len(endless), piece)])
     assert (sent[:12], closed) == (b"HTTP/1.1 431", True)
 

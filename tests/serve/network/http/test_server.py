@@ -102,7 +102,7 @@ def server(limited):
     return limited()
 
 
-def test_a_stock_client(server, predictor):
+def test_requests_of_a_stock_http_client(server, predictor):
     """One connection, bodies with a length and in chunks, GET and HEAD."""
     client = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=60)
     for body in (BODY, iter([BODY[:10], BODY[10:]])):
@@ -128,7 +128,7 @@ def test_a_stock_client(server, predictor):
         b"CONNECT example.org:443 HTTP/1.1\r\nHost: example.org\r\n\r\n",
     ],
 )
-def test_what_is_not_http(server, data):
+def test_bytes_that_are_not_http_are_refused(server, data):
     assert refused(exchange(server, data))[0] == 400
 
 
@@ -138,12 +138,12 @@ def test_what_is_not_http(server, data):
     [b"GET /v2 HTTP/1.1\r\nA: " + b"b" * 5000, b"GET /" + b"a" * 5000, b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 900],
 )
 @pytest.mark.parametrize("piece", [100_000, 1000])
-def test_long_headers(limited, head, end, piece):
+def test_headers_above_the_limit_are_refused(limited, head, end, piece):
     answer = refused(exchange(limited(header_bytes=4096), head + end, piece))
     assert answer == (431, "the request line and headers are longer than 4096 bytes")
 
 
-def test_long_bodies(limited):
+def test_body_above_the_limit_is_refused(limited):
     """One that says it is, one that never ends, and one that says more than a number holds."""
     server = limited(body_bytes=1000, body_seconds=0.3)
     status, error = refused(exchange(server, infer(LAST, bytes(1001))))
@@ -166,18 +166,18 @@ def test_long_bodies(limited):
     ],
     ids=["headers", "body", "nothing at all", "idle"],
 )
-def test_time_runs_out(limited, sent, limits, status):
+def test_incomplete_request_gets_408_after_the_deadline(limited, sent, limits, status):
     data = exchange(limited(**limits), sent)
     assert statuses(data) == status
     assert status != [408] or "waited too long for the end of the" in refused(data)[1]
 
 
-def test_drops_that_keep_coming_do_not_buy_time(limited):
+def test_slow_bytes_do_not_extend_the_deadline(limited):
     with connect(limited(header_seconds=0.3)) as connection, pytest.raises(OSError, match=r"reset|Broken pipe"):
         drip(connection, b"X", 1000, pause=0.05)
 
 
-def test_too_many_connections(limited):
+def test_connections_above_the_limit_are_refused(limited):
     server = limited(connections=3)
     with ExitStack() as stack:
         for _ in range(3):
@@ -188,7 +188,7 @@ def test_too_many_connections(limited):
     wait_until(lambda: is_well(server))
 
 
-def test_slow_clients_hold_nobody_up(limited):
+def test_slow_clients_delay_no_other_client(limited):
     """They never finish a request; when all places are taken, the oldest of them gives its own."""
     server = limited(connections=200)
     with ExitStack() as stack:
@@ -197,7 +197,7 @@ def test_slow_clients_hold_nobody_up(limited):
         assert [is_well(server) for _ in range(5)] == [True] * 5
 
 
-def test_a_client_that_does_not_read(limited):
+def test_client_that_does_not_read_is_disconnected(limited):
     server = limited(body_seconds=0.3)
     body = json.dumps({"inputs": [TENSOR | {"shape": [4096, 3], "data": TENSOR["data"] * 4096}]}).encode()
     with connect(server) as connection, pytest.raises(OSError, match=r"reset|Broken pipe"):
@@ -207,7 +207,7 @@ def test_a_client_that_does_not_read(limited):
 
 @pytest.mark.parametrize("protocol", ["h2c", "websocket"])
 @pytest.mark.parametrize("piece", [1 << 20, 7])
-def test_an_upgrade_is_ignored(server, protocol, piece):
+def test_upgrade_header_is_ignored(server, protocol, piece):
     """As HTTP lets a server do (RFC 9110, 7.8): the request is answered, and so is the next one."""
     upgrade = f"Connection: Upgrade, HTTP2-Settings\r\nUpgrade: {protocol}\r\nHTTP2-Settings: AAMAAABkAAQAAP__\r\n"
     bodiless = b"GET /v2 HTTP/1.1\r\nHost: localhost\r\n%s\r\n" % upgrade.encode()
@@ -216,13 +216,13 @@ def test_an_upgrade_is_ignored(server, protocol, piece):
 
 
 @pytest.mark.parametrize("requests", [[LOAD], [infer()], [LOAD, infer(), LOAD], [infer()] * 1000])
-def test_half_a_connection_is_enough_for_answers(server, requests):
+def test_half_closed_connection_receives_its_responses(server, requests):
     with connect(server) as connection, ThreadPoolExecutor(1) as threads:
         threads.submit(lambda: (send(connection, b"".join(requests)), connection.shutdown(socket.SHUT_WR)))
         assert statuses(everything(connection)) == [200] * len(requests)
 
 
-def test_a_client_that_asks_whether_to_go_on(server):
+def test_expect_100_continue(server):
     with connect(server) as connection:
         connection.sendall(infer(LAST + b"Expect: 100-continue\r\n").removesuffix(BODY))
         assert connection.recv(100) == b"HTTP/1.1 100 Continue\r\n\r\n"
@@ -230,7 +230,7 @@ def test_a_client_that_asks_whether_to_go_on(server):
         assert statuses(everything(connection)) == [200]
 
 
-def test_answers_come_in_the_order_of_requests(server, store, monkeypatch):
+def test_pipelined_requests_are_answered_in_order(server, store, monkeypatch):
     """What is answered on the spot does not overtake what takes long, on one connection."""
     load = store.load
     monkeypatch.setattr(store, "load", lambda name: (time.sleep(0.3), load(name)))
@@ -253,7 +253,7 @@ def slow_load(store, monkeypatch):
     go_on.set()
 
 
-def test_a_load_holds_nobody_up(server, slow_load):
+def test_loading_a_model_delays_no_other_request(server, slow_load):
     began, go_on = slow_load
     with connect(server) as connection:
         connection.sendall(LOAD)
@@ -263,7 +263,7 @@ def test_a_load_holds_nobody_up(server, slow_load):
         assert statuses(connection.recv(1000)) == [200]
 
 
-def test_stopping_finishes_what_has_begun(server, slow_load):
+def test_stop_finishes_requests_that_have_begun(server, slow_load):
     """A load, and a request that is still coming; idle connections end, and no request comes after."""
     began, go_on = slow_load
     with connect(server) as loads, connect(server) as begun, connect(server) as idle:
@@ -284,7 +284,7 @@ def test_stopping_finishes_what_has_begun(server, slow_load):
 
 
 @pytest.mark.parametrize(("certificate", "key"), [("cert.pem", "key.pem"), ("both.pem", None)])
-def test_tls_and_a_token(store, start_http, tls_files, trusted, certificate, key):
+def test_server_with_tls_and_token(store, start_http, tls_files, trusted, certificate, key):
     tls = Tls(tls_files / certificate, key and tls_files / key)
     server = start_http(Handler(store, token=Token("sesame")), tls=tls)
     assert server.url.startswith("https://127.0.0.1:")
@@ -299,7 +299,7 @@ def open_files():
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
-def test_half_handshakes_are_bounded(store, start_http, tls_files, trusted):
+def test_number_of_unfinished_tls_handshakes_is_limited(store, start_http, tls_files, trusted):
     """In number and in time; a client that finishes its own is served meanwhile."""
     handler = Handler(store, ServerLimits(connections=20, header_seconds=1.0))
     server = start_http(handler, tls=Tls(tls_files / "both.pem"))

@@ -109,12 +109,12 @@ def test_every_route_answers_its_method_only(ask, method, path):
         "/v2/systemsharedmemory/status",
     ],
 )
-def test_other_paths_are_not_there(ask, path):
+def test_unknown_path_gets_404(ask, path):
     assert refusal(ask("GET", path))[0] == 404
 
 
 @pytest.mark.parametrize("path", ["/v2/models/cubic/ready", "/v2/models/linear/versions/3/ready", "/v2/models//ready"])
-def test_other_models_are_not_there(ask, path):
+def test_unknown_model_gets_404(ask, path):
     status, error = refusal(ask("GET", path))
     assert status == 404
     assert error.endswith("is not found; serving: linear/1, linear/2")
@@ -127,7 +127,7 @@ def test_other_models_are_not_there(ask, path):
     [np.ravel, np.asarray, lambda rows: np.where(rows == rows.min(), 1, rows).astype(int).ravel()],
     ids=["flat", "rows", "whole, some of them 1"],
 )
-def test_answers_equal_a_bare_session(ask, bare, film, n, datatype, form):
+def test_outputs_equal_those_of_onnxruntime(ask, bare, film, n, datatype, form):
     data = form(np.resize(film.golden_pC(), (n, 3)))
     charges, sent = data.reshape(n, 3), request(np.zeros((n, 3)), datatype, id="a")
     sent["inputs"][0]["data"] = data.tolist()
@@ -150,7 +150,7 @@ def binary_request(charges, datatype="FP32", **changes):
 
 @pytest.mark.parametrize("datatype", ["FP32", "FP64"])
 @pytest.mark.parametrize("blanks", range(4))
-def test_binary_in_at_any_address(ask, bare, film, datatype, blanks):
+def test_binary_input_at_any_offset_in_the_body(ask, bare, film, datatype, blanks):
     body, length = binary_request(film.golden_pC(), datatype, id="x" * blanks)
     status, headers, body = ask("POST", INFER, body, inference_header_content_length=str(length))
     assert (status, headers["content-type"]) == (200, "application/json")
@@ -186,7 +186,7 @@ def outputs_of(headers, body):
         ),
     ],
 )
-def test_binary_out(ask, bare, film, asked, names):
+def test_binary_outputs(ask, bare, film, asked, names):
     status, headers, body = ask("POST", INFER, orjson.dumps(request(film.golden_pC(), **asked)))
     assert (status, headers["content-type"]) == (200, "application/octet-stream")
     found = outputs_of(headers, body)
@@ -196,13 +196,13 @@ def test_binary_out(ask, bare, film, asked, names):
 
 
 @pytest.mark.parametrize(("way", "pack"), [("gzip", gzip.compress), ("deflate", zlib.compress), ("identity", bytes)])
-def test_compressed_in(ask, film, way, pack):
+def test_compressed_request_body(ask, film, way, pack):
     plain = orjson.dumps(request(film.golden_pC()))
     assert ask("POST", INFER, pack(plain), content_encoding=way)[2] == ask("POST", INFER, plain)[2]
 
 
 @pytest.mark.parametrize(("way", "unpack"), [("gzip", gzip.decompress), ("deflate", zlib.decompress)])
-def test_compressed_out(ask, film, way, unpack):
+def test_compressed_response_body(ask, film, way, unpack):
     body = orjson.dumps(request(np.resize(film.golden_pC(), (200, 3))))
     _, headers, packed = ask("POST", INFER, body, accept_encoding=f"br, {way};q=0.5")
     assert headers["content-encoding"] == way
@@ -210,16 +210,16 @@ def test_compressed_out(ask, film, way, unpack):
 
 
 @pytest.mark.parametrize("accepted", ["", "br", "identity", "gzip;q=0", "gzip; q=0.000, deflate;q=0"])
-def test_nothing_is_compressed_unasked(ask, film, accepted):
+def test_response_is_not_compressed_without_accept_encoding(ask, film, accepted):
     body = orjson.dumps(request(np.resize(film.golden_pC(), (200, 3))))
     assert "content-encoding" not in ask("POST", INFER, body, accept_encoding=accepted)[1]
 
 
-def test_short_answers_stay_as_they_are():
+def test_short_responses_are_not_compressed():
     assert compress(b"a" * 500, b"gzip") == (b"a" * 500, b"")
 
 
-def test_unpacking_stops_at_the_limit():
+def test_decompression_stops_at_the_limit():
     bomb = gzip.compress(bytes(50_000_000))
     assert len(bomb) < 100_000
     tracemalloc.start()
@@ -290,14 +290,14 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_bodies_are_refused_with_the_reason(ask, case):
-    body, status, said = BAD[case]
+    body, status, message = BAD[case]
     got, error = refusal(ask("POST", INFER, body))
     assert got == status
-    assert re.search(said, error)
+    assert re.search(message, error)
 
 
 @pytest.mark.parametrize("length", ["", "-1", "+5", "1_0", "1e3", "9999", "9" * 5000, "0x10", " 5", "٣"])
-def test_bad_header_lengths(handler, length):
+def test_wrong_inference_header_content_length_is_refused(handler, length):
     body, _ = binary_request(np.float32(PRESS))
     response = handler.answer("POST", INFER, [(b"inference-header-content-length", length.encode())], body)
     assert response.status == 400
@@ -305,7 +305,7 @@ def test_bad_header_lengths(handler, length):
 
 
 @pytest.mark.parametrize(
-    ("changes", "spoil", "said"),
+    ("changes", "spoil", "message"),
     [
         ({"tensor": {"parameters": {"binary_data_size": 8}}}, bytes, "binary_data_size 8 and 12 bytes"),
         ({"tensor": {"parameters": {"binary_data_size": "12"}}}, bytes, "expected a whole number, got '12'"),
@@ -321,14 +321,14 @@ def test_bad_header_lengths(handler, length):
         ),
     ],
 )
-def test_binary_data_that_do_not_fit(ask, changes, spoil, said):
+def test_binary_data_of_another_size_is_refused(ask, changes, spoil, message):
     body, length = binary_request(np.float32(PRESS), **changes)
     status, error = refusal(ask("POST", INFER, spoil(body), inference_header_content_length=str(length)))
     assert status == 400
-    assert said in error
+    assert message in error
 
 
-def test_what_is_not_finite_is_null(ask, bare):
+def test_output_that_is_not_finite_is_null(ask, bare):
     """The toy film divides by the sum of the charges. JSON has no NaN, and the document says so."""
     status, _, body = ask("POST", INFER, orjson.dumps(request([[0.0, 0.0, 0.0]])))
     np.testing.assert_array_equal(bare([[0.0, 0.0, 0.0]])["contact"].ravel(), [np.nan, np.nan, 0.0])
@@ -337,7 +337,7 @@ def test_what_is_not_finite_is_null(ask, bare):
     jsonschema_rs.Draft202012Validator(schema).validate(orjson.loads(body))
 
 
-def test_the_document_says_how_a_route_is_asked_and_what_it_answers(ask):
+def test_openapi_describes_request_and_response_of_each_route(ask):
     document = orjson.loads(ask("GET", "/openapi.json")[2])
     for path, item in sorted(document["paths"].items(), key=lambda row: row[0].endswith("unload")):
         (method,) = item.keys() - {"parameters"}
@@ -354,7 +354,7 @@ def test_the_document_says_how_a_route_is_asked_and_what_it_answers(ask):
 
 
 @pytest.mark.parametrize(
-    ("way", "body", "status", "said"),
+    ("way", "body", "status", "message"),
     [
         ("br", b"x", 415, "expected gzip, deflate or identity"),
         ("gzip", b"no gzip", 400, "the body is not 'gzip'"),
@@ -364,16 +364,16 @@ def test_the_document_says_how_a_route_is_asked_and_what_it_answers(ask):
         ("gzip", gzip.compress(bytes(1 << 24), mtime=0), 413, "unpacks to more than 1048576 bytes"),
     ],
 )
-def test_bad_compression(ask, way, body, status, said):
+def test_wrong_content_encoding_is_refused(ask, way, body, status, message):
     got, error = refusal(ask("POST", INFER, body, content_encoding=way))
-    assert (got, said in error) == (status, True)
+    assert (got, message in error) == (status, True)
 
 
-def test_a_body_beyond_the_limit(store):
+def test_body_above_the_limit_is_refused(store):
     assert Handler(store, ServerLimits(body_bytes=100)).answer("POST", INFER, [], bytes(101)).status == 413
 
 
-def test_errors_that_are_ours_are_logged_and_not_told(ask, store, monkeypatch, caplog):
+def test_internal_errors_are_logged_and_not_sent(ask, store, monkeypatch, caplog):
     def fail(*_, **__):
         raise ZeroDivisionError("a secret")
 
@@ -383,19 +383,19 @@ def test_errors_that_are_ours_are_logged_and_not_told(ask, store, monkeypatch, c
     assert "a secret" in caplog.text
 
 
-def test_index_of_what_is_ready(ask, store):
+def test_repository_index_of_ready_versions(ask, store):
     store.unload("linear")
     assert len(orjson.loads(ask("POST", "/v2/repository/index", b"{}")[2])) == 2
     assert orjson.loads(ask("POST", "/v2/repository/index", b'{"ready": true}')[2]) == []
     assert refusal(ask("POST", "/v2/repository/index", b'{"ready": 1}'))[0] == 400
 
 
-def test_metadata_say_what_the_file_says(ask, store):
+def test_model_metadata_equal_those_of_the_file(ask, store):
     properties = orjson.loads(ask("GET", "/v2/models/linear")[2])["properties"]
     assert properties == store.get("linear").metadata.to_props()
 
 
-def test_the_page_lists_models_with_their_cards(ask, store, tmp_path):
+def test_start_page_lists_models_with_their_cards(ask, store, tmp_path):
     (tmp_path / "models/linear/2/card.md").write_text("# Card\n\n<script>x</script>\n")
     page = ask("GET", "/")[2].decode()
     parts = "<article>", "<pre># The linear film", "&lt;script&gt;x&lt;/script&gt;"
@@ -404,13 +404,13 @@ def test_the_page_lists_models_with_their_cards(ask, store, tmp_path):
     assert "No model is loaded" in ask("GET", "/")[2].decode()
 
 
-def test_the_page_s_example_runs(ask):
+def test_example_of_the_start_page_runs(ask):
     page = ask("GET", "/")[2].decode()
     body = page.split("-d &#x27;")[1].split("&#x27;")[0].replace("&quot;", '"')
     assert ask("POST", INFER, body.encode())[0] == 200
 
 
-def test_the_page_may_run_and_load_nothing(ask):
+def test_start_page_forbids_scripts_and_loading(ask):
     """Its one style is allowed by its hash, computed here from what was sent."""
     _, headers, page = ask("GET", "/")
     style = page.decode().split("<style>")[1].split("</style>")[0]
@@ -441,7 +441,7 @@ def operations(handler, start_http):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", GenerationMode, ids=lambda mode: mode.value)
-def test_the_server_does_what_its_document_says(operations, mode):
+def test_server_conforms_to_its_openapi_document(operations, mode):
     listed = {path for route in routes.ROUTES if route.summary for path in route.paths}
     assert {operation.path for operation in operations} == {path for path in listed if "unload" not in path}
     answered = set()
@@ -461,14 +461,14 @@ def test_the_server_does_what_its_document_says(operations, mode):
     assert answered & ({200} if mode is GenerationMode.POSITIVE else {400, 404})
 
 
-def test_the_page_shows_how_to_send_a_press_before_anything_else(ask):
+def test_start_page_begins_with_an_example_request(ask):
     _, _, body = ask("GET", "/")
     html = body.decode()
     assert html.index("curl $SERVER/v2/models/linear/infer") < html.index("<article>")
     assert html.index("x_mm, y_mm, force_N: position (mm) and force (N") < html.index("<article>")
 
 
-def test_the_openapi_document_says_what_each_output_holds(ask):
+def test_openapi_describes_each_output(ask):
     _, _, body = ask("GET", "/openapi.json")
     schema = orjson.loads(body)["components"]["schemas"]["answer"]["properties"]["outputs"]["items"]
     for name in ("contact", "contact_std", "contact_correlation", "misfit", "flags"):
