@@ -20,7 +20,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from press_faults import RingShares, WholeFilmStudy
 
-RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial,four-25um-biaxial-15mm,three-25um-biaxial-12mm"
+RELEASED = (
+    "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial,four-25um-biaxial-15mm,three-25um-biaxial-12mm,"
+    "eight-25um-biaxial"
+)
 RING_EDGES_mm = (8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 43.0)
 
 

@@ -112,7 +112,9 @@ def doctor_command(
         return
     if write is not None:
         refuse_existing(write)
-    electrodes = Predictor(model, models=models).metadata.electrodes if model else ()
+    metadata = Predictor(model, models=models).metadata if model else None
+    electrodes = metadata.electrodes if metadata else ()
+    unnoticed = metadata.unnoticed if metadata else None
     settings = {"pC_per_unit": pC_per_unit, "V_per_unit": V_per_unit, "feedback_pF": feedback_pF}
     say(f"listening for {seconds:g} s; leave the film alone")
     examination = examine(
@@ -127,6 +129,8 @@ def doctor_command(
     )
     if not json:
         show("\n".join(report_lines(examination)))
+    if metadata and unnoticed and not json:
+        show(f"{metadata.label}: {unnoticed.summary}")
     found_channels = None
     if check_wiring and examination.good and not examination.touch:
         wiring = _check_wiring(examination, electrodes)
@@ -135,7 +139,8 @@ def doctor_command(
         if not json:
             show("\n".join(wiring.sentences))
     if json:
-        show_json(asdict(examination) | {"found_channels": found_channels})
+        unnoticed_share = unnoticed.total_share if unnoticed else None
+        show_json(asdict(examination) | {"found_channels": found_channels, "unnoticed_share": unnoticed_share})
     alive = len(examination.channels)
     if examination.good and len(electrodes) > alive:
         say(f"models of {alive} electrodes: {', '.join(_models_of(alive, models)) or 'none'}; choose one with --model")

@@ -56,6 +56,66 @@ class ModelNoise(Struct, frozen=True, kw_only=True):
         return np.asarray(white_pC**2 + (gain * charge_pC) ** 2)
 
 
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+"""Share of presses, 0 to 1."""
+
+
+class UnnoticedPresses(Struct, frozen=True, kw_only=True):
+    """Presses outside the working area that a model answers wrongly without a flag, by place.
+
+    The film between two circles about the origin is divided into rings of equal width, and each ring into equal
+    sectors. The first sector begins at the x axis, and the others follow anticlockwise.
+
+    Attributes:
+        from_mm: Radius of the inner circle, mm.
+        to_mm: Radius of the outer circle, mm.
+        force_N: Smallest and largest force of the presses, N.
+        share: Share of the presses that are answered wrongly without a flag, by ring and sector.
+    """
+
+    from_mm: Positive
+    to_mm: Positive
+    force_N: tuple[Positive, Positive]
+    share: Annotated[tuple[tuple[Share, ...], ...], Meta(min_length=1)]
+
+    def __post_init__(self) -> None:
+        if self.from_mm >= self.to_mm:
+            raise WrongKey("to_mm", f"a number above from_mm ({self.from_mm:g})", self.to_mm)
+        if len({len(ring) for ring in self.share}) > 1 or not self.share[0]:
+            raise WrongKey("share", "as many sectors in every ring", [len(ring) for ring in self.share])
+
+    @property
+    def ring_edges_mm(self) -> Array:
+        """Radii of the circles between the rings, shape (n_ring + 1,), mm."""
+        return np.linspace(self.from_mm, self.to_mm, len(self.share) + 1)
+
+    @property
+    def ring_shares(self) -> Array:
+        """Share of each ring, shape (n_ring,)."""
+        return np.asarray(np.mean(self.share, axis=1))
+
+    @property
+    def total_share(self) -> float:
+        """Share of all presses between the two circles, 0 to 1."""
+        return float(np.average(self.ring_shares, weights=np.diff(self.ring_edges_mm**2)))
+
+    @property
+    def summary(self) -> str:
+        """Sentence about the share of all presses."""
+        lightest_N, hardest_N = self.force_N
+        return (
+            f"{percent_text(self.total_share)} of the presses outside the working area, from {self.from_mm:.3g} to "
+            f"{self.to_mm:.3g} mm from the centre and with {lightest_N:g} to {hardest_N:g} N, are answered wrongly "
+            "without a flag"
+        )
+
+
+def percent_text(share: float) -> str:
+    """Return a share of presses, 0 to 1, as text in percent with about two significant digits."""
+    percent = 100.0 * share
+    return f"{percent:.0f} %" if percent >= 9.5 else f"{percent:.1f} %"
+
+
 class ModelMetadata(Settings, frozen=True, kw_only=True):
     """Metadata of a model.
 
@@ -74,6 +134,8 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         format_version: Version of the format of the metadata.
         yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if that force is above
             the range of forces, or unknown.
+        unnoticed: Presses outside the working area that the model answers wrongly without a flag. None if they were not
+            measured.
     """
 
     name: ModelName
@@ -89,6 +151,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
     made_with: dict[str, Any]
     format_version: int = FORMAT_VERSION
     yield_force_N: Positive | None = None
+    unnoticed: UnnoticedPresses | None = None
 
     def __post_init__(self) -> None:
         """Check the keys that must fit each other; raise WrongKey for the first key that does not."""

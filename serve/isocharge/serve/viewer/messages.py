@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, to_builtins
 
 from isocharge.common.deflection_field import DeflectionField, read_deflection_field
 from isocharge.common.errors import InputError, RequestError
@@ -321,6 +321,7 @@ def describe_film(name: str, metadata: ModelMetadata, field: DeflectionField | N
         "working_area_mm": [[float(x), float(y)] for x, y in metadata.working_area_mm],
         "force_range_N": list(metadata.force_range_N),
         "probes": list(metadata.probes),
+        "unnoticed": to_builtins(metadata.unnoticed),
         "deflection": None if field is None else field.to_json(),
         "sample": SampleFormat(metadata.electrodes).describe(),
     }

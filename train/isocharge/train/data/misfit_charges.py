@@ -2,9 +2,8 @@
 
 The misfit network has to answer any charges, so it is trained on all kinds of charges: presses with noise; charges at
 any distance from the charges that contacts can have; wrong gains; failing electrodes; forces far outside of the range;
-two presses at the same time; and charges from a box that contains all of these. The charges of two presses are added.
-This is an approximation, because the film is not linear. With few electrodes, the space of all charges is small enough
-to be covered.
+two presses at the same time; presses outside the working area; and charges from a box that contains all of these. The
+charges of two presses at the same time are approximated from those of the single presses.
 """
 
 from typing import Any
@@ -23,6 +22,20 @@ KINDS = {"noisy": 0.35, "moved": 0.25, "gains": 0.12, "dying": 0.05, "scaled": 0
 
 FARTHEST = 2.5
 """Decimal logarithm of the largest shift of charges of any sign, in standard deviations of the noise."""
+
+PAIR_EXPONENTS = (1.0, 1.75)
+"""Smallest and largest exponent p with which the charges of two presses are combined, (Q1^p + Q2^p)^(1/p).
+
+On a taut film, charges of two presses add up (p = 1). On a slack film the charge grows with the force to the power 2/3,
+and two presses at the same place have p = 3/2. Presses solved with both loads at once lie in between.
+"""
+
+OUTSIDE_SHARE = 0.15
+"""Share of the training examples that are presses outside the working area, if those are given, dimensionless."""
+
+OUTSIDE_SCATTER = 0.02
+"""Standard deviation of the logarithm of a factor of all charges of a press outside the working area, dimensionless.
+It fills the gaps between the presses that are given."""
 
 LARGEST_FACTOR = 2.0
 """Largest factor by which the charge map is scaled at a press. A quotient of charges near zero is meaningless."""
@@ -44,6 +57,7 @@ def draw_misfit_examples(
     seed: int,
     *,
     candidates: int = CANDIDATES,
+    outside: Array | None = None,
     limits: tuple[Array | float, Array | float] = (LOWEST_CHARGE, HIGHEST_CHARGE),
 ) -> Array:
     """Draw charges of every kind, and compute their distance from the charges of the nearest contact.
@@ -55,6 +69,7 @@ def draw_misfit_examples(
         count: Number of examples.
         seed: Seed of the random numbers.
         candidates: Number of contacts from which a search starts.
+        outside: Charges of presses outside the working area, shape (m, n_electrode), pC; None to use none.
         limits: Smallest and largest charge, pC. Charges are clipped to these limits, as in the network.
 
     Returns:
@@ -64,8 +79,12 @@ def draw_misfit_examples(
     rng = np.random.default_rng(seed)
     chosen = presses[rng.integers(len(presses), size=count)]
     kinds, charge = draw_charges(rng, chosen.charge, presses.charge, noise)
-    charge = np.clip(charge, *limits)
     near = np.isin(kinds, ("noisy", "moved"))
+    if outside is not None:
+        outside_rows = np.flatnonzero(rng.random(count) < OUTSIDE_SHARE)
+        charge[outside_rows] = _draw_outside(rng, outside, noise, len(outside_rows))
+        near[outside_rows] = False
+    charge = np.clip(charge, *limits)
     return np.stack([charge, _residuals(charge_map, charge, noise.sigma(charge), chosen, near, candidates)])
 
 
@@ -150,7 +169,8 @@ def _draw(kind: str, rng: np.random.Generator, charge: Array, others: Array, noi
         case "scaled":
             return charge * _common_factors(rng, charge.shape)
         case "two":
-            return charge + others[rng.integers(len(others), size=len(charge))]
+            second = others[rng.integers(len(others), size=len(charge))]
+            return combined_charge(charge, second, rng.uniform(*PAIR_EXPONENTS, (len(charge), 1)))
         case _:
             return _any_charges(rng, charge.shape, others, noise)
 
@@ -222,3 +242,29 @@ def _any_charges(rng: np.random.Generator, shape: tuple[int, ...], others: Array
     n_press, _ = shape
     largest_decade = np.where(rng.random((n_press, 1)) < 0.3, np.log10(HIGHEST_CHARGE), 4.0)
     return 10.0 ** (largest_decade * rng.random(shape))
+
+
+def _draw_outside(rng: np.random.Generator, outside: Array, noise: Noise, count: int) -> Array:
+    """Draw noisy charges of presses outside the working area, shape (count, n_electrode), pC."""
+    chosen = outside[rng.integers(len(outside), size=count)]
+    factor = np.exp(OUTSIDE_SCATTER * rng.standard_normal((count, 1)))
+    return noise.add(chosen * factor, rng)
+
+
+def combined_charge(first: Array, second: Array, exponent: Array | float) -> Array:
+    """Approximate the charges of two presses at the same time, (Q1^p + Q2^p)^(1/p).
+
+    Args:
+        first: Charges of the first press alone, shape (n, n_electrode), pC.
+        second: Charges of the second press alone, same shape.
+        exponent: The exponent p, a number or shape (n, 1).
+
+    Returns:
+        Charges of both presses, shape (n, n_electrode), pC. Powers of negative charges keep the sign.
+    """
+
+    def signed_power(charge: Array, power: Array | float) -> Array:
+        return np.asarray(np.sign(charge) * np.abs(charge) ** power)
+
+    total = signed_power(first, exponent) + signed_power(second, exponent)
+    return signed_power(total, 1.0 / exponent)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
@@ -29,6 +30,7 @@ from isocharge.train.model_release.evaluate import evaluate
 from isocharge.train.model_release.graph_check import check_graph
 from isocharge.train.model_release.measured_card import measured_card, measured_errors
 from isocharge.train.model_release.onnx_graph import write_graph
+from isocharge.train.model_release.unnoticed import unnoticed_presses, unnoticed_section
 from isocharge.train.training.fitted import Fitted
 
 N_CORNERS = 64
@@ -72,8 +74,8 @@ No noise was added to these presses. The errors include those of the places and 
 
 LIMITS = """\
 - The model assumes one press at a time, inside its working area and its range of forces. The answer to any other press
-  is finite and wrong. If the electrodes lie on one circle, most presses far outside the working area have the charges
-  of a press inside it, so the misfit is small and the answer carries no flag.
+  is finite and wrong. If the electrodes lie on one circle of a biaxial film, four of five presses outside the working
+  area have the charges of a press inside it, so that the misfit is small and the answer carries no flag.
 - The standard deviations are valid for the noise named above. Gains that are wrong by 1 % cause larger errors than this
   noise.
 """
@@ -136,7 +138,7 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     return f"""{_interface_section(metadata, fitted)}
 {errors}
 {_misfit_section(metadata, fitted)}
-## Limits
+{unnoticed_section(metadata.unnoticed)}## Limits
 
 {truth}{cautions}{LIMITS}
 ## Make it again
@@ -294,6 +296,7 @@ def release(
         },
         yield_force_N=_yield_force(fitted),
     )
+    about = structs.replace(about, unnoticed=unnoticed_presses(fitted, about))
     graph = write_graph(fitted.network, about.to_props())
     golden_charges = check_graph(graph, fitted.network.outputs, fitted.good, fitted.misfit_noise, contact_floors(about))
     card_text = hub_block(about) + card(about, fitted)

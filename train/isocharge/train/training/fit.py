@@ -27,6 +27,7 @@ from isocharge.simulate.forward.charge_map import within
 from isocharge.train.data.channel_noise import ChannelNoise, Noise
 from isocharge.train.data.charge_field import ChargeField, invertible_domain
 from isocharge.train.data.misfit_charges import draw_misfit_examples, misfit_noise
+from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses, held_out, split_by_position
 from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.correlation import with_correlation
@@ -60,6 +61,9 @@ ROUNDED_FRACTION = 0.25
 
 VALIDATION_FRACTION = 0.5
 """Number of validation positions relative to the number of test positions, dimensionless."""
+
+N_OUTSIDE_PRESSES = 6_000
+"""Number of presses outside the working area from which charges for the misfit network are drawn."""
 
 SIGNED_FEATURE_SCALE = 0.1
 """Charge above which features of charges of both signs are logarithmic, relative to the charge above which the noise is
@@ -115,6 +119,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
         provenance=replace(data.provenance, made_with=made_with | dict(data.provenance.made_with), files=files),
         requested_domain=data.domain,
         cautions=split.cautions,
+        outside=trained.outside,
     )
 
 
@@ -200,10 +205,11 @@ class Split:
 
 @dataclass(frozen=True)
 class TrainedNetwork:
-    """A trained network in PyTorch, and the presses that it was trained on."""
+    """A trained network in PyTorch, the presses that it was trained on, and the film outside the working area."""
 
     network: InverseNetwork
     split: Split
+    outside: OutsidePresses | None
 
 
 def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | None = None) -> TrainedNetwork:
@@ -235,9 +241,12 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
         network = InverseNetwork(split.domain, features, config.network)
         contact = contact_stage(network, split.train, split.validation, training.noise_model, training, data.teacher)
         train_perceptron(contact, network.contact, config, run)
-        examples = _misfit_examples(split, features, training, run)
+        outside = None
+        if not data.presses.measured:
+            outside = OutsidePresses.of(data.sensor, data.probes, split.domain)
+        examples = _misfit_examples(split, outside, features, training, run)
         train_perceptron(misfit_stage(network, examples, training), network.misfit_vector, config, run)
-    return TrainedNetwork(network.eval(), split)
+    return TrainedNetwork(network.eval(), split, outside)
 
 
 @contextmanager
@@ -336,12 +345,17 @@ def contact_stage(
 
 
 def _misfit_examples(
-    split: Split, features: WhitenedFeatures, config: TrainingConfig, run: ResumableRun | None
+    split: Split,
+    outside: OutsidePresses | None,
+    features: WhitenedFeatures,
+    config: TrainingConfig,
+    run: ResumableRun | None,
 ) -> Array:
     """Draw the examples for the misfit network. The run saves them, because the search takes long.
 
     Args:
         split: Presses for training, and the charge field in which the nearest contacts are searched for.
+        outside: The film outside the working area; None if it is not simulated.
         features: Features of the network, which limit the charges.
         config: Noise, number of examples and seed.
         run: Run that saves the examples; None if they are not saved.
@@ -355,6 +369,8 @@ def _misfit_examples(
     if charge_features.mean is not None:
         noise = ChannelNoise.alike(misfit_noise(config.noise_model), charge_features.n_electrode)
         draw = partial(draw, limits=(charge_features.low_pC, charge_features.high_pC))
+    if outside is not None:
+        draw = partial(draw, outside=outside.draw(N_OUTSIDE_PRESSES, config.seed).charge)
     draw = partial(draw, noise, config.misfit_charges, config.seed)
     if run is None:
         return draw()

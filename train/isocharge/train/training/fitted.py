@@ -9,6 +9,7 @@ from isocharge.simulate import Domain, NoiseModel, Sensor
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.measured_sensor import MeasuredSensor
 from isocharge.train.data.misfit_charges import misfit_noise
+from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.folded_network import FoldedNetwork
 
@@ -61,6 +62,7 @@ class Fitted:
         cautions: Sentences that users of the network should read.
         cross_validated: Answers to the charges of `test` by networks that were not trained on them. They are given if
             this network was trained on all presses of `test`.
+        outside: The film outside the working area; None if it was not simulated.
     """
 
     network: FoldedNetwork
@@ -75,6 +77,7 @@ class Fitted:
     requested_domain: Domain
     cautions: tuple[str, ...] = ()
     cross_validated: Answers | None = None
+    outside: OutsidePresses | None = None
 
     @property
     def misfit_noise(self) -> Noise:

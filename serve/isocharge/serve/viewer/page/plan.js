@@ -2,6 +2,9 @@
 
 import { DASHES, fit, theme } from "./theme.js";
 
+/** Share of the presses at a place above which the place is shaded as a place without flags. */
+const UNNOTICED_SHARE = 0.5;
+
 const TRAIL_S = 1.6, LENS_MM = 1.0, SIGMAS_95 = 2.448, LENS_PX = 52;
 
 export class Plan {
@@ -48,6 +51,7 @@ export class Plan {
     this.toMillimetres(g);
     g.lineJoin = "round";
     if (film.radius_mm) { g.fillStyle = theme.film; circle(g, 0, 0, film.radius_mm); g.fill(); }
+    this.drawUnnoticed(g);
     g.lineWidth = px; g.strokeStyle = theme.line;
     this.drawGrid(g);
     g.fillStyle = theme.area; path(g, film.working_area_mm); g.fill();
@@ -66,6 +70,23 @@ export class Plan {
       segment(g, x0 + at, y0 - half, x0 + at, y0 + half);
       segment(g, x0 - half, y0 + at, x0 + half, y0 + at);
     }
+  }
+
+  /** Shade the places where most presses are answered with a wrong contact and without a flag. */
+  drawUnnoticed(g) {
+    const { unnoticed } = this.film;
+    if (!unnoticed) return;
+    const { from_mm, to_mm, share } = unnoticed, width = (to_mm - from_mm) / share.length;
+    g.beginPath();
+    share.forEach((sectors, ring) => sectors.forEach((value, sector) => {
+      if (value < UNNOTICED_SHARE) return;
+      const inner = from_mm + ring * width, step = 2 * Math.PI / sectors.length, start = sector * step, end = start + step;
+      g.moveTo(inner * Math.cos(start), inner * Math.sin(start));
+      g.arc(0, 0, inner + width, start, end);
+      g.arc(0, 0, inner, end, start, true);
+      g.closePath();
+    }));
+    g.fillStyle = `${theme.warn}40`; g.fill();
   }
 
   drawElectrode(g, name, k, px) {
@@ -92,11 +113,14 @@ export class Plan {
     const thin = px / scale;
     g.fillStyle = theme.card; g.strokeStyle = theme.quiet; g.lineWidth = 1.2 * thin;
     circle(g, 0, 0, this.film.radius_mm); g.fill(); g.stroke();
+    this.drawUnnoticed(g);
     g.fillStyle = theme.quiet;
     for (const outline of Object.values(this.film.outlines_mm)) { path(g, outline); g.fill(); }
     g.strokeStyle = theme.accent; g.strokeRect(-this.reach, -this.reach, 2 * this.reach, 2 * this.reach);
     g.restore();
     this.text(g, `Ø ${2 * this.film.radius_mm} mm`, x + size + 6 * px, y - size + 6 * px, 11 * px, theme.quiet, "left");
+    const isShaded = this.film.unnoticed?.share.flat().some((value) => value >= UNNOTICED_SHARE);
+    if (isShaded) this.text(g, "shaded: wrong, no flag", x + size + 6 * px, y - size + 20 * px, 11 * px, theme.warn, "left");
   }
 
   radius(force) { return (5 + 15 * Math.sqrt(Math.min(Math.max(force, 0) / this.largest, 1.5))) * this.css; }

@@ -1,0 +1,79 @@
+"""Charges for the training of the misfit network: pairs of presses, and presses outside the working area."""
+
+import numpy as np
+
+from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
+from isocharge.train.data.misfit_charges import (
+    OUTSIDE_SHARE,
+    PAIR_EXPONENTS,
+    combined_charge,
+    draw_misfit_examples,
+)
+from isocharge.train.data.presses import LabelledPresses
+from kept import kept
+from membrane_solver import Membrane, Touch, solve_touches
+
+NOISE = noise_model("reference")
+SENSOR = load_sensor("four-25um-biaxial")
+PAIRS = (
+    (Touch(3.0, 4.0, 0.5), Touch(-4.0, -3.0, 0.3)),
+    (Touch(7.0, -1.0, 0.2), Touch(-2.0, 5.0, 0.9)),
+)
+
+
+def solved_charges(touches):
+    """Return the charges of touches at the same time from the independent solver, shape (n_electrode,), pC."""
+    solution = solve_touches(Membrane(), touches)
+    piezo = SENSOR.piezo
+    return np.array([solution.charge(np.array(e.corners), piezo.d31, piezo.d32) for e in SENSOR.electrodes])
+
+
+def test_two_presses_at_one_place_are_a_press_with_the_sum_of_the_forces():
+    """On a slack membrane, the charge grows with the force to the power 2/3."""
+    place = np.array([[300.0, 100.0, -20.0]])
+    first = place * 0.3 ** (2.0 / 3.0)
+    second = place * 0.5 ** (2.0 / 3.0)
+    np.testing.assert_allclose(combined_charge(first, second, 1.5), place * 0.8 ** (2.0 / 3.0))
+    np.testing.assert_allclose(combined_charge(first, second, 1.0), first + second)
+
+
+def test_charges_of_pairs_lie_between_those_of_the_two_exponents():
+    """Pairs that are solved with both loads at once, by an independent solver. The sum of the charges is too large."""
+    smallest_exponent, largest_exponent = PAIR_EXPONENTS
+    for pair in PAIRS:
+        first, second = (solved_charges([touch])[None] for touch in pair)
+        both = solved_charges(pair)[None]
+        assert (both < 0.95 * combined_charge(first, second, smallest_exponent)).all()
+        assert (both > 0.98 * combined_charge(first, second, largest_exponent)).all()
+        np.testing.assert_allclose(combined_charge(first, second, 1.5), both, rtol=0.1)
+
+
+def test_the_independent_solver_agrees_with_the_simulator_for_one_touch():
+    simulated = kept(ForwardMap.build, SENSOR, Circle(1.0), 9.0, (0.05, 2.0)).charges(np.array([[3.0, 4.0, 0.5]]))[0]
+    np.testing.assert_allclose(solved_charges([Touch(3.0, 4.0, 0.5)]), simulated, rtol=0.005)
+
+
+def test_examples_contain_presses_outside_the_working_area_with_the_exact_misfit():
+    """All presses inside have the charges 100 pC times the force; those outside have one electrode with 900 pC."""
+
+    class ProportionalMap:
+        electrodes = ("A", "B", "C")
+        domain = kept(ForwardMap.build, SENSOR, Circle(1.0), 9.0, (0.05, 2.0)).domain
+
+        def charges(self, contact):
+            return 100.0 * np.tile(contact[:, 2:], 3)
+
+        def derivatives(self, contact):
+            slopes = np.zeros((len(contact), 3, 3))
+            slopes[:, :, 2] = self.charges(contact)
+            return slopes
+
+    rng = np.random.default_rng(0)
+    contact = np.column_stack([rng.uniform(-5.0, 5.0, (2000, 2)), rng.uniform(0.1, 2.0, 2000)])
+    presses = LabelledPresses(contact, ProportionalMap().charges(contact))
+    outside = np.array([[100.0, 100.0, 900.0]])
+    charge, residual = draw_misfit_examples(presses, ProportionalMap(), NOISE, 4000, 1, candidates=64, outside=outside)
+    is_outside = np.abs(charge / outside - 1.0).max(axis=1) < 0.12
+    assert np.mean(is_outside) == np.clip(np.mean(is_outside), OUTSIDE_SHARE - 0.02, OUTSIDE_SHARE + 0.02)
+    nearest = charge[is_outside] - residual[is_outside] * NOISE.sigma(charge[is_outside])
+    np.testing.assert_allclose(nearest, nearest[:, :1] * np.ones(3), rtol=1e-3)  # a press inside

@@ -1,0 +1,122 @@
+"""Presses outside the working area, for training the misfit network and for measuring what it does not notice.
+
+The charges come from the coarse map of the whole film. An error of a few percent near the clamp does not matter: the
+misfit network is trained with the exact misfit of the charges that it sees, and the measured shares of presses hardly
+depend on it.
+"""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Booleans
+from isocharge.common.errors import SceneError, SolveError
+from isocharge.serve.model.metadata import UnnoticedPresses
+from isocharge.simulate import Circle, Domain, Sensor, parse_probe
+from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
+from isocharge.train.data.presses import LabelledPresses
+
+_log = logging.getLogger(__name__)
+
+MIN_WIDTH = 1.0
+"""Smallest width of the ring between the working area and the clamp in which presses are drawn, mm."""
+
+FORCE_RATIO = 10.0
+"""Ratio of the largest to the smallest force of the presses whose answers are measured, dimensionless."""
+
+N_FORCES = 5
+N_RINGS = 24
+N_SECTORS = 36
+"""Numbers of forces, rings and sectors of the presses whose answers are measured."""
+
+SHARE_DECIMALS = 2
+"""Decimals of the measured shares."""
+
+
+@dataclass(frozen=True)
+class OutsidePresses:
+    """The part of a film between the working area and the clamp.
+
+    Attributes:
+        charge_map: Map of the whole film from contacts to charges.
+        inner: Radius of the working area, mm.
+    """
+
+    charge_map: ChargeMap
+    inner: float
+
+    @classmethod
+    def of(cls, sensor: Sensor, probes: tuple[str, ...], domain: Domain) -> "OutsidePresses | None":
+        """Solve the coarse map of the whole film for the widest probe.
+
+        Args:
+            sensor: The sensor.
+            probes: Notations of the probes. A probe that is not round is replaced by a disk with the same reach.
+            domain: Working area and forces of the model.
+
+        Returns:
+            The presses; None if the working area reaches the clamp, or if the film cannot be solved there.
+        """
+        reach = max(parse_probe(notation).reach for notation in probes)
+        probe = Circle(reach)
+        if outermost_distance(sensor.film, probe) < domain.radius + MIN_WIDTH:
+            return None
+        try:
+            return cls(whole_film_map(sensor, probe, domain.force_range), domain.radius)
+        except (SceneError, SolveError) as error:
+            _log.warning("presses outside the working area are not simulated: %s", error)
+            return None
+
+    @property
+    def outer(self) -> float:
+        """Largest distance of a press from the centre, mm."""
+        return self.charge_map.domain.radius
+
+    def draw(self, count: int, seed: int) -> LabelledPresses:
+        """Draw presses uniform over the ring, with log-uniform forces.
+
+        Args:
+            count: Number of presses.
+            seed: Seed of the random numbers.
+        """
+        rng = np.random.default_rng(seed)
+        distance = np.sqrt(rng.uniform(self.inner**2, self.outer**2, count))
+        angle = rng.uniform(0.0, 2.0 * np.pi, count)
+        low, high = np.log(self.charge_map.domain.force_range)
+        return self._presses(distance, angle, np.exp(rng.uniform(low, high, count)))
+
+    def grid(self) -> LabelledPresses:
+        """Return presses at the middle of every ring and sector, with `N_FORCES` forces each."""
+        edges = np.linspace(self.inner, self.outer, N_RINGS + 1)
+        distance = 0.5 * (edges[1:] + edges[:-1])
+        angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
+        grids = np.meshgrid(distance, angle, self._measured_forces(), indexing="ij")
+        return self._presses(*(grid.ravel() for grid in grids))
+
+    def unnoticed(self, is_unnoticed: Booleans) -> UnnoticedPresses:
+        """Return the measured shares, by place.
+
+        Args:
+            is_unnoticed: Whether each press of `grid` is answered wrongly without a flag, shape (n,).
+        """
+        shares = is_unnoticed.reshape(N_RINGS, N_SECTORS, -1).mean(axis=2).round(SHARE_DECIMALS)
+        forces = self._measured_forces()
+        return UnnoticedPresses(
+            from_mm=round(self.inner, 4),
+            to_mm=round(self.outer, 4),
+            force_N=(float(f"{forces[0]:.4g}"), float(f"{forces[-1]:.4g}")),
+            share=tuple(tuple(ring) for ring in shares.tolist()),
+        )
+
+    def _measured_forces(self) -> Array:
+        """Return the forces of the presses of `grid`, shape (N_FORCES,), N."""
+        low, high = self.charge_map.domain.force_range
+        return np.geomspace(max(low, high / FORCE_RATIO), high, N_FORCES)
+
+    def _presses(self, distance: Array, angle: Array, force: Array) -> LabelledPresses:
+        """Return presses at polar coordinates, each of shape (n,), mm, rad and N."""
+        contact = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), force])
+        contact[:, 2] = np.clip(contact[:, 2], *self.charge_map.domain.force_range)
+        return LabelledPresses(contact, self.charge_map.charges(contact))

@@ -1,0 +1,83 @@
+"""Measured share of the presses outside the working area that a model answers wrongly without a flag."""
+
+from textwrap import fill
+
+import numpy as np
+
+from isocharge.common.arrays import Array, Booleans
+from isocharge.serve.flags import STRESS
+from isocharge.serve.model.metadata import ModelMetadata, UnnoticedPresses, percent_text
+from isocharge.serve.prediction.contact import Contacts, Validity
+from isocharge.train.training.fitted import Fitted
+
+WRONG_STDS = 4.0
+"""Error of a coordinate, in reported standard deviations, above which an answer counts as wrong."""
+
+NOISE_SEED = 11
+"""Seed of the noise of the presses."""
+
+MAX_CARD_ROWS = 8
+"""Largest number of rows of the table in a card."""
+
+CARD_WIDTH = 120
+"""Largest length of a line of text in a card, characters."""
+
+MIN_NAMED_SHARE = 0.005
+"""Smallest share of unnoticed presses for which a card contains a table."""
+
+
+def unnoticed_presses(fitted: Fitted, about: ModelMetadata) -> UnnoticedPresses | None:
+    """Press the film outside the working area, and measure which answers are wrong and carry no flag.
+
+    Args:
+        fitted: The network.
+        about: Metadata, which contain the limits of the flags.
+
+    Returns:
+        The shares by place; None if the film outside the working area was not simulated.
+    """
+    outside = fitted.outside
+    if outside is None:
+        return None
+    presses = outside.grid()
+    contact, std, misfit = fitted.predict(presses.noisy(fitted.misfit_noise, NOISE_SEED))
+    is_wrong = (np.abs(contact - presses.contact) > WRONG_STDS * std).any(axis=1)
+    return outside.unnoticed(is_wrong & ~is_flagged(about, contact, std, misfit))
+
+
+def is_flagged(about: ModelMetadata, contact: Array, std: Array, misfit: Array) -> Booleans:
+    """Return which answers carry a flag other than `stress`, which does not say that an answer is wrong.
+
+    Args:
+        about: Metadata of the model.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        std: Their standard deviations, shape (n, 3).
+        misfit: Misfits, shape (n, 1).
+
+    Returns:
+        Shape (n,).
+    """
+    correlation = np.full_like(std, np.nan)
+    columns = np.concatenate([contact, std, misfit, correlation], axis=1).T
+    flags = Validity.of(about).batch_flags(Contacts(*columns))
+    return np.array([bool(set(words) - {STRESS}) for words in flags])
+
+
+def unnoticed_section(unnoticed: UnnoticedPresses | None) -> str:
+    """Return the section of a card about presses outside the working area; empty if they were not measured."""
+    if unnoticed is None:
+        return ""
+    sentence = fill(f"{unnoticed.summary}.", CARD_WIDTH)
+    text = f"## Presses outside the working area\n\n{sentence}\n"
+    if unnoticed.total_share < MIN_NAMED_SHARE:
+        return text + "\n"
+    step = -(-len(unnoticed.share) // MAX_CARD_ROWS)
+    edges = unnoticed.ring_edges_mm
+    areas = np.diff(edges**2)
+    rows = []
+    for start in range(0, len(areas), step):
+        rings = slice(start, start + step)
+        share = np.average(unnoticed.ring_shares[rings], weights=areas[rings])
+        last_edge = edges[min(start + step, len(areas))]
+        rows.append(f"| {edges[start]:.3g} to {last_edge:.3g} mm | {percent_text(float(share))} |\n")
+    return f"{text}\n| distance from the centre | wrong without a flag |\n|---|---|\n{''.join(rows)}\n"
