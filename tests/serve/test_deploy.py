@@ -276,3 +276,9 @@ def test_dashboard_and_alerts_ask_for_metrics_that_there_are(start_http):
         families = text_string_to_metric_families(answer.read().decode())
     there = {sample.name for family in families for sample in family.samples}
     assert set(re.findall(r"\b(?:isocharge|process)_\w+", asked)) <= there
+
+
+def test_the_ros2_package_has_the_version_of_isocharge():
+    folder = DEPLOY / "ros2/isocharge_ros"
+    assert f'version="{VERSION}"' in (folder / "setup.py").read_text()
+    assert f"<version>{VERSION}</version>" in (folder / "package.xml").read_text()
