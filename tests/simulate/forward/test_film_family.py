@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import InputError, SceneError
-from isocharge.simulate import Circle, Domain, FilmPrior, load_sensor, press, touch_charge
+from isocharge.simulate import Circle, Domain, FilmPrior, ForwardMap, load_sensor, press, touch_charge
 from isocharge.simulate.forward import film_family
 from isocharge.simulate.forward.film_family import FilmFamily
 
@@ -39,9 +39,10 @@ def test_family_maps_agree_with_direct_solves_between_the_grid_nodes(prior, fami
 
 def test_family_check_covers_all_forces_and_distances(prior, family, monkeypatch):
     checked = []
-    monkeypatch.setattr(film_family, "relative_error", lambda _, *press: checked.append(press) or 1e-4 * len(checked))
+    monkeypatch.setattr(film_family, "direct_charges", lambda *_: np.zeros(3))
+    monkeypatch.setattr(ForwardMap, "relative_error", lambda _, check, __: checked.append(check) or 1e-4 * len(checked))
     assert film_family._check_against_solves(family, prior, Domain(3.0, (0.2, 1.2))) == 1e-4 * film_family.CHECK_COUNT
-    distance, _, force = np.array(checked).T
+    distance, _, force, _ = np.array(checked).T
     assert (0.2 <= force.min() < 0.3, 0.8 < force.max() <= 1.2) == (True, True)
     assert (distance.min() < 1.0, distance.max()) == (True, 3.0)
 

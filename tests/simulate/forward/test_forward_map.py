@@ -20,7 +20,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.forward.family import Family
+from isocharge.simulate.forward.family import Family, check_presses
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
 
@@ -191,7 +191,7 @@ DOMAIN = Domain(8.0, (0.05, 2.0))
 
 @pytest.mark.parametrize(("folds", "rotations"), [(1, 14), (2, 14), (3, 15), (4, 16)])
 def test_orientations_are_spread_evenly_and_solved_once_each(folds, rotations):
-    family = Family.spread(DOMAIN, (3, 2), 2.0 * np.pi / folds, 14)
+    family = Family.spread(DOMAIN, 45.0, (3, 2), 2.0 * np.pi / folds, 14)
     assert family.rotation.size == rotations
     np.testing.assert_allclose(np.diff(family.rotation), 2.0 * np.pi / rotations, rtol=1e-12)
     assert family.solved_rotations.size * folds == rotations
@@ -208,13 +208,26 @@ def test_family_weights_interpolate_smooth_functions(period):
         return f**0.02 / (1.0 + (d / 12.0) ** 2) + 0.1 * np.cos(t - 0.3) + 0.05 * np.sin(3.0 * t)
 
     for count, expected in (((8, 3), 1e-4), ((15, 8), 1e-7)):
-        family = Family.spread(DOMAIN, count, period)
+        family = Family.spread(DOMAIN, 45.0, count, period)
         grid = np.meshgrid(family.distance, family.force, family.rotation, indexing="ij")
         found = family.weights(distance, force, rotation) @ smooth(*grid).ravel()
         np.testing.assert_allclose(found, smooth(distance, force, rotation), rtol=expected)
 
 
-def test_probes_between_cover_the_range_of_forces():
-    force = np.array([force for _, _, force, _ in Family.spread(DOMAIN, (3, 2), 0.0).probes_between(7)])
+def test_family_interpolates_fields_that_change_over_the_distance_to_the_clamp():
+    """The function depends on the distance to the clamp, as the image of a point load in the clamped circle does."""
+    domain = Domain(41.0, (1.0, 1.0))
+    family = Family.spread(domain, 45.0, (12, 1), 0.0)
+    distance = np.linspace(0.0, 41.0, 300)
+    weights = family.weights(distance, np.ones(300), np.zeros(300))
+    found = weights @ np.log(1.0 - (family.distance / 45.0) ** 2)
+    np.testing.assert_allclose(found, np.log(1.0 - (distance / 45.0) ** 2), atol=1e-5)
+
+
+def test_check_presses_cover_the_distances_and_forces():
+    presses = check_presses(DOMAIN, 7)
+    force = np.array([press.force for press in presses])
     assert len(set(force)) == 7
     assert (0.05 <= force.min() < 0.1, 1.0 < force.max() <= 2.0) == (True, True)
+    assert (presses[0].distance < 2.0, presses[-1].distance) == (True, DOMAIN.radius)
+    assert np.hypot(*presses[3].position) == pytest.approx(presses[3].distance)

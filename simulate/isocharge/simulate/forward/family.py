@@ -1,10 +1,11 @@
 """A family of presses of one probe: the presses that are solved, and the interpolation between them."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain
 from isocharge.simulate.forward.film_grid import FilmGrid
 from isocharge.simulate.mechanics.stress import rotate_stress
+from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film, Surface
@@ -34,7 +36,8 @@ class Family:
 
     Attributes:
         domain: Presses that the family covers.
-        distance: Distances from the centre, at Chebyshev nodes, shape (n_distance,), mm.
+        film_radius: Radius of the film, mm.
+        distance: Distances from the centre, at Chebyshev nodes in `distance_coordinate`, shape (n_distance,), mm.
         force: Forces, at Chebyshev nodes in the logarithm, shape (n_force,), N.
         rotation: Rotations of the probe relative to the direction of the press, evenly spaced over a full turn, shape
             (n_rotation,), rad.
@@ -42,17 +45,21 @@ class Family:
     """
 
     domain: Domain
+    film_radius: float
     distance: Array
     force: Array
     rotation: Array
     folds: int
 
     @classmethod
-    def spread(cls, domain: Domain, count: tuple[int, int], period: float, rotations: int = ROTATIONS) -> "Family":
+    def spread(
+        cls, domain: Domain, film_radius: float, count: tuple[int, int], period: float, rotations: int = ROTATIONS
+    ) -> "Family":
         """Distribute the nodes for a probe.
 
         Args:
             domain: Presses to cover.
+            film_radius: Radius of the film, mm.
             count: Number of distances and number of forces.
             period: Smallest rotation that maps the probe onto itself, rad; 0 for an axisymmetric probe.
             rotations: Smallest number of orientations of a probe that is not axisymmetric.
@@ -68,7 +75,9 @@ class Family:
             folds = round(2.0 * np.pi / period)
             n_rotation = folds * math.ceil(rotations / folds)
         rotation = 2.0 * np.pi * np.arange(n_rotation) / n_rotation
-        return cls(domain, chebyshev_nodes(distance_count, 0.0, domain.radius), force, rotation, folds)
+        largest_coordinate = float(distance_coordinate(domain.radius / film_radius))
+        distance = film_radius * np.tanh(chebyshev_nodes(distance_count, 0.0, largest_coordinate))
+        return cls(domain, film_radius, distance, force, rotation, folds)
 
     @property
     def solved_rotations(self) -> Array:
@@ -86,7 +95,9 @@ class Family:
         Returns:
             Shape (n, n_distance * n_force * n_rotation).
         """
-        distance_weights = lagrange_values(self.distance, barycentric_weights(self.distance), distance)
+        nodes = distance_coordinate(self.distance / self.film_radius)
+        at = distance_coordinate(distance / self.film_radius)
+        distance_weights = lagrange_values(nodes, barycentric_weights(nodes), at)
         log_force = np.log(self.force)
         force_weights = lagrange_values(log_force, barycentric_weights(log_force), np.log(force))
         products = distance_weights[:, :, None, None] * force_weights[:, None, :, None]
@@ -141,23 +152,44 @@ class Family:
         ]
         return np.asarray(np.concatenate(parts, axis=2).reshape(-1, solved.shape[-1]))
 
-    def probes_between(self, count: int) -> Iterator[tuple[float, float, float, float]]:
-        """Generate presses between the nodes, which are used to check the interpolation.
 
-        The last press lies at the largest distance.
+class CheckPress(NamedTuple):
+    """A press at which the interpolation of a family is compared with a direct solve.
 
-        Args:
-            count: Number of presses.
+    Attributes:
+        distance: Distance from the centre, mm.
+        angle: Direction from the centre, rad.
+        force: Force, N.
+        rotation: Further rotation of the probe, rad.
+    """
 
-        Yields:
-            Distance (mm), direction (rad), force (N) and orientation (rad).
-        """
-        distance_shares = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
-        low, high = np.log(self.domain.force_range)
-        for number, distance_share in enumerate([*distance_shares, 1.0]):
-            force_share = (0.5 + 0.618 * number) % 1.0
-            force = np.clip(np.exp(low + (high - low) * force_share), *self.domain.force_range)
-            yield float(self.domain.radius * distance_share), 2.4 * number, float(force), 0.7 * number
+    distance: float
+    angle: float
+    force: float
+    rotation: float
+
+    @property
+    def position(self) -> tuple[float, float]:
+        """Position (x, y), mm."""
+        return self.distance * math.cos(self.angle), self.distance * math.sin(self.angle)
+
+
+def check_presses(domain: Domain, count: int) -> list[CheckPress]:
+    """Return presses that cover the distances and forces of a domain. The last press lies at the largest distance.
+
+    Args:
+        domain: Presses that a family covers.
+        count: Number of presses.
+    """
+    distance_shares = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
+    low, high = np.log(domain.force_range)
+    presses = []
+    for number, distance_share in enumerate([*distance_shares, 1.0]):
+        force_share = (0.5 + 0.618 * number) % 1.0
+        force = np.clip(np.exp(low + (high - low) * force_share), *domain.force_range)
+        distance = float(domain.radius * distance_share)
+        presses.append(CheckPress(distance, 2.4 * number, float(force), 0.7 * number))
+    return presses
 
 
 def check_family(film: Film, probe: Probe, domain: Domain) -> None:

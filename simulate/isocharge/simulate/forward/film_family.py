@@ -25,10 +25,10 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, SceneError, SolveError
 from isocharge.simulate.forward.charge_map import Domain
-from isocharge.simulate.forward.family import Family, check_family, solve_films
+from isocharge.simulate.forward.family import CheckPress, Family, check_family, solve_films
 from isocharge.simulate.forward.film_grid import AXES, THEORY, FilmGrid, FilmLimits, bits_of, decompose, quantised
 from isocharge.simulate.forward.film_modes import MODES, FilmModes, ModeMap
-from isocharge.simulate.forward.forward_map import ForwardMap, relative_error
+from isocharge.simulate.forward.forward_map import ForwardMap, direct_charges
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.film_prior import FilmPrior
@@ -168,6 +168,7 @@ class FilmFamily:
         _, largest_distance = self.limits["distance"]
         family = Family(
             domain=Domain(largest_distance * a, (low * force_unit, high * force_unit)),
+            film_radius=a,
             distance=self.grid.distance * a,
             force=self.grid.load * force_unit,
             rotation=np.zeros(1),
@@ -301,7 +302,9 @@ def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) 
         distance = domain.radius * np.sqrt((number + 1.0) / CHECK_COUNT)
         angle = 2.4 * number
         force = float(low * (high / low) ** rng.random())
-        errors.append(relative_error(forward_map, distance, angle, force))
+        check = CheckPress(float(distance), angle, force, rotation=0.0)
+        direct = direct_charges(forward_map.sensor, forward_map.probe, forward_map.settings, check)
+        errors.append(forward_map.relative_error(check, direct))
     return max(errors)
 
 

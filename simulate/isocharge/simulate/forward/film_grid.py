@@ -8,6 +8,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.theory import Theory
+from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 
 AXES = ("distance", "load", "tension", "thickness", "reach")
@@ -50,7 +51,8 @@ class FilmGrid:
     def spread(cls, limits: FilmLimits, counts: Sequence[int]) -> "FilmGrid":
         """Distribute Chebyshev nodes between limits.
 
-        The nodes of the load, the reach and the tension (plus `SOFTENING`) are Chebyshev nodes in the logarithm.
+        The nodes of the load, the reach and the tension (plus `SOFTENING`) are Chebyshev nodes in the logarithm, and
+        those of the distance in `distance_coordinate`.
 
         Args:
             limits: Smallest and largest value along each axis.
@@ -77,6 +79,8 @@ def _stretched(axis: str, value: Array | float) -> Any:
         return np.log(value)
     if axis == "tension":
         return np.log(value + SOFTENING)
+    if axis == "distance":
+        return distance_coordinate(value)
     return value
 
 
@@ -86,6 +90,8 @@ def _unstretched(axis: str, value: Array) -> Array:
         return np.exp(value)
     if axis == "tension":
         return np.maximum(np.exp(value) - SOFTENING, 0.0)
+    if axis == "distance":
+        return np.tanh(value)
     return value
 
 

@@ -320,6 +320,7 @@ class FilmModes:
         force_unit = properties.young * properties.thickness * properties.radius
         family = Family(
             domain=Domain(film.domain.radius, film.domain.force_range),
+            film_radius=properties.radius,
             distance=self.grid.distance * properties.radius,
             force=self.grid.load * force_unit,
             rotation=np.zeros(1),

@@ -11,7 +11,7 @@ solves.
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,14 +20,24 @@ from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
+from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain, as_contacts, differences
-from isocharge.simulate.forward.family import ROTATIONS, Family, check_family
-from isocharge.simulate.forward.readout import COARSE, FINE, NEAR, ReadoutPoints, contact_charge, touch_charge
+from isocharge.simulate.forward.family import ROTATIONS, CheckPress, Family, check_family, check_presses
+from isocharge.simulate.forward.readout import (
+    COARSE,
+    FAR,
+    FAR_DISTANCE,
+    FINE,
+    NEAR,
+    ReadoutPoints,
+    contact_charge,
+    touch_charge,
+)
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.mechanics.theory import Theory, theory_for
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.placement import Placement
+from isocharge.simulate.mesh.placement import Placement, widest_smooth_layer
 from isocharge.simulate.mesh.point_location import locate_points
 from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.numerics.interpolation import tensor_values
@@ -47,6 +57,10 @@ CHARGE_FLOOR = 0.1
 
 EVEN_FIELD = np.zeros(1, dtype=bool)
 """Parity of the stress field under a press on an isotropic round film: one field, which is even."""
+
+SKIP_RATIO = 10.0
+"""Ratio of the error to `INTERPOLATION_ERROR` above which the next numbers of nodes would not suffice either and are
+skipped, dimensionless."""
 
 CHECK_COUNT = 10
 """Number of direct solves with which a forward map is compared."""
@@ -69,7 +83,7 @@ class NodeCount(NamedTuple):
 NODE_COUNTS = (
     NodeCount(5, 3, ROTATIONS),
     NodeCount(8, 5, 2 * ROTATIONS),
-    NodeCount(13, 8, 3 * ROTATIONS),
+    NodeCount(10, 7, 3 * ROTATIONS),
     NodeCount(13, 12, 3 * ROTATIONS),
 )
 """Numbers of nodes that are tried in turn. The last one is for taut films, whose charges change from one power of the
@@ -138,16 +152,27 @@ class ForwardMap:
         layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
         settings = replace(settings, theory=theory, layer=layer)
         resolution = needed_resolution(film, probe, (radius, 0.0), middle_force, settings)
-        settings = replace(settings, resolution=resolution)
         template = template_for(probe, resolution)
+        layer = min(layer, widest_smooth_layer(template, probe, radius, film.radius))
+        settings = replace(settings, resolution=resolution, layer=layer)
+        checks = check_presses(domain, CHECK_COUNT)
+        check_charges: list[Array] = []
         error = np.inf
-        for count in NODE_COUNTS:
-            family = Family.spread(domain, (count.distances, count.forces), probe.period, count.min_orientations)
+        remaining_counts = list(NODE_COUNTS)
+        while remaining_counts:
+            count = remaining_counts.pop(0)
+            node_count = (count.distances, count.forces)
+            family = Family.spread(domain, film.radius, node_count, probe.period, count.min_orientations)
             table = family.unfold(family.solve(sensor, probe, settings, executor), template)
             forward_map = cls(sensor, probe, family, theory, resolution, layer, table, error)
-            error = max(relative_error(forward_map, *press) for press in family.probes_between(CHECK_COUNT))
+            if not check_charges:
+                solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
+                check_charges = list(in_order(executor, solve_directly, checks))
+            error = max(map(forward_map.relative_error, checks, check_charges))
             if error <= INTERPOLATION_ERROR:
                 return replace(forward_map, error=error)
+            if error > SKIP_RATIO * INTERPOLATION_ERROR and len(remaining_counts) > 1:
+                remaining_counts.pop(0)
         raise SolveError(
             f"the forward map of {sensor.name} up to {radius:g} mm and {force_range[1]:g} N interpolates to "
             f"{error:.2g} only, expected {INTERPOLATION_ERROR:g}; ask for a smaller radius or range of forces"
@@ -214,6 +239,20 @@ class ForwardMap:
         contact = self.domain.check(contact, "forward map")
         return differences(lambda moved: self._unchecked_charges(moved, np.zeros(len(moved))), contact)
 
+    def relative_error(self, check: CheckPress, direct: Array) -> float:
+        """Compute the largest error of a charge of one press with respect to a direct solve.
+
+        The error is relative to the charge, or to `CHARGE_FLOOR` times the largest charge of the press if that is
+        larger.
+
+        Args:
+            check: The press.
+            direct: Charges of the direct solve, shape (n_electrode,), pC.
+        """
+        mapped = self.charges(np.array([[*check.position, check.force]]), check.rotation)[0]
+        scale = np.maximum(np.abs(direct), CHARGE_FLOOR * np.abs(direct).max())
+        return float((np.abs(mapped - direct) / scale).max())
+
     def field_charges(self, contact: Array, is_odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
         """Compute the charges of several stress fields that the table contains, under a circular probe.
 
@@ -240,6 +279,54 @@ class ForwardMap:
                 parts.append(self._integrate_fields(at[chunk], contact[chunk, 2], np.zeros(1), is_odd, rules))
         return np.concatenate(parts)
 
+    def stress_charges_by_force(self, position: Array, is_needed: Booleans) -> Array:
+        """Compute the charges that the stress causes, for all forces of the family at once.
+
+        The pressure on the electrodes and the crosstalk are omitted. The probe keeps its orientation.
+
+        Args:
+            position: Positions (x, y) in the domain, shape (n, 2), mm.
+            is_needed: Whether the charge of each electrode is needed, shape (n_electrode,).
+
+        Returns:
+            Shape (n, n_force, n_electrode), pC. Charges that are not needed are zero.
+        """
+        at = position[:, 0] + 1j * position[:, 1]
+        stacked = self._stacked_forces
+        unit_force = stacked.family.force[0]
+        even_fields = np.zeros(self.family.force.size, dtype=bool)
+        chunk_size = max(1, CHUNK_SIZE // even_fields.size)
+        parts = []
+        with single_threaded_blas():
+            for start in range(0, at.size, chunk_size):
+                chunk = at[start : start + chunk_size]
+                rules = tuple((readout, pairs & is_needed) for readout, pairs in self._rules(chunk))
+                force = np.full(chunk.size, unit_force)
+                parts.append(stacked._integrate_fields(chunk, force, np.zeros(1), even_fields, rules))
+        stress_unit = amplitude_squared(self.sensor.film, self.family.force)
+        scale = stress_unit / amplitude_squared(self.sensor.film, unit_force)
+        return np.asarray(np.concatenate(parts).swapaxes(1, 2) * scale[:, None])
+
+    def pressure_charges(self, position: Array) -> Array:
+        """Compute the charges of the pressure on the electrodes per force, without crosstalk.
+
+        Args:
+            position: Positions (x, y), shape (n, 2), mm.
+
+        Returns:
+            Shape (n, n_electrode), pC/N.
+        """
+        return self._pressure_charges(position[:, 0] + 1j * position[:, 1], np.zeros(len(position)))
+
+    @cached_property
+    def _stacked_forces(self) -> "ForwardMap":
+        """Map of a single force, in which the stress fields of all forces are separate fields, in single precision."""
+        force_count = self.family.force.size
+        family = replace(self.family, force=self.family.force[:1])
+        rows = self.table.reshape(self.family.distance.size, force_count, self.family.rotation.size, -1, 3)
+        stacked = np.moveaxis(rows, 1, 3).reshape(family.distance.size * family.rotation.size, -1)
+        return replace(self, family=family, table=stacked.astype(np.float32))
+
     def _unchecked_charges(self, contact: Array, orientation: Array) -> Array:
         """Compute the charges of presses in the domain or a little outside, shape (n, n_electrode), pC."""
         at = contact[:, 0] + 1j * contact[:, 1]
@@ -261,14 +348,27 @@ class ForwardMap:
         Returns:
             Shape (n, n_electrode), pC.
         """
-        near = self._is_near(at)
-        rules = ((self._fine_readout, near), (self._coarse_readout, ~near))
+        rules = self._rules(at)
         charge: Array = self._integrate_fields(at, force, orientation, EVEN_FIELD, rules)[..., 0]
-        if self.sensor.piezo.d33 != 0.0:
-            for i in np.flatnonzero(near.any(axis=1)):
-                probe = self.probe.rotated(float(orientation[i]))
-                charge[i] += contact_charge(self.sensor, probe, (at[i].real, at[i].imag), force[i])
+        charge += force[:, None] * self._pressure_charges(at, orientation)
         return self.sensor.calibration.read(charge)
+
+    def _pressure_charges(self, at: Complexes, orientation: Array) -> Array:
+        """Compute the charges of the pressure on the electrodes per force, without crosstalk.
+
+        Args:
+            at: Positions x + iy, shape (n,), mm.
+            orientation: Further rotation of the probe, shape (n,), rad.
+
+        Returns:
+            Shape (n, n_electrode), pC/N.
+        """
+        charge = np.zeros((at.size, len(self.electrodes)))
+        if self.sensor.piezo.d33 != 0.0:
+            for i in np.flatnonzero(self._is_near(at).any(axis=1)):
+                probe = self.probe.rotated(float(orientation[i]))
+                charge[i] = contact_charge(self.sensor, probe, (at[i].real, at[i].imag), 1.0)
+        return charge
 
     def _integrate_fields(
         self,
@@ -291,12 +391,12 @@ class ForwardMap:
             Shape (n, n_electrode, n_field), pC.
         """
         rotation = orientation - np.angle(at)
-        field = self.family.weights(np.abs(at), force, rotation) @ self.table
+        field = self.family.weights(np.abs(at), force, rotation).astype(self.table.dtype) @ self.table
         mesh = template_for(self.probe, self.resolution)
         placement = Placement.of(mesh, self.probe, np.abs(at), self.sensor.film.radius, self.layer, rotation)
         presses = _PressChunk(mesh, placement, field, np.angle(at), rotation + self.probe.angle)
         _, first_pairs = rules[0]
-        charge = np.empty((*first_pairs.shape, is_odd.size))
+        charge = np.zeros((*first_pairs.shape, is_odd.size))
         for readout, uses_rule in rules:
             for count in np.unique(readout.count):
                 press_index, electrode = np.nonzero(uses_rule & (readout.count == count))
@@ -315,6 +415,19 @@ class ForwardMap:
     def _coarse_readout(self) -> ReadoutPoints:
         """Integration rule for electrodes away from the probe."""
         return ReadoutPoints.of(self.sensor, COARSE)
+
+    @cached_property
+    def _far_readout(self) -> ReadoutPoints:
+        """Integration rule for electrodes far from the probe."""
+        return ReadoutPoints.of(self.sensor, FAR)
+
+    def _rules(self, at: Complexes) -> tuple[tuple[ReadoutPoints, Booleans], ...]:
+        """Return the integration rules for presses at positions x + iy (mm), each with the pairs of press and electrode
+        that use it, shape (n, n_electrode)."""
+        near = self._is_near(at)
+        parts = [(np.abs(at[:, None] - centre) / radius).min(axis=1) for centre, radius in self.sensor.part_circles]
+        far = ~near & (np.stack(parts, axis=1) > FAR_DISTANCE)
+        return (self._fine_readout, near), (self._coarse_readout, ~near & ~far), (self._far_readout, far)
 
     def _is_near(self, at: Complexes) -> Booleans:
         """Return whether each electrode is so near to each press that it needs the fine rule, shape (n,
@@ -360,7 +473,7 @@ class _PressChunk:
         element, xi, eta = locate_points(self.placement[press_index], mesh, position)
         frame_angle = direction if mesh.half else direction + self.probe_angle[press_index]
 
-        values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel())
+        values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel()).astype(self.field.dtype)
         width = 3 * is_odd.size
         nodal = self.field.reshape(len(self.field), mesh.n_element, -1, width)[press_index[:, None], element]
         stress = np.matmul(values[:, None, :], nodal.reshape(*values.shape, width)).reshape(*position.shape, width)
@@ -375,24 +488,8 @@ class _PressChunk:
         return charge
 
 
-def relative_error(
-    forward_map: ForwardMap, distance: float, angle: float, force: float, rotation: float = 0.0
-) -> float:
-    """Compute the largest error of a charge of one press with respect to a direct solve.
-
-    The error is relative to the charge, or to `CHARGE_FLOOR` times the largest charge of the press if that is larger.
-
-    Args:
-        forward_map: The map.
-        distance: Distance of the press from the centre, mm.
-        angle: Direction of the press from the centre, rad.
-        force: Force, N.
-        rotation: Further rotation of the probe, rad.
-    """
-    sensor = forward_map.sensor
-    at = (distance * float(np.cos(angle)), distance * float(np.sin(angle)))
-    probe = forward_map.probe.rotated(rotation)
-    direct = touch_charge(sensor, press(sensor.film, probe, at, force, forward_map.settings))
-    mapped = forward_map.charges(np.array([[*at, force]]), rotation)[0]
-    scale = np.maximum(np.abs(direct), CHARGE_FLOOR * np.abs(direct).max())
-    return float((np.abs(mapped - direct) / scale).max())
+def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check: CheckPress) -> Array:
+    """Compute the charges of one press by a direct solve, shape (n_electrode,), pC."""
+    at = check.position
+    rotated = probe.rotated(check.rotation)
+    return touch_charge(sensor, press(sensor.film, rotated, at, check.force, settings))

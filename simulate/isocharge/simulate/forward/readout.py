@@ -36,12 +36,19 @@ FINE = 12
 COARSE = 4
 """Number of Gauss points per side of an electrode away from the probe, for many presses."""
 
+FAR = 2
+"""Number of Gauss points per side of an electrode far from the probe, for many presses."""
+
 LINE_POINTS = 8
 """Number of Gauss points on a line."""
 
 NEAR = 1.0
 """Distance between the footprint and an electrode below which the fine rule is used, mm. At larger distances the
 relative error of the coarse rule is at most 1e-4 for squares of 1 to 6 mm."""
+
+FAR_DISTANCE = 8.0
+"""Distance between the press and the parts of an electrode above which `FAR` points are used, in radii of the parts,
+dimensionless. The relative error of this rule is about 2e-5."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 All lengths are in film radii. Angles are in radians.
 """
 
+from typing import Any
+
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
@@ -41,6 +43,21 @@ def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
     outer = np.arctanh(centre + radius)
     inner = np.arctanh(centre - radius)
     return np.tanh(0.5 * (outer + inner)), np.tanh(0.5 * (outer - inner))
+
+
+def distance_coordinate(distance: Array | float) -> Any:
+    """Return the coordinate in which fields are interpolated by polynomials between presses at different distances.
+
+    Near the clamp, the fields change over the distance from the press to the clamp, which this coordinate stretches.
+    The disk automorphism of `placement` is a translation along this coordinate.
+
+    Args:
+        distance: Distances from the centre of the film, in film radii.
+
+    Returns:
+        The inverse hyperbolic tangent, of the shape and type of `distance`.
+    """
+    return np.arctanh(distance)
 
 
 def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]:
@@ -211,9 +228,27 @@ def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
         return np.broadcast_to(even_edges, (*rho.shape, even_edges.size))
 
     # A step of ln |z| in the template plane is a step of the depth times ln(rho).
-    max_thin_depth = 1.0 / (resolution.rings + 1)
-    thin_depth = np.minimum(-layer / np.log(rho), max_thin_depth)[..., None]
+    thin_depth = np.minimum(-layer / np.log(rho), _max_thin_depth(resolution))[..., None]
     edges_of_even_rings = even_edges * (1.0 - thin_depth)
     edges_of_thin_rings = 1.0 - thin_depth * 3.0 ** -np.arange(1.0, resolution.rim + 1)
     edges_of_thin_rings[..., -1] = 1.0
     return np.concatenate([edges_of_even_rings, edges_of_thin_rings], axis=-1)
+
+
+def widest_layer(resolution: Resolution, c: Array, rho: Array) -> Array:
+    """Return the width of the thin rings above which `ring_edges` limits their depth, in film radii.
+
+    Args:
+        resolution: Fineness of the mesh.
+        c: Parameter of the conformal map, shape (...).
+        rho: Radius of the innermost circle in the template plane, shape (...).
+
+    Returns:
+        Shape (...).
+    """
+    return np.asarray(-np.log(rho) * _max_thin_depth(resolution) * (1.0 - c) / (1.0 + c))
+
+
+def _max_thin_depth(resolution: Resolution) -> float:
+    """Return the largest depth of all thin rings together, which is that of one even ring if they had equal depths."""
+    return 1.0 / (resolution.rings + 1)

@@ -29,8 +29,12 @@ from isocharge.simulate.mesh.conformal_map import (
     rim_angles,
     ring_edges,
     sector_angles,
+    widest_layer,
 )
 from isocharge.simulate.sensor.probe import Probe
+
+CHECKED_ORIENTATIONS = 12
+"""Number of orientations of a probe for which the width of the thin rings is checked."""
 
 
 @dataclass(frozen=True)
@@ -215,3 +219,21 @@ class Placement:
 def _unit_coordinates(blocks: Blocks) -> tuple[Array, Array]:
     """Return the radial and angular coordinates from 0 to 1 of the nodes of an element, each of shape (n_local,)."""
     return 0.5 * (blocks.xi + 1.0), 0.5 * (blocks.eta + 1.0)
+
+
+def widest_smooth_layer(mesh: Blocks, probe: Probe, distance: float, film_radius: float) -> float:
+    """Return the largest width of the thin rings, in film radii, with which the mesh is a smooth function of the
+    position up to a distance.
+
+    `ring_edges` limits the depth of wider rings near the rim. The nodes of such a mesh would move with a kink, which
+    polynomials in the distance do not interpolate.
+
+    Args:
+        mesh: Template of the mesh.
+        probe: The probe.
+        distance: Largest distance of a press from the centre, mm.
+        film_radius: Radius of the film, mm.
+    """
+    rotation = 2.0 * np.pi * np.arange(CHECKED_ORIENTATIONS) / CHECKED_ORIENTATIONS
+    placement = Placement.of(mesh, probe, np.full(CHECKED_ORIENTATIONS, distance), film_radius, 0.0, rotation)
+    return float(widest_layer(mesh.resolution, placement.c, placement.rho).min())
