@@ -2,8 +2,10 @@
 
 The charges are divided by the squared amplitude of `mechanics.scaling`, which removes most of their dependence on the
 force. For each of a few forces, the scaled charges are approximated by a cubic spline in (x, y), which is fitted by
-least squares to presses on the disk. Between the forces, Lagrange polynomials in ln F interpolate. A forward map
-interpolates its fields in the same way, so the interpolation in the force adds no error.
+least squares to presses on the disk. A charge changes over the length of the probe only if the press is near the
+electrode. Around each electrode, a second spline with finer knots therefore corrects the charge of this electrode.
+Between the forces, Lagrange polynomials in ln F interpolate. A forward map interpolates its fields in the same way, so
+the interpolation in the force adds no error.
 """
 
 from dataclasses import dataclass, replace
@@ -13,25 +15,33 @@ import scipy  # scipy.interpolate is imported when it is used
 from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.forward.charge_map import ChargeMap, Domain, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.scaling import amplitude_squared
 from isocharge.simulate.numerics.disk import lattice, onto_disk, sunflower
 from isocharge.simulate.numerics.interpolation import barycentric_weights, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.sensor import Calibration
+
+COARSE_SPACING = 0.6
+"""Largest distance between the knots of the spline over the disk, mm."""
+
+PATCH_MARGIN = 3.0
+"""Distance by which the fine spline of an electrode extends beyond the presses that touch the electrode, mm."""
 
 MAX_KNOT_SPACING = 0.3
-"""Largest distance between the knots, mm."""
+"""Largest distance between the knots near an electrode, mm."""
 
 KNOT_SPACING_SHARE = 1.0 / 6.0
-"""Largest distance between the knots, over the reach of the probe, which is the length scale of the charges."""
+"""Largest distance between the knots near an electrode, over the reach of the probe, which is the length scale of the
+charges there."""
 
 MIN_CELLS = 8
 """Smallest number of cells of the spline across the disk."""
 
 MAX_CELLS = 400
-"""Largest number of cells of the spline across the disk."""
+"""Largest number of cells of a spline along x or y."""
 
 PRESSES_PER_CELL = 1.6
 """Number of fitted presses per cell of the disk."""
@@ -60,23 +70,51 @@ LOG_FORCE_STEP = 1e-4
 
 
 @dataclass(frozen=True)
+class Patch:
+    """Correction of the charge of one electrode for presses in a rectangle around it.
+
+    The correction and its slopes are zero on the edges of the rectangle.
+
+    Attributes:
+        electrode: Number of the electrode.
+        low: Corner of the rectangle with the smallest coordinates, shape (2,), mm.
+        high: Corner of the rectangle with the largest coordinates, shape (2,), mm.
+        table: Spline of the correction in x and y, whose values have the shape (n_force,), pC.
+    """
+
+    electrode: int
+    low: Array
+    high: Array
+    table: "scipy.interpolate.NdBSpline"
+
+    def contains(self, position: Array) -> Booleans:
+        """Return whether positions, shape (n, 2), mm, lie in the rectangle."""
+        return np.asarray(((position > self.low) & (position < self.high)).all(axis=1))
+
+
+@dataclass(frozen=True)
 class ChargeSpline:
     """Touch charges as a function of (x, y, F), for one probe in one orientation.
 
     Attributes:
         electrodes: Names of the electrodes, in the order of the charges.
         film: Film whose amplitude scales the charges.
+        calibration: Calibration that adds the crosstalk to the charges.
         domain: Presses that the splines cover.
         force: Forces of the splines, shape (n_force,), N.
-        table: Spline of the scaled charges in x and y, whose values have the shape (n_force, n_electrode).
+        table: Spline of the scaled charges without crosstalk in x and y, whose values have the shape (n_force,
+            n_electrode).
+        patches: Corrections of the scaled charges near the electrodes.
         error: Largest error with respect to the forward map, relative to the largest charge of a press.
     """
 
     electrodes: tuple[str, ...]
     film: Film
+    calibration: Calibration
     domain: Domain
     force: Array
     table: "scipy.interpolate.NdBSpline"
+    patches: tuple[Patch, ...]
     error: float
 
     @classmethod
@@ -86,8 +124,8 @@ class ChargeSpline:
         Args:
             forward_map: The forward map. The probe keeps the orientation with which the map was built.
             radius: Largest distance from the centre, mm; None for that of the map.
-            spacing: Distance between the knots, mm; None for a sixth of the reach of the probe, and at most
-                `MAX_KNOT_SPACING`.
+            spacing: Distance between the knots near the electrodes, mm; None for a sixth of the reach of the probe,
+                and at most `MAX_KNOT_SPACING`.
 
         Raises:
             SceneError: If the radius is not positive or larger than that of the map.
@@ -96,16 +134,23 @@ class ChargeSpline:
         domain = map_domain if radius is None else map_domain.within(radius)
         check_radius(domain.radius, map_domain.radius, "forward map")
         spacing = spacing or min(MAX_KNOT_SPACING, KNOT_SPACING_SHARE * forward_map.probe.reach)
-        film = forward_map.sensor.film
-        force = _force_nodes(forward_map)
-        cells = int(np.clip(np.ceil(2.0 * domain.radius / spacing), MIN_CELLS, MAX_CELLS))
-        at = domain.radius * _samples(cells)
-        columns = []
-        for newtons in force.tolist():
-            contact = np.column_stack([at, np.full(len(at), newtons)])
-            columns.append(forward_map.charges(contact) / amplitude_squared(film, newtons))
-        table = _least_squares(at, np.stack(columns, axis=1), domain.radius, cells)
-        spline = cls(forward_map.electrodes, film, domain, force, table, np.nan)
+        sensor = forward_map.sensor
+        samples = _ScaledCharges(forward_map, _force_nodes(forward_map))
+        coarse = _fit_disk(samples, domain.radius, max(spacing, COARSE_SPACING))
+        patches: list[Patch] = []
+        if spacing < COARSE_SPACING:
+            for electrode in range(len(sensor.electrodes)):
+                patches += _fit_patch(samples, electrode, domain.radius, spacing, coarse)
+        spline = cls(
+            electrodes=forward_map.electrodes,
+            film=sensor.film,
+            calibration=sensor.calibration,
+            domain=domain,
+            force=samples.force,
+            table=coarse,
+            patches=tuple(patches),
+            error=np.nan,
+        )
         return replace(spline, error=_largest_error(spline, forward_map))
 
     def charges(self, contact: Array) -> Array:
@@ -191,7 +236,11 @@ class ChargeSpline:
         Returns:
             Shape (n, n_force, n_electrode), pC.
         """
-        return np.asarray(self.table(position))
+        scaled = np.asarray(self.table(position))
+        for patch in self.patches:
+            inside = patch.contains(position)
+            scaled[inside, :, patch.electrode] += patch.table(position[inside])
+        return self.calibration.read(scaled)
 
     def scaled_gradients(self, position: Array) -> Array:
         """Compute the derivatives of `scaled_charges` with respect to x and y.
@@ -202,7 +251,14 @@ class ChargeSpline:
         Returns:
             Shape (n, n_force, n_electrode, 2), pC/mm.
         """
-        return np.stack([self.table(position, nu=order) for order in ((1, 0), (0, 1))], axis=-1)
+        gradients = []
+        for order in ((1, 0), (0, 1)):
+            slope = np.asarray(self.table(position, nu=order))
+            for patch in self.patches:
+                inside = patch.contains(position)
+                slope[inside, :, patch.electrode] += patch.table(position[inside], nu=order)
+            gradients.append(self.calibration.read(slope))
+        return np.stack(gradients, axis=-1)
 
 
 def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
@@ -229,26 +285,131 @@ def _samples(cells: int) -> Array:
     return np.stack([at.real, at.imag], axis=1)
 
 
-def _least_squares(at: Array, values: Array, radius: float, cells: int) -> "scipy.interpolate.NdBSpline":
+@dataclass(frozen=True)
+class _ScaledCharges:
+    """Scaled charges of a forward map without crosstalk, to which splines are fitted.
+
+    Attributes:
+        forward_map: The forward map.
+        force: Forces of the splines, shape (n_force,), N.
+    """
+
+    forward_map: ForwardMap
+    force: Array
+
+    def at(self, position: Array, is_needed: Booleans) -> Array:
+        """Compute the scaled charges of presses.
+
+        Args:
+            position: Positions (x, y), shape (n, 2), mm.
+            is_needed: Whether the charge of each electrode is needed, shape (n_electrode,).
+
+        Returns:
+            Shape (n, n_force, n_electrode), pC.
+        """
+        forward_map = self.forward_map
+        film = forward_map.sensor.film
+        solved_force = forward_map.family.force
+        scaled = forward_map.stress_charges_by_force(position, is_needed)
+        scaled /= amplitude_squared(film, solved_force)[:, None]
+        if forward_map.sensor.piezo.d33 == 0.0:
+            return scaled
+
+        nodes = np.log(solved_force)
+        to_force = lagrange_values(nodes, barycentric_weights(nodes), np.log(self.force))
+        pressure_charge = forward_map.pressure_charges(position)
+        per_force = self.force / amplitude_squared(film, self.force)
+        return np.asarray(to_force @ scaled + pressure_charge[:, None] * per_force[:, None])
+
+
+def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.interpolate.NdBSpline":
+    """Fit splines of all charges over the disk.
+
+    Args:
+        samples: Scaled charges.
+        radius: Radius of the disk, mm.
+        spacing: Largest distance between the knots, mm.
+    """
+    cells = int(np.clip(np.ceil(2.0 * radius / spacing), MIN_CELLS, MAX_CELLS))
+    knots = _knots(-radius, radius, cells)
+    at = radius * _samples(cells)
+    every_electrode = np.ones(len(samples.forward_map.electrodes), dtype=bool)
+    return _least_squares(at, samples.at(at, every_electrode), (knots, knots), fixed=0)
+
+
+def _fit_patch(
+    samples: _ScaledCharges, electrode: int, radius: float, spacing: float, coarse: "scipy.interpolate.NdBSpline"
+) -> list[Patch]:
+    """Fit the correction near one electrode. The result is empty if no press of the disk is near the electrode.
+
+    Args:
+        samples: Scaled charges.
+        electrode: Number of the electrode.
+        radius: Radius of the disk, mm.
+        spacing: Largest distance between the knots, mm.
+        coarse: Splines of all charges over the disk.
+    """
+    sensor = samples.forward_map.sensor
+    corners = np.concatenate([sensor.calibration.place(part) for part in sensor.electrodes[electrode].parts])
+    margin = samples.forward_map.probe.reach + PATCH_MARGIN
+    low = corners.min(axis=0) - margin
+    high = corners.max(axis=0) + margin
+    cells = np.clip(np.ceil((high - low) / spacing), MIN_CELLS, MAX_CELLS).astype(int)
+    knots = (_knots(low[0], high[0], cells[0]), _knots(low[1], high[1], cells[1]))
+
+    counts = np.ceil(np.sqrt(PRESSES_PER_CELL) * cells).astype(int)
+    x, y = np.meshgrid(*(np.linspace(*ends) for ends in zip(low, high, counts, strict=True)))
+    grid = np.stack([x.ravel(), y.ravel()], axis=1)
+    edge_count = int(PRESSES_PER_EDGE_CELL * 2.0 * np.pi * radius / spacing)
+    edge_angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
+    edge = radius * (1.0 - 1e-12) * np.stack([np.cos(edge_angle), np.sin(edge_angle)], axis=1)
+    edge = edge[((edge > low) & (edge < high)).all(axis=1)]
+    at = np.concatenate([grid[np.hypot(*grid.T) < radius], edge])
+    if not len(at):
+        return []
+
+    is_needed = np.arange(len(sensor.electrodes)) == electrode
+    residual = (samples.at(at, is_needed) - coarse(at))[:, :, electrode]
+    table = _least_squares(at, residual, knots, fixed=2)
+    return [Patch(electrode, low, high, table)]
+
+
+def _knots(low: float, high: float, cells: int) -> Array:
+    """Return the knots of a cubic spline on an interval, shape (cells + 7,)."""
+    return np.concatenate([[low] * 3, np.linspace(low, high, cells + 1), [high] * 3])
+
+
+def _least_squares(at: Array, values: Array, knots: tuple[Array, Array], fixed: int) -> "scipy.interpolate.NdBSpline":
     """Fit a cubic spline by least squares with a penalty on the third differences of its coefficients.
 
     Args:
         at: Positions (x, y), shape (n, 2), mm.
         values: Values at the positions, shape (n, ...).
-        radius: Radius of the disk, mm.
-        cells: Number of cells across the disk.
+        knots: Knots along x and along y.
+        fixed: Number of coefficients at each end of each axis that are zero. With two such coefficients, the spline
+            and its slopes are zero on the edges.
     """
-    knots = np.concatenate([[-radius] * 3, np.linspace(-radius, radius, cells + 1), [radius] * 3])
-    count = knots.size - 4
-    entries = scipy.interpolate.NdBSpline.design_matrix(at, (knots, knots), 3)  # has too few columns
-    design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(at), count**2))
-    third_difference = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
-    smooth = SMOOTHING * vstack([kron(third_difference, eye_array(count)), kron(eye_array(count), third_difference)])
+    counts = tuple(each.size - 4 for each in knots)
+    entries = scipy.interpolate.NdBSpline.design_matrix(at, knots, 3)  # has too few columns
+    design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(at), counts[0] * counts[1]))
+    third_differences = [
+        diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count)) for count in counts
+    ]
+    along_x = kron(third_differences[0], eye_array(counts[1]))
+    along_y = kron(eye_array(counts[0]), third_differences[1])
+    smooth = SMOOTHING * vstack([along_x, along_y])
+
+    is_free = np.zeros(counts, dtype=bool)
+    is_free[fixed : counts[0] - fixed, fixed : counts[1] - fixed] = True
+    free = np.flatnonzero(is_free)
+    design = design[:, free]
+    smooth = smooth.tocsc()[:, free]
     normal = (design.T @ design + smooth.T @ smooth).tocsc()
     right = np.ascontiguousarray(design.T @ values.reshape(len(at), -1))
     factors = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    coefficients = factors.solve(right)  # the matrix is positive definite and needs no pivoting
-    return scipy.interpolate.NdBSpline((knots, knots), coefficients.reshape(count, count, *values.shape[1:]), 3)
+    coefficients = np.zeros((is_free.size, right.shape[1]))
+    coefficients[free] = factors.solve(right)  # the matrix is positive definite and needs no pivoting
+    return scipy.interpolate.NdBSpline(knots, coefficients.reshape(*counts, *values.shape[1:]), 3)
 
 
 def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:
