@@ -12,7 +12,7 @@ from isocharge.simulate.layout import design as design_module
 from isocharge.simulate.layout import search as search_module
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, WeightMap
 from isocharge.simulate.layout.charge_table import ChargeTable
-from isocharge.simulate.layout.design import UNAMBIGUOUS, ambiguities, design
+from isocharge.simulate.layout.design import NOT_SEARCHED, UNAMBIGUOUS, ambiguities, design
 from isocharge.simulate.layout.search import Search, random_layouts
 from kept import kept
 
@@ -34,7 +34,7 @@ def _rough(tables, sensor):
         ):
             patch.setattr(module, name, value)
         patch.setattr(ChargeTable, "solve", staticmethod(lambda sensor, *_: tables[sensor.name]))
-        patch.setattr(ForwardMap, "build", lambda new, *domain: replace(kept(build, sensor, *domain), sensor=new))
+        patch.setattr(ForwardMap, "build", lambda new, *domain, **_: replace(kept(build, sensor, *domain), sensor=new))
         yield
 
 
@@ -100,22 +100,39 @@ def test_ambiguous_layout_is_rejected_for_the_next_one(sensor, monkeypatch):
     assert best.value < second.value
 
 
-def test_ambiguities_reports_folds_pairs_and_charges_that_cannot_be_interpolated(sensor, monkeypatch):
-    """The charges of the first map fold at x = 3 mm. The second map cannot be interpolated."""
+def test_ambiguities_reports_folds_and_pairs(sensor, monkeypatch):
+    """The charges of the map fold at x = 3 mm."""
 
     def charges(contact):
         x, y, force = contact.T
         shapes = np.stack([4.0 + (x - x**2 / 6.0) / 3.0, 4.0 + 0.3 * y, np.full(len(x), 3.0)], axis=1)
         return 300.0 * force[:, None] ** (2.0 / 3.0) * shapes
 
-    monkeypatch.setattr(ForwardMap, "build", lambda *_: FunctionMap(charges, ("A", "B", "C"), Domain(4.0, (0.05, 2.0))))
-    monkeypatch.setattr(ChargeSpline, "of", lambda charge_map: charge_map)
     monkeypatch.setattr(design_module, "find_ambiguous_pairs", lambda *_: [1, 2])
     text = "the map folds 3.0 mm from the centre; 6 pairs of contacts have the same charges"
-    assert ambiguities(case_of(sensor), sensor) == text
+    charge_map = FunctionMap(charges, ("A", "B", "C"), Domain(4.0, (0.05, 2.0)))
+    assert ambiguities(case_of(sensor), charge_map) == text
 
-    def refuse(*_):
+
+def test_design_reports_that_charges_cannot_be_interpolated(sensor, monkeypatch):
+    def refuse(*_, **__):
         raise SolveError("rough")
 
     monkeypatch.setattr(ForwardMap, "build", refuse)
-    assert "could not be looked for" in ambiguities(case_of(sensor), sensor)
+    monkeypatch.setattr(Search, "refine", lambda _, places: np.append(places[0, 0], places))
+    found = design(case_of(sensor))
+    assert (found.summary, found.unambiguous) == (NOT_SEARCHED, False)
+
+
+def test_derivatives_of_the_log_errors_equal_central_differences(sensor, tables):
+    """Each column of the Jacobian integrates only the square that moves."""
+    for goal in ("worst", "rms"):
+        search = Search(case_of(sensor, goal=goal), tables["four-25um-biaxial"])
+        positions = np.array([[9.0, 1.0], [-5.0, 8.0], [-4.0, -7.0]])
+        which = np.arange(0, 60, 7) if goal == "worst" else slice(None)
+        jacobian = search._log_error_jacobian(positions, which)
+        for number in range(6):
+            step = np.zeros(6)
+            step[number] = 2e-3
+            above, below = (search._log_errors(positions + sign * step.reshape(3, 2), which) for sign in (1.0, -1.0))
+            assert jacobian[:, number] == pytest.approx((above - below) / 4e-3, rel=0.05, abs=2e-3)

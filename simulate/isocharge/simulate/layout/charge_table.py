@@ -4,10 +4,10 @@ The parameters are the contact and the nuisances. The equilibrium of a round fil
 distance of the press from the centre, not on the electrodes. In the coordinates of the conformal map that carries the
 circle of the probe onto |z| = rho (`mesh.placement`), its stress is smooth except for a kink on that circle.
 
-The equilibrium is solved at Chebyshev nodes in the distance. The stress and its finite differences with respect to the
-parameters are sampled on a grid that is uniform in |z| within the circle, in ln|z| from the circle to the rim, and in
-arg z. The table interpolates with polynomials in the distance and with local cubics on the grid. An electrode collects
-the mean over its area.
+The equilibrium is solved at Chebyshev nodes in `distance_coordinate`. The stress and its finite differences with
+respect to the parameters are sampled on a grid. The grid is uniform in |z| within the circle, in ln|z| from the circle
+to the rim, and in arg z. The table interpolates with polynomials in the distance coordinate and with local cubics on
+the grid. An electrode collects the mean over its area.
 """
 
 from concurrent.futures import Executor
@@ -21,7 +21,7 @@ from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.readout import electrode_rule
 from isocharge.simulate.mechanics.theory import theory_for
-from isocharge.simulate.mesh.conformal_map import automorphism_onto
+from isocharge.simulate.mesh.conformal_map import automorphism_onto, distance_coordinate
 from isocharge.simulate.numerics.interpolation import (
     barycentric_weights,
     chebyshev_nodes,
@@ -116,7 +116,8 @@ class ChargeTable:
         settings = SolveSettings(theory=theory_for(sensor, probe, (force, force)), layer=layer_for(film, force))
         settings = replace(settings, resolution=needed_resolution(film, probe, (radius, 0.0), force, settings))
         is_wide = radius > 0.25 * film.radius
-        distance = chebyshev_nodes(DISTANCES[int(is_wide)], 0.0, radius)
+        largest_coordinate = float(distance_coordinate(radius / film.radius))
+        distance = film.radius * np.tanh(chebyshev_nodes(DISTANCES[int(is_wide)], 0.0, largest_coordinate))
         solve = partial(_stress_at, film, sensor.surface, probe, force, settings)
         solved = list(track(in_order(executor, solve, distance.tolist()), "solving the film", len(distance)))
         stress = np.stack(solved).transpose(0, 3, 2, 1).reshape(3 * len(distance), -1).astype(np.float32)
@@ -188,7 +189,9 @@ class _PressedFilm:
         coefficients = np.stack([s11_coefficient, s22_coefficient, s12_coefficient], axis=1)
 
         # Interpolation over the distance and sum over the components of the stress in one matrix product
-        distance_weights = lagrange_values(table.distance, barycentric_weights(table.distance), distance)
+        nodes = distance_coordinate(table.distance / table.film_radius)
+        coordinate = distance_coordinate(distance / table.film_radius)
+        distance_weights = lagrange_values(nodes, barycentric_weights(nodes), coordinate)
         weights = distance_weights[:, :, None] * coefficients[:, None, :]  # shape (n, n_distance, 3)
         weights = weights.reshape(len(position), -1).astype(np.float32)
         density = (weights @ table.stress).reshape(-1, len(COLUMNS))

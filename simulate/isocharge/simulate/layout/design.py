@@ -1,7 +1,7 @@
 """Design of a layout: table of charges, search, refinement, and rejection of ambiguous layouts."""
 
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import SolveError
 from isocharge.common.progress import track
 from isocharge.simulate.execution.workers import in_order
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.ambiguous_pairs import find_ambiguous_pairs
@@ -27,6 +28,9 @@ DECIMALS = 3
 
 UNAMBIGUOUS = "no folds, no ambiguous pairs"
 """Summary of a layout without folds and ambiguous pairs."""
+
+NOT_SEARCHED = "folds and ambiguous pairs could not be looked for: the charges vary too quickly"
+"""Summary of a layout whose charges cannot be interpolated."""
 
 
 @dataclass(frozen=True)
@@ -124,11 +128,14 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     refined_layouts.sort(key=lambda layout: layout[0])
 
     # Check the layouts in the order of their errors, up to the first one that is not ambiguous.
+    forward_map = _solve_forward_map(case, executor)
     candidates: list[tuple[Sensor, float, str]] = []
     for error, *coordinates in track(refined_layouts, "looking for folds and ambiguous pairs"):
         centres = np.round(np.array(coordinates).reshape(-1, 2), DECIMALS)
         sensor = case.layout(centres)
-        summary = ambiguities(case, sensor)
+        summary = NOT_SEARCHED
+        if forward_map is not None:
+            summary = ambiguities(case, ChargeSpline.of(replace(forward_map, sensor=sensor)))
         candidates.append((sensor, float(error), summary))
         if summary == UNAMBIGUOUS:
             break
@@ -139,23 +146,38 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     return Design(case, sensor, error, summary, n_refused, errors_before, errors_after)
 
 
-def ambiguities(case: DesignCase, sensor: Sensor) -> str:
-    """Search folds and ambiguous pairs of a layout over the default range of forces, and summarise them.
+def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMap | None:
+    """Build the forward map of the film over the default range of forces.
+
+    The stress does not depend on the electrodes, so all layouts use the same map.
 
     Args:
         case: Design case.
-        sensor: Sensor with the layout.
+        executor: Executor that runs the solves; this process if absent.
+
+    Returns:
+        Map with the electrodes of the sensor of the case, or None if it does not reach its accuracy.
+    """
+    low = min(DEFAULT_FORCE_RANGE[0], case.force)
+    high = max(DEFAULT_FORCE_RANGE[1], case.force)
+    try:
+        return ForwardMap.build(case.sensor, case.probe, case.radius, (low, high), executor=executor)
+    except SolveError:
+        return None
+
+
+def ambiguities(case: DesignCase, charges: ChargeMap) -> str:
+    """Search folds and ambiguous pairs of a layout over the range of forces of its charge map, and summarise them.
+
+    Args:
+        case: Design case.
+        charges: Charges of the layout as a function of the contact.
 
     Returns:
         `UNAMBIGUOUS`, or a sentence about the folds and pairs.
     """
-    low = min(DEFAULT_FORCE_RANGE[0], case.force)
-    high = max(DEFAULT_FORCE_RANGE[1], case.force)
+    low, high = charges.domain.force_range
     forces = sorted({low, case.force, high})
-    try:
-        charges = ChargeSpline.of(ForwardMap.build(sensor, case.probe, case.radius, (low, high)))
-    except SolveError:
-        return "folds and ambiguous pairs could not be looked for: the charges vary too quickly"
     rings = Rings.spread(case.radius)
     folds = np.concatenate([find_folds(charges, rings, force, case.noise).points for force in forces])
     pairs = sum(len(find_ambiguous_pairs(charges, case.noise, force)) for force in forces)

@@ -83,7 +83,7 @@ CLEARANCE_TOLERANCE = 1e-3
 """Largest violation of a distance rule that a refined layout may have, mm."""
 
 DIFFERENCE_STEP = 1e-2
-"""Step of the finite differences of the optimiser, mm."""
+"""Step of the finite differences with respect to the coordinates of the squares, mm."""
 
 ALL_PRESSES = slice(None)
 """Selection of all presses of the fine grid."""
@@ -217,10 +217,57 @@ class Search:
             ln of the error of each press if the goal is the worst error, shape (n_press,). For other goals ln of the
             weighted root mean square, shape (1,).
         """
-        squared = self.squared(positions, which)
+        rows = self.table.rows(self.presses[which], positions, self.case.square_side)
+        return self._goal_values(np.concatenate([rows, self.kept_rows[which]], axis=1), which)
+
+    def _goal_values(self, rows: Array, which: Integers | slice) -> Array:
+        """Compute the result of `_log_errors` from the rows of all electrodes, shape (n_press, n_electrode, 6)."""
+        squared = self.model.squared(rows)
         if self.case.goal != "worst":
-            squared = np.average(squared, weights=self.weights, keepdims=True)
+            squared = np.average(squared, weights=self.weights[which], keepdims=True)
         return np.asarray(0.5 * np.log(squared))
+
+    def _log_error_jacobian(self, positions: Array, which: Integers | slice) -> Array:
+        """Compute the derivatives of `_log_errors` with respect to the coordinates by differences.
+
+        The electrodes that do not move keep their rows, so that only one square is integrated for each coordinate.
+
+        Args:
+            positions: Centres of the new squares, shape (n_new, 2), mm.
+            which: Selection of presses.
+
+        Returns:
+            Shape (n_error, 2 n_new), 1/mm.
+        """
+        presses = self.presses[which]
+        side = self.case.square_side
+        kept = self.kept_rows[which]
+        steps = DIFFERENCE_STEP * np.eye(2)
+        moved = (positions[:, None] + steps).reshape(-1, 2)
+        rows = self.table.rows(presses, np.concatenate([positions, moved]), side)
+        base_rows = rows[:, : len(positions)]
+        base = self._goal_values(np.concatenate([base_rows, kept], axis=1), which)
+        columns = []
+        for number in range(2 * len(positions)):
+            changed = base_rows.copy()
+            changed[:, number // 2] = rows[:, len(positions) + number]
+            values = self._goal_values(np.concatenate([changed, kept], axis=1), which)
+            columns.append((values - base) / DIFFERENCE_STEP)
+        return np.stack(columns, axis=1)
+
+    def _clearance_jacobian(self, positions: Array) -> Array:
+        """Compute the derivatives of all distance rules with respect to the coordinates by differences.
+
+        Args:
+            positions: Centres of the new squares, shape (n_new, 2), mm.
+
+        Returns:
+            Shape (n_rule, 2 n_new), dimensionless.
+        """
+        base = self.case.all_clearances(positions)
+        steps = DIFFERENCE_STEP * np.eye(positions.size).reshape(-1, *positions.shape)
+        moved = [self.case.all_clearances(positions + step) for step in steps]
+        return (np.stack(moved, axis=1) - base[:, None]) / DIFFERENCE_STEP
 
     def refine(self, positions: Array) -> Array:
         """Improve a layout by small steps that satisfy the distance rules.
@@ -268,6 +315,15 @@ class Search:
             bound = variables[-1]
             return np.concatenate([bound - self._log_errors(moved, active), self.case.all_clearances(moved)])
 
+        def constraint_jacobian(variables: Array) -> Array:
+            moved = variables[:-1].reshape(-1, 2)
+            log_error_jacobian = self._log_error_jacobian(moved, active)
+            clearance_jacobian = self._clearance_jacobian(moved)
+            by_position = np.concatenate([-log_error_jacobian, clearance_jacobian])
+            by_bound = np.zeros((len(by_position), 1))
+            by_bound[: len(log_error_jacobian)] = 1.0
+            return np.concatenate([by_position, by_bound], axis=1)
+
         start = np.append(positions, self._log_errors(positions, active).max())
         gradient = np.append(np.zeros(positions.size), 1.0)
         bounds = [*((x - max_step, x + max_step) for x in positions.ravel().tolist()), (None, None)]
@@ -277,8 +333,8 @@ class Search:
             jac=lambda _: gradient,
             method="SLSQP",
             bounds=bounds,
-            constraints={"type": "ineq", "fun": constraints},
-            options={"maxiter": MAX_ITERATIONS, "ftol": 1e-4, "eps": DIFFERENCE_STEP},
+            constraints={"type": "ineq", "fun": constraints, "jac": constraint_jacobian},
+            options={"maxiter": MAX_ITERATIONS, "ftol": 1e-4},
         )
         return np.asarray(solution.x[:-1].reshape(-1, 2))
 
