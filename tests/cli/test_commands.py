@@ -16,6 +16,7 @@ import pytest
 from pyarrow.parquet import read_table
 
 from isocharge.cli.demo.full_demo import run_demo
+from isocharge.cli.demo.played_area import played_radius_mm
 from isocharge.cli.shared.terminal import shown_progress
 from isocharge.common.progress import report
 from isocharge.common.toml_text import to_toml
@@ -383,3 +384,15 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     apart = [points.get_ydata(), np.hypot(*(np.array(pressed.get_data()) - felt.get_data()))]
     np.testing.assert_allclose([*map(np.median, apart)], printed_errors[[0, 2]], atol=1e-3)
     assert np.all(np.diff(median.get_xdata()) > 0.0)
+
+
+def test_demo_plays_the_working_area_of_the_released_model_of_the_sensor():
+    """A sensor without a released model is played up to the default radius."""
+    assert played_radius_mm("three-25um-biaxial") == pytest.approx(8.0)
+    assert played_radius_mm("four-25um-biaxial-15mm") == pytest.approx(15.0)
+    assert played_radius_mm("no-such-sensor") == 8.0
+
+
+def test_demo_refuses_an_unknown_sensor(refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refused("demo", "--sensor", "no-such-sensor", said="no-such-sensor", code=2)

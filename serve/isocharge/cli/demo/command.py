@@ -33,6 +33,15 @@ def demo_command(
             help="Duration of the live part, s. (default: 20; with --live until Ctrl-C)",
         ),
     ] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            "--sensor",
+            metavar="NAME",
+            help="Name of a built-in sensor. --live also needs a released model with this name. (default: "
+            "three-25um-biaxial)",
+        ),
+    ] = None,
     config: ConfigOption = None,
     live: LiveOption = None,
     playground: Annotated[
@@ -54,7 +63,7 @@ def demo_command(
     Example: isocharge demo -o first-light
     """
     if playground is not None:
-        if any(option is not None for option in (output, seconds, config, live)):
+        if any(option is not None for option in (output, seconds, sensor, config, live)):
             raise InputError("expected --playground without another option, got another option with it")
         _write_playground(playground)
         return
@@ -62,13 +71,13 @@ def demo_command(
     if live is None:
         with require("train"):
             from isocharge.cli.demo.full_demo import run_demo
-        run_demo(output, seconds, config)
+        run_demo(output, seconds, config, sensor)
         return
     address = page_address(live, None)
     with require("simulate", "http"):
         from isocharge.cli.demo.live_film import show_live_film
 
-        show_live_film(address, seconds)
+        show_live_film(address, seconds, sensor)
 
 
 def _write_playground(path: Path) -> None:

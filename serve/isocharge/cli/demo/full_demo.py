@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from scipy.stats import binned_statistic
 
+from isocharge.cli.demo.played_area import DEFAULT_SENSOR, played_radius_mm
 from isocharge.cli.shared.terminal import say, show, shown_progress, this_command
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.arrays import Array
@@ -31,9 +32,6 @@ from isocharge.simulate.plots.film import (
     draw_section,
 )
 from isocharge.train import fit, load_config, release
-
-SENSOR = "three-25um-biaxial"
-"""Name of the simulated sensor and of the model that is trained."""
 
 SAMPLES = 24_000
 """Number of presses on which the model is trained."""
@@ -81,28 +79,32 @@ class FollowedPress(NamedTuple):
     force_N: float
 
 
-def run_demo(output: Path | None, seconds: float | None, config: Path | None) -> None:
+def run_demo(output: Path | None, seconds: float | None, config: Path | None, sensor_name: str | None = None) -> None:
     """Run the demo, print a table of its results, and write dataset, model and picture into a new folder.
 
     Args:
         output: The folder; None for the first free name of demo-output, demo-output-2, ...
         seconds: Duration of the live part, s; None for `LIVE_S`.
         config: Training settings, TOML; None for those of the released models.
+        sensor_name: Name of the simulated sensor and of the model that is trained; None for `DEFAULT_SENSOR`.
     """
     settings = load_config(config) if config else None
     folder = output or _free_name(Path("demo-output"))
-    sweep = Sweep(samples=SAMPLES, seed=SEED)
+    sensor = load_sensor(sensor_name or DEFAULT_SENSOR)
+    sweep = Sweep(played_radius_mm(sensor.name), samples=SAMPLES, seed=SEED)
     durations_s: dict[str, float] = {}
     with new_folder(folder) as draft:
-        with _step("simulate", f"{SENSOR}, circle of 1 mm, 0.05 to 2 N, within 8 mm", durations_s):
-            (forward_map,) = solve_maps(load_sensor(SENSOR), (Circle(1.0),), sweep)
+        with _step(
+            "simulate", f"{sensor.name}, circle of 1 mm, 0.05 to 2 N, within {sweep.radius:.3g} mm", durations_s
+        ):
+            (forward_map,) = solve_maps(sensor, (Circle(1.0),), sweep)
             dataset = read_dataset(write_sweep(draft / "presses", (forward_map,), sweep))
             say(
                 f"   {len(dataset.samples)} presses interpolated from {forward_map.solves} solves, relative error "
                 f"{forward_map.error:.1e}"
             )
         with _step("train", "a small network on noisy charges, exported to ONNX", durations_s):
-            model = release(fit(dataset, settings), draft / "models" / SENSOR, command=this_command())
+            model = release(fit(dataset, settings), draft / "models" / sensor.name, command=this_command())
             predictor = Predictor(model.folder)
             say(f"   median position error {model.metadata.errors['position_median_mm']:g} mm with noise")
         with _step(
@@ -117,7 +119,7 @@ def run_demo(output: Path | None, seconds: float | None, config: Path | None) ->
             equilibrium = press(forward_map.sensor.film, forward_map.probe, DRAWN_POSITION_MM, DRAWN_FORCE_N)
             draw_page(forward_map, equilibrium, followed, tested, draft / "demo.png")
     say(f"   {folder / 'demo.png'}")
-    show(_summary(tested, followed, durations_s, folder))
+    show(_summary(tested, followed, durations_s, folder / "models" / sensor.name))
 
 
 @contextmanager
@@ -215,17 +217,17 @@ def _position_words(presses: Array) -> str:
     return f"median {median_mm:.3f} mm, 95 % {p95_mm:.3f} mm"
 
 
-def _summary(tested: Array, followed: Array, durations_s: dict[str, float], folder: Path) -> str:
+def _summary(tested: Array, followed: Array, durations_s: dict[str, float], model_folder: Path) -> str:
     """Return the table of results.
 
     Args:
         tested: Test presses, true and estimated (x, y, F), shape (m, 6), mm and N.
         followed: Frames of the live part, columns as in `FollowedPress`, shape (n, 7), mm and N.
         durations_s: Duration of each step, s.
-        folder: Folder of the results.
+        model_folder: Folder of the model in the folder of the results.
     """
     errors = ContactErrorStatistics.of(tested[:, 3:], tested[:, :3])
-    model = load_model(find_model(str(folder / "models" / SENSOR)))
+    model = load_model(find_model(str(model_folder)))
     predictor = Predictor(model.folder)
     charges = press_charges(predictor, model.golden.charge_pC)
     (latency,) = take_turns(in_process_contenders(predictor, charges)[1:2], LATENCY_S)
@@ -237,7 +239,7 @@ def _summary(tested: Array, followed: Array, durations_s: dict[str, float], fold
         ("model", f"{size_KiB:.0f} KiB, {model.metadata.label}"),
         ("one prediction", f"p50 {latency.p50_us:.1f} us, p99 {latency.p99_us:.1f} us"),
         ("seconds", ", ".join(f"{name} {duration:.1f}" for name, duration in durations_s.items())),
-        ("results in", str(folder)),
+        ("results in", str(model_folder.parent.parent)),
     ]
     return "\n" + "\n".join(f"{name:<32} {value}" for name, value in rows)
 

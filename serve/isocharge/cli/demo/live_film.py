@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack, closing
 
+from isocharge.cli.demo.played_area import DEFAULT_SENSOR, played_radius_mm
 from isocharge.cli.shared.live_page import PageFeed, answering, live_page
 from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
@@ -11,9 +12,6 @@ from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.network.address import Address
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 
-SENSOR = "three-25um-biaxial"
-"""Name of the sensor and of its released model."""
-
 RATE_HZ = 200.0
 """Frames per second of the virtual sensor, Hz."""
 
@@ -21,21 +19,27 @@ SEED = 0
 """Seed of the presses."""
 
 
-def show_live_film(address: Address, seconds: float | None) -> None:
+def show_live_film(address: Address, seconds: float | None, sensor_name: str | None = None) -> None:
     """Play a virtual sensor, estimate its contacts, and show both on the live page.
 
     Args:
         address: Address at which the page listens.
         seconds: Time after which to stop, s; None for Ctrl-C.
+        sensor_name: Name of the sensor and of its released model; None for `DEFAULT_SENSOR`.
+
+    Raises:
+        ModelError: If there is no released model with this name.
     """
-    predictor = Predictor(SENSOR)
+    sensor = sensor_name or DEFAULT_SENSOR
+    predictor = Predictor(sensor)
     touch = TouchStream(predictor)
     live = RecordedStream(touch)
     with ExitStack() as stack:
         stack.enter_context(until_stopped())
-        link = stack.enter_context(live_page(address, None, SENSOR, predictor.metadata, find_model(SENSOR)))
+        link = stack.enter_context(live_page(address, None, sensor, predictor.metadata, find_model(sensor)))
         with shown_progress():
-            forward_map = ForwardMap.build(load_sensor(SENSOR), Circle(1.0), force_range=DEFAULT_PLAYED_FORCE_RANGE)
+            radius_mm = played_radius_mm(sensor)
+            forward_map = ForwardMap.build(load_sensor(sensor), Circle(1.0), radius_mm, DEFAULT_PLAYED_FORCE_RANGE)
         board = stack.enter_context(virtual_sensor(forward_map, "reference", SEED, RATE_HZ))
         port = stack.enter_context(Port(board.url))
         stack.enter_context(answering(link, live, ("every", {}, "")))

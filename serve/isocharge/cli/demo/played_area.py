@@ -1,0 +1,29 @@
+"""Sensor and area of the presses that the demo plays."""
+
+import numpy as np
+
+from isocharge.common.defaults import DEFAULT_RADIUS
+from isocharge.common.errors import ModelError
+from isocharge.serve import find_model, load_model
+
+DEFAULT_SENSOR = "three-25um-biaxial"
+"""Name of the sensor of the demo, and of its released model."""
+
+
+def played_radius_mm(sensor: str) -> float:
+    """Return the largest distance of a press from the centre of the film, mm.
+
+    It is the radius of the largest disk in the working area of the released model with the name of the sensor, or
+    `DEFAULT_RADIUS` if there is no such model.
+
+    Args:
+        sensor: Name of the sensor.
+    """
+    try:
+        model = load_model(find_model(sensor))
+    except ModelError:
+        return DEFAULT_RADIUS
+    corners = np.array(model.metadata.working_area_mm)
+    edges = np.roll(corners, -1, axis=0) - corners
+    edge_distance = np.abs(corners[:, 0] * edges[:, 1] - corners[:, 1] * edges[:, 0]) / np.hypot(*edges.T)
+    return round(float(edge_distance.min()), 3)
