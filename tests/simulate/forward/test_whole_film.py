@@ -31,5 +31,5 @@ def test_coarse_map_agrees_with_direct_solves_up_to_the_clamp(pretension):
         np.testing.assert_allclose(coarse.charges(np.array([[*at, force]]))[0], direct, rtol=error)
 
 
-def test_coarse_map_ends_two_probe_radii_before_the_clamp():
-    assert outermost_distance(SENSOR.film, Circle(1.5)) == 42.0
+def test_coarse_map_leaves_a_gap_of_more_than_the_probe_radius_to_the_clamp():
+    assert outermost_distance(SENSOR.film, Circle(1.5)) == pytest.approx(45.0 - 1.5 - 1.8)

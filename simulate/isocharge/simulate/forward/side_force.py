@@ -75,7 +75,7 @@ class SideForceMap:
                 f"side forces: expected a circular probe, got {film.probe.notation}; use `press(..., side_force=...)` "
                 "or `isocharge simulate point --side-force` for other probes"
             )
-        family = Family.spread(film.domain, NODE_COUNTS, period=0.0)
+        family = Family.spread(film.domain, film.sensor.film.radius, NODE_COUNTS, period=0.0)
         theory = replace(film.theory, stretching=True)
         settings = SolveSettings(theory=theory, resolution=film.resolution, layer=film.layer)
         chains = [

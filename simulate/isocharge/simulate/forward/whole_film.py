@@ -13,6 +13,7 @@ from isocharge.simulate.forward.family import ROTATIONS, Family, check_family
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.theory import Theory
 from isocharge.simulate.mesh.blocks import Resolution
+from isocharge.simulate.mesh.placement import widest_smooth_layer
 from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.probe import Probe
@@ -23,8 +24,12 @@ COARSE_ERROR = 0.05
 """Largest relative error of a charge of the coarse map, dimensionless. The error is below 0.5 % up to two thirds of the
 film radius."""
 
-COARSE_RESOLUTION = Resolution(order=4, around=8, rings=6, rim=2)
+COARSE_RESOLUTION = Resolution(order=5, around=8, rings=6, rim=2)
 """Mesh of the solves."""
+
+RIM_GAP = 1.2
+"""Smallest gap between the probe and the clamp, in units of the reach of the probe, dimensionless. The mesh does not
+resolve narrower gaps."""
 
 DISTANCES = 12
 """Number of distances from the centre at which presses are solved."""
@@ -34,17 +39,14 @@ FORCES = 4
 
 
 def outermost_distance(film: Film, probe: Probe) -> float:
-    """Return the largest distance of a press from the centre that the coarse map covers, mm.
-
-    The probe then leaves a gap to the clamp that is as wide as its reach.
-    """
-    return film.radius - 2.0 * probe.reach
+    """Return the largest distance of a press from the centre that the coarse map covers, mm. See `RIM_GAP`."""
+    return film.radius - (1.0 + RIM_GAP) * probe.reach
 
 
 def whole_film_map(
     sensor: Sensor, probe: Probe, force_range: tuple[float, float], *, executor: Executor | None = None
 ) -> ForwardMap:
-    """Solve a coarse forward map of nearly the whole film, which takes about 4 s of CPU time.
+    """Solve a coarse forward map of nearly the whole film, which takes about 5 s of CPU time.
 
     Args:
         sensor: Sensor with an axisymmetric film.
@@ -61,9 +63,10 @@ def whole_film_map(
     check_family(sensor.coated_film, probe, domain)
     theory = Theory(stretching=True, bending=True, pretensioned=film.pretension != 0.0)
     middle_force = float(np.sqrt(force_range[0] * force_range[1]))
-    layer = layer_for(film, middle_force)
+    template = template_for(probe, COARSE_RESOLUTION)
+    layer = min(layer_for(film, middle_force), widest_smooth_layer(template, probe, domain.radius, film.radius))
     settings = SolveSettings(theory=theory, resolution=COARSE_RESOLUTION, layer=layer)
-    family = Family.spread(domain, (DISTANCES, FORCES), probe.period, ROTATIONS)
+    family = Family.spread(domain, film.radius, (DISTANCES, FORCES), probe.period, ROTATIONS)
     solved = family.solve(sensor, probe, settings, executor)
-    table = family.unfold(solved, template_for(probe, COARSE_RESOLUTION))
+    table = family.unfold(solved, template)
     return ForwardMap(sensor, probe, family, theory, COARSE_RESOLUTION, layer, table, COARSE_ERROR)
