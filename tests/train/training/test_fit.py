@@ -15,8 +15,14 @@ from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, T
 from isocharge.train.training import descent
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fit import Split, fit_identity, train_network
-from isocharge.train.training.losses import distillation_loss, warm_up_loss
-from isocharge.train.training.network import LARGEST_INT8, TrainablePerceptron
+from isocharge.train.training.losses import (
+    STD_EXPONENT,
+    distillation_loss,
+    likelihood_loss,
+    warm_up_loss,
+    weighted_likelihood_loss,
+)
+from isocharge.train.training.network import FIRST_LAYER_SLOPES, LARGEST_INT8, TrainablePerceptron
 
 REPORT_EVERY = 20
 
@@ -170,6 +176,46 @@ def test_the_warm_up_loss_is_least_squares_for_the_mean():
     warm_up_loss(mean, log_std, target).backward()
     np.testing.assert_allclose(mean.grad, 60.0 / 20 * (mean - target).detach(), rtol=1e-9)
     np.testing.assert_allclose(log_std.grad, 0.0, atol=1e-12)
+
+
+def test_the_weighted_loss_has_the_gradient_of_the_likelihood_times_weights_of_mean_one():
+    random = torch.Generator().manual_seed(2)
+    mean, log_std, target = torch.randn((3, 40, 3), generator=random, dtype=torch.float64)
+    gradients = []
+    for loss in (likelihood_loss, weighted_likelihood_loss):
+        parameters = [mean.clone().requires_grad_(), log_std.clone().requires_grad_()]
+        loss(*parameters, target).backward()
+        gradients.append([parameter.grad for parameter in parameters])
+    (mean_gradient, std_gradient), (weighted_mean_gradient, weighted_std_gradient) = gradients
+    torch.testing.assert_close(weighted_std_gradient, std_gradient)
+    weight = weighted_mean_gradient / mean_gradient
+    torch.testing.assert_close(weight.mean(dim=0), torch.ones(3, dtype=torch.float64))
+    slope = torch.log(weight[1:] / weight[:1]) / (log_std[1:] - log_std[:1])
+    torch.testing.assert_close(slope, torch.full_like(slope, 2.0 * STD_EXPONENT))
+
+
+def test_the_linear_part_of_linear_targets_leaves_a_small_remainder():
+    torch.manual_seed(0)
+    inputs = torch.randn(500, 3)
+    targets = inputs @ torch.tensor([[1.0, -2.0], [0.5, 0.3], [0.0, 4.0]]) + torch.tensor([0.7, -0.2])
+    perceptron = TrainablePerceptron(3, (8, 8), 4)
+    before = perceptron(inputs).detach()
+    perceptron.fit_linear_part(inputs, targets)
+    after = perceptron(inputs).detach()
+    assert (after[:, :2] - targets).abs().max() < 0.2
+    torch.testing.assert_close(after[:, 2:], before[:, 2:])
+
+
+def test_the_units_of_a_sharpened_layer_bend_among_the_inputs():
+    torch.manual_seed(0)
+    perceptron = TrainablePerceptron(3, (400, 8), 4)
+    perceptron.sharpen_first_layer()
+    first, *_ = perceptron.linear_layers()
+    slope = first.weight.norm(dim=1)
+    distance_of_bend = first.bias.detach() / slope.detach()
+    smallest, largest = FIRST_LAYER_SLOPES
+    assert smallest <= slope.min() < slope.max() <= largest
+    assert distance_of_bend.std().item() == pytest.approx(1.0, abs=0.1)
 
 
 def test_the_loss_of_a_student_is_the_kullback_leibler_divergence_of_gaussians():

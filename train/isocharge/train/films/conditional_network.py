@@ -26,7 +26,7 @@ from isocharge.train.films.film_scaling import FilmScaling
 from isocharge.train.films.films_data import FilmPresses
 from isocharge.train.films.films_model import CONTEXT_LAYERS
 from isocharge.train.training.features import whitening
-from isocharge.train.training.network import TrainableNetwork, as_tensor
+from isocharge.train.training.network import as_tensor
 from isocharge.train.training.torch_evaluation import evaluate, evaluate_features, evaluate_hidden_layers
 
 N_BASES = 6
@@ -98,7 +98,7 @@ class FilmInputs:
         return as_tensor(self.scaling.context(parameters))
 
 
-class ConditionalPerceptron(TrainableNetwork):
+class ConditionalPerceptron(nn.Module):
     """A perceptron with a skip layer whose weights depend on the film. It is evaluated for many films at once.
 
     Args:

@@ -54,6 +54,12 @@ FORCE_MARGINS = (0.8, 1.2)
 LARGEST_GRADIENT = 5.0
 """Norm to which larger gradients are clipped. Films whose map nearly folds have large gradients."""
 
+MUON_RATE_FACTOR = 6.0
+"""Learning rate of Muon, relative to that of Adam. The size of a step of Muon does not depend on the gradient."""
+
+ADAM_BETAS = (0.9, 0.98)
+"""Decay rates of Adam's moving averages of the gradient and of its square."""
+
 MAX_NOISE_FACTOR = 8.0
 """Largest factor on the noise of good presses in the training of the misfit network."""
 
@@ -222,7 +228,24 @@ def _new_perceptron(
 
 def _train(stage: TrainingStage, config: FilmsConfig, run: ResumableRun | None) -> None:
     """Train without early stopping, because the last steps of the schedule have the smallest loss."""
+    stage = replace(stage, optimisers=muon_and_adam)
     Descent(stage, config.learning_rate, stage.steps, config.seed).run(run)
+
+
+def muon_and_adam(stage: TrainingStage) -> list[torch.optim.Optimizer]:
+    """Return Muon (Jordan et al. 2024) for the constant weights between hidden layers, and Adam for all other weights.
+
+    Args:
+        stage: The training of a `ConditionalPerceptron`.
+    """
+    network = stage.network
+    assert isinstance(network, ConditionalPerceptron)
+    hidden_matrices = network.hidden_matrices()
+    hidden_ids = {id(matrix) for matrix in hidden_matrices}
+    other_parameters = [parameter for parameter in network.parameters() if id(parameter) not in hidden_ids]
+    muon = torch.optim.Muon([{"params": hidden_matrices, "rate_factor": MUON_RATE_FACTOR}], weight_decay=0.0)
+    adam = torch.optim.Adam([{"params": other_parameters, "rate_factor": 1.0}], betas=ADAM_BETAS)
+    return [muon, adam]
 
 
 class _Batch(NamedTuple):

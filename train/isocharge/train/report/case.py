@@ -64,7 +64,7 @@ class Settings:
     hold_out: float = 0.1
     learn_from: int = 200_000
     sizes: tuple[tuple[int, ...], ...] = ((16, 16), (32, 32), (64, 64, 64), (128, 128, 128))
-    steps: int = 4_000
+    steps: int = 2_000
     seconds: float = 0.1
     batch: int = 4096
     draws: int = 20

@@ -54,7 +54,7 @@ class TrainingConfig(Settings, frozen=True):
         misfit_steps: Number of optimiser steps of the misfit network.
         misfit_charges: Number of charges from which the misfit network learns.
         batch: Number of samples in a batch.
-        learning_rate: Largest learning rate of Adam; that of Muon is a multiple of it.
+        learning_rate: Largest learning rate of the optimiser SOAP.
         patience: Number of steps without a better validation score after which the training stops. The network then
             gets the best weights.
         hold_out: Fraction of the positions that are used for testing; half as many are used for validation. Of measured
@@ -65,11 +65,11 @@ class TrainingConfig(Settings, frozen=True):
             other programs on the second core.
     """
 
-    steps: Count = 8_000
-    misfit_steps: Count = 6_000
+    steps: Count = 2_000
+    misfit_steps: Count = 4_000
     misfit_charges: Annotated[int, Meta(ge=1_000, le=10_000_000)] = 80_000
-    batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 1024
-    learning_rate: Annotated[float, Meta(gt=0.0, lt=1.0, description="a number between 0 and 1")] = 5e-3
+    batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 512
+    learning_rate: Annotated[float, Meta(gt=0.0, lt=1.0, description="a number between 0 and 1")] = 2e-2
     patience: Count = 3_000
     hold_out: Annotated[float, Meta(gt=0.0, lt=0.6, description="a number between 0 and 0.6")] = 0.1
     noise: Annotated[str | NoiseModel, Meta(description="a text")] = "reference"

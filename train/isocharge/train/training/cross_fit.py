@@ -325,6 +325,7 @@ def _distillation_stage(
         member_outputs = [torch.stack(member.posterior(charge)) for member in members]
     target_mean, target_log_std = torch.stack(member_outputs).mean(dim=0)
     n_train = len(charge) - len(presses) // 2
+    network.contact.fit_linear_part(network.inputs(charge[:n_train]), target_mean[:n_train])
 
     def divergence(rows: Tensor | slice) -> Tensor:
         """Return the divergence of the outputs of the network from the targets, for some rows of the charges."""
@@ -341,7 +342,14 @@ def _distillation_stage(
         validation_loss = divergence(slice(n_train, None)).item()
         return validation_loss, f"{validation_loss:.4f} from the mean of {len(members)} networks"
 
-    return TrainingStage("contact", network.contact, loss, score, max(config.steps // 2, 1))
+    return TrainingStage(
+        "contact",
+        network.contact,
+        loss,
+        score,
+        max(config.steps // 2, 1),
+        slow_parameters=(network.contact.skip.weight,),
+    )
 
 
 def _misfit_examples(

@@ -1,8 +1,7 @@
-"""Training of one network by gradient descent: optimisers, learning rate, early stopping, checkpoints.
+"""Training of one network by gradient descent: learning rate, early stopping, checkpoints.
 
-Weights between hidden layers are trained by Muon (Jordan et al. 2024), all other weights by Adam with a short memory.
-With the same number of steps, this combination halves the error of plain Adam on charges without noise. The learning
-rate rises during the first tenth of the steps and then falls to zero along a cosine.
+The usual optimiser is SOAP (`isocharge.train.training.soap`). The learning rate rises during the first tenth of the
+steps and then falls to zero along a cosine.
 """
 
 import copy
@@ -11,33 +10,43 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from isocharge.common.errors import TrainingError
 from isocharge.common.progress import report
 from isocharge.common.resumable_run import ResumableRun
-from isocharge.train.training.network import TrainableNetwork
-
-MUON_RATE_FACTOR = 6.0
-"""Learning rate of Muon, relative to that of Adam. The size of a step of Muon does not depend on the gradient."""
+from isocharge.train.training.soap import Soap
 
 WARM_UP_FRACTION = 0.1
 """Fraction of the steps during which the learning rate rises, dimensionless."""
 
+SLOW_RATE_FACTOR = 0.1
+"""Learning rate of slow parameters, relative to that of the others."""
+
 INITIAL_RATE = 0.04
 """Learning rate of the first step, relative to the largest rate."""
-
-ADAM_BETAS = (0.9, 0.98)
-"""Decay rates of Adam's moving averages of the gradient and of its square."""
 
 REPORT_EVERY = 200
 """Number of steps between two evaluations on the validation data."""
 
 SAVE_EVERY_S = 3.0
 """Time between two checkpoints, s."""
+
+
+def soap_optimiser(stage: "TrainingStage") -> list[torch.optim.Optimizer]:
+    """Return the optimiser SOAP for the parameters of a stage's network. Rounded weights are not trained."""
+    slow_ids = {id(parameter) for parameter in stage.slow_parameters}
+    trained = [parameter for parameter in stage.network.parameters() if parameter.requires_grad]
+    slow = [parameter for parameter in trained if id(parameter) in slow_ids]
+    fast = [parameter for parameter in trained if id(parameter) not in slow_ids]
+    groups: list[dict[str, Any]] = [
+        {"params": fast, "rate_factor": 1.0},
+        {"params": slow, "rate_factor": SLOW_RATE_FACTOR},
+    ]
+    return [Soap(group for group in groups if group["params"])]
 
 
 @dataclass(frozen=True)
@@ -52,22 +61,20 @@ class TrainingStage:
         steps: Number of steps.
         warm_up_steps: Number of first steps with another loss. Weights of these steps are never the best ones.
         largest_gradient: Norm to which larger gradients are clipped after these steps.
+        slow_parameters: Parameters of the network that have a smaller learning rate in SOAP.
+        optimisers: Function from this stage to the optimisers of its network. The key `rate_factor` of each group of
+            parameters is the learning rate relative to that of the training.
     """
 
     name: str
-    network: TrainableNetwork
+    network: nn.Module
     loss: Callable[[int, torch.Generator], Tensor]
     score: Callable[[], tuple[float, str]]
     steps: int
     warm_up_steps: int = 0
     largest_gradient: float = math.inf
-
-
-class _OptimiserRate(NamedTuple):
-    """An optimiser and its largest learning rate."""
-
-    optimiser: torch.optim.Optimizer
-    largest_rate: float
+    slow_parameters: tuple[Tensor, ...] = ()
+    optimisers: Callable[["TrainingStage"], list[torch.optim.Optimizer]] = soap_optimiser
 
 
 class Descent:
@@ -75,7 +82,7 @@ class Descent:
 
     Args:
         stage: What to train.
-        rate: Largest learning rate of Adam.
+        rate: Largest learning rate.
         patience: Number of steps without a better validation score after which the training stops.
         seed: Seed of the batches and the noise.
 
@@ -89,13 +96,14 @@ class Descent:
 
         Args:
             stage: Network, loss and validation.
-            rate: Largest learning rate of Adam.
+            rate: Largest learning rate.
             patience: Number of steps without a better validation score after which the training ends.
             seed: Seed of the batches and of the noise.
         """
         self.stage = stage
         self.patience = patience
-        self.optimisers = _optimisers(stage.network, rate)
+        self.rate = rate
+        self.optimisers = stage.optimisers(stage)
         self.random = torch.Generator().manual_seed(seed)
         self.step = 0
         self.best = math.inf
@@ -131,16 +139,16 @@ class Descent:
     def _take_step(self) -> Tensor:
         """Change the weights by one step of the optimisers and return the loss before it."""
         network = self.stage.network
-        relative_rate = _relative_rate(self.step / self.stage.steps)
-        for optimiser, largest_rate in self.optimisers:
-            (group,) = optimiser.param_groups
-            group["lr"] = relative_rate * largest_rate
+        rate = self.rate * _relative_rate(self.step / self.stage.steps)
+        for optimiser in self.optimisers:
+            for group in optimiser.param_groups:
+                group["lr"] = rate * group["rate_factor"]
         loss = self.stage.loss(self.step, self.random)
         network.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         if self.step >= self.stage.warm_up_steps and math.isfinite(self.stage.largest_gradient):
             torch.nn.utils.clip_grad_norm_(network.parameters(), self.stage.largest_gradient)
-        for optimiser, _ in self.optimisers:
+        for optimiser in self.optimisers:
             optimiser.step()
         self.step += 1
         return loss
@@ -168,7 +176,7 @@ class Descent:
         """Return everything that a checkpoint holds."""
         return {
             "part": self.stage.network.state_dict(),
-            "optimisers": [optimiser.state_dict() for optimiser, _ in self.optimisers],
+            "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
             "random": self.random.get_state(),
             "step": self.step,
             "best": (self.best, self.best_step),
@@ -178,7 +186,7 @@ class Descent:
     def _restore(self, state: dict[str, Any]) -> None:
         """Continue from the state of a checkpoint."""
         self.stage.network.load_state_dict(state["part"])
-        for (optimiser, _), saved in zip(self.optimisers, state["optimisers"], strict=True):
+        for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
             optimiser.load_state_dict(saved)
         self.random.set_state(state["random"])
         self.step = state["step"]
@@ -208,23 +216,3 @@ def _relative_rate(progress: float) -> float:
         rise = 0.5 * (1.0 - math.cos(math.pi * progress / WARM_UP_FRACTION))
         return INITIAL_RATE + (1.0 - INITIAL_RATE) * rise
     return 0.5 * (1.0 + math.cos(math.pi * (progress - WARM_UP_FRACTION) / (1.0 - WARM_UP_FRACTION)))
-
-
-def _optimisers(network: TrainableNetwork, rate: float) -> list[_OptimiserRate]:
-    """Return the optimisers of a network. Weights that were rounded are not trained.
-
-    Args:
-        network: The network.
-        rate: Largest learning rate of Adam.
-    """
-    hidden_matrices = network.hidden_matrices()
-    hidden_ids = {id(matrix) for matrix in hidden_matrices}
-    other_parameters = [parameter for parameter in network.parameters() if id(parameter) not in hidden_ids]
-    trained_matrices = [matrix for matrix in hidden_matrices if matrix.requires_grad]
-    optimisers = []
-    if trained_matrices:
-        muon = torch.optim.Muon(trained_matrices, weight_decay=0.0)
-        optimisers.append(_OptimiserRate(muon, MUON_RATE_FACTOR * rate))
-    adam = torch.optim.Adam(other_parameters, betas=ADAM_BETAS)
-    optimisers.append(_OptimiserRate(adam, rate))
-    return optimisers

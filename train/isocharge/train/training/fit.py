@@ -36,10 +36,10 @@ from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fitted import Fitted
 from isocharge.train.training.losses import (
     distillation_loss,
-    likelihood_loss,
     mean_squared_distance,
     validation_score,
     warm_up_loss,
+    weighted_likelihood_loss,
     with_fresh_noise,
 )
 from isocharge.train.training.network import (
@@ -306,6 +306,8 @@ def contact_stage(
 ) -> TrainingStage:
     """Return the training of the contact perceptron on charges with fresh noise.
 
+    The linear part of the perceptron is fitted at once.
+
     Args:
         network: The network, whose contact perceptron is trained.
         train: Presses for training.
@@ -321,6 +323,8 @@ def contact_stage(
     validation_charge = as_tensor(validation.charge if validation.measured else validation.noisy(noise, config.seed))
     validation_target = as_tensor(domain.to_unit(validation.contact))
     batch = min(config.batch, len(charge))
+    noisy_charge = with_fresh_noise(charge, noise, torch.Generator().manual_seed(config.seed))
+    network.contact.fit_linear_part(network.inputs(noisy_charge), target)
 
     def loss(step: int, random: torch.Generator) -> Tensor:
         """Return the loss of a random batch with new noise. It is the warm-up loss in the first steps."""
@@ -329,7 +333,7 @@ def contact_stage(
         mean, log_std = network.posterior(noisy)
         is_warm_up = step < warm_up_steps
         if teacher is None:
-            loss_function = warm_up_loss if is_warm_up else likelihood_loss
+            loss_function = warm_up_loss if is_warm_up else weighted_likelihood_loss
             return loss_function(mean, log_std, target[rows])
         teacher_mean, teacher_log_std = teacher.posterior(noisy, domain)
         if is_warm_up:
@@ -341,7 +345,15 @@ def contact_stage(
         mean, log_std = network.posterior(validation_charge)
         return validation_score(mean, log_std, validation_target, domain, "presses")
 
-    return TrainingStage("contact", network.contact, loss, score, config.steps, warm_up_steps)
+    return TrainingStage(
+        "contact",
+        network.contact,
+        loss,
+        score,
+        config.steps,
+        warm_up_steps,
+        slow_parameters=(network.contact.skip.weight,),
+    )
 
 
 def _misfit_examples(

@@ -15,6 +15,11 @@ WARM_UP_STD_WEIGHT = 0.1
 """Weight of the standard deviations in the warm-up loss."""
 
 
+STD_EXPONENT = 0.75
+"""Exponent of the variances by which the squared errors of the mean are weighted: 0 gives the likelihood, 1 gives least
+squares."""
+
+
 def with_fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor:
     """Add normally distributed noise to charges.
 
@@ -58,6 +63,27 @@ def likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
     """
     deviation = (mean - target) * torch.exp(-log_std)
     return (log_std + 0.5 * deviation**2).sum(dim=1).mean()
+
+
+def weighted_likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> Tensor:
+    """Compute a loss with the same minimum as `likelihood_loss`, in which uncertain presses count more.
+
+    The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Where a network
+    overestimates the standard deviation, it therefore learns the mean slowly (Seitzer et al. 2022, arXiv 2203.09168).
+    Here the squared errors of the mean are multiplied by the estimated standard deviation to the power of
+    `2 * STD_EXPONENT`. The standard deviations have the gradient of the likelihood.
+
+    Args:
+        mean: Estimated unit coordinates, shape (n, 3).
+        log_std: Logarithms of their standard deviations, shape (n, 3).
+        target: True unit coordinates, shape (n, 3).
+    """
+    squares = (mean - target) ** 2
+    fixed_log_std = log_std.detach()
+    mean_weight = torch.exp((2.0 * STD_EXPONENT - 2.0) * fixed_log_std)
+    mean_weight = mean_weight / torch.exp(2.0 * STD_EXPONENT * fixed_log_std).mean(dim=0)
+    std_loss = log_std + 0.5 * squares.detach() * torch.exp(-2.0 * log_std)
+    return (std_loss + 0.5 * mean_weight * squares).sum(dim=1).mean()
 
 
 def distillation_loss(mean: Tensor, log_std: Tensor, teacher_mean: Tensor, teacher_log_std: Tensor) -> Tensor:

@@ -10,7 +10,6 @@ as the length of a vector, (Q - Q(c)) / sigma at the nearest contact. Unlike its
 charges Q are those of a contact. Its length, which ranges from a tenth to thousands, is compressed by asinh.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -31,19 +30,18 @@ from isocharge.train.training.torch_evaluation import evaluate, evaluate_feature
 LARGEST_INT8 = 127
 """Largest absolute value of a weight that is rounded to 8 bits, in units of the scale of its output."""
 
+FIRST_LAYER_SLOPES = (0.5, 3.5)
+"""Smallest and largest norm of the initial weights of a unit of a sharpened first layer. The inputs have unit
+variance."""
+
+INITIAL_NONLINEAR_SIZE = 0.2
+"""Factor on the initial weights of outputs whose linear part was fitted."""
+
 MIN_LENGTH = 1e-9
 """Length below which a misfit vector counts as having this length, so that no division by zero occurs."""
 
 
-class TrainableNetwork(nn.Module, ABC):
-    """A network that `Descent` trains."""
-
-    @abstractmethod
-    def hidden_matrices(self) -> list[Tensor]:
-        """Return the weights between hidden layers, which the optimiser Muon trains."""
-
-
-class TrainablePerceptron(TrainableNetwork):
+class TrainablePerceptron(nn.Module):
     """A perceptron with a skip layer (`isocharge.common.perceptron`).
 
     The logarithm of the force is nearly linear in the logarithms of the charges and is needed with a relative error of
@@ -70,6 +68,40 @@ class TrainablePerceptron(TrainableNetwork):
         self.layers = nn.ModuleList([nn.Linear(*sizes) for sizes in pairwise((n_input, *hidden, n_output))])
         self.skip = nn.Linear(n_input, n_output, bias=False)
         nn.init.zeros_(self.skip.weight)
+
+    def sharpen_first_layer(self) -> None:
+        """Draw the first layer again with larger weights, so that the units bend at random places among the inputs.
+
+        The posterior mean of contacts at the rim of the working area bends within a small distance. Units that are
+        nearly linear over all inputs learn this slowly.
+        """
+        first, *_ = self.linear_layers()
+        n_unit = first.out_features
+        direction = nn.functional.normalize(torch.randn(n_unit, first.in_features), dim=1)
+        smallest, largest = FIRST_LAYER_SLOPES
+        slope = smallest + (largest - smallest) * torch.rand(n_unit, 1)
+        centre = torch.randn(n_unit, first.in_features)
+        with torch.no_grad():
+            first.weight.copy_(slope * direction)
+            first.bias.copy_(-(first.weight * centre).sum(dim=1))
+
+    def fit_linear_part(self, inputs: Tensor, targets: Tensor) -> None:
+        """Set the skip layer to the linear least-squares fit of the first outputs.
+
+        The hidden layers then start with a small contribution to these outputs, and learn what is not linear.
+
+        Args:
+            inputs: Shape (n, n_input).
+            targets: Targets of the first n_target outputs, shape (n, n_target).
+        """
+        n_target = targets.shape[1]
+        _, *_, last = self.linear_layers()
+        design = torch.cat([inputs, torch.ones(len(inputs), 1)], dim=1)
+        *slopes, offset = torch.linalg.lstsq(design.double(), targets.double()).solution.float()
+        with torch.no_grad():
+            self.skip.weight[:n_target] = torch.stack(slopes, dim=1)
+            last.weight[:n_target] *= INITIAL_NONLINEAR_SIZE
+            last.bias[:n_target] = offset
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Compute the outputs, shape (n, n_output), of inputs of shape (n, n_input)."""
@@ -125,6 +157,7 @@ class InverseNetwork(nn.Module):
         n_electrode = features.charge_features.n_electrode
         activation = ACTIVATIONS[config.activation]
         self.contact = TrainablePerceptron(n_electrode, config.hidden, N_CONTACT_ANSWERS, activation)
+        self.contact.sharpen_first_layer()
         self.misfit_vector = TrainablePerceptron(n_electrode, config.misfit_hidden, n_electrode, activation)
         self.centre = nn.Buffer(as_tensor(domain.centre))
         self.scale = nn.Buffer(as_tensor(domain.scale))

@@ -1,0 +1,116 @@
+"""SOAP: Adam in the eigenbasis of the second moments of the gradient.
+
+A weight matrix W has a gradient G. The optimiser averages G G^T and G^T G over the steps. Their eigenvectors are axes
+along which the entries of the gradient are nearly uncorrelated, so that Adam, which scales each entry separately, comes
+close to a second-order method (Vyas et al. 2024, arXiv 2409.11321, algorithm 3). The eigenvectors change slowly and are
+updated every few steps by one orthogonal iteration.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+BASIS_PERIOD = 10
+"""Number of steps between two updates of the eigenvectors."""
+
+EPSILON = 1e-10
+"""Smallest root mean square of an entry of the gradient by which a step is divided."""
+
+
+class Soap(torch.optim.Optimizer):
+    """The optimiser SOAP. Parameters with one dimension, such as biases, are trained by Adam.
+
+    Args:
+        params: Parameters, or groups of parameters as of all optimisers of PyTorch. A parameter with more than two
+            dimensions is an array of matrices.
+        lr: Learning rate: the change of each entry in one step, approximately.
+        betas: Decay rates of the moving averages of the gradient and of its second moments.
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Tensor] | Iterable[dict[str, Any]],
+        lr: float = 1e-3,
+        betas: tuple[float, float] = (0.95, 0.95),
+    ) -> None:
+        """Prepare the optimiser. See the class for the arguments."""
+        super().__init__(params, {"lr": lr, "betas": betas})
+
+    @torch.no_grad()
+    def step(self) -> None:  # type: ignore[override]
+        """Change all parameters that have a gradient."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    self._update(parameter, parameter.grad, group["lr"], group["betas"])
+
+    def _update(self, parameter: Tensor, gradient: Tensor, rate: float, betas: tuple[float, float]) -> None:
+        """Change one parameter.
+
+        Args:
+            parameter: The parameter.
+            gradient: Its gradient, of the same shape.
+            rate: Learning rate.
+            betas: Decay rates of the moving averages.
+        """
+        state = self.state[parameter]
+        if not state:
+            state.update(_initial_state(gradient))
+        state["step"] += 1
+        mean_decay, square_decay = betas
+        if gradient.ndim > 1:
+            state["row_moment"].lerp_(gradient @ gradient.mT, 1.0 - square_decay)
+            state["column_moment"].lerp_(gradient.mT @ gradient, 1.0 - square_decay)
+            if state["step"] % BASIS_PERIOD == 1:
+                _update_basis(state)
+
+        mean = state["mean"].lerp_(gradient, 1.0 - mean_decay)
+        rotated_gradient = _rotate(gradient, state)
+        square = state["square"].mul_(square_decay)
+        square.addcmul_(rotated_gradient, rotated_gradient, value=1.0 - square_decay)
+
+        mean_weight = 1.0 - mean_decay ** state["step"]
+        square_weight = 1.0 - square_decay ** state["step"]
+        size = (square / square_weight).sqrt_().add_(EPSILON)
+        step = _rotate_back(_rotate(mean, state) / size, state)
+        parameter.add_(step, alpha=-rate / mean_weight)
+
+
+def _initial_state(gradient: Tensor) -> dict[str, Any]:
+    """Return the state of a parameter before its first step."""
+    state: dict[str, Any] = {
+        "step": 0,
+        "mean": torch.zeros_like(gradient),
+        "square": torch.zeros_like(gradient),
+    }
+    if gradient.ndim > 1:
+        *batch, n_row, n_column = gradient.shape
+        for name, size in (("row", n_row), ("column", n_column)):
+            state[f"{name}_moment"] = gradient.new_zeros(*batch, size, size)
+            state[f"{name}_basis"] = torch.eye(size, dtype=gradient.dtype).expand(*batch, size, size).clone()
+    return state
+
+
+def _update_basis(state: dict[str, Any]) -> None:
+    """Bring both bases nearer to the eigenvectors of the second moments by one orthogonal iteration."""
+    for name in ("row", "column"):
+        basis = state[f"{name}_basis"]
+        state[f"{name}_basis"] = torch.linalg.qr(state[f"{name}_moment"] @ basis).Q
+
+
+def _rotate(matrix: Tensor, state: dict[str, Any]) -> Tensor:
+    """Return a matrix in the eigenbasis. Vectors are not rotated."""
+    if matrix.ndim < 2:
+        return matrix
+    rotated: Tensor = state["row_basis"].mT @ matrix @ state["column_basis"]
+    return rotated
+
+
+def _rotate_back(matrix: Tensor, state: dict[str, Any]) -> Tensor:
+    """Return a matrix that is given in the eigenbasis. Vectors are not rotated."""
+    if matrix.ndim < 2:
+        return matrix
+    rotated: Tensor = state["row_basis"] @ matrix @ state["column_basis"].mT
+    return rotated
