@@ -201,13 +201,13 @@ def fill_disk(monkeypatch):
     """Let files take so many bytes until the disk is full."""
 
     def fill(room):
-        write, left = os.write, [room]
+        write, remaining = os.write, [room]
 
         def write_until_full(descriptor, data):
-            if not left[0]:
+            if not remaining[0]:
                 raise OSError(errno.ENOSPC, "No space left on device")
-            taken = write(descriptor, bytes(data)[: left[0]])
-            left[0] -= taken
+            taken = write(descriptor, bytes(data)[: remaining[0]])
+            remaining[0] -= taken
             return taken
 
         monkeypatch.setattr("os.write", write_until_full)

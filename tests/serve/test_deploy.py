@@ -269,13 +269,13 @@ def test_dashboard_and_alerts_ask_for_metrics_that_there_are(start_http):
     assert all((files / mount).is_file() for mount in mounts if mount != "./token")
     rules = [rule["expr"] for rule in yaml.safe_load((files / "alerts.yml").read_text())["groups"][0]["rules"]]
     panels = json.loads((files / "grafana/isocharge.json").read_text())["panels"]
-    asked = " ".join(rules + [target["expr"] for panel in panels for target in panel["targets"]])
+    queries = " ".join(rules + [target["expr"] for panel in panels for target in panel["targets"]])
     url = start_http(Handler(open_model_store(MODELS))).url
     assert status_of(f"{url}/v2/health/ready") == 200
     with urllib.request.urlopen(f"{url}/metrics", timeout=20) as answer:
         families = text_string_to_metric_families(answer.read().decode())
-    there = {sample.name for family in families for sample in family.samples}
-    assert set(re.findall(r"\b(?:isocharge|process)_\w+", asked)) <= there
+    served = {sample.name for family in families for sample in family.samples}
+    assert set(re.findall(r"\b(?:isocharge|process)_\w+", queries)) <= served
 
 
 def test_the_ros2_package_has_the_version_of_isocharge():

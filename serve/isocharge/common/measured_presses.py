@@ -144,12 +144,12 @@ class MeasuredPresses:
             np.array_equal(column, other_columns[name], equal_nan=True) for name, column in own_columns.items()
         )
 
-    def of_electrodes(self, electrodes: Sequence[str], whose: str) -> "MeasuredPresses":
+    def of_electrodes(self, electrodes: Sequence[str], owner: str) -> "MeasuredPresses":
         """Return the same presses with the charges of some electrodes, in the given order.
 
         Args:
             electrodes: Names of the electrodes.
-            whose: Possessor of the electrodes, for the message, such as "the model".
+            owner: Object that has these electrodes, for the error message, such as "the model".
 
         Raises:
             PressError: If one of the electrodes is missing.
@@ -158,7 +158,7 @@ class MeasuredPresses:
         missing = [name for name in names if name not in self.electrodes]
         if missing:
             raise PressError(
-                f"expected charges of the electrodes {names} of {whose}, got {self.electrodes}; "
+                f"expected charges of the electrodes {names} of {owner}, got {self.electrodes}; "
                 f"missing: {', '.join(map(shown, missing))}"
             )
         order = [self.electrodes.index(name) for name in names]

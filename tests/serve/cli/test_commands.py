@@ -207,8 +207,8 @@ def test_a_recording_that_was_killed_is_readable(board, models, start, tmp_path,
 
 def test_sigusr1_requests_a_new_tare(models, run):
     rest = lambda level, count: [(level, level + 1.0, level + 2.0)] * count  # noqa: E731
-    asked = (interrupt(signal.SIGUSR1) for _ in range(1))
-    rows = chain(rest(0.0, 400), filter(None, asked), rest(5.0, 400))
+    signals = (interrupt(signal.SIGUSR1) for _ in range(1))
+    rows = chain(rest(0.0, 400), filter(None, signals), rest(5.0, 400))
     with TcpBoard(rows) as board:
         words = ["--count", 780, "--no-reconnect", "--models", models]
         records = records_of(run("stream", "linear", "--port", board.url, *words).stdout)

@@ -159,7 +159,7 @@ def test_plot_draws_the_film_of_a_released_model_and_omits_an_unknown_film(comma
     assert (code, "without" in err) == (0, False)
     assert {"A", "B", "C", "D"} <= {text.get_text() for text in film_of(figures[0]).texts}
     code, _, err = command(*words, tmp_path / "touch.png")
-    assert (code, "drawn without the film, whose model is not to be had: no model 'linear/1'" in err) == (0, True)
+    assert (code, "drawn without the film, whose model is not available: no model 'linear/1'" in err) == (0, True)
 
 
 def test_plot_of_a_recording_without_a_touch(command, models, tmp_path):

@@ -28,17 +28,17 @@ def small_map(sensor, probe):
 
 
 @pytest.fixture(autouse=True)
-def asked(monkeypatch):
+def solved(monkeypatch):
     """What the commands ask for; they get a small map, of film 9 or of the described one."""
-    asked = []
+    solved = []
 
     def build(sensor, probe, *, radius, force_range):
-        asked.append((sensor, probe, radius, force_range))
+        solved.append((sensor, probe, radius, force_range))
         return small_map(*(FILM_9 if (sensor, probe) == FILM_9 else DESCRIBED))
 
     monkeypatch.setattr(ForwardMap, "build", build)
     monkeypatch.setattr("isocharge.cli.shared.virtual_sensor.SCRIPT_S", 3.0)
-    return asked
+    return solved
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def played(run, tmp_path):
     return play
 
 
-def test_random_presses_come_after_a_second_of_rest(played, asked):
+def test_random_presses_come_after_a_second_of_rest(played, solved):
     values, result = played(300, "--noise", "clean", "--force-max", 0.5)
     total = values.sum(axis=1)
     assert values.shape[1] == 3
@@ -84,7 +84,7 @@ def test_random_presses_come_after_a_second_of_rest(played, asked):
     assert re.match(
         r"\d+ frames sent, \d+ withheld because no program read them, 0 lost", result.stderr.splitlines()[-1]
     )
-    assert asked == [(*DESCRIBED, 8.0, (0.05, 0.5))]
+    assert solved == [(*DESCRIBED, 8.0, (0.05, 0.5))]
 
 
 def test_virtual_option_rest_delays_the_first_press(played):
@@ -125,20 +125,20 @@ def test_described_frames_with_the_faults_of_a_script(played, tmp_path):
     assert unplugged >= 1
 
 
-def test_virtual_solves_the_film_only_up_to_the_scripted_distance(tmp_path, run, asked):
+def test_virtual_solves_the_film_only_up_to_the_scripted_distance(tmp_path, run, solved):
     (tmp_path / "far.toml").write_text("presses = [[0, 0, 0, 0], [1, 0, 0, 0], [2, 5, 12, 1], [4, 5, 12, 0]]\n")
     for words in ((), ("--radius", 15), ("--script", tmp_path / "far.toml")):
         with suppress(SceneError):  # the small map does not reach so far
             run("virtual", "four-25um-biaxial-15mm", "--seconds", 0, *words)
-    assert [round(radius, 3) for _, _, radius, _ in asked] == [8.0, 15.0, 13.0]
+    assert [round(radius, 3) for _, _, radius, _ in solved] == [8.0, 15.0, 13.0]
 
 
-def test_random_presses_stay_below_the_yield_point_of_the_film_by_default(run, asked, monkeypatch):
+def test_random_presses_stay_below_the_yield_point_of_the_film_by_default(run, solved, monkeypatch):
     """A probe of 1 mm radius yields the built-in films at 0.87 N."""
     run("virtual", "three-25um-biaxial", "--seconds", 0)
     with suppress(SceneError):  # the small map has a smaller range of forces
         run("virtual", "three-25um-biaxial", "--seconds", 0, "--force-max", 1.5)
-    assert [force_range for _, _, _, force_range in asked] == [(0.05, 0.8), (0.05, 1.5)]
+    assert [force_range for _, _, _, force_range in solved] == [(0.05, 0.8), (0.05, 1.5)]
     assert wander(seed=1).force_N.max() <= 0.8
     domain = Domain(8.0, (0.05, 2.0))
     forward_map = SimpleNamespace(domain=domain, electrodes=("A",), charges=lambda contact: 100.0 * contact[:, 2:])
@@ -148,12 +148,12 @@ def test_random_presses_stay_below_the_yield_point_of_the_film_by_default(run, a
     assert 0.05 < played_scripts[0].force_N.max() <= 0.8
 
 
-def test_virtual_script_may_exceed_the_force_of_random_presses(run, asked, tmp_path):
+def test_virtual_script_may_exceed_the_force_of_random_presses(run, solved, tmp_path):
     script = tmp_path / "hard.toml"
     script.write_text("presses = [[0, 0, 0, 0], [1, 0, 0, 0], [2, 1, 1, 1.5], [4, 1, 1, 0]]\n")
     with suppress(SceneError):  # the small map has a smaller range of forces
         run("virtual", "three-25um-biaxial", "--seconds", 0, "--script", script)
-    assert asked[0][-1] == pytest.approx((0.05, 1.5), rel=1e-3)
+    assert solved[0][-1] == pytest.approx((0.05, 1.5), rel=1e-3)
 
 
 def test_charges_below_the_smallest_force_follow_the_power_law_of_a_membrane():
@@ -163,12 +163,12 @@ def test_charges_below_the_smallest_force_follow_the_power_law_of_a_membrane():
     assert charges(np.array([[1.0, 2.0, 0.025], [1.0, 2.0, 0.5]])) == pytest.approx(np.array([[5.0], [50.0]]))
 
 
-def test_virtual_film_with_the_same_seed_is_the_same(run, asked):
+def test_virtual_film_with_the_same_seed_is_the_same(run, solved):
     """The same film for the same seed, another for another, the described without one."""
     for words in ((), ("--film", 3), ("--film", 3, "--seed", 8), ("--film", 4)):
         run("virtual", "four-25um-biaxial", "--probe", "circle:1.5", "--seconds", 0, *words)
     described = load_sensor("four-25um-biaxial"), Circle(1.5)
-    films = [one[:2] for one in asked]
+    films = [one[:2] for one in solved]
     assert films[0] == described
     assert films[1] == films[2] == virtual_film(*described, 3)
     assert films[3] == virtual_film(*described, 4) != films[1]
@@ -184,10 +184,10 @@ def test_virtual_film_with_the_same_seed_is_the_same(run, asked):
         (f"{SENSOR} --device TMP/plain.toml", InputError, "expected a file with described frames"),
     ],
 )
-def test_virtual_refuses_wrong_options(run, asked, tmp_path, words, error, message):
+def test_virtual_refuses_wrong_options(run, solved, tmp_path, words, error, message):
     (tmp_path / "film").write_text("mine")
     (tmp_path / "plain.toml").touch()
     with pytest.raises(error, match=message):
         run("virtual", *words.replace("TMP", str(tmp_path)).split())
-    assert len(asked) <= 1
+    assert len(solved) <= 1
     assert (tmp_path / "film").read_text() == "mine"

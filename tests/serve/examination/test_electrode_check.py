@@ -51,10 +51,10 @@ def sensor_with_wiring(charges, directions, wiring, gain=1.0, **options):
 def check(sensor, electrodes, timeout_s=20.0):
     device = device_from_table({}, "test")
     channels = {electrode: str(number + 1) for number, electrode in enumerate(electrodes)}
-    asked = []
+    requests = []
     with sensor, Port(sensor.url) as port:
-        result = check_electrodes(port, device, channels, asked.append, timeout_s)
-    assert [sentence.split()[3].rstrip(",") for sentence in asked] == list(electrodes)
+        result = check_electrodes(port, device, channels, requests.append, timeout_s)
+    assert [sentence.split()[3].rstrip(",") for sentence in requests] == list(electrodes)
     return result
 
 

@@ -122,8 +122,8 @@ def test_device_file_renames_frame_counter_and_clock(device):
 
 def test_device_file_with_a_request(device):
     assert device("[frames]\n").request is None
-    asked = device('[frames]\nrequest = "3F 0A"\nrequest_Hz = 50\necho = true\n').request
-    assert (asked.data, asked.rate_Hz, asked.echo) == (b"?\n", 50.0, True)
+    request = device('[frames]\nrequest = "3F 0A"\nrequest_Hz = 50\necho = true\n').request
+    assert (request.data, request.rate_Hz, request.echo) == (b"?\n", 50.0, True)
     described = 'sync = "55"\nlength = 5\nfields = [{name = "A", type = "f32"}]'
     assert device(f'[frames]\nformat = "described"\nrequest = "01"\n{described}').request.data == b"\x01"
 

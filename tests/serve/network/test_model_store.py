@@ -278,15 +278,15 @@ def test_log_has_the_messages_of_python_loggers(lines):
 def test_log_has_a_line_for_each_grpc_call(store, lines):
     """About no model, about one by its name and version, without a tensor, and without the token."""
     app = Handler(store, None, Traffic(RequestLog(lines.append, secret=SECRET)), Token(SECRET))
-    told, forged = ([("authorization", value)] for value in (f"Bearer {SECRET}", FORGED.replace("\n", " ")))
+    with_secret, forged = ([("authorization", value)] for value in (f"Bearer {SECRET}", FORGED.replace("\n", " ")))
     with (
         grpc_server(app, "127.0.0.1", 0) as url,
         grpc.insecure_channel(url.removeprefix("grpc://")) as channel,
     ):
         ask = {name: channel.unary_unary(f"/{SERVICE}/{name}") for name in ("ServerReady", "ModelReady", "ModelInfer")}
         ask["ServerReady"](b"", timeout=20)
-        ask["ModelReady"](b"\x0a\x06linear\x12\x011", metadata=told, timeout=20)
-        for metadata in (told, forged):
+        ask["ModelReady"](b"\x0a\x06linear\x12\x011", metadata=with_secret, timeout=20)
+        for metadata in (with_secret, forged):
             with pytest.raises(grpc.RpcError):
                 ask["ModelInfer"](b"\x0a\x06linear", metadata=metadata, timeout=20)
     logged = [(line["route"], line["status"], line["model"], line["error"]) for line in map(json.loads, lines)]

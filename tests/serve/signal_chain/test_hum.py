@@ -23,8 +23,8 @@ def mains(n, rate_Hz, amplitude_pC, frequency_Hz=50.0):
 @pytest.mark.parametrize("frequency_Hz", [50.0, 50.05])
 def test_hum_is_gone_after_two_seconds(rate_Hz, frequency_Hz):
     """The mains wander by 0.05 Hz; an eighth of the hum may then be left."""
-    left = clean(mains(int(4 * rate_Hz), rate_Hz, 5.0, frequency_Hz), rate_Hz)[int(2 * rate_Hz) :]
-    assert np.abs(left).max() < (0.1 if frequency_Hz == 50.0 else 1.0)
+    residual_pC = clean(mains(int(4 * rate_Hz), rate_Hz, 5.0, frequency_Hz), rate_Hz)[int(2 * rate_Hz) :]
+    assert np.abs(residual_pC).max() < (0.1 if frequency_Hz == 50.0 else 1.0)
 
 
 def test_touch_passes_hum_removal_without_delay_and_ringing():

@@ -101,9 +101,9 @@ def bayes(wrong, after_s):
     scales = np.array([CREEP, STEP]) * wrong
     left_pC = np.linalg.norm(SHAPE) * scales * less(rest_s, 60.0)
     noise_pC2 = SHAPE.size * WARMTH_CHANGE_PC**2 * (60.0 + rest_s) + (CREEP_LAW_DEVIATION * left_pC.sum(axis=1)) ** 2
-    told = np.einsum("ni,nj,n->ij", left_pC, left_pC, 1.0 / noise_pC2) / (RATE_HZ * LEARN_S)
-    covariance = np.linalg.inv(np.eye(2) / 0.2**2 + told)
-    scales = scales * (1.0 + covariance @ told @ (1.0 / wrong - 1.0))
+    information = np.einsum("ni,nj,n->ij", left_pC, left_pC, 1.0 / noise_pC2) / (RATE_HZ * LEARN_S)
+    covariance = np.linalg.inv(np.eye(2) / 0.2**2 + information)
+    scales = scales * (1.0 + covariance @ information @ (1.0 / wrong - 1.0))
     held = np.column_stack([-np.log10(after_s), np.exp(-after_s / WARMTH_S)]) - less(after_s + 10.0, 60.0)
     return np.sqrt(np.einsum("ni,ij,nj->n", held * scales, covariance, held * scales))
 
@@ -162,9 +162,11 @@ def test_uncertain_memory_increases_standard_deviations_and_correlations():
 )
 def test_second_prediction_is_repeated_after_the_contact_has_moved(moved, again):
     """A model whose answer grows in proportion to what is not known: half a unit moves it by half of where it was."""
-    told, first = Sensitivity(0.1), np.array([2.0, 1.0, 0.5])
+    sensitivity, first = Sensitivity(0.1), np.array([2.0, 1.0, 0.5])
     for at in (first, first + moved):
-        shift = told.shift(Contact(*at, 0.1, 0.1, 0.01, 0.0), 0.05, partial(Contact, *2.0 * at, 0.1, 0.1, 0.01, 0.0))
+        shift = sensitivity.shift(
+            Contact(*at, 0.1, 0.1, 0.01, 0.0), 0.05, partial(Contact, *2.0 * at, 0.1, 0.1, 0.01, 0.0)
+        )
     np.testing.assert_allclose(shift, 0.5 * (first + again * np.array(moved)), rtol=1e-12)
 
 

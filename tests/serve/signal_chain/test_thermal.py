@@ -60,15 +60,17 @@ def test_charge_and_slope_are_estimated_by_a_kalman_filter():
     gain = predicted[:, 0] / (predicted[0, 0] + (rule.noise * 2.0 / across.sum()) ** 2)
     after = track_thermal_drift(rule, before, PRESS + off_pC, misfit_of(UNIAXIAL), t, warmth_s=warmth_s)
     found = after.charge_pC - 3.0, after.rate_pC_per_s, after.variance_pC2, after.covariance, after.rate_variance
-    left = predicted - np.outer(gain, predicted[0])
-    assert found == pytest.approx([*off_pC * gain, left[0, 0], left[0, 1], left[1, 1]], rel=1e-3)
+    posterior = predicted - np.outer(gain, predicted[0])
+    assert found == pytest.approx([*off_pC * gain, posterior[0, 0], posterior[0, 1], posterior[1, 1]], rel=1e-3)
 
 
 def test_misfit_is_evaluated_twenty_times_a_second():
-    asked, state = [], NO_DRIFT
+    evaluated, state = [], NO_DRIFT
     for _ in range(1000):
-        state = track_thermal_drift(ThermalRule(), state, np.ones(4), lambda q: asked.append(q) or np.ones(5), 0.001)
-    assert 19 <= len(asked) <= 20
+        state = track_thermal_drift(
+            ThermalRule(), state, np.ones(4), lambda q: evaluated.append(q) or np.ones(5), 0.001
+        )
+    assert 19 <= len(evaluated) <= 20
 
 
 PRESS = UNIAXIAL @ [850.0, 3.0, -2.0]

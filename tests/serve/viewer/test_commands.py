@@ -86,15 +86,15 @@ def test_live_page_shows_a_press_and_the_stream_continues_without_the_page(board
 def test_displayed_frame_rate_is_that_of_the_board_in_a_fast_replay(predictor, record, monkeypatch, capsys):
     """Unknown until time has passed between two frames."""
     monkeypatch.setattr(live_page_module, "STATE_INTERVAL_S", -1.0)
-    told = []
-    link = SimpleNamespace(send_sample=id, send_message=lambda **state: told.append(state), is_open=True, dropped=0)
+    states = []
+    link = SimpleNamespace(send_sample=id, send_message=lambda **state: states.append(state), is_open=True, dropped=0)
     feed = live_page_module.PageFeed(link, TouchStream(predictor))
     for k in (0, 0, *range(2, 51)):
         feed.write(record(timestamp=1e9 + 0.005 * k))
-    assert [state["rate_Hz"] for state in told[:2]] == [None, None]
+    assert [state["rate_Hz"] for state in states[:2]] == [None, None]
     monkeypatch.setattr(live_page_module, "STATE_INTERVAL_S", 60.0)
     feed.write(record())
-    assert (len(told), told[-1]["rate_Hz"]) == (51, pytest.approx(200.0, rel=1e-3))
+    assert (len(states), states[-1]["rate_Hz"]) == (51, pytest.approx(200.0, rel=1e-3))
     assert capsys.readouterr().err == ""  # the page is there
 
 

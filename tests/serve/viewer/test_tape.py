@@ -89,13 +89,13 @@ def test_reader_does_not_wait_for_a_page_that_reads_nothing():
     began = time.perf_counter()
     for _ in range(40_000):
         reader.send_sample(SAMPLE)
-    told = sum(reader.send_message(counters={"frames": 1}, note="x" * 500) for _ in range(2000))
+    sent_count = sum(reader.send_message(counters={"frames": 1}, note="x" * 500) for _ in range(2000))
     assert time.perf_counter() - began < 5.0
     assert reader.dropped > 0
-    assert told < 2000
+    assert sent_count < 2000
     taken = len(b"".join(iter(lambda: page.receive_samples(64), b""))) // 64
     assert taken + reader.dropped == 40_000
-    assert len(page.receive_messages()) == told
+    assert len(page.receive_messages()) == sent_count
     reader.close()
     page.close_here()
 

@@ -77,16 +77,19 @@ def plot_command(
     recording = Recording(file)
     with shown_progress():
         traces = traces_of(recording.records(PlottedRecord), str(file))
-    sensor = working_area = None
+    sensor = None
+    working_area = None
     try:
         folder = find_model(model, models) if model else find_labelled_model(recording.model, models)
         metadata = load_model(folder).metadata
         working_area = np.array(metadata.working_area_mm)
         sensor = sensor_from_dict(metadata.sensor, metadata.label)
     except InputError as error:
-        missing = "the film, whose model is not to be had" if working_area is None else "electrodes"
-        say(f"drawn without {missing}: {error}")
-    save_picture(recording_picture(traces, sensor, working_area, f"{file.name}, {recording.model}"), output)
+        omitted = "the film, whose model is not available" if working_area is None else "electrodes"
+        say(f"drawn without {omitted}: {error}")
+    title = f"{file.name}, {recording.model}"
+    picture = recording_picture(traces, sensor, working_area, title)
+    save_picture(picture, output)
     say(f"drawn in {output}: {len(traces['timestamp'])} records")
 
 

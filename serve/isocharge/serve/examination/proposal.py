@@ -231,12 +231,13 @@ def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str,
     """
     rests = {electrode: rest_of(column) for electrode, column in columns.items()}
     offsets = {electrode: _offset(column) for electrode, column in columns.items()}
-    if gain:
+    if gain:  # a tare accepts a small offset, so half of its limit is allowed
         limit = 0.5 * TareRule().offset_limit_pC / _largest_pC(gain)
         limits = dict.fromkeys(columns, limit)
-        if any(abs(rest - offsets[electrode]) > limit for electrode, rest in rests.items()):
+        differences = [abs(rest - offsets[electrode]) for electrode, rest in rests.items()]
+        if any(difference > limit for difference in differences):
             offsets = {electrode: _rounded(rest) for electrode, rest in rests.items()}
-    else:
+    else:  # only the noise shows whether a channel rests at 0
         limits = {electrode: max(REST_SIGMAS * noise_of(column), 1e-9) for electrode, column in columns.items()}
 
     all_rest_at_zero = all(abs(rest) <= limits[electrode] for electrode, rest in rests.items())

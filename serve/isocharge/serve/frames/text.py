@@ -92,10 +92,12 @@ class TextParser(DelimitedParser):
         self._seq_wrap = CounterWrap(SEQ_MODULI, SEQ_MODULUS, MAX_SEQ_STEPS)
         self._clock_wrap = clock_wrap(1.0)
         self._last_unreadable_line = b""
+        self._is_first_line = True
+        # Lines from which the layout is recognised, with their sizes in bytes.
         self._unrecognised: list[tuple[Line, int]] = []
+        # Values by name, and number of bytes, of the present cycle of lines.
         self._cycle_values: dict[str, float] = {}
         self._cycle_bytes = 0
-        self._is_first_line = True
 
     def reset(self) -> None:
         """Drop the bytes of an unfinished frame, because the next bytes come from another connection."""

@@ -92,8 +92,11 @@ class RecordedStream:
     def follow(self, chunks: Iterable[Chunk]) -> Generator[PredictionRecord]:
         """Yield the records until the chunks end.
 
-        A chunk is recorded after its last record has been yielded. Close the generator before the recorder. The
-        present chunk is then recorded, too, even if the program is interrupted.
+        Requests are executed before each chunk. A chunk is recorded after its last record has been yielded. Close the
+        generator before the recorder. The present chunk is then recorded, too, even if the program is interrupted.
+
+        Args:
+            chunks: Chunks of a port or of a file.
 
         Raises:
             As `isocharge.serve.live.stream.stream`.

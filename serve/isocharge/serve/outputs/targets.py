@@ -60,6 +60,9 @@ def kind_of(target: str) -> OutputKind:
 def _load_kind(entry_point: EntryPoint) -> OutputKind:
     """Return the kind of output that a package adds.
 
+    Args:
+        entry_point: Entry point of the package, which refers to an OutputKind.
+
     Raises:
         InputError: If the package cannot be loaded, or its entry point is not an OutputKind.
     """

@@ -123,15 +123,15 @@ class DeviceClock:
             return
 
         delay_s = arrival_s - self._predict(self._device_us)
-        is_lost = abs(delay_s) > MAX_DEVIATION_s
-        if is_lost or self._is_first_fit:
+        was_clock_set = abs(delay_s) > MAX_DEVIATION_s
+        if was_clock_set or self._is_first_fit:  # begin a new fit at this arrival
             self._fitted_us = self._device_us
             self._fitted_host_s = arrival_s
             self._fit_age_s = 0.0
             self.rate = 1.0
             self._is_first_fit = False
-            if is_lost:
-                self._latest_host_s = -math.inf
+            if was_clock_set:
+                self._latest_host_s = -math.inf  # the host time may decrease here
             return
 
         # One step of the delay-locked loop (Adriaensen 2005): the delay corrects the time with the gain sqrt(2) * w,

@@ -168,6 +168,7 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     if len(binary_frames) >= MIN_FRAMES and binary_share > CLEAR_SHARE:
         return {"format": "binary"}
 
+    # If most of the bytes are not lines of one layout, the board may send binary frames that resemble text in places.
     text_table = None
     text_parser = TextParser()
     all_text_frames, text_share = _read(text_parser, chunks)

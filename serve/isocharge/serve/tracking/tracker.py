@@ -86,10 +86,10 @@ class Tracker:
         if self.mixture is None or charge_pC is None:
             tracked = self._filter.step(contact, t_s, flags)
         else:
-            if SATURATED in flags:
-                return self._tracked, None
-            hypotheses = self.mixture.update(charge_pC, t_s)
-            if not hypotheses:
+            hypotheses: list[ContactHypothesis] = []
+            if SATURATED not in flags:
+                hypotheses = self.mixture.update(charge_pC, t_s)
+            if not hypotheses:  # the frame contains no information about the contact
                 return self._tracked, None
             self.mixture_contact = hypotheses[0].contact
             self.other = _other_contact(hypotheses)

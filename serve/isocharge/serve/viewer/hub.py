@@ -313,7 +313,7 @@ class Hub:
             self.tape.append(np.frombuffer(data, self._dtype))
         for message in self._link.receive_messages():
             self._update_state(message)
-        if not self._link.is_open:
+        if not self._link.is_open:  # the reader has closed its end
             self._update_state({"has_ended": True})
 
     def _update_progress(self) -> None:
@@ -322,12 +322,16 @@ class Hub:
             self._update_state({"samples": self.tape.total, "span": self.tape.span(), "overview": self.tape.overview()})
 
     def _update_state(self, message: dict[str, Any]) -> None:
-        """Update the state with the content of a message. A marker is appended to the list of markers."""
-        marker = message.pop("marker", None)
+        """Update the state with the values in a message of the reader.
+
+        A marker is appended to the list of markers. All other values replace the values with the same names.
+        """
+        values = dict(message)
+        marker = values.pop("marker", None)
         if marker is not None:
             markers = [*self.state.get("markers", ()), marker]
             self.state["markers"] = markers[-MAX_MARKERS:]
-        self.state.update(message)
+        self.state.update(values)
         self.version += 1
 
 

@@ -206,7 +206,7 @@ def wander(
         is_press = (t_s >= start_s) & (t_s < end_s)
         press_s = t_s[is_press] - start_s
         position_mm[is_press] = radius_mm * _random_path(rng, press_s)
-        force_level = _force_level(rng, press_s, end_s - start_s)
+        force_level = _force_level(rng, press_s, end_s - start_s)  # from 0 to 1 on a logarithmic scale
         force_N[is_press] = min_force_N * (max_force_N / min_force_N) ** force_level
         start_s = end_s + rng.uniform(*PAUSE_DURATION_S)
     return Script(position_mm.real, position_mm.imag, force_N, rate_Hz)

@@ -172,7 +172,7 @@ def outputs_of(headers, body):
 
 
 @pytest.mark.parametrize(
-    ("asked", "names"),
+    ("options", "names"),
     [
         ({"parameters": {"binary_data_output": True}}, ("contact", "contact_std", "misfit")),
         ({"outputs": [{"name": "misfit", "parameters": {"binary_data": True}}, {"name": "contact"}]}, None),
@@ -186,8 +186,8 @@ def outputs_of(headers, body):
         ),
     ],
 )
-def test_binary_outputs(ask, bare, film, asked, names):
-    status, headers, body = ask("POST", INFER, orjson.dumps(request(film.golden_pC(), **asked)))
+def test_binary_outputs(ask, bare, film, options, names):
+    status, headers, body = ask("POST", INFER, orjson.dumps(request(film.golden_pC(), **options)))
     assert (status, headers["content-type"]) == (200, "application/octet-stream")
     found = outputs_of(headers, body)
     assert tuple(found) == (names or ("misfit", "contact"))
