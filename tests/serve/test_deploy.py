@@ -282,3 +282,24 @@ def test_the_ros2_package_has_the_version_of_isocharge():
     folder = DEPLOY / "ros2/isocharge_ros"
     assert f'version="{VERSION}"' in (folder / "setup.py").read_text()
     assert f"<version>{VERSION}</version>" in (folder / "package.xml").read_text()
+
+
+def test_the_page_copies_every_file_that_the_units_read(tmp_path):
+    """The commands of the page, with folders below a temporary one in place of /etc, and without systemctl."""
+    page = (ROOT / "serve/docs/secure_service.md").read_text("utf-8")
+    section = page.partition("## 5. ")[2].partition("\n## ")[0]
+    commands = [line for block in re.findall(r"```text\n(.*?)```", section, re.DOTALL) for line in block.splitlines()]
+    installs = [line.replace(" /etc/", f" {tmp_path}/etc/") for line in commands if line.startswith("install ")]
+    assert len(installs) == len([line for line in commands if "systemctl" not in line])
+    (tmp_path / "etc/systemd/system").mkdir(parents=True)
+    desk = tmp_path / "desk"
+    shutil.copytree(SYSTEMD, desk)
+    for name in ("fullchain.pem", "privkey.pem", "isocharge.env", "board.toml"):
+        (desk / name).write_text("secret")
+    subprocess.run(["sh", "-ec", "\n".join(installs)], cwd=desk, check=True, timeout=60)
+    installed = [path for path in (tmp_path / "etc/systemd/system").rglob("*") if path.is_file()]
+    assert {path.name for path in installed} == {"isocharge.service", "tls.conf", "isocharge-stream.service"}
+    for unit in installed:
+        read = re.findall(r"^(?:LoadCredential=\S+:|EnvironmentFile=)(/etc/\S+)$", unit.read_text(), re.MULTILINE)
+        for path in read:
+            assert (tmp_path / path.lstrip("/")).stat().st_mode & 0o777 == 0o600
