@@ -239,37 +239,48 @@ class FilmFilter:
         self._covariance = decay_of_products * self._covariance + (1.0 - decay_of_products) * stationary
 
     def _change_level(self) -> None:
-        """Let the offset level change; the new level's mean offset does not depend on that of the old one."""
+        """Let the level of the offsets change with a small probability.
+
+        This is the mixing step of an interacting multiple model (Blom and Bar-Shalom 1988). The mean offset of a new
+        level does not depend on the mean offset of the old level.
+        """
         level_count = self._level_std.size
         if level_count == 1:
             return
         offset = self._layout.offset
-        stay = (1.0 - LEVEL_CHANGE_PROBABILITY) * self._probability
-        arrive = LEVEL_CHANGE_PROBABILITY / level_count * self._probability.sum(axis=0)
+        pretension_probability = self._probability.sum(axis=0)  # over all levels, shape (n_pretension,)
+        staying_probability = (1.0 - LEVEL_CHANGE_PROBABILITY) * self._probability
+        arriving_probability = LEVEL_CHANGE_PROBABILITY / level_count * pretension_probability
 
-        share = self._probability / self._probability.sum(axis=0)
-        arriving_mean = (share[..., None] * self._mean).sum(axis=0)
+        # A film arrives at a new level with the gains that are averaged over all levels, and with a new offset.
+        level_share = self._probability / pretension_probability
+        arriving_mean = (level_share[..., None] * self._mean).sum(axis=0)
         arriving_mean[:, offset] = 0.0
-        arriving_covariance = np.repeat((share[..., None, None] * self._covariance).sum(axis=0)[None], level_count, 0)
+        average_covariance = (level_share[..., None, None] * self._covariance).sum(axis=0)
+        arriving_covariance = np.repeat(average_covariance[None], level_count, 0)
         arriving_covariance[:, :, offset, :] = 0.0
         arriving_covariance[:, :, :, offset] = 0.0
         arriving_covariance[:, :, offset, offset] = self._level_std[:, None] ** 2
 
-        self._probability = stay + arrive
-        arrived = arrive / self._probability
+        self._probability = staying_probability + arriving_probability
+        arrived = arriving_probability / self._probability  # share of the films that have just arrived
         stayed = 1.0 - arrived
         self._mean = stayed[..., None] * self._mean + arrived[..., None] * arriving_mean
         self._covariance = stayed[..., None, None] * self._covariance + arrived[..., None, None] * arriving_covariance
 
     def _change_pretension(self, elapsed_s: float) -> None:
-        """Let the pretension drift, and jump with a small probability.
+        """Let the pretension drift, and jump to any other pretension with a small probability.
 
         The linear unknowns move with the probability: their means and covariances are averaged over the pretensions
         from which the film may have come.
+
+        Args:
+            elapsed_s: Time since the latest touch, s.
         """
         self._pending_variance += self._drift**2 * elapsed_s / 3600.0
         level_count, grid_size = self._probability.shape
         size = self._layout.size
+        # Columns: probability, mean and covariance, each multiplied by the probability, so that they can be added.
         moments = np.concatenate(
             [
                 np.ones((level_count, grid_size, 1)),
@@ -280,7 +291,7 @@ class FilmFilter:
         )
         moments *= self._probability[..., None]
         drift_std = math.sqrt(self._pending_variance)
-        if drift_std >= GRID_STEP_MPa:
+        if drift_std >= GRID_STEP_MPa:  # a smaller drift is added to the next one, because the grid cannot represent it
             moments = _convolve(moments, drift_std)
             self._pending_variance = 0.0
         moments /= moments[..., 0].sum()
@@ -380,7 +391,16 @@ def _normal(deviation: Reals, std: float) -> Array:
 
 
 def _convolve(moments: Array, std: float) -> Array:
-    """Smooth moments over the pretensions (axis 1) by a normal distribution; beyond the ends they are constant."""
+    """Smooth moments over the pretensions by a normal distribution.
+
+    Args:
+        moments: Moments at each pretension of the grid, shape (n_level, n_pretension, n_moment). Beyond the ends of the
+            grid they are taken as constant.
+        std: Standard deviation of the normal distribution, MPa.
+
+    Returns:
+        The smoothed moments, of the same shape.
+    """
     grid_size = moments.shape[1]
     reach = min(round(4.0 * std / GRID_STEP_MPa), grid_size)
     kernel = _normal(GRID_STEP_MPa * np.arange(-reach, reach + 1.0), std)

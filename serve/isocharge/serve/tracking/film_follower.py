@@ -248,18 +248,23 @@ class FilmFollower:
         )
 
     def _is_unexplained(self) -> bool:
-        """Return whether the last touches fit the film at no pretension."""
+        """Return whether no pretension explains the latest touches.
+
+        The squared misfits of the touches are added up for the pretension that is estimated now, and for the
+        pretensions that were estimated at each touch. The smaller sum is compared with a limit.
+        """
         count = len(self._recent)
         nearest = self._filter.nearest
-        now = sum(float(touch.filtered[nearest]) for touch in self._recent)
-        then = sum(touch.filtered_then for touch in self._recent)
-        return min(now, then) > EXPLAINED_SQUARE * count + EXPLAINED_SCATTER * math.sqrt(count)
+        sum_at_present_estimate = sum(float(touch.filtered[nearest]) for touch in self._recent)
+        sum_at_earlier_estimates = sum(touch.filtered_then for touch in self._recent)
+        limit = EXPLAINED_SQUARE * count + EXPLAINED_SCATTER * math.sqrt(count)
+        return min(sum_at_present_estimate, sum_at_earlier_estimates) > limit
 
     def _is_gain_wrong(self) -> bool:
-        """Return whether one wrong gain explains the last touches far better than any pretension."""
-        without_gains = np.sum([touch.without_gains for touch in self._recent], axis=0)
-        wrong_gain = np.sum([touch.wrong_gain for touch in self._recent], axis=0)
-        return bool(wrong_gain.min() < without_gains.min() - WRONG_GAIN_MARGIN)
+        """Return whether a wrong gain of one electrode explains the latest touches far better than any pretension."""
+        sum_by_pretension = np.sum([touch.without_gains for touch in self._recent], axis=0)
+        sum_by_wrong_gain = np.sum([touch.wrong_gain for touch in self._recent], axis=0)
+        return bool(sum_by_wrong_gain.min() < sum_by_pretension.min() - WRONG_GAIN_MARGIN)
 
     def _estimate(self) -> PretensionEstimate:
         """Return the pretension if films that have changed and films that have not are equally likely beforehand."""
