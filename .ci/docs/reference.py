@@ -7,6 +7,7 @@ from pathlib import Path
 from pkgutil import walk_packages
 from typing import Any
 
+PUBLIC_PACKAGES = ("isocharge.serve", "isocharge.simulate", "isocharge.train")
 ATTRIBUTE = re.compile(r":ivar (?P<names>[^:]+): ?(?P<text>.*)")
 DOTTED = re.compile(r"`(isocharge(?:\.\w+)+)`")
 
@@ -53,7 +54,10 @@ def write_pages(names: list[str], folder: Path) -> None:
         if hasattr(import_module(name), "__all__"):  # a package's public names are explained where they are defined
             lines += ["   :imported-members:", "   :no-index:"]
         _write(folder / f"{name}.rst", lines)
-    _write(folder / "index.rst", ["Modules", "=======", "", *(f"* :doc:`{name}`" for name in names)])
+    lines = ["Modules", "=======", "", "The public names are those of these packages:", ""]
+    lines += [f"* :doc:`{name}`" for name in PUBLIC_PACKAGES]
+    lines += ["", "All modules:", "", *(f"* :doc:`{name}`" for name in names)]
+    _write(folder / "index.rst", lines)
 
 
 def _write(path: Path, lines: list[str]) -> None:
