@@ -1,7 +1,8 @@
-"""A backend `onnxruntime` for Triton, in Python: runs the `model.onnx` of a version as it stands.
+"""A backend `onnxruntime` for Triton, written in Python: it runs the `model.onnx` of a version without changes.
 
-Triton's own backend of this name is a library, which its containers have and the wheel `nvidia-pytriton` has not. Put
-this folder into Triton's folder of backends, beside `python`; the configuration of a model needs no word about it.
+Triton's own backend of this name is a library, which the containers of Triton contain and the wheel `nvidia-pytriton`
+does not contain. This folder is copied into Triton's folder of backends, beside `python`. The configuration of a model
+needs no entry for the backend.
 """
 
 import json
@@ -12,31 +13,39 @@ import triton_python_backend_utils as pb_utils
 
 
 class TritonPythonModel:
-    """One version of one model."""
+    """One version of one model. Triton calls the methods."""
 
     @staticmethod
     def auto_complete_config(config):
-        """The configuration as it is: `config.pbtxt` says everything."""
+        """Return the configuration unchanged, because `config.pbtxt` is complete."""
         return config
 
     def initialize(self, args):
-        """Open the session: one thread, as a press takes microseconds."""
+        """Open a session with one thread, because a press takes microseconds.
+
+        Args:
+            args: Repository, version and configuration of the model, as Triton passes them.
+        """
         options = ort.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.intra_op_num_threads = 1
+        options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         path = Path(args["model_repository"], args["model_version"], "model.onnx")
         self._session = ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-        (self._input,) = (tensor["name"] for tensor in json.loads(args["model_config"])["input"])
+        (input_tensor,) = json.loads(args["model_config"])["input"]
+        self._input_name = input_tensor["name"]
 
     def execute(self, requests):
-        """One response for each request; what fails is the answer to that request alone."""
+        """Return a response to each request. An error affects only the response to its request."""
         return [self._respond(request) for request in requests]
 
     def _respond(self, request):
-        names = list(request.requested_output_names())
+        """Run the model, and return the requested outputs or the error as a response."""
+        output_names = list(request.requested_output_names())
         try:
-            charges = pb_utils.get_input_tensor_by_name(request, self._input).as_numpy()
-            rows = self._session.run(names, {self._input: charges})
-        except Exception as error:  # onnxruntime's exceptions have no common base of their own
+            charges = pb_utils.get_input_tensor_by_name(request, self._input_name).as_numpy()
+            outputs = self._session.run(output_names, {self._input_name: charges})
+        except Exception as error:  # onnxruntime's exceptions have no common base class of their own
             return pb_utils.InferenceResponse(error=pb_utils.TritonError(str(error)))
-        return pb_utils.InferenceResponse([pb_utils.Tensor(*of) for of in zip(names, rows, strict=True)])
+        tensors = [pb_utils.Tensor(name, rows) for name, rows in zip(output_names, outputs, strict=True)]
+        return pb_utils.InferenceResponse(tensors)
