@@ -122,7 +122,7 @@ def test_the_base_install_writes_the_playground(installed, tmp_path):
     assert text.startswith("<!doctype html>")
     assert "{{data}}" not in text
     again = run(["demo", "--playground", "pages/playground.html"], installed(), tmp_path)
-    assert again.returncode == 2
+    assert again.returncode == 1
     assert "is already there" in again.stderr
 
 
