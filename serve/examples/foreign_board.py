@@ -2,9 +2,9 @@
 What does my board send?
 ========================
 
-Nobody described these frames: a sync byte, a counter, three channels of 24 bits, a checksum. They are recognised from
-their bytes, and the section ``[frames]`` of a device file comes out; ``isocharge serve doctor --port PORT --write
-board.toml`` does the same at a port and examines the channels, too.
+A board sends frames that no device file describes: a sync byte, a counter, three channels of 24 bits, and a checksum.
+This example recognises the frames from their bytes and prints the section ``[frames]`` of a device file. The command
+``isocharge serve doctor --port PORT --write board.toml`` does the same at a port, and also examines the channels.
 """
 
 import matplotlib.pyplot as plt
@@ -13,11 +13,14 @@ import numpy as np
 from isocharge.serve import device_from_table
 from isocharge.serve.recognition.recognise import recognise
 
-rng, frames = np.random.default_rng(1), []
+rng = np.random.default_rng(1)
+frames = []
 for number in range(400):
     counts = rng.normal((52_000, -31_000, 8_000), 300.0).astype(int)
-    body = bytes([0xA5, number % 256]) + b"".join(int(count).to_bytes(3, "big", signed=True) for count in counts)
-    frames.append(body + bytes([sum(body[1:]) % 256]))
+    channels = b"".join(int(count).to_bytes(3, "big", signed=True) for count in counts)
+    body = bytes([0xA5, number % 256]) + channels
+    checksum = sum(body[1:]) % 256
+    frames.append(body + bytes([checksum]))
 
 found = recognise(frames, seconds=2.0)
 for key, value in found.items():
@@ -26,13 +29,19 @@ parser = device_from_table({"frames": found}, "board").parser()
 values = np.array([frame.values for data in frames for frame in parser.feed(data)])
 print(f"{len(values)} of {len(frames)} frames are read, channels near {np.median(values, axis=0).round(-3)}")
 
-names, at = [], 0
-for field in [{"name": "sync", "type": "u8"}, *found["fields"], {"name": found["checksum"], "type": "u8"}]:
+# The picture shows one row for each frame, and the name and the type of each field below its bytes.
+fields = [{"name": "sync", "type": "u8"}, *found["fields"], {"name": found["checksum"], "type": "u8"}]
+tick_positions = []
+tick_labels = []
+first_byte = 0
+for field in fields:
     size = int(field["type"][1:]) // 8
-    names.append((at + 0.5 * (size - 1), f"{field.get('name', '')}\n{field['type']}"))
-    at += size
+    tick_positions.append(first_byte + 0.5 * (size - 1))
+    tick_labels.append(f"{field.get('name', '')}\n{field['type']}")
+    first_byte += size
+frame_bytes = np.frombuffer(b"".join(frames[:60]), np.uint8).reshape(60, -1)
 plt.figure(figsize=(6.4, 4.8), layout="constrained")
-plt.imshow(np.frombuffer(b"".join(frames[:60]), np.uint8).reshape(60, -1), aspect="auto", cmap="Blues")
-plt.xticks(*zip(*names, strict=True))
-plt.gca().set(ylabel="frame", title="60 frames, byte by byte, and what was recognised")
+plt.imshow(frame_bytes, aspect="auto", cmap="Blues")
+plt.xticks(tick_positions, tick_labels)
+plt.gca().set(ylabel="frame", title="bytes of 60 frames, and the recognised fields")
 plt.show()

@@ -2,8 +2,8 @@
 How do I switch a lamp by touch?
 ================================
 
-Each frame of a board becomes a record: act on it. ``python serve/examples/lamp.py /dev/ttyACM0`` follows a board at a
-port for twenty seconds; without a port, a simulated sensor plays.
+The loop receives one record for each frame of a board and acts on it. ``python serve/examples/lamp.py /dev/ttyACM0``
+reads a board at a port for twenty seconds. Without a port, a simulated sensor is used.
 """
 
 import sys
@@ -13,35 +13,46 @@ import matplotlib.pyplot as plt
 from isocharge.serve import Chunk, Port, Predictor, VirtualSensor, stream, wander
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 
-RATE_HZ, SECONDS, HARD_N = 200.0, 20.0, 0.5
+RATE_HZ = 200.0
+SECONDS = 20.0
+HARD_PRESS_N = 0.5
 
 
-def simulated():
-    """What a board sends in each of its frames, without waiting for it."""
-    film = ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0))
-    sensor = VirtualSensor(film.charges, wander(seed=4, rate_Hz=RATE_HZ), noise=noise_model("reference").add)
-    return (Chunk(data, number / RATE_HZ, 0) for number, data in enumerate(sensor.frames()))
+def simulated_chunks():
+    """Yield the bytes of each frame of a simulated board, without waiting for the time of the frame."""
+    forward_map = ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0))
+    script = wander(seed=4, rate_Hz=RATE_HZ)
+    sensor = VirtualSensor(forward_map.charges, script, noise=noise_model("reference").add)
+    for number, data in enumerate(sensor.frames()):
+        yield Chunk(data, number / RATE_HZ, 0)
 
 
-chunks = Port(sys.argv[1], wait=60.0) if len(sys.argv) > 1 else simulated()
-time, force, lamp, on, touched = [], [], [], False, False
+chunks = Port(sys.argv[1], wait=60.0) if len(sys.argv) > 1 else simulated_chunks()
+times_s = []
+forces_N = []
+lamp_states = []
+is_on = False
+has_switched = False  # whether this touch has switched the lamp
 for record in stream(chunks, Predictor("three-25um-biaxial")):  # the first half second is the tare
-    trusted = record.contact and not set(record.flags) - {"stress"}  # that flag says that the film will have a dent
-    pressed = trusted and record.force_N > HARD_N
-    if pressed and not touched:
-        on = not on  # here a program would switch its lamp
-        print(f"{'on' if on else 'off'} by {record.force_N:.2f} N at ({record.x_mm:.1f}, {record.y_mm:.1f}) mm")
-    touched = record.contact and (touched or pressed)
-    time.append(record.timestamp)
-    force.append(record.force_N or 0.0)
-    lamp.append(on)
-    if time[-1] - time[0] > SECONDS:
+    # The flag `stress` means that the film will have a dent. The contact is correct nevertheless.
+    is_reliable = record.contact and not set(record.flags) - {"stress"}
+    is_hard_press = is_reliable and record.force_N > HARD_PRESS_N
+    if is_hard_press and not has_switched:
+        is_on = not is_on  # a real program would switch its lamp here
+        state = "on" if is_on else "off"
+        print(f"{state} by {record.force_N:.2f} N at ({record.x_mm:.1f}, {record.y_mm:.1f}) mm")
+    has_switched = record.contact and (has_switched or is_hard_press)
+    times_s.append(record.timestamp)
+    forces_N.append(record.force_N or 0.0)
+    lamp_states.append(is_on)
+    if times_s[-1] - times_s[0] > SECONDS:
         break
 
 figure, axes = plt.subplots(figsize=(9.0, 3.6), layout="constrained")
-axes.fill_between(time, 0.0, [2.0 * value for value in lamp], color="gold", alpha=0.4, step="post", label="the lamp")
-axes.plot(time, force, label="force")
-axes.axhline(HARD_N, color="k", ls=":", lw=0.8)
+lamp_heights = [2.0 * is_on for is_on in lamp_states]
+axes.fill_between(times_s, 0.0, lamp_heights, color="gold", alpha=0.4, step="post", label="the lamp")
+axes.plot(times_s, forces_N, label="force")
+axes.axhline(HARD_PRESS_N, color="k", ls=":", lw=0.8)
 axes.set(xlabel="time, s", ylabel="force, N")
 axes.legend(loc="upper right")
 plt.show()

@@ -2,8 +2,9 @@
 How do I look at a recording?
 =============================
 
-``isocharge serve stream --record`` keeps bytes and records, and ``isocharge serve plot`` draws them. In Python a
-recording gives its records as they were written, each as a structure of the fields that are wanted.
+``isocharge serve stream --record`` writes the bytes of a board and the records into a file, and ``isocharge serve
+plot`` draws this file. In Python, a recording returns its records as they were written. A structure declares which
+fields are read.
 """
 
 import tempfile
@@ -17,9 +18,12 @@ from isocharge.serve import Chunk, Predictor, Recorder, Recording, TouchStream, 
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 from isocharge.simulate.plots.film import draw_electrodes, frame_film
 
+RATE_HZ = 200.0
+FRAMES = 4000
+
 
 class Touch(Struct):
-    """What is wanted of a record; where nothing touches, there is no place."""
+    """The fields that are read of each record. The position is None if nothing touches."""
 
     contact: bool
     x_mm: float | None
@@ -27,23 +31,28 @@ class Touch(Struct):
     force_N: float | None
 
 
-sensor, touch = load_sensor("three-25um-biaxial"), TouchStream(Predictor("three-25um-biaxial"))
-film = ForwardMap.build(sensor, Circle(1.0))
-board = VirtualSensor(film.charges, wander(seed=2), noise=noise_model("reference").add)
+sensor = load_sensor("three-25um-biaxial")
+touch = TouchStream(Predictor("three-25um-biaxial"))
+forward_map = ForwardMap.build(sensor, Circle(1.0))
+board = VirtualSensor(forward_map.charges, wander(seed=2), noise=noise_model("reference").add)
 with tempfile.TemporaryDirectory() as folder:
     path = Path(folder) / "touch.rec"
     with Recorder(path, "three-25um-biaxial/1", "every", {}) as recorder:
-        for number, data in enumerate(islice(board.frames(), 4000)):
-            chunk = Chunk(data, number / 200.0, 0)
-            recorder.chunk(chunk, [record.to_json() for record in touch.feed(chunk)])
+        for number, data in enumerate(islice(board.frames(), FRAMES)):
+            chunk = Chunk(data, number / RATE_HZ, 0)
+            lines = [record.to_json() for record in touch.feed(chunk)]
+            recorder.chunk(chunk, lines)
     records = list(Recording(path).records(Touch))
+
 touches = [record for record in records if record.contact]
-print(f"{len(records)} records, {len(touches)} of them of touches, up to {max(t.force_N for t in touches):.2f} N")
+x_mm = [record.x_mm for record in touches]
+y_mm = [record.y_mm for record in touches]
+force_N = [record.force_N for record in touches]
+print(f"{len(records)} records, {len(touches)} of them of touches, up to {max(force_N):.2f} N")
 
 figure, axes = plt.subplots(figsize=(6.4, 5.6), layout="constrained")
-x, y, force = zip(*((t.x_mm, t.y_mm, t.force_N) for t in touches), strict=True)
-shades = axes.scatter(x, y, c=force, s=4, cmap="viridis")
-figure.colorbar(shades, label="force, N")
+dots = axes.scatter(x_mm, y_mm, c=force_N, s=4, cmap="viridis")
+figure.colorbar(dots, label="force, N")
 draw_electrodes(axes, sensor)
 frame_film(axes, sensor, 8.0, "twenty seconds of touches")
 plt.show()

@@ -2,8 +2,8 @@
 How do I read two films at once?
 ================================
 
-One stream for each film, taken in turns: here two fingertips, and a pinch is when both are touched. Each stream has
-its own model, tare and name; at two ports each would run in a thread or a process of its own.
+Each film has a stream of its own, with its own model, tare and name. Here the films are on two fingertips, and a pinch
+is the time in which both films are touched. With two ports, run each stream in a thread or a process of its own.
 """
 
 from itertools import islice
@@ -14,28 +14,32 @@ import numpy as np
 from isocharge.serve import Chunk, Predictor, TouchStream, VirtualSensor, wander
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 
-RATE_HZ, forces = 200.0, []
-for seed, (finger, name) in enumerate((("thumb", "three-25um-biaxial"), ("index", "four-25um-biaxial"))):
-    film = ForwardMap.build(load_sensor(name), Circle(1.0))
-    board = VirtualSensor(
-        film.charges, wander(seed=seed, rate_Hz=RATE_HZ), noise=noise_model("reference").add, seed=seed
-    )
-    touch = TouchStream(Predictor(name), frame_id=finger)
-    chunks = (Chunk(data, number / RATE_HZ, 0) for number, data in enumerate(islice(board.frames(), 4000)))
-    records = [record for chunk in chunks for record in touch.feed(chunk)]
-    forces.append([record.force_N or 0.0 for record in records])
-    print(
-        f"{records[0].frame_id}, {records[0].model}: touched in {np.mean(np.array(forces[-1]) > 0.0):.0%} of the frames"
-    )
-thumb, index = np.array(forces)
-pinch = np.minimum(thumb, index)
-print(f"a pinch in {np.mean(pinch > 0.0):.0%} of the frames, up to {pinch.max():.2f} N")
+RATE_HZ = 200.0
+FRAMES = 4000
+MODELS = {"thumb": "three-25um-biaxial", "index": "four-25um-biaxial"}
 
-time = np.arange(len(thumb)) / RATE_HZ
+forces_N = {}
+for seed, (finger, model) in enumerate(MODELS.items()):
+    forward_map = ForwardMap.build(load_sensor(model), Circle(1.0))
+    script = wander(seed=seed, rate_Hz=RATE_HZ)
+    board = VirtualSensor(forward_map.charges, script, noise=noise_model("reference").add, seed=seed)
+
+    touch = TouchStream(Predictor(model), frame_id=finger)
+    records = []
+    for number, data in enumerate(islice(board.frames(), FRAMES)):
+        records += touch.feed(Chunk(data, number / RATE_HZ, 0))
+    forces_N[finger] = np.array([record.force_N or 0.0 for record in records])
+    touched_share = np.mean(forces_N[finger] > 0.0)
+    print(f"{records[0].frame_id}, {records[0].model}: touched in {touched_share:.0%} of the frames")
+
+pinch_N = np.minimum(forces_N["thumb"], forces_N["index"])
+print(f"a pinch in {np.mean(pinch_N > 0.0):.0%} of the frames, up to {pinch_N.max():.2f} N")
+
+times_s = np.arange(len(pinch_N)) / RATE_HZ
 plt.figure(figsize=(9.0, 3.6), layout="constrained")
-plt.plot(time, thumb, label="thumb")
-plt.plot(time, index, label="index")
-plt.fill_between(time, 0.0, pinch, alpha=0.5, color="C2", label="pinch")
+for finger, force_N in forces_N.items():
+    plt.plot(times_s, force_N, label=finger)
+plt.fill_between(times_s, 0.0, pinch_N, alpha=0.5, color="C2", label="pinch")
 plt.gca().set(xlabel="time, s", ylabel="force, N")
 plt.legend()
 plt.show()
