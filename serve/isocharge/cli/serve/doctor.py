@@ -166,27 +166,29 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
     """
     device = device_from_table(examination.device, "board")
     names = [channel.name for channel in examination.channels]
+    are_electrodes_named = set(electrodes) <= set(names)
     if device.channels:
         channels = dict(device.channels)
-    elif len(electrodes) == len(names) and not set(electrodes) <= set(names):
-        channels = dict(zip(electrodes, names, strict=True))
+    elif len(electrodes) == len(names) and not are_electrodes_named:
+        channels = dict(zip(electrodes, names, strict=True))  # the channels are assigned by their order
     else:
-        channels = dict(zip(names, names, strict=True))
+        channels = dict(zip(names, names, strict=True))  # each channel is the electrode of its name
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
         return check_electrodes(port, device, channels, say)
 
 
 def port_lines() -> Iterator[str]:
     """Yield a line for each serial port of this machine: its description, and what came within a second."""
-    for found in sorted(list_ports.comports()):
+    for port in sorted(list_ports.comports()):
         try:
-            examination = examine(found.device, seconds=1.0)
-            received = examination.missing[0] if examination.missing else "nothing is missing"
-            if examination.good:
-                received = f"{examination.format}, {examination.rate_Hz:.0f} frames/s at {examination.baud} baud"
+            examination = examine(port.device, seconds=1.0)
         except IsochargeError as error:
-            received = str(error)
-        yield f"{found.device} ({found.description}): {received}"
+            yield f"{port.device} ({port.description}): {error}"
+            continue
+        received = examination.missing[0] if examination.missing else "nothing is missing"
+        if examination.good:
+            received = f"{examination.format}, {examination.rate_Hz:.0f} frames/s at {examination.baud} baud"
+        yield f"{port.device} ({port.description}): {received}"
 
 
 def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
@@ -259,7 +261,11 @@ def _write(path: Path, examination: Examination, model: str) -> None:
 
 
 def report_lines(examination: Examination) -> Iterator[str]:
-    """Yield the lines of an examination as text for people."""
+    """Yield the lines of the report about a port: the frames, a table of the channels, and what is missing.
+
+    Args:
+        examination: Result of the port check.
+    """
     speed = f" at {examination.baud} baud" if has_speed(examination.url) else ""
     yield f"{examination.url}{speed}: {examination.format}"
     yield f"{examination.bytes_seen} bytes in {examination.seconds:.1f} s, {examination.rate_Hz:.1f} frames/s"

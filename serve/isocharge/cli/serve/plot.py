@@ -261,7 +261,12 @@ def _draw_flags(axes: Any, groups: _Groups, traces: dict[str, Array], words: lis
 
 
 def _label_axes(axes: Any, label: str) -> None:
-    """Add a label, a grid and, if there is anything to list, a legend to axes."""
+    """Add a label, a grid and, if a line of the axes has a label, a legend.
+
+    Args:
+        axes: Axes of matplotlib.
+        label: Label of the vertical axis.
+    """
     axes.set_ylabel(label, fontsize=9)
     axes.grid(alpha=0.3)
     handles, _ = axes.get_legend_handles_labels()

@@ -82,6 +82,10 @@ TlsKeyOption = Annotated[
 def given_tls(certificate: Path | None, key: Path | None) -> Tls | None:
     """Return the TLS files of the options; None without a certificate.
 
+    Args:
+        certificate: Value of `--tls-cert`; None if the option is not given.
+        key: Value of `--tls-key`; None if the option is not given.
+
     Raises:
         InputError: If the key is given without a certificate.
     """
@@ -125,7 +129,8 @@ def page_address(live: str, token: str | None) -> Address:
     host, colon, port = live.rpartition(":")
     if not colon:
         host = LOOPBACK
-    is_port = port.isascii() and port.isdecimal() and len(port) <= len(str(MAX_PORT)) and int(port) <= MAX_PORT
+    is_short_number = port.isascii() and port.isdecimal() and len(port) <= len(str(MAX_PORT))
+    is_port = is_short_number and int(port) <= MAX_PORT
     if not (host and is_port):
         raise InputError(f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}")
     address = Address(host.removeprefix("[").removesuffix("]"), int(port))
@@ -260,8 +265,15 @@ def _carry_out(
 ) -> None:
     """Carry out one request of the page.
 
+    Args:
+        request: The request.
+        link: The reader's end of the link to the page.
+        live: The stream.
+        header: Policy, device table and name of the film, for recordings that the page begins; None if the command
+            itself records the stream.
+
     Raises:
-        InputError: If the page asks for a recording while the command makes one.
+        InputError: If the page requests a recording while the command records the stream.
     """
     match request:
         case Marker(text=text):

@@ -154,7 +154,12 @@ def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
 
 
 def _fit_line(x: Array, y: Array) -> LineFit:
-    """Fit a straight line to points with the coordinates x and y, each of shape (n,), by least squares."""
+    """Fit a straight line to points by least squares.
+
+    Args:
+        x: First coordinates of the points, shape (n,).
+        y: Second coordinates of the points, shape (n,).
+    """
     centred_x = x - x.mean()
     centred_y = y - y.mean()
     slope = float(centred_x @ centred_y) / float(centred_x @ centred_x)

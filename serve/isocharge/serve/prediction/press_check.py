@@ -248,8 +248,8 @@ def _frequent_misfits(errors: PressErrors, rows: Booleans, metadata: ModelMetada
 def _probability_of_fewer(misfit_count: int, count: int) -> float:
     """Return the probability that fewer than `misfit_count` of `count` good presses have a misfit above the limit.
 
-    The number follows a binomial distribution. Its terms are computed by logarithms, because the binomial coefficients
-    overflow.
+    The number of such presses follows a binomial distribution with the probability `MISFIT_FRACTION`. Its terms are
+    computed by logarithms, because the binomial coefficients overflow.
     """
     log_odds = math.log(MISFIT_FRACTION / (1.0 - MISFIT_FRACTION))
     log_probability_of_none = count * math.log1p(-MISFIT_FRACTION)
@@ -317,7 +317,12 @@ def _explaining_rig_std(errors: ErrorSummary) -> float:
 
 
 def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
-    """Yield a note for each reason for which presses were excluded."""
+    """Yield a note for each reason for which presses were excluded, with the numbers of these presses.
+
+    Args:
+        errors: Errors of all presses, with the reasons.
+        metadata: Metadata of the model.
+    """
     reasons = errors.exclusion_reasons
     for reason in sorted(set(reasons) - {""}):
         lines = [line for line, line_reason in zip(errors.lines, reasons, strict=True) if line_reason == reason]

@@ -53,7 +53,15 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
 
 
 def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str] | None:
-    """Return the names of the parts of a field with several columns; None for a field with one column."""
+    """Return the names of the parts of a field that has several columns.
+
+    Args:
+        field: The field.
+        electrodes: Names of the electrodes.
+
+    Returns:
+        The names; None if the field has one column.
+    """
     if field.kind == "charges":
         return electrodes
     if field.kind == "object":

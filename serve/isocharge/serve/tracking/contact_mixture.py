@@ -442,7 +442,12 @@ class ContactMixture:
 
 
 def _updated_covariance(prior: Components, linearised: LinearisedUpdate) -> Array:
-    """Return the covariance of each component after a Kalman update, shape (n, 6 + n_electrode, 6 + n_electrode)."""
+    """Return the covariances of the components after a Kalman update, shape (n, 6 + n_electrode, 6 + n_electrode).
+
+    Args:
+        prior: Predicted components.
+        linearised: The update, linearised about the new states.
+    """
     cross_covariance = linearised.cross_covariance
     gain = np.linalg.solve(linearised.innovation_covariance, cross_covariance)
     covariance = prior.covariance - cross_covariance.swapaxes(1, 2) @ gain

@@ -106,7 +106,12 @@ def run_page(page: Page, announce: Callable[[str], object]) -> None:
 
 
 def _run(page: Page, url_sender: Connection) -> None:
-    """Run the page's process, and send its URL or the error that prevents it from starting."""
+    """Serve the page in its own process. Send the URL of the page, or the error that prevents the page from starting.
+
+    Args:
+        page: Settings of the page.
+        url_sender: Pipe to the process that has started the page.
+    """
     with suppress(OSError):
         os.nice(NICE)
     try:

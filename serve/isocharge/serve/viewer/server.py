@@ -155,7 +155,12 @@ class RateLimit:
         self._latest_s = now_s
 
     def allows(self, count: int, now_s: float) -> bool:
-        """Count received data, bytes, and return whether they are within the limit."""
+        """Count received data, and return whether they are within the limit.
+
+        Args:
+            count: Size of the data, bytes.
+            now_s: Time on a monotonic clock, s.
+        """
         elapsed_s = max(now_s - self._latest_s, 0.0)
         refilled_bytes = min(self._burst_bytes, self._available_bytes + elapsed_s * self._bytes_per_s)
         self._available_bytes = refilled_bytes - count
@@ -297,7 +302,13 @@ class PageServer:
             pass
 
     async def _handle_message(self, viewer: Viewer, connection: ServerConnection, message: str | bytes) -> None:
-        """Handle a confirmation or a request of the page. The response to an invalid message is the error."""
+        """Handle a confirmation or a request of the page. The response to an invalid message is the error.
+
+        Args:
+            viewer: The viewer that has sent the message.
+            connection: Connection of the viewer.
+            message: Bytes for a confirmation, text for a request.
+        """
         try:
             if isinstance(message, bytes):
                 viewer.confirm(confirmed_number(message))

@@ -322,7 +322,7 @@ class Connection(asyncio.Protocol):
         self._url += url
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Append a header. Trailers, which follow the body, are ignored."""
+        """Append a header, whose name may be in any case. Trailers, which follow the body, are ignored."""
         if self._phase is Phase.BODY:
             return
         lower_name = name.lower()

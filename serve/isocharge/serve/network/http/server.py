@@ -121,7 +121,12 @@ class HttpServer:
             handshake.add_done_callback(self._handshakes.pop)
 
     async def _connect(self, accepted: socket.socket, loop: asyncio.AbstractEventLoop) -> None:
-        """Create the connection of an accepted socket, after the TLS handshake if the server uses TLS."""
+        """Create the connection of an accepted socket, after the TLS handshake if the server uses TLS.
+
+        Args:
+            accepted: The accepted socket, which is closed if the handshake fails.
+            loop: Event loop of the server.
+        """
         new_connection = partial(Connection, self._handler, self._connections, loop)
         timeout_s = self._limits.header_seconds if self._tls else None
         try:
