@@ -45,6 +45,15 @@ def test_a_thicker_and_a_tauter_film_give_less_charge(run):
     assert (np.diff(by_thickness, axis=1) < 0.0).all()
 
 
+def test_effects_of_the_bench_agree_with_an_independent_linear_inverse(run):
+    """Position errors by another solver: 1.4, 3.2, 5.1 mm for a closed cavity, 0.24, 1.7, 0.9 mm for a kelvin."""
+    lines = run("simulate/examples/bench_effects.py").splitlines()
+    closed = [float(re.search(r": ([\d.]+) mm", line)[1]) for line in lines if "cavity" in line]
+    warm = [float(re.search(r": ([\d.]+) mm", line)[1]) for line in lines if "warmer" in line]
+    np.testing.assert_allclose(closed, [1.4, 3.2, 5.1], atol=0.06)
+    np.testing.assert_allclose(warm, [0.24, 1.7, 0.9], rtol=0.2)
+
+
 def test_a_lamp_is_switched_by_each_hard_press(run, monkeypatch):
     monkeypatch.setattr(ForwardMap, "build", partial(kept, ForwardMap.build))
     lines = run("serve/examples/lamp.py").splitlines()

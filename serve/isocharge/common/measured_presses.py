@@ -2,7 +2,8 @@
 
 A file of presses is CSV or Parquet with the columns `x_mm`, `y_mm`, `force_N` and one column for each electrode (pC),
 in any order. An empty cell is unknown. The optional columns `position_std_mm` and `force_std` (a share: 0.01 is 1 %)
-state how exactly the rig knows position and force, and `temperature_C` is the temperature of the ring of the film.
+state how exactly the rig knows position and force, and `temperature_C` is the temperature of the ring of the film, and
+`film_temperature_C` that of the film itself or of the air at its surface.
 Further columns are ignored if the electrodes are named. `isocharge serve predict` reads these files, too.
 """
 
@@ -38,12 +39,20 @@ CONTACT = ("x_mm", "y_mm", "force_N")
 UNCERTAINTY = ("position_std_mm", "force_std")
 
 TEMPERATURE = "temperature_C"
+FILM_TEMPERATURE = "film_temperature_C"
 MIN_TEMPERATURE_C = -100.0
 MAX_TEMPERATURE_C = 200.0
 """Range of temperatures that a film of PVDF may have."""
 
 _POSITION = "a position in mm, or an empty cell if it is unknown"
 _FORCE_WORDS = frozenset({"force", "kraft", "fuerza", "forza", "f", "load", "last"})
+
+_TEMPERATURE_RULE = ColumnRule(
+    f"a temperature of {MIN_TEMPERATURE_C:g} to {MAX_TEMPERATURE_C:g} degrees Celsius, or an empty cell if it is "
+    "unknown",
+    MIN_TEMPERATURE_C,
+    MAX_TEMPERATURE_C,
+)
 
 PRESS_RULES = {
     "x_mm": ColumnRule(_POSITION, meaning=ColumnMeaning(unit="mm", words=frozenset({"x"}))),
@@ -55,12 +64,8 @@ PRESS_RULES = {
     ),
     "position_std_mm": ColumnRule("a positive standard deviation in mm", is_positive=True),
     "force_std": ColumnRule("a positive share of the force up to 1 (0.01 is 1 %)", maximum=1.0, is_positive=True),
-    TEMPERATURE: ColumnRule(
-        f"a temperature of {MIN_TEMPERATURE_C:g} to {MAX_TEMPERATURE_C:g} degrees Celsius, or an empty cell if it is "
-        "unknown",
-        MIN_TEMPERATURE_C,
-        MAX_TEMPERATURE_C,
-    ),
+    TEMPERATURE: _TEMPERATURE_RULE,
+    FILM_TEMPERATURE: _TEMPERATURE_RULE,
 }
 """The columns of a file of presses that are not electrodes."""
 
@@ -88,6 +93,8 @@ class MeasuredPresses:
         ignored: Columns of the file that were not read.
         temperature_C: Temperature of the ring of the film, shape (n,), degrees Celsius; NaN if unknown, None if it is
             unknown for all presses.
+        film_temperature_C: Temperature of the film or of the air at its surface, shape (n,), degrees Celsius; NaN if
+            unknown, None if it is unknown for all presses. It is only allowed together with `temperature_C`.
         row_noun: What `lines` counts, for messages: "line", "row" or "press".
 
     Raises:
@@ -103,6 +110,7 @@ class MeasuredPresses:
     ignored: tuple[str, ...] = ()
     temperature_C: Array | None = None
     row_noun: str = "line"
+    film_temperature_C: Array | None = None
 
     def __post_init__(self) -> None:
         _check_electrodes(self.electrodes)
@@ -122,6 +130,7 @@ class MeasuredPresses:
             position_std_mm=self.position_std_mm[chosen],
             force_std=self.force_std[chosen],
             temperature_C=None if self.temperature_C is None else self.temperature_C[chosen],
+            film_temperature_C=None if self.film_temperature_C is None else self.film_temperature_C[chosen],
             lines=tuple(self.lines[row] for row in chosen),
         )
 
@@ -134,6 +143,11 @@ class MeasuredPresses:
     def knows_temperature(self) -> bool:
         """Whether the temperature of at least one press is known."""
         return self.temperature_C is not None and not bool(np.isnan(self.temperature_C).all())
+
+    @property
+    def knows_film_temperature(self) -> bool:
+        """Whether the temperature of the film itself is known for at least one press."""
+        return self.film_temperature_C is not None and not bool(np.isnan(self.film_temperature_C).all())
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, MeasuredPresses):
@@ -175,6 +189,8 @@ class MeasuredPresses:
         columns |= dict(zip(UNCERTAINTY, (self.position_std_mm, self.force_std), strict=True))
         if self.temperature_C is not None and self.knows_temperature:
             columns[TEMPERATURE] = self.temperature_C
+        if self.film_temperature_C is not None and self.knows_film_temperature:
+            columns[FILM_TEMPERATURE] = self.film_temperature_C
         return columns
 
     def _check_shapes(self) -> None:
@@ -188,6 +204,8 @@ class MeasuredPresses:
         }
         if self.temperature_C is not None:
             expected_shapes[TEMPERATURE] = (count,)
+        if self.film_temperature_C is not None:
+            expected_shapes[FILM_TEMPERATURE] = (count,)
         for name, shape in expected_shapes.items():
             given = getattr(self, name).shape
             if given != shape:
@@ -201,6 +219,11 @@ class MeasuredPresses:
         columns = NumberColumns(self.columns, np.array(self.lines, dtype=np.intp), self.row_noun)
         columns.check(rules, "", PressError)
 
+        if self.knows_film_temperature and not self.knows_temperature:
+            raise PressError(
+                f"{FILM_TEMPERATURE}: expected also the temperature of the ring in the column {TEMPERATURE}, got none; "
+                "measure both, because their difference changes the pretension"
+            )
         x_is_unknown = np.isnan(self.contact[:, CONTACT.index("x_mm")])
         y_is_unknown = np.isnan(self.contact[:, CONTACT.index("y_mm")])
         self._refuse_first(
@@ -266,6 +289,7 @@ def read_presses(
     for name, std in default_stds.items():
         values[name] = np.where(np.isnan(values[name]), std, values[name])
     temperature_C = values[TEMPERATURE]
+    film_temperature_C = values[FILM_TEMPERATURE]
     with error_prefix(f"{path}, ", PressError):
         return MeasuredPresses(
             contact=np.column_stack([values[name] for name in CONTACT]),
@@ -277,6 +301,7 @@ def read_presses(
             ignored=ignored,
             temperature_C=None if np.isnan(temperature_C).all() else temperature_C,
             row_noun=columns.row_noun,
+            film_temperature_C=None if np.isnan(film_temperature_C).all() else film_temperature_C,
         )
 
 

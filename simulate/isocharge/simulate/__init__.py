@@ -25,6 +25,7 @@ with require("simulate"):
     from isocharge.simulate.forward.forward_map import ForwardMap
     from isocharge.simulate.forward.readout import touch_charge
     from isocharge.simulate.forward.side_force import SideForceMap
+    from isocharge.simulate.forward.tension_map import TensionMap
     from isocharge.simulate.identifiability.cramer_rao import limits_at
     from isocharge.simulate.identifiability.identification import identify
     from isocharge.simulate.identifiability.working_area import working_area
@@ -71,6 +72,7 @@ __all__ = [
     "SideForceMap",
     "SolveSettings",
     "Sweep",
+    "TensionMap",
     "Theory",
     "Triangulation",
     "built_in_sensors",

@@ -67,6 +67,38 @@ def test_what_a_kelvin_does_is_learned_and_said(day):
     assert f"The pretension changes by {known.MPa_per_K:.3g}" in " ".join(day.summary)
 
 
+def test_pretension_per_kelvin_of_the_film_above_its_ring_is_estimated(problem):
+    """Presses with the column film_temperature_C, on charges of direct solves; the ring stays at 21 C."""
+    per_film_K = 1e-4 * 3000.0 / (1.0 - 0.34)
+    excess_K = np.random.default_rng(3).permutation(np.linspace(-1.0, 1.0, 12))
+    rng = np.random.default_rng(6)
+    contact = draw_contacts(rng, problem.domain.within(7.5), 12)
+    charge = problem.noise.add(kept(charges_at, contact, 1.1 - per_film_K * excess_K), rng)
+    ring_C = np.full(12, 21.0)
+    presses = replace(
+        presses_of(problem, contact, charge, 0.02, 0.003), temperature_C=ring_C, film_temperature_C=ring_C + excess_K
+    )
+    result = calibrate(presses, problem)
+    estimate = result.posterior.nuisances["pretension_per_film_K"]
+    assert estimate.value == pytest.approx(-per_film_K, abs=2.5 * estimate.std)
+    assert estimate.std < 0.06
+    assert result.posterior.parameters[0] == pytest.approx(1.1, abs=0.15)
+    assert "per kelvin that the film is warmer than its ring" in " ".join(result.summary)
+
+
+def test_film_temperature_is_written_read_and_refused_without_that_of_the_ring(problem, tmp_path):
+    presses = replace(
+        pressed(problem, 5, DAY)[:3],
+        temperature_C=np.array([20.0, 20.1, 20.2]),
+        film_temperature_C=np.array([20.5, np.nan, 21.0]),
+    )
+    write_presses(tmp_path / "presses.csv", presses)
+    assert "film_temperature_C" in (tmp_path / "presses.csv").read_text()
+    assert read_presses(tmp_path / "presses.csv", problem.electrodes) == presses
+    with pytest.raises(PressError, match="expected also the temperature of the ring in the column temperature_C"):
+        replace(presses, temperature_C=None)
+
+
 def test_the_film_at_another_temperature(day, tmp_path, command):
     _, out, _ = command(*CALIBRATE, "--from", written(day, tmp_path), "--temperature", "20.5", "--json")
     table = json.loads(out)

@@ -15,7 +15,7 @@ from isocharge.cli.shared.forward_maps import ROUNDING_MARGIN
 from isocharge.cli.shared.options import SensorArgument
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import announce, say, shown_progress, until_stopped
-from isocharge.cli.shared.virtual_sensor import film_charges, measuring, random_script
+from isocharge.cli.shared.virtual_sensor import film_charges, film_charges_per_K, measuring, random_script
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
@@ -143,11 +143,12 @@ def virtual_command(
                 radius=_largest_distance_mm(radius, scripted_presses),
                 force_range=(DEFAULT_PLAYED_FORCE_RANGE[0], _largest_force_N(force_max, scripted_presses)),
             )
+            charges_per_K = film_charges_per_K(forward_map)
         remaining_rest_s = start_s + rest - time.monotonic()
         if remaining_rest_s > 0.0:
             threading.Event().wait(remaining_rest_s)
         presses = scripted_presses or random_script(forward_map, seed, rate, force_max)
-        player.use(film_charges(forward_map), presses)
+        player.use(film_charges(forward_map), presses, charges_per_K)
         played_name = sensor if film is None else f"film {film} of {sensor}"
         say(f"playing {played_name} at {rate:g} Hz; Ctrl-C stops")
         threading.Event().wait(seconds)

@@ -8,7 +8,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE
 from isocharge.serve import Script, VirtualSensor, wander
 from isocharge.serve.virtual_sensor.sensor import Charges
-from isocharge.simulate import Amplifier, ForwardMap, load_amplifier
+from isocharge.simulate import Amplifier, ForwardMap, TensionMap, load_amplifier
 
 SCRIPT_S = 60.0
 """Length of the random script that a virtual sensor repeats, s."""
@@ -54,25 +54,43 @@ def film_charges(forward_map: ForwardMap) -> Charges:
     Below the smallest force of the forward map, the charges of a contact fall with the force to the power of 2/3, as
     those of a membrane.
     """
-    return partial(_charges, forward_map)
+    return partial(_charges, forward_map.charges, forward_map.domain.force_range[0])
 
 
-def _charges(forward_map: ForwardMap, contact: Array) -> Array:
+def film_charges_per_K(forward_map: ForwardMap) -> Charges | None:
+    """Return the function from contacts to the change of the touch charges per kelvin of the film, pC/K.
+
+    The result is None if the temperature of the film does not change its pretension. Otherwise further presses are
+    solved.
+
+    Args:
+        forward_map: Charges of the presses.
+
+    Raises:
+        SceneError: If the probe of the forward map is not circular.
+    """
+    if forward_map.sensor.film.expansion is None:
+        return None
+    tension_map = TensionMap.build(forward_map)
+    return partial(_charges, tension_map.temperature_jacobian, forward_map.domain.force_range[0])
+
+
+def _charges(map_charges: Callable[[Array], Array], min_force_N: float, contact: Array) -> Array:
     """Compute the charges of contacts, also below the smallest force of the forward map; see `film_charges`.
 
     Args:
-        forward_map: Charges of the presses in its domain.
+        map_charges: Function from contacts in the domain of the forward map to charges.
+        min_force_N: Smallest force of the forward map, N.
         contact: Contacts (x, y, force), shape (n, 3), mm and N.
 
     Returns:
         Charges, shape (n, electrodes), pC.
     """
-    min_force_N = forward_map.domain.force_range[0]
     force_N = contact[:, 2]
     charge_share = (force_N.clip(max=min_force_N) / min_force_N) ** (2.0 / 3.0)  # 1 from the smallest force on
     contact_in_domain = contact.copy()
     contact_in_domain[:, 2] = force_N.clip(min=min_force_N)
-    return forward_map.charges(contact_in_domain) * charge_share[:, None]
+    return map_charges(contact_in_domain) * charge_share[:, None]
 
 
 def measuring(amplifier: Amplifier, rate_Hz: float) -> Callable[..., Any]:
@@ -83,16 +101,17 @@ def measuring(amplifier: Amplifier, rate_Hz: float) -> Callable[..., Any]:
         rate_Hz: Frames per second, Hz.
 
     Returns:
-        Function of the charges of consecutive frames, shape (n, electrodes), pC, and of a source of random numbers. It
-        returns the measured charges. The running amplifier, with its drift and its noise, is created by the first call.
+        Function of the charges of consecutive frames, shape (n, electrodes), pC, of a source of random numbers and,
+        optionally, of the change of the charges per kelvin of the film. It returns the measured charges. The running
+        amplifier, with its drift and its noise, is created by the first call.
     """
-    running_amplifier: Callable[[Any], Any] | None = None
+    running_amplifier: Callable[..., Any] | None = None
 
-    def measure(charge_pC: Any, rng: Any) -> Any:
+    def measure(charge_pC: Any, rng: Any, charge_pC_per_K: Any = None) -> Any:
         """Return the measured charges of the next frames."""
         nonlocal running_amplifier
         if running_amplifier is None:
             running_amplifier = amplifier.start(charge_pC.shape[1], rate_Hz, rng)
-        return running_amplifier(charge_pC)
+        return running_amplifier(charge_pC, charge_pC_per_K)
 
     return measure

@@ -90,8 +90,11 @@ def posix_modules() -> tuple[Any, Any, Any]:
 Charges = Callable[[Array], Array]
 """Forward map: function from contacts (x, y, F), shape (n, 3), mm and N, to charges, shape (n, electrodes), pC."""
 
-Noise = Callable[[Array, np.random.Generator], Array]
+Noise = Callable[..., Array]
 """Amplifier: function from charges and a random generator to measured charges, both of shape (n, electrodes), pC.
+
+If the touch charges depend on the temperature of the film, the third argument is their change per kelvin, shape
+(n, electrodes), pC/K.
 
 The function is called block by block in the order of time, so that the output may depend on earlier charges.
 """
@@ -178,7 +181,8 @@ class VirtualSensor:
         self._faults = faults or Faults()
         self._link = link
         self._clean_pC = _clean_charges(charges, script)
-        self._next_script: tuple[Script, Array] | None = None
+        self._clean_pC_per_K: Array | None = None
+        self._next_script: tuple[Script, Array, Array | None] | None = None
         n_electrode = self._clean_pC.shape[1]
         random_pC = self._rng.uniform(-MAX_RANDOM_OFFSET_pC, MAX_RANDOM_OFFSET_pC, n_electrode)
         self._offset_pC = random_pC if offset_pC is None else np.asarray(offset_pC)
@@ -212,7 +216,7 @@ class VirtualSensor:
         """Number of frames that were written."""
         return self._frame_count - self.withheld - self.lost
 
-    def use(self, charges: Charges, script: Script) -> None:
+    def use(self, charges: Charges, script: Script, charges_per_K: Charges | None = None) -> None:
         """Continue with another script of the same frame rate, from its start. The amplifier keeps its state.
 
         The change takes effect within `BLOCK_S`.
@@ -220,11 +224,14 @@ class VirtualSensor:
         Args:
             charges: Forward map.
             script: The presses.
+            charges_per_K: Function from contacts to the change of the touch charges per kelvin of the film, pC/K; None
+                if the temperature does not change the touch charges.
 
         Raises:
             SceneError: If the forward map returns charges of another shape, or charges that are not finite.
         """
-        self._next_script = (script, _clean_charges(charges, script))
+        clean_pC_per_K = None if charges_per_K is None else _clean_charges(charges_per_K, script)
+        self._next_script = (script, _clean_charges(charges, script), clean_pC_per_K)
 
     def frames(self) -> Iterator[bytes]:
         """Yield the bytes of each frame without waiting for its time; empty bytes for a frame that a fault loses.
@@ -238,16 +245,29 @@ class VirtualSensor:
         block_size = max(1, round(BLOCK_S * self._script.rate_Hz))
         for first_number in itertools.count(step=block_size):
             if self._next_script is not None:
-                self._script, self._clean_pC = self._next_script
+                self._script, self._clean_pC, self._clean_pC_per_K = self._next_script
                 self._next_script = None
                 self._script_start = first_number
             first_row = first_number - self._script_start
             rows = range(first_row, first_row + block_size)
             clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")
-            measured_pC = clean_pC if self._noise is None else self._noise(clean_pC, self._rng)
+            measured_pC = self._measured(clean_pC, rows)
             sent_pC = measured_pC + self._offset_pC
             for number, charge_pC in enumerate(sent_pC.tolist(), first_number):
                 yield self._frame(number, tuple(charge_pC))
+
+    def _measured(self, clean_pC: Array, rows: range) -> Array:
+        """Return the measured charges of a block of frames, shape (n, electrodes), pC.
+
+        Args:
+            clean_pC: Touch charges of the block, shape (n, electrodes), pC.
+            rows: Rows of the script, which is repeated without end.
+        """
+        if self._noise is None:
+            return clean_pC
+        if self._clean_pC_per_K is None:
+            return self._noise(clean_pC, self._rng)
+        return self._noise(clean_pC, self._rng, self._clean_pC_per_K.take(rows, axis=0, mode="wrap"))
 
     def _frame(self, number: int, charge_pC: tuple[float, ...]) -> bytes:
         """Return the bytes of a frame after the faults; empty if a fault loses the frame.

@@ -182,18 +182,23 @@ class Measurement:
         if math.isfinite(self.amplifier.tau):
             self._output = self.bias / (1.0 - np.exp(-1.0 / (self.rate * self.tau))) / self.rate
 
-    def __call__(self, charge: Array) -> Array:
+    def __call__(self, charge: Array, charge_per_K: Array | None = None) -> Array:
         """Simulate the readings of the next block of touch charges.
 
         Args:
             charge: Touch charges, shape (n, electrodes), pC.
+            charge_per_K: Change of the touch charges per kelvin of the film, because the pretension of a warm film is
+                smaller, shape (n, electrodes), pC/K. None if the temperature does not change the touch charges.
 
         Returns:
             Readings, shape (n, electrodes), pC.
         """
         time = (self._readings + np.arange(len(charge))) / self.rate
         self._readings += len(charge)
-        film_charge = self._relaxed(charge) + self.pyro * self._temperature(time)[:, np.newaxis]
+        temperature = self._temperature(time)[:, np.newaxis]
+        if charge_per_K is not None:
+            charge = charge + charge_per_K * temperature
+        film_charge = self._relaxed(charge) + self.pyro * temperature
         output = self._integrate(film_charge) + self.offset
         hum_angle = 2.0 * np.pi * self.amplifier.hum_frequency * time[:, np.newaxis] + self.phase
         noisy = self.amplifier.noise.add(output + self.amplifier.hum * np.sin(hum_angle), self.rng)

@@ -147,6 +147,12 @@ SIDE_FORCE_FIELDS = (StressField(_side_load((1.0, 0.0)), False), StressField(_si
 SIDE_FORCE_IS_ODD = np.array([field.odd for field in SIDE_FORCE_FIELDS])
 """Whether each of `SIDE_FORCE_FIELDS` is odd, shape (2,)."""
 
+TENSION_FIELDS = (StressField(_tension((1.0, 1.0, 0.0)), False), *FIELDS["tension"])
+"""Fields of a change of the mean pretension, and of both components of an uneven pretension."""
+
+TENSION_IS_ODD = np.array([field.odd for field in TENSION_FIELDS])
+"""Whether each of `TENSION_FIELDS` is odd, shape (3,)."""
+
 IS_ODD = np.array([field.odd for fields in FIELDS.values() for field in fields])
 """Whether each field is odd, in the order of `stress_changes`, shape (n_field,)."""
 
@@ -181,6 +187,21 @@ def side_force_stress(solved: Equilibrium, surface: Surface = "middle") -> Array
         of a `ForwardMap` with several fields.
     """
     return np.moveaxis(_stress_changes(solved, SIDE_FORCE_FIELDS, surface), 0, 2)
+
+
+def tension_stress(solved: Equilibrium, surface: Surface = "middle") -> Array:
+    """Compute the change of the scaled stress at the nodes by each of `TENSION_FIELDS`, per unit of the tension.
+
+    The unit is E A^2 plus the mean pretension. The probe and the film are as in `stress_changes`.
+
+    Args:
+        solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
+        surface: Surface in the thickness; see `touch_stress`.
+
+    Returns:
+        Shape (n_element, n_local, 3, 3): the field, then the stress (S11, S22, S12), as in `side_force_stress`.
+    """
+    return np.moveaxis(_stress_changes(solved, TENSION_FIELDS, surface), 0, 2)
 
 
 def _stress_changes(solved: Equilibrium, fields: Sequence[StressField], surface: Surface) -> Array:

@@ -19,7 +19,7 @@ from isocharge.train.calibration.cross_validation import HeldOutAnswers, cross_v
 from isocharge.train.calibration.diagnosis import check_channels, check_places, explain, find_mistakes, misfit
 from isocharge.train.calibration.film_fit import MISTAKE_PROBABILITY, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.hypotheses import Hypothesis
-from isocharge.train.calibration.nuisances import NUISANCES, NuisanceEstimate
+from isocharge.train.calibration.nuisances import NUISANCES, NuisanceEstimate, film_warming_sentences
 from isocharge.train.calibration.press_data import PressData, no_presses, temperatures
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity, quantities, summarise
@@ -218,6 +218,7 @@ class CalibrationResult:
             *self._held_out_sentences(),
             *film_quantities,
             *self._temperature_sentences(),
+            *film_warming_sentences(self.posterior.nuisances),
             rig_errors,
             *self._discrepancy_sentences(),
             *self.cautions,

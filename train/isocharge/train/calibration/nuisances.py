@@ -8,7 +8,7 @@ Nuisances are not stored after the session. The only exception is the change of 
 (`problem.Warming`), which the next calibration needs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -71,6 +71,14 @@ class PretensionPerKelvin(Nuisance):
         return value * data.warming_K
 
 
+class PretensionPerFilmExcess(Nuisance):
+    """Change of the pretension per kelvin that the film is warmer than its ring, because a warm film slackens."""
+
+    def tension_change(self, data: PressData, value: float) -> Array:
+        """Return the change relative to the mean difference between the temperatures of film and ring."""
+        return value * data.film_excess_K
+
+
 class ChargeOffset(Nuisance):
     """Common offset of all charges, as from a wrong tare."""
 
@@ -109,12 +117,31 @@ PRETENSION_PER_KELVIN = PretensionPerKelvin("pretension_per_K", "MPa/K", std_wit
 """Change of the pretension with temperature. Its standard deviation before the presses is E da / (1 - nu), which is
 0.3 to 0.44 MPa/K on aluminium."""
 
+PRETENSION_PER_FILM_EXCESS = PretensionPerFilmExcess("pretension_per_film_K", "MPa/K", std_with_temperatures=0.6)
+"""Change of the pretension per kelvin of the film above its ring. Its standard deviation before the presses exceeds
+E a / (1 - nu), which is 0.4 to 0.55 MPa/K."""
+
 NUISANCES: tuple[Nuisance, ...] = (
     PRETENSION_PER_KELVIN,
+    PRETENSION_PER_FILM_EXCESS,
     ChargeOffset("offset", "pC", ((0.0, 0.9), (30.0, 0.1))),
     ChargeDrift("drift", "1", ((0.0, 0.95), (0.15, 0.05))),
 )
 """All nuisances, in the order of their unknowns."""
+
+
+def film_warming_sentences(estimates: Mapping[str, NuisanceEstimate]) -> Iterator[str]:
+    """Yield a sentence about the effect of a film that is warmer than its ring, if the presses determine the effect.
+
+    Args:
+        estimates: Estimates of the nuisances by name.
+    """
+    estimate = estimates[PRETENSION_PER_FILM_EXCESS.name]
+    if 0.0 < estimate.std <= 0.5 * PRETENSION_PER_FILM_EXCESS.std_with_temperatures:
+        yield (
+            f"The pretension changes by {estimate.value:.3g} +- {estimate.std:.2g} MPa per kelvin that the film is "
+            "warmer than its ring. The result holds for the mean difference of both temperatures."
+        )
 
 
 def without_nuisances(data: PressData, values: Sequence[float] | Array) -> PressData:

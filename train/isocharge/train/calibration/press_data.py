@@ -31,6 +31,8 @@ class PressData:
         measured: Which charges and coordinates were measured, shape (n, n_electrode + 3).
         session_time: Time of each press, from -1/2 for the first press to 1/2 for the last, shape (n,), dimensionless.
         warming_K: Temperature of each press less the mean temperature, shape (n,), K.
+        film_excess_K: Temperature of the film above that of its ring during each press, less the mean of this
+            difference, shape (n,), K; zero if the temperature of the film was not measured.
         tension_change: Pretension during each press less that of the film, shape (n,), MPa.
     """
 
@@ -41,6 +43,7 @@ class PressData:
     measured: Booleans
     session_time: Array
     warming_K: Array
+    film_excess_K: Array
     tension_change: Array
 
     @classmethod
@@ -67,6 +70,7 @@ class PressData:
             measured=np.column_stack([has_charge, has_coordinate]),
             session_time=np.linspace(-0.5, 0.5, len(presses)) if len(presses) > 1 else np.zeros(1),
             warming_K=temperature_C - temperature_C.mean(),
+            film_excess_K=_film_excess(presses),
             tension_change=np.zeros(len(presses)),
         )
 
@@ -150,9 +154,22 @@ def temperatures(presses: MeasuredPresses) -> Array:
     """
     if presses.temperature_C is None or not presses.knows_temperature:
         return np.zeros(len(presses))
-    number = np.arange(len(presses))
-    measured = np.isfinite(presses.temperature_C)
-    return np.interp(number, number[measured], presses.temperature_C[measured])
+    return _without_gaps(presses.temperature_C)
+
+
+def _film_excess(presses: MeasuredPresses) -> Array:
+    """Return the temperature of the film above that of its ring, less the mean of this difference, shape (n,), K."""
+    if presses.film_temperature_C is None or not presses.knows_film_temperature:
+        return np.zeros(len(presses))
+    excess = _without_gaps(presses.film_temperature_C) - temperatures(presses)
+    return np.asarray(excess - excess.mean())
+
+
+def _without_gaps(temperature_C: Array) -> Array:
+    """Interpolate missing temperatures between those of the presses before and after; both have the shape (n,)."""
+    number = np.arange(len(temperature_C))
+    measured = np.isfinite(temperature_C)
+    return np.interp(number, number[measured], temperature_C[measured])
 
 
 def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:

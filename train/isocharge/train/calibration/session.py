@@ -186,6 +186,9 @@ class PressSession:
         temperature_C = presses.temperature_C
         if temperature_C is not None:
             temperature_C = np.append(temperature_C, np.nan)
+        film_temperature_C = presses.film_temperature_C
+        if film_temperature_C is not None:
+            film_temperature_C = np.append(film_temperature_C, np.nan)
         self._change(
             replace(
                 presses,
@@ -194,6 +197,7 @@ class PressSession:
                 position_std_mm=np.append(presses.position_std_mm, self._stds["position_std_mm"]),
                 force_std=np.append(presses.force_std, self._stds["force_std"]),
                 temperature_C=temperature_C,
+                film_temperature_C=film_temperature_C,
                 lines=(*presses.lines, len(presses) + 1),
             )
         )

@@ -1,0 +1,118 @@
+"""Change of the charges by a change of the pretension, and by the temperature of the film.
+
+A change of the pretension by (T11, T22, T12) changes the charges to first order by
+
+    dQ = tension_jacobian @ (T11, T22, T12).
+
+The stress fields are solved with the tangent of the equilibrium (`solver.sensitivity`) at a few distances and forces,
+and interpolated as in a forward map. If the film becomes warmer than its ring, its pretension changes by
+`mechanics.film_temperature`.
+
+Example:
+
+    forward_map = ForwardMap.build(sensor, Circle(1.0))
+    tension_map = TensionMap.build(forward_map)
+    tension_map.temperature_jacobian(contact)  # pC/K, shape (n, n_electrode)
+"""
+
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.errors import SceneError
+from isocharge.simulate.forward.family import Chain, Family, solve_chains
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.mechanics.film_temperature import tension_change
+from isocharge.simulate.mechanics.scaling import amplitude_squared
+from isocharge.simulate.solver.load_case import SolveSettings
+from isocharge.simulate.solver.sensitivity import TENSION_IS_ODD, tension_stress
+
+NODE_COUNTS = (6, 6)
+"""Number of distances and number of forces at which the fields are solved."""
+
+
+@dataclass(frozen=True)
+class TensionMap:
+    """Derivatives of the charges with respect to the pretension, as a function of position and force.
+
+    Attributes:
+        film: Forward map of the film.
+        fields: Map whose table contains the stress fields of a change of the mean pretension, of the difference between
+            the pretensions along and across the direction of the press, and of its shear.
+    """
+
+    film: ForwardMap
+    fields: ForwardMap
+
+    @classmethod
+    def build(cls, film: ForwardMap, *, executor: Executor | None = None) -> "TensionMap":
+        """Solve the fields at `NODE_COUNTS` presses in the domain of a forward map, which takes about ten seconds.
+
+        Args:
+            film: Forward map of the film, whose probe is a circle. Its mesh and its readout are used.
+            executor: Executor that runs the solves; None for this process.
+
+        Raises:
+            SceneError: If the probe is not axisymmetric.
+            SolveError: If a press has no equilibrium.
+        """
+        if not film.probe.is_axisymmetric:
+            raise SceneError(f"temperature of the film: expected a circular probe, got {film.probe.notation}")
+        family = Family.spread(film.domain, NODE_COUNTS, period=0.0)
+        theory = replace(film.theory, stretching=True)
+        settings = SolveSettings(theory=theory, resolution=film.resolution, layer=film.layer)
+        sensor = film.sensor
+        chains = [
+            Chain(sensor.film, film.probe, distance, family.force, sensor.surface, settings, tension_stress)
+            for distance in family.distance.tolist()
+        ]
+        rows = solve_chains(chains, executor)
+        table = rows.reshape(-1, rows.shape[-1])
+        return cls(film, replace(film, family=family, theory=theory, table=table))
+
+    def tension_jacobian(self, contact: Array) -> Array:
+        """Compute the derivatives of the charges with respect to the pretension (T11, T22, T12) along x and y.
+
+        Args:
+            contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
+
+        Returns:
+            Shape (n, n_electrode, 3), pC/MPa.
+
+        Raises:
+            SceneError: If a press lies outside the domain.
+        """
+        contact = self.film.domain.check(contact, "temperature of the film")
+        film = self.film.sensor.film
+        field_charge = self.fields.field_charges(contact, TENSION_IS_ODD)
+        tension_unit = film.young * amplitude_squared(film, contact[:, 2]) + film.pretension
+        by_mean, by_difference, by_shear = np.moveaxis(field_charge / tension_unit[:, None, None], 2, 0)
+
+        # The difference and the shear of the tension in axes that are rotated to the direction of the press
+        twice_angle = 2.0 * np.arctan2(contact[:, 1], contact[:, 0])[:, None]
+        cosine = np.cos(twice_angle)
+        sine = np.sin(twice_angle)
+        by_film_difference = cosine * by_difference - sine * by_shear
+        by_film_shear = sine * by_difference + cosine * by_shear
+        by_t11 = 0.5 * (by_mean + by_film_difference)
+        by_t22 = 0.5 * (by_mean - by_film_difference)
+        calibration = self.film.sensor.calibration
+        return np.stack([calibration.read(charge) for charge in (by_t11, by_t22, by_film_shear)], axis=2)
+
+    def temperature_jacobian(self, contact: Array) -> Array:
+        """Compute the change of the touch charges per kelvin that the film is warmer than its ring.
+
+        The pyroelectric charge is not included.
+
+        Args:
+            contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
+
+        Returns:
+            Shape (n, n_electrode), pC/K. Zero if the film has no expansion coefficients.
+
+        Raises:
+            SceneError: If a press lies outside the domain.
+        """
+        return np.asarray(self.tension_jacobian(contact) @ tension_change(self.film.sensor.film, 1.0, 0.0))

@@ -1,0 +1,69 @@
+"""Change of the charges by the pretension and by the temperature of the film, against direct solves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from isocharge.common.errors import SceneError
+from isocharge.simulate import Circle, ForwardMap, Polygon, TensionMap, load_sensor, press, touch_charge
+from isocharge.simulate.mechanics.film_temperature import warmed
+from isocharge.simulate.solver.load_case import SolveSettings
+from kept import kept
+
+PROBE = Circle(1.0)
+ACCURATE = SolveSettings(accuracy=1e-4)
+
+
+def drawn_sensor():
+    """Return a uniaxial film of 0.8 MPa that expands mostly across the drawn direction."""
+    sensor = load_sensor("four-25um-uniaxial")
+    return replace(sensor, film=replace(sensor.film, pretension=0.8, expansion=(-5e-6, 1e-4)))
+
+
+@pytest.fixture(scope="module")
+def tension_map() -> TensionMap:
+    return kept(tension_map_of, drawn_sensor())
+
+
+def tension_map_of(sensor) -> TensionMap:
+    return TensionMap.build(ForwardMap.build(sensor, PROBE, 8.0, (0.1, 1.0)))
+
+
+@pytest.mark.parametrize("contact", [(3.0, -2.0, 0.5), (-5.0, 4.0, 0.15)])
+def test_tension_jacobian_equals_differences_of_direct_solves(tension_map, contact):
+    x, y, force = contact
+    sensor = tension_map.film.sensor
+    step = 0.02
+    expected = []
+    for pretension, deviator in ((0.5, (0.5, 0.0)), (0.5, (-0.5, 0.0)), (0.0, (0.0, 1.0))):
+        charges = []
+        for sign in (step, -step):
+            film = replace(
+                sensor.film,
+                pretension=0.8 + sign * pretension,
+                deviator=(sign * deviator[0], sign * deviator[1]),
+            )
+            solved = press(film, PROBE, (x, y), force, ACCURATE)
+            charges.append(touch_charge(replace(sensor, film=film), solved))
+        expected.append((charges[0] - charges[1]) / (2.0 * step))
+    jacobian = tension_map.tension_jacobian(np.array([contact]))[0]
+    np.testing.assert_allclose(jacobian.T, expected, atol=1e-2 * np.abs(expected).max())
+
+
+def test_temperature_jacobian_equals_the_difference_of_warmed_films(tension_map):
+    sensor = tension_map.film.sensor
+    charges = []
+    for kelvin in (0.05, -0.05):
+        warm_sensor = warmed(sensor, kelvin)
+        solved = press(warm_sensor.film, PROBE, (3.0, -2.0), 0.5, ACCURATE)
+        charges.append(touch_charge(warm_sensor, solved))
+    warm, cold = charges
+    jacobian = tension_map.temperature_jacobian(np.array([[3.0, -2.0, 0.5]]))[0]
+    np.testing.assert_allclose(jacobian, (warm - cold) / 0.1, atol=1e-2 * np.abs(warm - cold).max() / 0.1)
+    assert (jacobian > 0.0).all()  # a warm film has less tension, and its charges are larger
+
+
+def test_tension_map_of_a_square_probe_raises_a_scene_error(tension_map):
+    with pytest.raises(SceneError, match="temperature of the film: expected a circular probe"):
+        TensionMap.build(replace(tension_map.film, probe=Polygon.rectangle(2.0, 2.0)))
