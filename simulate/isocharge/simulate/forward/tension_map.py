@@ -60,7 +60,7 @@ class TensionMap:
         """
         if not film.probe.is_axisymmetric:
             raise SceneError(f"temperature of the film: expected a circular probe, got {film.probe.notation}")
-        family = Family.spread(film.domain, NODE_COUNTS, period=0.0)
+        family = Family.spread(film.domain, film.sensor.film.radius, NODE_COUNTS, period=0.0)
         theory = replace(film.theory, stretching=True)
         settings = SolveSettings(theory=theory, resolution=film.resolution, layer=film.layer)
         sensor = film.sensor
