@@ -206,12 +206,14 @@ class ChargeSpline:
         weights = self.force_weights(log_force)
         weights_above = self.force_weights(log_force + LOG_FORCE_STEP)
         weights_below = self.force_weights(log_force - LOG_FORCE_STEP)
-        weights_by_log_force = (weights_above - weights_below) / (2.0 * LOG_FORCE_STEP)
-        scaled = self.scaled_charges(position)
-        charge = np.einsum("nk,nke->ne", weights, scaled)
-        by_position = np.einsum("nk,nkei->nei", weights, self.scaled_gradients(position))
-        by_log_force = np.einsum("nk,nke->ne", weights_by_log_force, scaled)
-        return charge, by_position, by_log_force
+        weight_slopes = (weights_above - weights_below) / (2.0 * LOG_FORCE_STEP)
+        scaled_charge = self.scaled_charges(position)
+        scaled_gradient = self.scaled_gradients(position)
+        # weighted sums over k, the forces of the splines, for each press n and electrode e (i is x or y)
+        charge = np.einsum("nk,nke->ne", weights, scaled_charge)
+        position_derivative = np.einsum("nk,nkei->nei", weights, scaled_gradient)
+        log_force_derivative = np.einsum("nk,nke->ne", weight_slopes, scaled_charge)
+        return charge, position_derivative, log_force_derivative
 
     def force_weights(self, log_force: Array) -> Array:
         """Compute the weights with which the scaled charges at the forces of the splines give the charges.

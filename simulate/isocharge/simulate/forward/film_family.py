@@ -160,6 +160,7 @@ class FilmFamily:
         }
         self._check_inside(sensor.coated_film, sensor.surface, groups)
         tension, thickness, reach = (self.grid.weights(name, value) for name, value in groups.items())
+        # weight of every film of the grid: the product of its weights along the three axes
         film_weights = np.einsum("t,h,p->thp", tension, thickness, reach).ravel()
         n_distance, n_load, *_, n_mode = self.coefficients.shape
         press_coefficients = film_weights @ self.coefficients.reshape(n_distance * n_load, -1, n_mode)
@@ -193,60 +194,70 @@ class FilmFamily:
         return self.imperfections.mode_map(self.forward_map(sensor, probe), names)
 
     def to_arrays(self) -> dict[str, Any]:
-        """Return the family as arrays, numbers and texts for a file."""
-        imperfections = {} if self.imperfections is None else self.imperfections.to_arrays()
+        """Return the family as arrays, numbers and texts for a file.
+
+        Returns:
+            The values by their names. The coefficients and modes are rounded to integers; "mode_scale" is the product
+            of the scales of both for each mode, shape (n_mode, 1).
+        """
         bits = bits_of(self.coefficients, self.modes, MAX_BITS, EXTRA_BITS)
-        coefficients, scale = quantised(self.coefficients, (0, 1, 2, 3, 4), bits)
-        modes, size = quantised(self.modes, 1, bits[:, None])
+        coefficients, coefficient_scale = quantised(self.coefficients, (0, 1, 2, 3, 4), bits)
+        modes, mode_scale = quantised(self.modes, 1, bits[:, None])
+        imperfections = {} if self.imperfections is None else self.imperfections.to_arrays()
         return {
-            **{name: getattr(self, name) for name in ("poisson", "surface", "layer", "error")},
-            "limits": np.array([self.limits[name] for name in AXES]),
+            "poisson": self.poisson,
+            "surface": self.surface,
+            "layer": self.layer,
+            "error": self.error,
+            "limits": np.array([self.limits[axis] for axis in AXES]),
             "resolution": np.array(list(asdict(self.resolution).values())),
             "grid_shape": np.array(self.grid.shape),
-            "grid": np.concatenate([getattr(self.grid, name) for name in AXES]),
+            "grid": np.concatenate([getattr(self.grid, axis) for axis in AXES]),
             "coefficients": coefficients,
             "modes": modes,
-            "mode_scale": np.float32(scale.ravel()[:, None] * size),
-            **{IMPERFECTION_PREFIX + name: value for name, value in imperfections.items()},
+            "mode_scale": np.float32(coefficient_scale.ravel()[:, None] * mode_scale),
+            **{IMPERFECTION_PREFIX + name: array for name, array in imperfections.items()},
         }
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any]) -> "FilmFamily":
         """Create the family from the arrays that `to_arrays` returned.
 
+        Args:
+            arrays: Arrays, numbers and texts by their names.
+
+        Returns:
+            The family. Its coefficients are integers, and its modes contain the scales of both.
+
         Raises:
             InputError: If an array is missing, or the shapes are inconsistent.
         """
         try:
-            shape = tuple(int(size) for size in arrays["grid_shape"])
-            coefficients = arrays["coefficients"]
-            modes = arrays["modes"]
-            scale = arrays["mode_scale"]
-            has_scales = scale.shape == (len(modes), 1)
-            has_coefficients = coefficients.shape == (*shape, len(modes))
-            if not (has_coefficients and has_scales and len(shape) == len(AXES)):
-                raise ValueError(f"coefficients {coefficients.shape} and modes {modes.shape} do not fit {shape}")
-            sizes = len(arrays["limits"]), arrays["grid"].size, arrays["resolution"].size
-            if sizes != (len(AXES), sum(shape), len(fields(Resolution))):
-                raise ValueError(f"limits, grid and resolution have {sizes} numbers")
+            _check_shapes(arrays)
+            surface = str(arrays["surface"])
+            if surface not in get_args(Surface):
+                raise ValueError(f"surface {surface}")
+            limits = {
+                axis: (float(smallest), float(largest))
+                for axis, (smallest, largest) in zip(AXES, arrays["limits"], strict=True)
+            }
+            first_nodes = np.cumsum(arrays["grid_shape"])[:-1]  # of all axes but the first
+            axis_nodes = np.split(np.asarray(arrays["grid"], dtype=float), first_nodes)
+            modes = arrays["modes"] * np.asarray(arrays["mode_scale"], dtype=float)
             imperfections = {
-                name.removeprefix(IMPERFECTION_PREFIX): arrays[name]
-                for name in arrays
+                name.removeprefix(IMPERFECTION_PREFIX): array
+                for name, array in arrays.items()
                 if name.startswith(IMPERFECTION_PREFIX)
             }
-            if str(arrays["surface"]) not in get_args(Surface):
-                raise ValueError(f"surface {arrays['surface']!s}")
             return cls(
                 poisson=float(arrays["poisson"]),
-                surface=cast(Surface, str(arrays["surface"])),
-                limits={
-                    name: (float(low), float(high)) for name, (low, high) in zip(AXES, arrays["limits"], strict=True)
-                },
-                grid=FilmGrid(*np.split(np.asarray(arrays["grid"], dtype=float), np.cumsum(shape)[:-1])),
-                resolution=Resolution(*(int(value) for value in arrays["resolution"])),
+                surface=cast(Surface, surface),
+                limits=limits,
+                grid=FilmGrid(*axis_nodes),
+                resolution=Resolution(*(int(count) for count in arrays["resolution"])),
                 layer=float(arrays["layer"]),
-                coefficients=coefficients.astype(float),
-                modes=modes * np.asarray(scale, dtype=float),
+                coefficients=arrays["coefficients"].astype(float),
+                modes=modes,
                 error=float(arrays["error"]),
                 imperfections=FilmModes.from_arrays(imperfections, modes.shape[1]) if imperfections else None,
             )
@@ -273,9 +284,35 @@ class FilmFamily:
             raise SceneError(f"film: expected an axisymmetric film, got {film.asymmetries}; use modes for these")
         _check_back(film)
         for name, value in groups.items():
-            low, high = self.limits[name]
-            if not low * (1.0 - LIMIT_TOLERANCE) - 1e-15 <= value <= high * (1.0 + LIMIT_TOLERANCE):
-                raise SceneError(f"film: {name} {value:.4g} is outside the family: expected {low:.4g} to {high:.4g}")
+            smallest, largest = self.limits[name]
+            is_above_smallest = value >= smallest * (1.0 - LIMIT_TOLERANCE) - 1e-15
+            is_below_largest = value <= largest * (1.0 + LIMIT_TOLERANCE)
+            if not (is_above_smallest and is_below_largest):
+                raise SceneError(
+                    f"film: {name} {value:.4g} is outside the family: expected {smallest:.4g} to {largest:.4g}"
+                )
+
+
+def _check_shapes(arrays: Mapping[str, Any]) -> None:
+    """Raise an error if the arrays of a file have inconsistent shapes.
+
+    Args:
+        arrays: Arrays of `FilmFamily.to_arrays`.
+
+    Raises:
+        ValueError: If the coefficients, modes and scales do not have the same number of modes, or the limits, the grid
+            or the resolution have a wrong number of values.
+    """
+    grid_shape = tuple(int(count) for count in arrays["grid_shape"])
+    coefficients = arrays["coefficients"]
+    modes = arrays["modes"]
+    has_scales = arrays["mode_scale"].shape == (len(modes), 1)
+    has_coefficients = coefficients.shape == (*grid_shape, len(modes))
+    if not (has_coefficients and has_scales and len(grid_shape) == len(AXES)):
+        raise ValueError(f"coefficients {coefficients.shape} and modes {modes.shape} do not fit {grid_shape}")
+    counts = len(arrays["limits"]), arrays["grid"].size, arrays["resolution"].size
+    if counts != (len(AXES), sum(grid_shape), len(fields(Resolution))):
+        raise ValueError(f"limits, grid and resolution have {counts} numbers")
 
 
 def _check_back(film: Film) -> None:
@@ -309,20 +346,33 @@ def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) 
 
 
 def _limits_of(prior: FilmPrior, domain: Domain) -> FilmLimits:
-    """Return the limits of the dimensionless parameters of the presses on the films that a calibration may find."""
-    low_bounds, high_bounds = prior.bounds
-    low = dict(zip(prior.names, low_bounds.tolist(), strict=True))
-    high = dict(zip(prior.names, high_bounds.tolist(), strict=True))
+    """Return the limits of the dimensionless parameters of the presses on the films that a calibration may find.
+
+    Args:
+        prior: Prior distribution of the films, with the smallest and largest value of each of their parameters.
+        domain: Presses on each film.
+
+    Returns:
+        Smallest and largest value along each of `AXES`.
+    """
+    lower_bounds, upper_bounds = prior.bounds
+    smallest = dict(zip(prior.names, lower_bounds.tolist(), strict=True))
+    largest = dict(zip(prior.names, upper_bounds.tolist(), strict=True))
     film = prior.sensor.film
-    a = film.radius
-    min_stiffness = film.young * film.thickness * a * np.exp(low["young"] + low["thickness"])
-    max_stiffness = film.young * film.thickness * a * np.exp(high["young"] + high["thickness"])
-    min_young = film.young * np.exp(low["young"])
+    # the parameters "young" and "thickness" are the logarithms of factors, and "probe_radius" is a difference
+    min_thickness = film.thickness * np.exp(smallest["thickness"])
+    max_thickness = film.thickness * np.exp(largest["thickness"])
+    min_young = film.young * np.exp(smallest["young"])
+    max_young = film.young * np.exp(largest["young"])
+    min_probe_radius = prior.probe.radius + smallest["probe_radius"]
+    max_probe_radius = prior.probe.radius + largest["probe_radius"]
     min_force, max_force = domain.force_range
+    min_load = min_force / (max_young * max_thickness * film.radius)
+    max_load = max_force / (min_young * min_thickness * film.radius)
     return {
-        "distance": (0.0, domain.radius / a),
-        "load": (min_force / max_stiffness, max_force / min_stiffness),
-        "tension": (low["pretension"] / min_young, high["pretension"] / min_young),
-        "thickness": (film.thickness / a * np.exp(low["thickness"]), film.thickness / a * np.exp(high["thickness"])),
-        "reach": ((prior.probe.radius + low["probe_radius"]) / a, (prior.probe.radius + high["probe_radius"]) / a),
+        "distance": (0.0, domain.radius / film.radius),
+        "load": (min_load, max_load),
+        "tension": (smallest["pretension"] / min_young, largest["pretension"] / min_young),
+        "thickness": (min_thickness / film.radius, max_thickness / film.radius),
+        "reach": (min_probe_radius / film.radius, max_probe_radius / film.radius),
     }

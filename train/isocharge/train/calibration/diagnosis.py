@@ -5,7 +5,6 @@ other units. The mistakes that explain them are named. The data are never change
 """
 
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -70,19 +69,25 @@ AXES = (
 
 
 def check_places(presses: MeasuredPresses, radius: float) -> None:
-    """Refuse presses off a film of this radius (mm), and places in metres.
+    """Raise an error if a press lies off the film, or the positions were written in metres.
+
+    Args:
+        presses: The presses. Positions that were not measured are NaN.
+        radius: Radius of the film, mm.
 
     Raises:
-        PressError: If there are any.
+        PressError: If a position is off the film, or all positions lie within `METRES_MM` of each other.
     """
     places = presses.contact[:, :2]
-    for row in np.flatnonzero(np.hypot(*places.T) >= radius)[:1]:
+    outside_rows = np.flatnonzero(np.hypot(*places.T) >= radius)
+    if outside_rows.size:
+        row = outside_rows[0]
         raise PressError(
             f"{presses.row_noun} {presses.lines[row]}: a press at ({places[row, 0]:g}, {places[row, 1]:g}) mm "
             f"is off the film, whose radius is {radius:g} mm; positions are in mm from the film's centre"
         )
-    places = places[np.isfinite(places[:, 0])]
-    spread = np.ptp(places, axis=0).max() if len(places) else 0.0
+    measured_places = places[np.isfinite(places[:, 0])]
+    spread = np.ptp(measured_places, axis=0).max() if len(measured_places) else 0.0
     if 0.0 < spread < METRES_MM:
         raise PressError(
             f"all places lie within {spread:.3g} mm of each other; positions are in mm: were they written in metres?"
@@ -90,10 +95,14 @@ def check_places(presses: MeasuredPresses, radius: float) -> None:
 
 
 def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
-    """Refuse channels that are dead or have the wrong sign.
+    """Raise an error if a channel has no charges, is dead or has the wrong sign.
+
+    Args:
+        presses: The measured presses.
+        charges: Films of the calibration, which tell how small the charges of a channel may be.
 
     Raises:
-        PressError: If there are any.
+        PressError: If there is such a channel.
     """
     charge = presses.charge_pC
     placed = presses.contact[presses.placed]
@@ -101,10 +110,11 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
         if np.isnan(column).all():
             raise PressError(f"electrode {name!r}: no press has a charge of it; a calibration needs all electrodes")
     shares = _shares(charge)
-    least = np.min(
-        [1.0 + 0.0 * shares, *map(_shares, expected_charges(charges, placed) if len(placed) else ())], axis=0
-    )
-    for name, column, share, smallest in zip(presses.electrodes, charge.T, shares, least, strict=True):
+    smallest_shares = np.ones_like(shares)
+    if len(placed):
+        film_shares = [_shares(film_charge) for film_charge in expected_charges(charges, placed)]
+        smallest_shares = np.minimum(np.min(film_shares, axis=0), 1.0)
+    for name, column, share, smallest in zip(presses.electrodes, charge.T, shares, smallest_shares, strict=True):
         if share < DEAD_SHARE * smallest:
             raise PressError(
                 f"electrode {name!r} is dead: half of its charges are below {np.nanmedian(np.abs(column)):.3g} pC, "
@@ -112,9 +122,8 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
             )
         negative = np.sum(column < 0.0)
         measured = np.sum(np.isfinite(column))
-        if (
-            negative > REVERSED * measured and share > REVERSED_SHARE
-        ):  # weak ones may be negative, on taut uniaxial films
+        # the charges of weak channels may be negative on taut uniaxial films
+        if negative > REVERSED * measured and share > REVERSED_SHARE:
             raise PressError(
                 f"electrode {name!r}: {negative} of its {measured} charges are negative; a press gives a positive "
                 "charge: exchange its wires or its sign"
@@ -122,10 +131,17 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
 
 def _shares(charge: Array) -> Array:
-    """Return the typical charge of each channel over that of the others, from charges of shape (n, n_electrode)."""
+    """Return the ratio of the median charge of each channel to that of the other channels.
+
+    Args:
+        charge: Charges, shape (n, n_electrode), pC; NaN where none was measured.
+
+    Returns:
+        Shape (n_electrode,).
+    """
     typical = np.nanmedian(np.abs(charge), axis=0)
-    others = [np.median(np.delete(typical, number)) for number in range(typical.size)]
-    return np.asarray(typical / np.maximum(others, 1e-9))
+    typical_of_others = [np.median(np.delete(typical, channel)) for channel in range(typical.size)]
+    return np.asarray(typical / np.maximum(typical_of_others, 1e-9))
 
 
 def expected_charges(charges: FilmCharges, contact: Array) -> Array:
@@ -141,20 +157,29 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
 
 
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
-    """Return the mistakes that explain presses far better than the presses as they are written, best first."""
+    """Find the mistakes that explain presses far better than the presses as they are written.
+
+    Args:
+        presses: The measured presses.
+        charges: Films of the calibration.
+
+    Returns:
+        One sentence for each mistake, the best explanation first; empty if no mistake explains the presses.
+    """
     placed = presses[presses.placed]
     if not len(placed):
         return []
-    sentences, contacts, measured = zip(*_tried(placed, charges), strict=True)
+    sentences, contacts, measured = zip(*_corrected_presses(placed, charges), strict=True)
+    # the charges of all corrected contacts are computed together, which is faster
     expected = np.split(expected_charges(charges, np.concatenate(contacts)), len(contacts), axis=1)
-    mistakes = [*zip(map(partial(charge_misfit, charges), contacts, measured, expected), sentences, strict=True)]
-    limit = CLEARER * misfit(presses, charges)
-    least_misfit = min(mistake_misfit for mistake_misfit, _ in mistakes)
-    return [
-        sentence
-        for mistake_misfit, sentence in sorted(mistakes)
-        if mistake_misfit < limit and mistake_misfit <= AS_GOOD * least_misfit
+    misfits = [
+        charge_misfit(charges, contact, charge, film_charges)
+        for contact, charge, film_charges in zip(contacts, measured, expected, strict=True)
     ]
+    limit = CLEARER * misfit(presses, charges)
+    second_limit = AS_GOOD * min(misfits)
+    ranked = sorted(zip(misfits, sentences, strict=True))
+    return [sentence for its_misfit, sentence in ranked if its_misfit < limit and its_misfit <= second_limit]
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
@@ -179,20 +204,32 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
         charge: Measured charges, shape (n, n_electrode), pC.
         expected: Charges of each film, shape (n_film, n, n_electrode), pC.
     """
-    if (charges.into_domain(contact) != contact).any(axis=1).mean() > 0.2:
+    is_outside = (charges.into_domain(contact) != contact).any(axis=1)
+    if is_outside.mean() > 0.2:
         return np.inf
+    # one offset and one mean squared deviation from it for each film; the limit of 4 bounds the effect of outliers
     log_ratio = np.log(np.maximum(charge, 1e-3)) - np.log(np.maximum(expected, 1e-3))
-    common = np.nanmedian(log_ratio, axis=(1, 2))
-    scatter = np.nanmean(np.minimum((log_ratio - common[:, None, None]) ** 2, 4.0), axis=(1, 2))
-    return float(np.min(scatter / SCATTER**2 + (common / OFFSET) ** 2))
+    offset = np.nanmedian(log_ratio, axis=(1, 2))
+    squared_deviation = np.minimum((log_ratio - offset[:, None, None]) ** 2, 4.0)
+    scatter = np.nanmean(squared_deviation, axis=(1, 2))
+    return float(np.min(scatter / SCATTER**2 + (offset / OFFSET) ** 2))
 
 
-def _tried(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str, Array, Array]]:
-    """Yield every mistake that is tried, in words, with contacts and charges as they are without it."""
+def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str, Array, Array]]:
+    """Generate the presses without each of the mistakes that are considered.
+
+    Args:
+        presses: The measured presses, with place and force.
+        charges: Films of the calibration, which are used to find the orders of the columns.
+
+    Yields:
+        A sentence that describes the mistake, the corrected contacts, shape (n, 3), and charges, shape
+        (n, n_electrode).
+    """
     contact = presses.contact
     charge = presses.charge_pC
     electrodes = presses.electrodes
-    for order in _orders(presses, charges):
+    for order in _fitting_orders(presses, charges):
         swapped = ", ".join(electrodes[number] for number in order)
         sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {swapped}"
         yield sentence, contact, charge[:, np.argsort(order)]
@@ -203,7 +240,7 @@ def _tried(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str
         yield f"the {what} are in {other}, not {unit}", contact * of_contact, charge * of_charge
 
 
-def _orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
+def _fitting_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
     """Return other orders of the electrodes that fit the columns best, one for each of `PRETENSIONS` at most.
 
     The logarithms of every column are compared with those of every electrode, and the best assignment is taken.
@@ -211,8 +248,10 @@ def _orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ..
     orders = set()
     log_measured = np.log(np.maximum(presses.charge_pC, 1e-3))
     for expected in expected_charges(charges, presses.contact):
-        log_ratio = log_measured[:, :, None] - np.log(np.maximum(expected, 1e-3))[:, None]
-        distance = np.nansum(np.minimum((log_ratio - np.nanmedian(log_ratio)) ** 2, 4.0), axis=0)
+        log_expected = np.log(np.maximum(expected, 1e-3))
+        log_ratio = log_measured[:, :, None] - log_expected[:, None]  # shape (n, n_column, n_electrode)
+        squared_deviation = np.minimum((log_ratio - np.nanmedian(log_ratio)) ** 2, 4.0)
+        distance = np.nansum(squared_deviation, axis=0)
         _, electrode_of_column = linear_sum_assignment(distance)
         orders.add(tuple(electrode_of_column.tolist()))
     as_written = tuple(range(len(presses.electrodes)))

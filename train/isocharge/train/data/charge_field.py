@@ -127,14 +127,19 @@ class ChargeField:
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Return charges and derivatives together, which takes half the time; see `ChargeMap`."""
         unit = self.domain.to_unit(contact)
-        values = self._series.values(unit)
-        if self.log_size is None:
-            charge = np.exp(values[:, 0])
-            return charge, charge[:, :, None] * values[:, 1:].swapaxes(1, 2) / self.domain.scale
-        size, growth = _size(self.log_size, unit[:, 2])
-        slopes = values[:, 1:]
-        slopes[:, 2] += growth * values[:, 0]
-        return size * values[:, 0], size[:, :, None] * slopes.swapaxes(1, 2) / self.domain.scale
+        # value of the series, then its derivatives with respect to x, y and l, shape (n, 4, n_electrode)
+        values_and_slopes = self._series.values(unit)
+        value = values_and_slopes[:, 0]
+        slopes = values_and_slopes[:, 1:]
+        if self.log_size is None:  # ln Q = value
+            charge = np.exp(value)
+            factor = charge
+        else:  # Q = S(l) * value
+            size, log_size_slope = _size(self.log_size, unit[:, 2])
+            charge = size * value
+            slopes[:, 2] += log_size_slope * value
+            factor = size
+        return charge, factor[:, :, None] * slopes.swapaxes(1, 2) / self.domain.scale
 
     @cached_property
     def _series(self) -> Series:
@@ -218,40 +223,68 @@ def invertible_domain(
         DatasetError: If hardly anything is left of the domain.
     """
     asked = field.domain
-    fold = _fold_radius(field, noise)
+    fold_radius = _fold_radius(field, noise)
     if field.error > SURE:
-        if fold < (CREDIBLE_SMOOTH if field.error < SMOOTH else CREDIBLE_NOISY) * asked.radius:
-            return asked, (
-                f"the map from contacts to charges seems to fold about {fold:.2g} mm from the centre, where two "
-                "contacts give the same charges; the presses cannot tell it for certain, and the model is trained "
-                f"across it, up to {asked.radius:g} mm; see 'isocharge simulate identify', then ask for a smaller "
-                "radius or add an electrode",
-            )
-        fold = np.inf
-    if fold < SMALLEST_SHARE * asked.radius:
+        credible_share = CREDIBLE_SMOOTH if field.error < SMOOTH else CREDIBLE_NOISY
+        if fold_radius < credible_share * asked.radius:
+            return asked, (_uncertain_fold_caution(fold_radius, asked.radius),)
+        fold_radius = np.inf
+    if fold_radius < SMALLEST_SHARE * asked.radius:
         raise DatasetError(
-            f"the map from contacts to charges folds {fold:g} mm from the centre, of {asked.radius:g} mm asked for: "
-            "beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
+            f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of {asked.radius:g} mm asked "
+            "for: beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
         )
     domain = asked
     cautions = []
-    if fold < asked.radius:
-        domain = asked.within(fold)
-        cautions.append(
-            f"the map from contacts to charges folds beyond {fold:g} mm: two contacts give the same charges there; the "
-            f"model is trained for {fold:g} mm, not {asked.radius:g} mm, on {len(presses.within(fold))} of "
-            f"{len(presses)} presses"
-            + ("" if field.of_positive is None else f"; 'serve stream --track' follows contacts to {asked.radius:g} mm")
-        )
+    if fold_radius < asked.radius:
+        domain = asked.within(fold_radius)
+        cautions.append(_fold_caution(field, presses, fold_radius))
     if field.error < SMOOTH:
         inner = within(field, RIM * domain.radius)
-        if pairs := find_ambiguous_pairs(inner, noise, asked.force_range[0], PAIR_PLACES).summary:
-            which = "no model tells which of them it is; see 'isocharge simulate identify'"
-            cautions.append(f"{pairs[0].lower()}{pairs[1:-1]}; {which}")
+        pairs = find_ambiguous_pairs(inner, noise, asked.force_range[0], PAIR_PLACES)
+        if pairs.summary:
+            sentence = pairs.summary[0].lower() + pairs.summary[1:-1]  # continued below, so without its full stop
+            cautions.append(f"{sentence}; no model tells which of them it is; see 'isocharge simulate identify'")
     return domain, tuple(cautions)
 
 
+def _uncertain_fold_caution(fold_radius: float, asked_radius: float) -> str:
+    """Return the sentence about a fold that a poor fit shows inside the domain, which is not reduced.
+
+    Args:
+        fold_radius: Distance of the fold from the centre, mm.
+        asked_radius: Radius of the domain, mm.
+    """
+    return (
+        f"the map from contacts to charges seems to fold about {fold_radius:.2g} mm from the centre, where two "
+        "contacts give the same charges; the presses cannot tell it for certain, and the model is trained "
+        f"across it, up to {asked_radius:g} mm; see 'isocharge simulate identify', then ask for a smaller "
+        "radius or add an electrode"
+    )
+
+
+def _fold_caution(field: ChargeField, presses: LabelledPresses, fold_radius: float) -> str:
+    """Return the sentence about a certain fold, to which the domain is reduced.
+
+    Args:
+        field: Charge field with the domain before the reduction.
+        presses: The presses, some of which lie beyond the fold.
+        fold_radius: Distance of the fold from the centre, mm.
+    """
+    asked_radius = field.domain.radius
+    caution = (
+        f"the map from contacts to charges folds beyond {fold_radius:g} mm: two contacts give the same charges there; "
+        f"the model is trained for {fold_radius:g} mm, not {asked_radius:g} mm, on {len(presses.within(fold_radius))} "
+        f"of {len(presses)} presses"
+    )
+    if field.of_positive is None:
+        return caution
+    return f"{caution}; 'serve stream --track' follows contacts to {asked_radius:g} mm"
+
+
 def _fold_radius(field: ChargeField, noise: NoiseModel) -> float:
-    """Return the distance of the nearest fold from the centre, mm; infinity if there is no fold."""
+    """Return the distance of the nearest fold from the centre, mm, rounded; infinity if there is no fold."""
     area = working_area(within(field, RIM * field.domain.radius), noise, search_pairs=False)
-    return float(f"{area.unambiguous_radius:.6g}") if np.isfinite(area.fold_radius) else np.inf
+    if not np.isfinite(area.fold_radius):
+        return np.inf
+    return float(f"{area.unambiguous_radius:.6g}")
