@@ -174,9 +174,15 @@ def write_manifest(
 
 
 def data_card(name: str, manifest: dict[str, Any]) -> str:
-    """Return the text of the data card, README.md, of a dataset with a given name and manifest."""
+    """Return the text of the data card, README.md, of a dataset.
+
+    Args:
+        name: Name of the dataset.
+        manifest: Content of its file `manifest.json`.
+    """
+    probes = manifest.get("probes", [])
     ranges = manifest.get("ranges", {})
-    solver = manifest.get("solver", {})
+    solver_settings = _flat(manifest.get("solver", {}))
     lines = [
         "---",  # metadata for data hubs: https://huggingface.co/docs/hub/datasets-cards
         f"pretty_name: {json.dumps(name)}",
@@ -198,10 +204,10 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
         "",
         "| what | value |",
         "|---|---|",
-        f"| probes | {', '.join(manifest.get('probes', []))} |",
-        *(f"| {key} | {value} |" for key, value in ranges.items()),
+        f"| probes | {', '.join(probes)} |",
+        *(f"| {quantity} | {limits} |" for quantity, limits in ranges.items()),
         *(f"| {key} | {manifest[key]} |" for key in ("sampling", "noise", "seed") if key in manifest),
-        *(f"| solver: {key} | {value} |" for key, value in _flat(solver)),
+        *(f"| solver: {key} | {setting} |" for key, setting in solver_settings),
         "",
         "Read it with `isocharge.simulate.read_dataset(folder)`, which checks every shard's checksum.",
         "",

@@ -112,6 +112,7 @@ class ReadoutPoints:
         Returns:
             Charges, shape (..., n_electrode), pC.
         """
+        # sum over the points p and the stress components c of each electrode e
         return np.asarray(np.einsum("...epc,epc->...e", stress, self.weights))
 
 

@@ -56,7 +56,10 @@ def has_reversed_orientation(first: Array, second: Array) -> Booleans:
     Returns:
         Shape (...).
     """
-    products = np.einsum("...ei,...ej->...ij", _unit_columns(first), _unit_columns(second))
+    first_directions = _unit_columns(first)
+    second_directions = _unit_columns(second)
+    # matrix of the scalar products of the columns, with sums over the electrodes e, shape (..., 3, 3)
+    products = np.einsum("...ei,...ej->...ij", first_directions, second_directions)
     return np.asarray(np.linalg.det(products) < 0.0)
 
 
@@ -95,8 +98,10 @@ def singular_values(scaled: Array) -> Array:
     """
     by_position = scaled[:, :, :2]
     by_force = scaled[:, :, 2]
-    force_direction = by_force / np.maximum(np.linalg.norm(by_force, axis=1, keepdims=True), np.finfo(float).tiny)
-    along_force = np.einsum("ne,nei->ni", force_direction, by_position)
+    force_length = np.linalg.norm(by_force, axis=1, keepdims=True)
+    force_direction = by_force / np.maximum(force_length, np.finfo(float).tiny)
+    # A change of the force can cancel the part of a change of the charges along its direction, so this part is removed.
+    along_force = np.einsum("ne,nei->ni", force_direction, by_position)  # sum over the electrodes e
     across_force = by_position - force_direction[:, :, None] * along_force[:, None]
     return np.asarray(np.linalg.svd(across_force, compute_uv=False))
 

@@ -61,7 +61,8 @@ class ForceProfile:
         Returns:
             Charges, shape (n, n_electrode), pC.
         """
-        return np.asarray(np.einsum("nk,nke->ne", self.weights(logs), terms))
+        term_weights = self.weights(logs)  # shape (n, n_term)
+        return np.asarray(np.einsum("nk,nke->ne", term_weights, terms))
 
     def slope(self, logs: Array, charge: Array) -> Array:
         """Compute dQ / d ln F with the common exponent.

@@ -69,17 +69,24 @@ class MirrorRegion:
             radius: Radius of the working area, mm.
             whole_film: Charge map of the whole film.
             noise: Noise of the readings.
+
+        Returns:
+            The mirror region, from presses in the middle of each sector of each ring.
         """
-        low, high = charges.domain.force_range
-        forces = np.geomspace(max(low, high / FORCE_RATIO), high, FORCE_COUNT)
+        min_force, max_force = charges.domain.force_range
+        forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, FORCE_COUNT)
         outer = whole_film.domain.radius
         edges = np.linspace(radius, outer, N_RINGS + 1)
-        distance = 0.5 * (edges[1:] + edges[:-1])
-        angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
-        r, theta, force = (grid.ravel() for grid in np.meshgrid(distance, angle, forces, indexing="ij"))
-        contact = np.column_stack([r * np.cos(theta), r * np.sin(theta), force])
+        ring_distance = 0.5 * (edges[1:] + edges[:-1])
+        sector_angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
+
+        # presses with every combination of ring, sector and force
+        grids = np.meshgrid(ring_distance, sector_angle, forces, indexing="ij")
+        distance, angle, force = (grid.ravel() for grid in grids)
+        contact = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), force])
         is_mirrored = has_mirror(within(charges, radius), whole_film.charges(contact), noise)
-        return cls(radius, outer, forces, is_mirrored.reshape(N_RINGS, N_SECTORS, FORCE_COUNT).mean(axis=2))
+        share_of_forces = is_mirrored.reshape(N_RINGS, N_SECTORS, FORCE_COUNT).mean(axis=2)
+        return cls(radius, outer, forces, share_of_forces)
 
     @property
     def distance(self) -> Array:
@@ -129,14 +136,17 @@ def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
     Returns:
         Shape (n,).
     """
-    contact, residual = search(inside, charge, noise.sigma(charge), candidates=N_CANDIDATES)
-    return np.asarray((np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS) & _is_interior(inside.domain, contact))
+    nearest_contact, residual = search(inside, charge, noise.sigma(charge), candidates=N_CANDIDATES)
+    is_same_charge = np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS
+    return np.asarray(is_same_charge & _is_interior(inside.domain, nearest_contact))
 
 
 def _is_interior(domain: Domain, contact: Array) -> Booleans:
     """Return which contacts, shape (n, 3), lie inside a domain and not on its edge, shape (n,)."""
-    unit = domain.to_unit(contact)
-    return np.asarray((np.hypot(unit[:, 0], unit[:, 1]) < INTERIOR) & (np.abs(unit[:, 2]) < INTERIOR))
+    unit_x, unit_y, unit_log_force = domain.to_unit(contact).T
+    is_position_inside = np.hypot(unit_x, unit_y) < INTERIOR
+    is_force_inside = np.abs(unit_log_force) < INTERIOR
+    return np.asarray(is_position_inside & is_force_inside)
 
 
 def mirror_region(

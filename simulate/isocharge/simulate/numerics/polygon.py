@@ -218,13 +218,14 @@ def gauss_quadrilateral(corners: Array, count: int, length: float) -> tuple[Arra
     """
     complex_corners = to_complex(corners)
     a, b, c, d = _four_corners(complex_corners)
-    s_side = max(abs(b - a), abs(c - d))
+    s_side = max(abs(b - a), abs(c - d))  # the longer one of the two sides along the coordinate s of the square
     t_side = max(abs(d - a), abs(c - b))
     s_line, s_weights = _gauss_line_for(s_side, count, length)
     t, t_weights = _gauss_line_for(t_side, count, length)
     s = s_line[:, None]
 
     points = bilinear(complex_corners, s, t)  # shape (n_s, n_t)
+    # The determinant of the Jacobian is the cross product of the derivatives of the points.
     s_derivative = (b - a) * (1.0 - t) + (c - d) * t
     t_derivative = (d - a) * (1.0 - s) + (c - b) * s
     determinant = (np.conj(s_derivative) * t_derivative).imag

@@ -12,7 +12,15 @@ from isocharge.simulate.plots.film import draw_circle, draw_electrodes
 
 
 def mirror_picture(identification: Identification, mirror: MirrorRegion) -> Figure:
-    """Draw the mirror region on the film, and its share as a function of the distance from the centre."""
+    """Draw the mirror region on the film, and its share as a function of the distance from the centre.
+
+    Args:
+        identification: The identification of the sensor.
+        mirror: Mirror region of the sensor.
+
+    Returns:
+        A figure with two axes.
+    """
     figure = new_figure(13.0, 5.8)
     film_axes, distance_axes = figure.subplots(1, 2)
     shades = _draw_region(film_axes, identification, mirror)
@@ -30,27 +38,38 @@ def mirror_picture(identification: Identification, mirror: MirrorRegion) -> Figu
 def _draw_region(axes: Any, identification: Identification, mirror: MirrorRegion) -> Any:
     """Draw the shares as colours, with the clamp, the working area and the electrodes to scale.
 
+    Args:
+        axes: Axes of matplotlib.
+        identification: The identification, which contains the sensor.
+        mirror: Mirror region of the sensor.
+
     Returns:
         The coloured cells, for which a colour bar can be drawn.
     """
     n_ring, n_sector = mirror.share.shape
-    radius = np.linspace(mirror.inner, mirror.outer, n_ring + 1)
-    angle = 2.0 * np.pi * np.arange(n_sector + 1) / n_sector
-    x = np.outer(radius, np.cos(angle))
-    y = np.outer(radius, np.sin(angle))
-    shades = axes.pcolormesh(x, y, mirror.share, vmin=0.0, vmax=1.0, cmap="Reds")
+    # corners of the cells, shape (n_ring + 1, n_sector + 1)
+    edge_radius = np.linspace(mirror.inner, mirror.outer, n_ring + 1)
+    edge_angle = 2.0 * np.pi * np.arange(n_sector + 1) / n_sector
+    corner_x = np.outer(edge_radius, np.cos(edge_angle))
+    corner_y = np.outer(edge_radius, np.sin(edge_angle))
+    shades = axes.pcolormesh(corner_x, corner_y, mirror.share, vmin=0.0, vmax=1.0, cmap="Reds")
     film_radius = identification.sensor.film.radius
     draw_circle(axes, film_radius, color=INK, lw=2.0)
     draw_circle(axes, mirror.inner, color=INK, ls="--", lw=1.6)
     draw_electrodes(axes, identification.sensor)
-    limits = (-1.03 * film_radius, 1.03 * film_radius)
+    axis_limits = (-1.03 * film_radius, 1.03 * film_radius)
     title = f"dashed: working area, {mirror.inner:.3g} mm; solid: clamp, {film_radius:g} mm"
-    axes.set(xlim=limits, ylim=limits, aspect="equal", xlabel="x, mm", ylabel="y, mm", title=title)
+    axes.set(xlim=axis_limits, ylim=axis_limits, aspect="equal", xlabel="x, mm", ylabel="y, mm", title=title)
     return shades
 
 
 def _draw_distance(axes: Any, mirror: MirrorRegion) -> None:
-    """Draw the share of each ring against its distance from the centre."""
+    """Draw the mean share of each ring against its distance from the centre.
+
+    Args:
+        axes: Axes of matplotlib.
+        mirror: Mirror region of a sensor.
+    """
     edges = np.linspace(mirror.inner, mirror.outer, len(mirror.share) + 1)
     axes.stairs(100.0 * mirror.share.mean(axis=1), edges, color=FELT, lw=2.0)
     axes.axvline(mirror.inner, ls="--", color=INK)

@@ -1,1 +1,1 @@
-"""A film of your own: its parameters from a few presses, what they cannot identify, and a model of it."""
+"""Calibration of a film: its parameters from a few presses, which of them the presses identify, and its model."""

@@ -92,7 +92,8 @@ def _interpolated(charge: Array) -> Array:
         Charges for `INTERPOLATED_COUNT` pretensions, shape (INTERPOLATED_COUNT, n, n_electrode), pC.
     """
     shares = np.linspace(PRETENSIONS[0], PRETENSIONS[-1], INTERPOLATED_COUNT)
-    weights = np.array([np.interp(shares, PRETENSIONS, unit) for unit in np.eye(len(PRETENSIONS))])
+    # Interpolating the unit vectors gives the weight of each pretension k for each interpolated pretension i.
+    weights = np.array([np.interp(shares, PRETENSIONS, unit_vector) for unit_vector in np.eye(len(PRETENSIONS))])
     return np.asarray(np.einsum("ki,kne->ine", weights, charge))
 
 

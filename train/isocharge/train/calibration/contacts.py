@@ -42,14 +42,14 @@ class AdjustedContacts(NamedTuple):
 
 
 def derivatives_with_adjusted_contacts(by_unknowns: Array, by_contact: Array) -> Array:
-    """Return the derivatives of the residuals by unknowns if the contacts are adjusted to every film.
+    """Return the derivatives of the residuals with respect to unknowns if the contacts are adjusted to every film.
 
     A small change of the unknowns moves the contact such that the sum of squares stays minimal. The part of the
     derivatives that the contact can compensate disappears (Golub and Pereyra 1973).
 
     Args:
         by_unknowns: Derivatives at fixed contacts, shape (n, n_electrode + 3, n_unknown).
-        by_contact: Derivatives by the contacts, shape (n, n_electrode + 3, 3).
+        by_contact: Derivatives with respect to the contacts, shape (n, n_electrode + 3, 3).
 
     Returns:
         Shape (n, n_electrode + 3, n_unknown).
@@ -65,7 +65,7 @@ def with_force(contact: Array) -> Array:
 
 
 def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> AdjustedContacts:
-    """Return the contacts that fit the charges and the statements of the rig best on one film.
+    """Return the contacts that fit the measured charges and the contacts stated by the rig best on one film.
 
     Args:
         charges: The films.
@@ -87,7 +87,15 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
         start_factor, factor_slopes = _interpolated(factors, shares)
 
     def residuals(rows: Integers, scaled_contact: Array) -> tuple[Array, Array]:
-        """Return the residuals of some presses, shape (n, n_electrode + 3), and their derivatives by the contact."""
+        """Return the residuals of some presses, and their derivatives with respect to the scaled contact.
+
+        Args:
+            rows: Indices of the presses, shape (k,).
+            scaled_contact: Contacts in which the domain is the unit disk times [-1, 1], shape (k, 3).
+
+        Returns:
+            Residuals, shape (k, n_electrode + 3), and derivatives, shape (k, 3, n_electrode + 3).
+        """
         contact = scaled_contact * domain.scale + domain.centre
         displacement = (contact - start[rows])[:, None]
         factor = start_factor[rows] + (factor_slopes[rows] * displacement).sum(axis=2)
@@ -156,7 +164,7 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
         contact: Contacts (x, y, F), shape (n, 3).
 
     Returns:
-        The values, shape (n, n_electrode), and the derivatives by (x, y, ln F), shape (n, n_electrode, 3).
+        The values, shape (n, n_electrode), and the derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3).
     """
     x_step, y_step, log_force_step = CONTACT_STEPS
     # One call for the contacts and for the three displaced copies of them.
@@ -176,9 +184,9 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
 def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Array:
     """Return the contacts (x, y, ln F) at which the search begins, shape (n, 3).
 
-    They are those of the rig. For a press of unknown position, it is the position among `CANDIDATE_POSITIONS` at which
-    the ratios of the charges are closest to those of the film. These ratios hardly depend on the stiffness and on the
-    coefficients of the film, which are not known yet.
+    A press starts at the contact that the rig states. If its position is unknown, it starts at the position among
+    `CANDIDATE_POSITIONS` at which the ratios of its charges are closest to those of the film. These ratios hardly
+    depend on the stiffness and on the coefficients of the film, which are not known yet.
 
     Args:
         charges: The films.

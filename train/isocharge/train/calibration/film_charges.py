@@ -442,8 +442,8 @@ class FilmCharges:
     def _trace_slopes(self, unknowns: Array, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of ln(factor of traces) with respect to the parameters that are not in the load.
 
-        These are the piezoelectric coefficients, the place of the electrodes and the radius of the probe. A trace lies
-        at another place than its electrode, so that its charge changes by another share than that of the electrode.
+        These are the piezoelectric coefficients, the place of the electrodes and the radius of the probe. A trace and
+        its electrode lie at different places, so that their charges change by different shares.
 
         Args:
             unknowns: Parameters and coefficients of the film.

@@ -68,7 +68,7 @@ MAX_LINEAR_STEP = 0.2
 """Largest change of a parameter, in standard deviations of its prior, after which the derivatives are still used."""
 
 SMALLEST_DERIVATIVE = 1e-12
-"""Length by which the derivatives of the residuals by the force are divided at least."""
+"""Smallest length by which the derivatives of the residuals with respect to the force are divided."""
 
 BOUND_MARGIN = 1e-3
 """Smallest distance of a start from the bounds, in standard deviations, because the method must start inside them."""
@@ -288,10 +288,12 @@ class FitProblem:
         deviation = unknowns - self.mean
         model = LinearModel.of(jacobian.reshape(-1, unknowns.size), contacts.residual.ravel(), deviation)
 
-        # A scatter of the forces is additional noise of each press, along the derivative of its residuals by the force.
+        # A scatter of the forces is additional noise of each press, in the direction in which the force changes its
+        # residuals.
         force_derivative = self._force_derivative(unknowns, data, contacts)
         length = np.linalg.norm(force_derivative, axis=1)
         direction = force_derivative / np.maximum(length, SMALLEST_DERIVATIVE)[:, None]
+        # sum over the residuals k of each press n, for each unknown u
         jacobian_along = np.einsum("nk,nku->nu", direction, jacobian)
         residual_along = (direction * contacts.residual).sum(axis=1)
         models = {
@@ -317,7 +319,7 @@ class FitProblem:
         return adjust_contacts(self.charges, film, corrected, start)
 
     def derivatives(self, solved: SolvedFilm, data: PressData, *, with_coefficients: bool = True) -> Array:
-        """Return the derivatives of the residuals by the unknowns. The contacts are adjusted to each film.
+        """Return the derivatives of the residuals with respect to the unknowns. The contacts are adjusted to each film.
 
         Args:
             solved: The film, and the contacts of the presses on it.
@@ -385,7 +387,7 @@ class FitProblem:
         return neighbouring_films(self.charges, self._film(unknowns), self._without_nuisances(unknowns, data))
 
     def _force_derivative(self, unknowns: Array, data: PressData, contacts: AdjustedContacts) -> Array:
-        """Return the derivatives of the residuals by the stated force, shape (n, n_electrode + 3).
+        """Return the derivatives of the residuals with respect to the stated force, shape (n, n_electrode + 3).
 
         The contacts are adjusted to the stated force.
         """

@@ -55,16 +55,9 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
     calibrated_MPa = float(posterior.parameters[pretension])
     lower, upper = (float(bound[pretension]) for bound in prior.bounds)
     nodes = _nodes(calibrated_MPa, lower, upper)
-    networks = []
-    for node in nodes:
-        if node == calibrated_MPa:
-            networks.append(network)
-            continue
-        parameters = posterior.parameters.copy()
-        parameters[pretension] = node
-        networks.append(_like(network, result.fitted_film(parameters).network))
+    arrays_at_nodes = [_arrays(each) for each in _networks_at(nodes, result, network)]
+    weights = [np.stack(arrays) for arrays in zip(*arrays_at_nodes, strict=True)]
     drifted_std = np.sqrt(np.diag(posterior.drifted(prior).covariance)) * prior.std
-    weights = [np.stack(arrays) for arrays in zip(*map(_arrays, networks), strict=True)]
     pretensions = Pretensions(
         node_MPa=nodes,
         calibrated_MPa=calibrated_MPa,
@@ -77,14 +70,48 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
         activation=network.layers.activation.name,
         weights=dict(zip(_constants(network), weights, strict=True)),
     )
-    rng = np.random.default_rng(SEED)
-    touches = draw_contacts(rng, problem.domain, TOUCHES)
-    charge = problem.noise.add(problem.charges.charges(posterior.unknowns, touches), rng)
-    misfits = [pretensions.misfits(row, np.array([calibrated_MPa])) for row in charge]
-    typical_misfit = rms(np.array(misfits))
+    typical_misfit = _typical_misfit(pretensions, result)
     if typical_misfit > ROUGH:
         return None
     return replace(pretensions, misfit_rms=max(typical_misfit, 1.0))
+
+
+def _networks_at(pretensions_MPa: Array, result: CalibrationResult, network: FoldedNetwork) -> list[FoldedNetwork]:
+    """Return networks for the calibrated film with other pretensions.
+
+    Args:
+        pretensions_MPa: The pretensions, shape (n,), MPa.
+        result: The calibration.
+        network: Network of the model, which is returned for the calibrated pretension.
+    """
+    posterior = result.posterior
+    pretension = result.problem.prior.index("pretension")
+    networks = []
+    for pretension_MPa in pretensions_MPa:
+        if pretension_MPa == posterior.parameters[pretension]:
+            networks.append(network)
+        else:
+            parameters = posterior.parameters.copy()
+            parameters[pretension] = pretension_MPa
+            networks.append(_like(network, result.fitted_film(parameters).network))
+    return networks
+
+
+def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> float:
+    """Return the root mean square of the misfits of simulated touches on the calibrated film, in units of the noise.
+
+    Args:
+        pretensions: Weights of the network at several pretensions.
+        result: The calibration.
+    """
+    problem = result.problem
+    rng = np.random.default_rng(SEED)
+    touches = draw_contacts(rng, problem.domain, TOUCHES)
+    exact_charge = problem.charges.charges(result.posterior.unknowns, touches)
+    charge = problem.noise.add(exact_charge, rng)
+    calibrated_MPa = np.array([pretensions.calibrated_MPa])
+    misfits = [pretensions.misfits(touch_charge, calibrated_MPa) for touch_charge in charge]
+    return rms(np.array(misfits))
 
 
 def _nodes(calibrated: float, lower: float, upper: float) -> Array:
@@ -125,10 +152,15 @@ def _arrays(network: FoldedNetwork) -> list[np.ndarray]:
 
 
 def _constants(network: FoldedNetwork) -> list[str]:
-    """Return the names of the constants of the ONNX graph that hold these weights."""
+    """Return the names of the constants of the ONNX graph that contain the weights, in the order of `_arrays`."""
     graph = onnx.load_from_string(write_graph(network, {})).graph
     constants = [(constant.name, numpy_helper.to_array(constant)) for constant in graph.initializer]
-    return [next(name for name, held in constants if np.array_equal(held, array)) for array in _arrays(network)]
+
+    def name_of(array: Array) -> str:
+        """Return the name of the first constant that is equal to an array."""
+        return next(str(name) for name, values in constants if np.array_equal(values, array))
+
+    return [name_of(array) for array in _arrays(network)]
 
 
 def _floor(result: CalibrationResult) -> float:
@@ -141,5 +173,8 @@ def _floor(result: CalibrationResult) -> float:
     pretension = prior.index("pretension")
     misfit = result.sensitivity.misfit
     by_pretension = misfit[:, :, pretension]
+    # Change of the least-squares estimate of the pretension with each parameter p: a sum over all misfits k of all
+    # touches n, over the sum for the pretension itself.
     weights = np.einsum("nk,nkp->p", by_pretension, misfit) / (by_pretension**2).sum()
-    return float(np.sqrt(weights @ result.posterior.joint @ weights) * prior.std[pretension])
+    relative_variance = weights @ result.posterior.joint @ weights
+    return float(np.sqrt(relative_variance) * prior.std[pretension])

@@ -140,7 +140,7 @@ class LinearModel(NamedTuple):
         """Return the model of residuals whose values and derivatives are known at one point.
 
         Args:
-            jacobian: Derivatives of the residuals by the unknowns, shape (n, n_unknown).
+            jacobian: Derivatives of the residuals with respect to the unknowns, shape (n, n_unknown).
             residual: Residuals in units of their standard deviations, shape (n,).
             deviation: Unknowns at this point less their mean before the presses, shape (n_unknown,).
         """

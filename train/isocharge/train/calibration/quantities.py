@@ -39,8 +39,8 @@ class Quantity:
         value: Best estimate.
         std: Standard deviation after the presses.
         before_std: Standard deviation before the presses.
-        weights: Derivatives of the quantity by the parameters in units of their prior standard deviations, shape
-            (n_parameter,).
+        weights: Derivatives of the quantity with respect to the parameters in units of their prior standard
+            deviations, shape (n_parameter,).
     """
 
     name: str
@@ -72,7 +72,7 @@ class _Definition(NamedTuple):
 
     Attributes:
         meaning: Description in words.
-        weights: Derivatives by the parameters in their own units, shape (n_parameter,).
+        weights: Derivatives with respect to the parameters in their own units, shape (n_parameter,).
         offset: Value at parameters of zero.
     """
 
@@ -151,7 +151,7 @@ def _relative(meaning: str, log_weights: Array) -> _Definition:
 
     Args:
         meaning: Description in words.
-        log_weights: Derivatives of the logarithm of the quantity by the parameters, shape (n_parameter,).
+        log_weights: Derivatives of the logarithm of the quantity with respect to the parameters, shape (n_parameter,).
     """
     return _Definition(f"{meaning}{RELATIVE}, %", 100.0 * log_weights)
 

@@ -16,7 +16,10 @@ from isocharge.train.data.channel_noise import usual_size
 from isocharge.train.data.measured_sensor import PressedArea
 
 USUAL_SIZES = (1e-30, 1e30)
-"""Range of the median size of the charges of a channel, pC: squares and shares of them are still float32 numbers."""
+"""Range of the median size of the charges of a channel, pC.
+
+Within this range, float32 numbers can represent the squares of the charges and small fractions of them.
+"""
 
 LEAST_VARIATION = 1e-6
 """Smallest range of the charges of a channel, relative to the largest size."""

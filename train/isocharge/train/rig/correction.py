@@ -2,8 +2,8 @@
 
 The correction is a factor on the charge of each electrode, with the polynomials of `calibration.discrepancy` in place
 and logarithm of the force. The covariance of the residuals contains the noise of the charges, and the errors of the
-measured places and forces, which act through the derivatives of the map. Several sizes of the correction are weighed by
-the presses. If no correction is the most probable size, the charges are not corrected.
+measured places and forces, which act through the derivatives of the map. The probability of
+several sizes of the correction is computed. If the size zero is the most probable, the charges are not corrected.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,10 @@ from isocharge.train.calibration.film_charges import CONTACT_STEPS
 from isocharge.train.calibration.hypotheses import Hypothesis, LinearModel, mix_hypotheses
 
 SIZES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
-"""Sizes of the correction that are weighed, dimensionless: a sensor that is not calibrated may be far off."""
+"""Sizes of the correction that are compared, dimensionless.
+
+Large sizes are needed for a sensor that is not calibrated.
+"""
 
 MIN_RATIO = 0.5
 """Ratio of the measured charge to that of the map below which the logarithm is continued by its tangent."""
