@@ -120,7 +120,7 @@ def test_a_network_with_infinite_answers_is_not_released(trained, held_out, monk
     monkeypatch.setattr(correlation, "N_EXAMPLES", 1_000)  # the errors of this network have no correlations
     network = copy.deepcopy(trained.network)
     with torch.no_grad():
-        network.contact.skip.weight *= 1e3
+        network.contact.skip.weight *= 15.0
     diverging = fold_with_correlation(network, trained.split.train)
     with pytest.raises(TrainingError, match=r"answers contact = .* expected finite numbers for any charges"):
         check_graph(write_graph(diverging, {}), diverging.outputs, held_out, REFERENCE)

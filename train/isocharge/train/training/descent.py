@@ -126,7 +126,7 @@ class Descent:
             if state is not None:
                 self._restore(state)
         while self.step < self.stage.steps and not self._is_stalled():
-            loss = self._take_step()
+            loss = self.take_step()
             if self.step % REPORT_EVERY == 0 or self.step == self.stage.steps:
                 self._evaluate(loss.item())
             if run is not None and time.monotonic() - saved_at >= SAVE_EVERY_S:
@@ -136,7 +136,7 @@ class Descent:
             run.save(self.stage.name, tensor_bytes(self._state()))
         self.stage.network.load_state_dict(self.best_weights)
 
-    def _take_step(self) -> Tensor:
+    def take_step(self) -> Tensor:
         """Change the weights by one step of the optimisers and return the loss before it."""
         network = self.stage.network
         rate = self.rate * _relative_rate(self.step / self.stage.steps)
