@@ -1,4 +1,4 @@
-"""Arrays of small companion files of a model: those of `charges.npz` and of `pretensions.npz`."""
+"""Arrays of small companion files of a model: `charges.npz`, `pretensions.npz` and `film_directions.npz`."""
 
 import io
 
@@ -20,6 +20,19 @@ def linear_series():
 def charge_arrays():
     """The arrays of a small `charges.npz`."""
     return {"series": linear_series(), "radius_mm": np.array(8.0), "force_N": np.array([0.05, 2.0])}
+
+
+def direction_arrays():
+    """The arrays of a small `film_directions.npz` with two directions and four electrodes."""
+    series = np.zeros((2, 2, 2, 2, 4))
+    series[0, 0, 0, 0] = 0.01
+    series[1, 0, 0, 1] = [0.02, -0.02, 0.01, 0.0]
+    return {
+        "series": series,
+        "radius_mm": np.array(8.0),
+        "force_N": np.array([0.05, 2.0]),
+        "by_pretension": np.array([0.1, -0.2]),
+    }
 
 
 def pretension_arrays():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from attacks.companions import charge_arrays, pretension_arrays
+from attacks.companions import charge_arrays, direction_arrays, pretension_arrays
 from attacks.faults import mutated, with_junk
 from isocharge.common.files import sha256_of
 from isocharge.common.resumable_run import resume_folder
@@ -28,6 +28,7 @@ from isocharge.serve import (
     read_charges,
 )
 from isocharge.serve.model.charge_series import read_charges as read_charge_series
+from isocharge.serve.model.film_directions import read_film_directions
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.pretensions import read_pretensions
 from isocharge.serve.network.model_store import open_model_store
@@ -335,10 +336,15 @@ def series_with_faults(rng, arrays):
     return changed
 
 
-@pytest.mark.parametrize("name", ["charges.npz", "pretensions.npz"])
+@pytest.mark.parametrize("name", ["charges.npz", "pretensions.npz", "film_directions.npz"])
 def test_companion_files_with_faults(name, tmp_path, attack):
     """A file that is accepted gives finite numbers."""
-    good = {"charges.npz": charge_arrays, "pretensions.npz": pretension_arrays}[name]()
+    arrays_of_file = {
+        "charges.npz": charge_arrays,
+        "pretensions.npz": pretension_arrays,
+        "film_directions.npz": direction_arrays,
+    }
+    good = arrays_of_file[name]()
 
     def packed(arrays):
         file = io.BytesIO()
@@ -350,6 +356,10 @@ def test_companion_files_with_faults(name, tmp_path, attack):
         if name == "charges.npz":
             charges = read_charge_series(tmp_path, 3)
             assert np.isfinite(charges.linearised(np.array([[0.0, 0.0, 0.0], [3.0, -2.0, -1.0]]))[0]).all()
+        elif name == "film_directions.npz":
+            directions = read_film_directions(tmp_path, 4)
+            log_changes = directions.log_changes(np.array([[0.0, 0.0, 0.5], [30.0, -20.0, 100.0]]))
+            assert np.isfinite(np.exp(log_changes)).all()
         else:
             pretensions = read_pretensions(tmp_path)
             middle = np.array([sum(pretensions.range_MPa) / 2.0])

@@ -104,8 +104,8 @@ def observe(follower: FilmFollower, charges: np.ndarray) -> tuple[float, list[fl
 
 
 def answers(follower: FilmFollower, charges: np.ndarray) -> list[Contact]:
-    """Return the contacts of charges, with the uncertainty of the pretension."""
-    return [follower.add_pretension_error(follower.predictor.predict(charge), charge) for charge in charges]
+    """Return the contacts of charges on the followed film."""
+    return [follower.follow_contact(follower.predictor.predict(charge), charge).contact for charge in charges]
 
 
 def changed_film(film: Film, change_MPa: float, seed: list[int]) -> dict[str, float]:

@@ -7,13 +7,14 @@ import shutil
 import numpy as np
 import pytest
 
-from attacks.companions import charge_arrays, linear_series, pretension_arrays
+from attacks.companions import charge_arrays, direction_arrays, linear_series, pretension_arrays
 from isocharge.common.chebyshev_series import Series
 from isocharge.common.errors import ModelError
 from isocharge.common.files import sha256_of
 from isocharge.serve import load_model, write_model
 from isocharge.serve.model.charge_series import ChargeSeries, read_charges
 from isocharge.serve.model.companion_files import read_companion_file
+from isocharge.serve.model.film_directions import FilmDirections, read_film_directions
 from isocharge.serve.model.pretensions import read_pretensions
 
 ADVICE = "train again"
@@ -145,6 +146,55 @@ def test_pretensions_that_nothing_can_be_computed_from_are_refused(tmp_path, cha
     write_npz(tmp_path, "pretensions.npz", pretension_arrays() | change)
     with pytest.raises(ModelError, match=rf"pretensions\.npz: .*{reason}.*calibrate again"):
         read_pretensions(tmp_path)
+
+
+def test_film_directions_are_read_as_they_were_written(tmp_path):
+    arrays = direction_arrays()
+    written = FilmDirections(arrays["series"], 8.0, (0.05, 2.0), arrays["by_pretension"])
+    (tmp_path / "film_directions.npz").write_bytes(written.to_bytes())
+    read = read_film_directions(tmp_path, 4)
+    np.testing.assert_allclose(read.coefficients, written.coefficients, rtol=1e-6)
+    np.testing.assert_array_equal(read.by_pretension, written.by_pretension)
+    assert (read.radius_mm, read.force_N, read.count) == (8.0, (0.05, 2.0), 2)
+
+
+def test_film_directions_change_the_charges_as_the_chebyshev_series_says(tmp_path):
+    """The second direction of the small file is linear in x, and contacts beyond the radius are clipped to it."""
+    write_npz(tmp_path, "film_directions.npz", direction_arrays())
+    directions = read_film_directions(tmp_path, 4)
+    log_changes = directions.log_changes(np.array([[4.0, 1.0, 0.3], [80.0, 0.0, 9.0]]))
+    np.testing.assert_allclose(log_changes[:, 0], 0.01, rtol=1e-5)
+    expected = np.array([0.02, -0.02, 0.01, 0.0])
+    np.testing.assert_allclose(log_changes[0, 1], 0.5 * expected, rtol=1e-5)
+    np.testing.assert_allclose(log_changes[1, 1], expected, rtol=1e-5)
+
+
+def test_model_without_film_directions_has_none(tmp_path):
+    directions = read_film_directions(tmp_path, 4)
+    assert directions.count == 0
+    assert directions.log_changes(np.array([[1.0, 2.0, 0.5]])).shape == (1, 0, 4)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"series": None}, "the array 'series' is missing"),
+        ({"series": np.zeros((2, 2, 2, 2, 3))}, "expected an array of shape"),
+        ({"series": np.zeros((2, 3, 2, 2, 4))}, "equal degrees in x and y"),
+        ({"series": np.zeros((2, 2, 2, 50, 4)), "by_pretension": np.zeros(50)}, "up to 40 directions"),
+        ({"series": np.zeros((40, 40, 2, 2, 4))}, "degrees up to 30"),
+        ({"series": np.full((2, 2, 2, 2, 4), 1e3)}, "changes of ln Q up to 10"),
+        ({"series": np.full((2, 2, 2, 2, 4), np.nan)}, "expected finite numbers"),
+        ({"by_pretension": np.zeros(3)}, "expected an array of shape"),
+        ({"by_pretension": np.full(2, 1e6)}, "changes up to 1000 per MPa"),
+        ({"radius_mm": np.array(0.0)}, "expected a radius"),
+        ({"force_N": np.array([1.0, 0.5])}, "got 1 and 0.5 N"),
+    ],
+)
+def test_film_directions_that_describe_no_film_are_refused(tmp_path, change, reason):
+    write_npz(tmp_path, "film_directions.npz", direction_arrays() | change)
+    with pytest.raises(ModelError, match=rf"film_directions\.npz: .*{reason}.*calibrate again"):
+        read_film_directions(tmp_path, 4)
 
 
 def test_released_models_hold_the_checksums_of_their_files(pytestconfig):

@@ -53,6 +53,8 @@ class ContactFrame:
         film: The followed film; None if the film is not followed.
         tracking: The tracked contact; None if contacts are not tracked.
         is_mixture_contact: Whether the contact is that of a `ContactMixture` and not that of the model.
+        model_charge_pC: Charges for which the current model gives the contact, shape (n_electrode,), pC; None out of
+            contact. On a followed film they differ from those of the reading.
     """
 
     reading: Reading
@@ -62,6 +64,7 @@ class ContactFrame:
     film: FollowedFilm | None = None
     tracking: Tracking | None = None
     is_mixture_contact: bool = False
+    model_charge_pC: Array | None = None
 
 
 class ContactStage(ABC):
@@ -93,6 +96,7 @@ class PredictionStage(ContactStage):
         if INVALID in reading.flags or not reading.contact or reading.charge_pC is None:
             return
         frame.contact = self._model.predictor.predict(reading.charge_pC)
+        frame.model_charge_pC = reading.charge_pC
         frame.flags = reading.flags + self._validity.flags(frame.contact)
 
 
@@ -118,10 +122,10 @@ class FilmStage(ContactStage):
         self.follower = FilmFollower(model.predictor, rule, warming_ratio)
 
     def step(self, frame: ContactFrame) -> None:
-        """Add the uncertainty of the pretension to the contact, and use the frame to follow the film."""
+        """Correct the contact for what is known of the film, and use the frame to follow the film."""
         charge_pC = frame.reading.charge_pC
         if frame.contact is not None and charge_pC is not None:
-            frame.contact = self.follower.add_pretension_error(frame.contact, charge_pC)
+            frame.contact, frame.model_charge_pC = self.follower.follow_contact(frame.contact, charge_pC)
         frame.film = self.follower.film
         self.follower.observe_frame(charge_pC, frame.contact, frame.flags, frame.clock_s)
         self._model.predictor = self.follower.predictor
@@ -214,7 +218,7 @@ class ChargeScaleStage(ContactStage):
         For a contact of the mixture, only the force is assumed to depend on the scale, with the largest exponent.
         """
         charge_scale_std = frame.reading.charge_scale_std
-        charge_pC = frame.reading.charge_pC
+        charge_pC = frame.model_charge_pC
         if frame.is_mixture_contact:
             return 0.0, 0.0, LARGEST_FORCE_EXPONENT * charge_scale_std * contact.force_N
         if charge_scale_std <= 0.0 or charge_pC is None:

@@ -136,7 +136,7 @@ class Sensitivity:
         Returns:
             Changes of x and y, mm, and of the force, N.
         """
-        if not self._is_reusable(contact):
+        if not is_close(contact, self._reference):
             contact_after_unit = other()
             self._reference = contact
             self._unit_shift = (
@@ -148,15 +148,15 @@ class Sensitivity:
         factor = size / self._unit
         return factor * x_shift, factor * y_shift, factor * force_shift
 
-    def _is_reusable(self, contact: Contact) -> bool:
-        """Return whether the contact is close to that of the latest second prediction."""
-        reference = self._reference
-        return (
-            reference is not None
-            and abs(contact.x_mm - reference.x_mm) <= REUSE_DISTANCE_mm
-            and abs(contact.y_mm - reference.y_mm) <= REUSE_DISTANCE_mm
-            and abs(contact.force_N - reference.force_N) <= REUSE_FORCE_RATIO * reference.force_N
-        )
+
+def is_close(contact: Contact, reference: Contact | None) -> bool:
+    """Return whether a contact is so close to another contact that its sensitivities are the same."""
+    return (
+        reference is not None
+        and abs(contact.x_mm - reference.x_mm) <= REUSE_DISTANCE_mm
+        and abs(contact.y_mm - reference.y_mm) <= REUSE_DISTANCE_mm
+        and abs(contact.force_N - reference.force_N) <= REUSE_FORCE_RATIO * reference.force_N
+    )
 
 
 class Contacts(NamedTuple):

@@ -1,13 +1,15 @@
-"""Bayesian filter for the pretension of a film, the gains of its electrodes, and a charge that warmth adds to all.
+"""Bayesian filter for the pretension of a film, its other unknowns, its gains, and a charge that warmth adds to all.
 
 Every touch gives one misfit vector, which depends on
 
 - the pretension of the film, non-linearly: the pretension is estimated on a grid;
-- the gain of each electrode, and a common offset, i.e. a charge that is added to all electrodes while a touch lasts
-  (the pyroelectric charge of a warm finger). The misfit vector is linearised in these unknowns.
+- the directions in which the calibration left the film uncertain (`FilmDirections`), the drift of the gain of each
+  electrode, and a common offset, i.e. a charge that is added to all electrodes while a touch lasts (the pyroelectric
+  charge of a warm finger). The misfit vector is linearised in these unknowns.
 
 At each pretension a Kalman filter estimates the linear unknowns (a Rao-Blackwellised filter, Doucet et al. 2000). A
-change of the misfit that a gain or an offset explains is therefore not taken for a change of the film.
+change of the misfit that a gain, an offset or an error of the calibration explains is therefore not taken for a change
+of the pretension.
 
 How large offsets are is not known beforehand. The filter therefore compares several offset levels: films that are
 touched without any offset, and films whose offsets have a small or a large standard deviation. Each level has a Kalman
@@ -23,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array, Reals
+from isocharge.serve.model.film_directions import FilmDirections
 from isocharge.serve.model.pretensions import Pretensions
 
 GRID_STEP_MPa = 0.02
@@ -78,9 +81,11 @@ class UnknownsLayout:
 
     Attributes:
         electrodes: Number of electrodes.
+        direction_count: Number of directions in which the film is uncertain.
     """
 
     electrodes: int
+    direction_count: int
 
     @property
     def gains(self) -> slice:
@@ -93,9 +98,14 @@ class UnknownsLayout:
         return self.electrodes
 
     @property
+    def directions(self) -> slice:
+        """Coordinates along the directions in which the film is uncertain, in standard deviations."""
+        return slice(self.electrodes + 1, self.size)
+
+    @property
     def size(self) -> int:
         """Number of linear unknowns."""
-        return self.electrodes + 1
+        return self.electrodes + 1 + self.direction_count
 
 
 class TouchResiduals(NamedTuple):
@@ -103,7 +113,7 @@ class TouchResiduals(NamedTuple):
 
     Attributes:
         filtered: With the estimated gains and offset, at each pretension, shape (n_pretension,).
-        without_gains: With the estimated offset only, at each pretension, shape (n_pretension,).
+        without_gains: With the estimated offset and directions only, at each pretension, shape (n_pretension,).
         offset_variance: Variance that the unknown offset of this touch adds to its misfit, over that of a good touch
             with a known offset.
     """
@@ -121,12 +131,18 @@ class FilmFilter:
     """
 
     def __init__(
-        self, pretensions: Pretensions, drift_MPa_per_root_hour: float, largest_offset_pC: float, offset_ratio: Array
+        self,
+        pretensions: Pretensions,
+        directions: FilmDirections,
+        drift_MPa_per_root_hour: float,
+        largest_offset_pC: float,
+        offset_ratio: Array,
     ) -> None:
         """Begin with the film as it was calibrated.
 
         Args:
             pretensions: The network of the film at any pretension.
+            directions: Directions in which the film is uncertain at a given pretension.
             drift_MPa_per_root_hour: Standard deviation of the pretension's change in an hour.
             largest_offset_pC: Standard deviation of the largest offsets that the filter tolerates; 0 for none.
             offset_ratio: Charge of each electrode over the common offset, shape (n_electrode,).
@@ -138,7 +154,8 @@ class FilmFilter:
         self._drift = drift_MPa_per_root_hour
         self._largest_offset = largest_offset_pC
         self._offset_ratio = offset_ratio
-        self._layout = UnknownsLayout(pretensions.typical_pC.size)
+        self._directions = directions
+        self._layout = UnknownsLayout(pretensions.typical_pC.size, directions.count)
 
         relative_levels = RELATIVE_LEVELS if largest_offset_pC > 0.0 else RELATIVE_LEVELS[:1]
         self._level_std = largest_offset_pC * np.array(relative_levels)
@@ -156,6 +173,8 @@ class FilmFilter:
         shape = self._probability.shape
         size = self._layout.size
         self._mean = np.zeros((*shape, size))
+        change_MPa = self.grid_MPa - self._pretensions.calibrated_MPa
+        self._mean[..., self._layout.directions] = np.outer(change_MPa, self._directions.by_pretension)
         self._covariance = np.zeros((*shape, size, size))
         self._covariance[:] = self._stationary_covariance()[:, None]
         self._last_touch_s: float | None = None
@@ -208,6 +227,12 @@ class FilmFilter:
     def _likeliest_level(self) -> int:
         return int(self.level_probability.argmax())
 
+    def direction_means(self, pretension_MPa: float) -> Array:
+        """Return the means of the directions at one pretension, shape (n_direction,), in standard deviations."""
+        share = self._probability / self._probability.sum(axis=0)
+        means = (share[..., None] * self._mean[..., self._layout.directions]).sum(axis=0)
+        return np.array([np.interp(pretension_MPa, self.grid_MPa, column) for column in means.T])
+
     def _stationary_covariance(self) -> Array:
         """Return the covariance of the linear unknowns before any touch, shape (n_level, n_unknown, n_unknown)."""
         layout = self._layout
@@ -233,6 +258,7 @@ class FilmFilter:
         decay = np.empty(layout.size)
         decay[layout.gains] = math.exp(-elapsed_s / GAIN_TIME_CONSTANT_s)
         decay[layout.offset] = math.exp(-elapsed_s / OFFSET_TIME_CONSTANT_s)
+        decay[layout.directions] = 1.0
         decay_of_products = np.outer(decay, decay)
         stationary = self._stationary_covariance()[:, None]
         self._mean = decay * self._mean
@@ -301,13 +327,15 @@ class FilmFilter:
         self._mean = moments[..., 1 : 1 + size]
         self._covariance = moments[..., 1 + size :].reshape(level_count, grid_size, size, size)
 
-    def update(self, charge_pC: Array) -> TouchResiduals:
+    def update(self, charge_pC: Array, log_changes: Array) -> TouchResiduals:
         """Update the distribution by a touch.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
+            log_changes: Changes of the logarithms of the charges by one unit of each direction at the contact, shape
+                (n_direction, n_electrode).
         """
-        misfit, jacobian = self._linearise(charge_pC)
+        misfit, jacobian = self._linearise(charge_pC, log_changes)
         by_offset = jacobian[..., self._layout.offset]
         scatter = self._scatter_std[:, None, None, None] ** 2 * (by_offset[..., :, None] * by_offset[..., None, :])
         noise = np.eye(charge_pC.size) + scatter
@@ -330,7 +358,7 @@ class FilmFilter:
         self._probability = posterior / posterior.sum()
         return self._residuals(misfit, jacobian, noise)
 
-    def _linearise(self, charge_pC: Array) -> tuple[Array, Array]:
+    def _linearise(self, charge_pC: Array, log_changes: Array) -> tuple[Array, Array]:
         """Return the misfit vector of a touch at each pretension, and its Jacobian for the linear unknowns.
 
         The derivative with respect to the offset is the difference quotient between the charges and the charges
@@ -342,17 +370,20 @@ class FilmFilter:
         """
         layout = self._layout
         offset_step_pC = self._offset_steps()
-        changed = np.tile(charge_pC, (1 + layout.electrodes + offset_step_pC.size, 1))
-        with_gain = slice(1, 1 + layout.electrodes)
-        without_offset = slice(1 + layout.electrodes, None)
-        changed[with_gain] += GAIN_STD * np.diag(charge_pC)
-        changed[without_offset] -= np.outer(offset_step_pC, self._offset_ratio)
-        vectors = self._network.vectors(changed, self.grid_MPa) / self._pretensions.misfit_rms
+        changes = [
+            charge_pC[None],
+            charge_pC + GAIN_STD * np.diag(charge_pC),
+            charge_pC - np.outer(offset_step_pC, self._offset_ratio),
+            charge_pC * np.exp(log_changes),
+        ]
+        vectors = self._network.vectors(np.concatenate(changes), self.grid_MPa) / self._pretensions.misfit_rms
+        split = np.cumsum([len(rows) for rows in changes])[:-1]
+        (misfit,), with_gain, without_offset, with_direction = np.split(vectors, split)
 
-        misfit = vectors[0]
         jacobian = np.empty((*self._probability.shape, layout.electrodes, layout.size))
-        jacobian[..., layout.gains] = np.moveaxis(vectors[with_gain] - misfit, 0, 2)
-        jacobian[..., layout.offset] = (misfit - vectors[without_offset]) / offset_step_pC[:, None, None]
+        jacobian[..., layout.gains] = np.moveaxis(with_gain - misfit, 0, 2)
+        jacobian[..., layout.offset] = (misfit - without_offset) / offset_step_pC[:, None, None]
+        jacobian[..., layout.directions] = np.moveaxis(with_direction - misfit, 0, 2)
         return misfit, jacobian
 
     def _offset_steps(self) -> Array:
@@ -368,7 +399,9 @@ class FilmFilter:
         mean = self._mean[level]
         by_offset = jacobian[level, :, :, self._layout.offset]
         filtered = misfit - (jacobian[level] @ mean[:, :, None])[:, :, 0]
-        without_gains = misfit - by_offset * mean[:, self._layout.offset, None]
+        mean_without_gains = mean.copy()
+        mean_without_gains[:, self._layout.gains] = 0.0
+        without_gains = misfit - (jacobian[level] @ mean_without_gains[:, :, None])[:, :, 0]
         precision = np.linalg.inv(noise[level])
         offset_variance = self._scatter_std[level] ** 2 * (by_offset[self.nearest] ** 2).sum()
         return TouchResiduals(

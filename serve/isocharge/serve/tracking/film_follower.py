@@ -2,8 +2,9 @@
 
 Four charges have one degree of freedom more than a contact (x, y, force): the misfit. If a film has become tauter or
 slacker, for instance because the room is a degree warmer, the misfits of all touches grow, and the pretension at which
-they are smallest is that of the film. `isocharge.serve.tracking.film_filter` estimates the pretension, together with
-the gains and a common offset, from the hardest frame of each touch.
+they are smallest is that of the film. `isocharge.serve.tracking.film_filter` estimates the pretension from the hardest
+frame of each touch, together with the gains, a common offset, and the directions in which the calibration left the film
+uncertain (`FilmDirections`). Contacts are corrected for the estimated pretension and directions.
 
 Touches that no pretension explains hardly change the estimate. The film is lost, i.e. not followed any more, if the
 last touches are of that kind (two contacts, for instance), if they are explained far better by a wrong gain, or if
@@ -21,8 +22,9 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError
 from isocharge.serve.flags import BEYOND, GAP, MISFIT, OUTSIDE, REPEAT, STRESS
+from isocharge.serve.model.film_directions import read_film_directions
 from isocharge.serve.model.pretensions import Pretensions, read_pretensions
-from isocharge.serve.prediction.contact import Contact, Sensitivity
+from isocharge.serve.prediction.contact import Contact, Sensitivity, is_close
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.rule import Rule, Setting
@@ -80,17 +82,51 @@ class FollowRule(Rule, frozen=True, kw_only=True):
     largest_offset_pC: Setting = 30.0
 
 
-class PretensionEstimate(NamedTuple):
-    """Estimate of the pretension and its standard deviation, MPa."""
+class FilmStateEstimate(NamedTuple):
+    """Estimate of the film.
+
+    Attributes:
+        pretension_MPa: Estimate of the pretension.
+        std_MPa: Standard deviation of the pretension.
+        directions: Estimate of the directions at this pretension, shape (n_direction,), in standard deviations.
+        directions_per_MPa: Change of this estimate with the pretension, shape (n_direction,), 1/MPa.
+    """
 
     pretension_MPa: float
     std_MPa: float
+    directions: Array
+    directions_per_MPa: Array
+
+    def charge_factor(self, log_changes: Array, step_MPa: float = 0.0) -> Array:
+        """Compute the charges of this film over those of the calibrated film, both at the same pretension.
+
+        Args:
+            log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode).
+            step_MPa: Distance of that pretension from the estimated one.
+
+        Returns:
+            Shape (n_electrode,), dimensionless.
+        """
+        directions = self.directions + step_MPa * self.directions_per_MPa
+        return np.asarray(np.exp(directions @ log_changes))
+
+
+class FollowedContact(NamedTuple):
+    """A contact on the followed film.
+
+    Attributes:
+        contact: The contact.
+        charge_pC: Charges for which the model of the followed pretension gives this contact, shape (n_electrode,), pC.
+    """
+
+    contact: Contact
+    charge_pC: Array
 
 
 class HardestFrame(NamedTuple):
-    """The frame of a touch with the largest force (N), and its touch charges, shape (n_electrode,), pC."""
+    """The contact of the frame of a touch with the largest force, and its touch charges, shape (n_electrode,), pC."""
 
-    force_N: float
+    contact: Contact
     charge_pC: Array
 
 
@@ -132,12 +168,20 @@ class FilmFollower:
         """
         self._calibrated = predictor
         self._pretensions = followable_pretensions(predictor)
+        self._directions = read_film_directions(predictor.folder, self._pretensions.typical_pC.size)
         rule = rule or FollowRule()
         self._filter = FilmFilter(
             self._pretensions,
+            self._directions,
             rule.drift_MPa_per_root_hour,
             rule.largest_offset_pC,
             np.broadcast_to(np.asarray(offset_ratio, dtype=float), self._pretensions.typical_pC.shape),
+        )
+        self._calibrated_estimate = FilmStateEstimate(
+            self._pretensions.calibrated_MPa,
+            self._pretensions.std_MPa,
+            np.zeros(self._directions.count),
+            np.zeros(self._directions.count),
         )
         self._wrong_gains = 1.0 + np.kron(np.eye(self._pretensions.typical_pC.size), WRONG_GAINS[:, None])
         self.reset()
@@ -149,10 +193,13 @@ class FilmFollower:
         self.is_lost = False
         self._answer = self._calibrated_estimate
         self._neighbour: Predictor | None = None
+        self._neighbour_step_MPa = SENSITIVITY_STEP_MPa
+        self._factors: tuple[Array, Array] | None = None
+        self._factors_contact: Contact | None = None
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
         self._touches = 0
         self._recent: deque[TouchSquares] = deque(maxlen=RECENT_TOUCHES)
-        self._earlier: deque[PretensionEstimate] = deque(maxlen=RECENT_TOUCHES)
+        self._earlier: deque[FilmStateEstimate] = deque(maxlen=RECENT_TOUCHES)
         self.discard_touch()
 
     def discard_touch(self) -> None:
@@ -164,10 +211,6 @@ class FilmFollower:
     def film(self) -> FollowedFilm:
         """The film as it is now."""
         return FollowedFilm(self._answer.pretension_MPa, self._answer.std_MPa, self._touches)
-
-    @property
-    def _calibrated_estimate(self) -> PretensionEstimate:
-        return PretensionEstimate(self._pretensions.calibrated_MPa, self._pretensions.std_MPa)
 
     def observe_frame(
         self, charge_pC: Array | None, contact: Contact | None, flags: tuple[str, ...], clock_s: float
@@ -188,39 +231,65 @@ class FilmFollower:
             if not harmless.issuperset(flags):
                 self._is_spoiled = True
             return
-        if self._hardest is None or contact.force_N > self._hardest.force_N:
+        if self._hardest is None or contact.force_N > self._hardest.contact.force_N:
             assert charge_pC is not None
-            self._hardest = HardestFrame(contact.force_N, charge_pC)
+            self._hardest = HardestFrame(contact, charge_pC)
 
     def _end_touch(self, clock_s: float) -> None:
         """Use the touch that was under way, if there was one and none of its frames speaks against it."""
         if self._hardest is not None and not self._is_spoiled:
-            self.observe_touch(self._hardest.charge_pC, clock_s)
+            self.observe_touch(self._hardest, clock_s)
         self.discard_touch()
 
-    def add_pretension_error(self, contact: Contact, charge_pC: Array) -> Contact:
-        """Add the uncertainty of the pretension to the standard deviations of a contact, once the film is followed.
+    def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
+        """Correct a contact for what touches have shown of the film, and add the uncertainty of the pretension.
+
+        Before the film is followed, the contact is returned as it is.
 
         Args:
-            contact: The model's answer.
-            charge_pC: The charges that it belongs to, shape (n_electrode,), pC.
+            contact: Answer of `predictor` to the charges.
+            charge_pC: Touch charges, shape (n_electrode,), pC.
         """
         if self._neighbour is None:
-            return contact
-        neighbour = partial(self._neighbour.predict, charge_pC)
-        return contact.widened(self._sensitivity.shift(contact, self._answer.std_MPa, neighbour))
+            return FollowedContact(contact, charge_pC)
+        answer = self._answer
+        if self._directions.count == 0:
+            neighbour = partial(self._neighbour.predict, charge_pC)
+            return FollowedContact(
+                contact.widened(self._sensitivity.shift(contact, answer.std_MPa, neighbour)), charge_pC
+            )
+        factor, neighbour_factor = self._charge_factors(contact)
+        corrected_pC = charge_pC / factor
+        corrected = self.predictor.predict(corrected_pC)
+        neighbour = partial(self._neighbour.predict, charge_pC / neighbour_factor)
+        shift = self._sensitivity.shift(corrected, answer.std_MPa, neighbour)
+        return FollowedContact(corrected.widened(shift), corrected_pC)
 
-    def observe_touch(self, charge_pC: Array, clock_s: float) -> None:
-        """Estimate the pretension anew by the charges of a touch, and decide for which film the model answers.
+    def _charge_factors(self, contact: Contact) -> tuple[Array, Array]:
+        """Return the charges over those for which the models of the followed and of the neighbouring pretension answer.
+
+        Each factor has the shape (n_electrode,). The factors are computed again only if the contact has moved.
+        """
+        if self._factors is None or not is_close(contact, self._factors_contact):
+            (log_changes,) = self._directions.log_changes(np.array([contact[:3]]))
+            factor = self._answer.charge_factor(log_changes)
+            neighbour_factor = self._answer.charge_factor(log_changes, self._neighbour_step_MPa)
+            self._factors = factor, neighbour_factor
+            self._factors_contact = contact
+        return self._factors
+
+    def observe_touch(self, touch: HardestFrame, clock_s: float) -> None:
+        """Estimate the film anew by a touch, and decide for which film the model answers.
 
         Args:
-            charge_pC: Touch charges of the hardest frame, shape (n_electrode,), pC.
+            touch: The hardest frame of the touch.
             clock_s: Time of the touch on a clock that does not jump, s.
         """
+        (log_changes,) = self._directions.log_changes(np.array([touch.contact[:3]]))
         self._filter.predict(clock_s)
-        residuals = self._filter.update(charge_pC)
+        residuals = self._filter.update(touch.charge_pC, log_changes)
         self._touches += 1
-        self._recent.append(self._touch_squares(charge_pC, residuals))
+        self._recent.append(self._touch_squares(touch.charge_pC, log_changes, residuals))
         if len(self._recent) < FEWEST_TOUCHES:
             return
         was_lost = self.is_lost
@@ -233,9 +302,11 @@ class FilmFollower:
             self._answer_for(self._earlier[0] if before_recent else self._calibrated_estimate)
             self._earlier.clear()
 
-    def _touch_squares(self, charge_pC: Array, residuals: TouchResiduals) -> TouchSquares:
+    def _touch_squares(self, charge_pC: Array, log_changes: Array, residuals: TouchResiduals) -> TouchSquares:
         """Return the squared misfits of a touch that decide whether the film is lost."""
-        candidates = (charge_pC - self._filter.offset_pC) * self._wrong_gains
+        directions = self._filter.direction_means(self._filter.mean_MPa)
+        corrected_pC = (charge_pC - self._filter.offset_pC) * np.exp(-directions @ log_changes)
+        candidates = corrected_pC * self._wrong_gains
         misfits = [model.predict_batch(candidates).misfit for model in (self._calibrated, self.predictor)]
         scale = self._pretensions.misfit_rms**2 * (1.0 + residuals.offset_variance)
         wrong_gain = np.concatenate(misfits).astype(float) ** 2 / scale
@@ -266,7 +337,7 @@ class FilmFollower:
         sum_by_wrong_gain = np.sum([touch.wrong_gain for touch in self._recent], axis=0)
         return bool(sum_by_wrong_gain.min() < sum_by_pretension.min() - WRONG_GAIN_MARGIN)
 
-    def _estimate(self) -> PretensionEstimate:
+    def _estimate(self) -> FilmStateEstimate:
         """Return the pretension if films that have changed and films that have not are equally likely beforehand."""
         pretensions = self._pretensions
         mean_MPa = self._filter.mean_MPa
@@ -279,22 +350,28 @@ class FilmFollower:
         odds_of_unchanged = math.sqrt(changed_variance / unchanged_variance) * math.exp(exponent)
         share = 1.0 / (1.0 + odds_of_unchanged)
         std = math.sqrt(unchanged_variance + share * (1.0 - share) * change**2)
-        return PretensionEstimate(pretensions.calibrated_MPa + share * change, std)
+        pretension_MPa = pretensions.calibrated_MPa + share * change
+        directions = self._filter.direction_means(pretension_MPa)
+        neighbouring = self._filter.direction_means(pretension_MPa + SENSITIVITY_STEP_MPa)
+        return FilmStateEstimate(pretension_MPa, std, directions, (neighbouring - directions) / SENSITIVITY_STEP_MPa)
 
-    def _answer_for(self, estimate: PretensionEstimate) -> None:
-        """Make the model of this pretension the one that answers; a very small change is not worth new weights."""
-        if abs(estimate.pretension_MPa - self._answer.pretension_MPa) >= SMALLEST_CHANGE_MPa:
-            self._answer = estimate
+    def _answer_for(self, estimate: FilmStateEstimate) -> None:
+        """Let the models answer for another estimate; a very small change of the pretension needs no new weights."""
+        is_same_film = abs(estimate.pretension_MPa - self._answer.pretension_MPa) < SMALLEST_CHANGE_MPa
+        if is_same_film:
+            estimate = estimate._replace(pretension_MPa=self._answer.pretension_MPa)
+        self._answer = estimate
+        self._factors = None
+        if is_same_film and self._neighbour is not None:
+            return
+        if not is_same_film:
             self.predictor = self._model_at(estimate.pretension_MPa)
-        else:
-            self._answer = self._answer._replace(std_MPa=estimate.std_MPa)
-            if self._neighbour is not None:
-                return
         largest_MPa = self._pretensions.range_MPa[1]
         step = SENSITIVITY_STEP_MPa
-        if self._answer.pretension_MPa + step > largest_MPa:
+        if estimate.pretension_MPa + step > largest_MPa:
             step = -step
-        self._neighbour = self._model_at(self._answer.pretension_MPa + step)
+        self._neighbour_step_MPa = step
+        self._neighbour = self._model_at(estimate.pretension_MPa + step)
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
 
     def _model_at(self, pretension_MPa: float) -> Predictor:

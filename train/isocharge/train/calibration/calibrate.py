@@ -1,8 +1,8 @@
 """Calibration: from measured presses to the film they were made on, with its remaining uncertainty."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import scipy  # loads a part when it is used
@@ -137,48 +137,32 @@ class CalibrationResult:
             return None
         warming = self.posterior.warming
         at_C = None if warming is None else warming.at_C
-        return cross_validate(self.problem, self.presses, self.posterior, self._network_of, at_C)
+
+        def network_of(film: FilmPosterior) -> Fitted:
+            return self._network_of(film.unknowns, film.joint)
+
+        return cross_validate(self.problem, self.presses, self.posterior, network_of, at_C)
 
     def fitted_film(self, parameters: Array, *, release: bool = False) -> Fitted:
-        """Return the network of a film near this one, with the same discrepancy and the same uncertainty.
+        """Return the network of a film near this one, with the same coefficients and the same uncertainty.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
             release: Whether the network will be released; see `CalibrationProblem.fitted`.
         """
-        added_variance = self._added_variance(self.posterior)
-        return self.problem.fitted(parameters, added_variance, self._factor, release=release)
+        unknowns = np.concatenate([parameters, self.posterior.coefficients])
+        return self._network_of(unknowns, self.posterior.joint, release=release)
 
-    def _network_of(self, film: FilmPosterior) -> Fitted:
-        """Return the network of another estimate of the film, with its own discrepancy and uncertainty."""
+    def _network_of(self, unknowns: Array, covariance: Array, *, release: bool = False) -> Fitted:
+        """Return the network of a film with the variances of contacts by a covariance of its unknowns.
 
-        def factor(contact: Array) -> Array:
-            return self.problem.charges.factor(film.unknowns, contact)
-
-        return self.problem.fitted(film.parameters, self._added_variance(film), factor, release=False)
-
-    def _added_variance(self, film: FilmPosterior) -> AddedVariance:
-        """Return the variances of contacts that the uncertainty of a film causes, linearised at the calibrated film."""
-        contact_covariance = self.sensitivity.contact_covariance(film.joint)
-        return AddedVariance(self.sensitivity.contact, np.einsum("nii->ni", contact_covariance))
-
-    @cached_property
-    def _factor(self) -> Callable[[Array], Array]:
-        """Function that returns the factor of the discrepancy at contacts.
-
-        Its values are cached, because the networks of a film evaluate it at the same contacts.
+        The variances are linearised at the calibrated film.
         """
-        cache: dict[bytes, Array] = {}
-
-        def factor(contact: Array) -> Array:
-            keys = [row.tobytes() for row in contact]
-            missing = [number for number, key in enumerate(keys) if key not in cache]
-            if missing:
-                factors = self.problem.charges.factor(self.posterior.unknowns, contact[missing])
-                cache.update(zip([keys[number] for number in missing], factors, strict=True))
-            return np.stack([cache[key] for key in keys])
-
-        return factor
+        contact_covariance = self.sensitivity.contact_covariance(covariance)
+        added_variance = AddedVariance(self.sensitivity.contact, np.einsum("nii->ni", contact_covariance))
+        parameters = unknowns[self.problem.charges.layout.parameters]
+        factor = partial(self.problem.charges.factor, unknowns)
+        return self.problem.fitted(parameters, added_variance, factor, release=release)
 
     @property
     def reduced_chi2(self) -> float:

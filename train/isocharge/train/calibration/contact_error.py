@@ -84,12 +84,14 @@ class ContactSensitivity:
         noise: Covariance of (x, y, ln F) by noise alone, shape (n, 3, 3).
         misfit: Derivatives of the part of the charges that no contact explains, by the same unknowns, shape
             (n, n_electrode, n_unknown), in units of the noise.
+        log_charge: Derivatives of ln Q at fixed contacts by the same unknowns, shape (n, n_electrode, n_unknown).
     """
 
     contact: Array
     by_parameter: Array
     noise: Array
     misfit: Array
+    log_charge: Array
 
     @classmethod
     def at(cls, problem: CalibrationProblem, parameters: Array) -> "ContactSensitivity":
@@ -105,12 +107,19 @@ class ContactSensitivity:
         force = low * (high / low) ** ((0.5 + np.arange(CONTACTS)) * GOLDEN_SHARE % 1.0)
         contact = np.column_stack([place.real, place.imag, force])
         contact_slopes, film_slopes = _whitened_slopes(problem, parameters, contact)
+        charge = problem.charges.charges(parameters, contact)
         log_force_std = max(np.log(high / low), 0.1) / np.sqrt(12.0)
         prior_std = np.array([0.5 * domain.radius, 0.5 * domain.radius, log_force_std])
         precision = np.einsum("nki,nkj->nij", contact_slopes, contact_slopes) + np.diag(prior_std**-2)
         noise = np.linalg.inv(precision)
         by_parameter = -np.einsum("nij,nkj,nkp->nip", noise, contact_slopes, film_slopes)
-        return cls(contact, by_parameter, noise, misfit=derivatives_with_adjusted_contacts(film_slopes, contact_slopes))
+        return cls(
+            contact=contact,
+            by_parameter=by_parameter,
+            noise=noise,
+            misfit=derivatives_with_adjusted_contacts(film_slopes, contact_slopes),
+            log_charge=film_slopes * (problem.noise.sigma(charge) / charge)[:, :, None],
+        )
 
     def contact_error(self, covariance: Array) -> ContactError:
         """Return the errors for a covariance of the film's unknowns."""

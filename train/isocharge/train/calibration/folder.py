@@ -6,6 +6,7 @@
     FOLDER/<version>/calibration.json    parameters, errors, correlations, what cannot be identified
     FOLDER/<version>/presses.csv   the presses, unless it was moved to another temperature without any
     FOLDER/<version>/pretensions.npz     weights for `serve stream --follow`, with four electrodes or more
+    FOLDER/<version>/film_directions.npz    what else is uncertain about the film, for the same command
     FOLDER/<version>/calibration.png
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the last version's
 
@@ -30,6 +31,7 @@ from isocharge.common.files import as_output_errors, remove_empty, write_whole
 from isocharge.common.json_values import plain_values
 from isocharge.common.measured_presses import presses_text
 from isocharge.common.resumable_run import locked
+from isocharge.serve.model.film_directions import FILE as DIRECTIONS
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import check_target, version_folders
 from isocharge.serve.model.pretensions import FILE as PRETENSIONS
@@ -39,6 +41,7 @@ from isocharge.train.calibration.calibrate import CalibrationResult, film_withou
 from isocharge.train.calibration.calibration_file import film_table, read_film
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.cross_validation import FOLD_COUNT
+from isocharge.train.calibration.film_directions import film_directions
 from isocharge.train.calibration.following import pretensions_of
 from isocharge.train.calibration.picture import calibration_picture
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
@@ -129,6 +132,7 @@ def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
     fitted = result.fitted
     if (pretensions := pretensions_of(result, fitted.network)) is not None:
         files[PRETENSIONS] = pretensions.to_bytes()
+        files[DIRECTIONS] = film_directions(result).to_bytes()
     return release(
         replace(fitted, provenance=Provenance(files=files)),
         folder,

@@ -103,7 +103,7 @@ class ChargeField:
             if FEWEST_PER_TERM * count > len(unit):
                 break
             rows = slice(0, ROWS_PER_TERM * count)
-            series = _least_squares(unit[rows], target[rows], degree, force_degree)
+            series = fit_series(unit[rows], target[rows], degree, force_degree)
             field = cls(domain, electrodes, series, np.inf, log_size)
             error = rms((field.charges(held.contact) - held.charge) / np.hypot(held.charge, NOISY if signed else 0.0))
             if best is None or error < best.error:
@@ -166,8 +166,18 @@ def _size(coefficients: Array, logs: Array) -> tuple[Array, Array]:
     return np.exp(chebyshev.chebval(inside, coefficients)), np.asarray(slope)
 
 
-def _least_squares(unit: Array, target: Array, degree: int, force_degree: int) -> Array:
-    """Fit the series to targets of shape (n, k) by the normal equations, which are well conditioned here."""
+def fit_series(unit: Array, target: Array, degree: int, force_degree: int) -> Array:
+    """Fit a Chebyshev series in position and force by the normal equations, which are well conditioned here.
+
+    Args:
+        unit: Scaled contacts, shape (n, 3).
+        target: Values of the series at these contacts, shape (n, k).
+        degree: Largest total degree in x and y.
+        force_degree: Largest degree in the logarithm of the force.
+
+    Returns:
+        Coefficients, shape (degree + 1, degree + 1, force_degree + 1, k).
+    """
     count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
     normal = RIDGE * len(unit) * np.eye(count)
     moment = np.zeros((count, target.shape[1]))

@@ -1,0 +1,111 @@
+"""Films with imperfections that no parameter describes, whose charges are solved in full for every press.
+
+A calibration uses forward maps of isotropic round films and adds imperfections to first order. These films do not use
+those maps: each press is a separate nonlinear solve of the orthotropic, unevenly stretched film in its oval clamp.
+"""
+
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from isocharge.simulate import Circle, Sensor, press, touch_charge
+from isocharge.train import CalibrationProblem
+from isocharge.train.data.presses import draw_contacts
+
+PRETENSION_MPa = (0.6, 1.2)
+"""Range of the mean pretensions of the films."""
+
+RELATIVE_UNEVENNESS = (0.1, 0.3)
+"""Range of the uneven part of the tension over its mean: T1 / T2 is then up to 1.9."""
+
+YOUNG_RATIO = (1.05, 1.3)
+"""Range of E1 / E2."""
+
+LARGEST_OVAL = 0.012
+"""Largest parameter e of the oval clamp."""
+
+LARGEST_FORCE_N = 1.6
+"""Largest force of a press."""
+
+
+@dataclass(frozen=True)
+class SolvedFilm:
+    """A film with imperfections, and the charges of its presses without noise.
+
+    Attributes:
+        contact: Presses (x, y, F) on the film as it is calibrated, shape (n, 3), mm and N.
+        charge: Their charges, shape (n, n_electrode), pC.
+        later_contact: Presses on the film after its pretension has changed.
+        later_charge: Their charges.
+    """
+
+    contact: np.ndarray
+    charge: np.ndarray
+    later_contact: np.ndarray
+    later_charge: np.ndarray
+
+
+def draw_film(problem: CalibrationProblem, seed: int) -> tuple[Sensor, Circle]:
+    """Draw a film: the parameters from the prior, and imperfections besides; every third film has ink on its pads."""
+    rng = np.random.default_rng([seed, 49])
+    parameters = problem.prior.draw(rng, 1)[0]
+    parameters[problem.prior.index("pretension")] = rng.uniform(*PRETENSION_MPa)
+    sensor, probe = problem.prior.film(parameters)
+    angle = rng.uniform(0.0, np.pi, 3)
+    unevenness = rng.uniform(*RELATIVE_UNEVENNESS) * sensor.film.pretension
+    film = replace(
+        sensor.film,
+        deviator=(unevenness * np.cos(2.0 * angle[0]), unevenness * np.sin(2.0 * angle[0])),
+        young_ratio=rng.uniform(*YOUNG_RATIO),
+        axis=angle[1],
+        oval=rng.uniform(0.0, LARGEST_OVAL),
+        oval_axis=angle[2],
+    )
+    coating = 0.3 * film.young * film.thickness if seed % 3 == 2 else 0.0
+    return replace(sensor, film=film, coating=coating), probe
+
+
+def solve_charges(sensor: Sensor, probe: Circle, contact: np.ndarray) -> np.ndarray:
+    """Solve the film under each contact (x, y, F), shape (3,) or (n, 3), and return the charges, pC."""
+    film = sensor.coated_film
+    rows = [touch_charge(sensor, press(film, probe, (x, y), force)) for x, y, force in contact.tolist()]
+    return np.array(rows)
+
+
+def solved_film(
+    problem: CalibrationProblem,
+    seed: int,
+    change_MPa: float,
+    counts: tuple[int, int],
+    folder: Path,
+    pool: Executor,
+) -> SolvedFilm:
+    """Draw a film and solve its presses, or read them from an earlier run.
+
+    Args:
+        problem: The films.
+        seed: Seed of the film and of the contacts.
+        change_MPa: Change of the pretension after the calibration.
+        counts: Number of presses before and after the change.
+        folder: Folder in which solved presses are stored.
+        pool: Processes that solve the presses.
+    """
+    path = folder / f"{problem.sensor.name}-{seed}-{change_MPa:+g}-{counts[0]}-{counts[1]}.npz"
+    if not path.exists():
+        rng = np.random.default_rng([seed, 50])
+        sensor, probe = draw_film(problem, seed)
+        later = replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension + change_MPa))
+        arrays = {}
+        for name, film, count in zip(("", "later_"), (sensor, later), counts, strict=True):
+            contact = draw_contacts(rng, problem.domain, count)
+            contact[:, 2] = np.minimum(contact[:, 2], LARGEST_FORCE_N)
+            parts = np.array_split(contact, max(count // 10, 1))
+            arrays[f"{name}contact"] = contact
+            arrays[f"{name}charge"] = np.concatenate(list(pool.map(partial(solve_charges, film, probe), parts)))
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savez(path, **arrays)
+    with np.load(path) as stored:
+        return SolvedFilm(**{name: stored[name] for name in stored.files})

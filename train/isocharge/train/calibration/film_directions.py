@@ -1,0 +1,77 @@
+"""Directions in which a calibrated film remains uncertain, for following the film live.
+
+The result is written as `film_directions.npz`; see `serve.model.film_directions`.
+
+At a given pretension, the other unknowns of a film have the covariance C = R R'. Let M be the derivative of the misfit
+vectors by the unknowns, in units of the noise. The right singular vectors of M R are combinations of the unknowns that
+are independent before any touch, and whose effects on the misfits of touches are orthogonal (the likelihood-informed
+directions of Cui et al. 2014). Touches hardly identify a combination with a small singular value. Such a combination is
+left out.
+"""
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.serve.model.film_directions import FilmDirections
+from isocharge.simulate import Domain
+from isocharge.train.calibration.calibrate import CalibrationResult
+from isocharge.train.data.charge_field import fit_series
+
+DEGREES = ((5, 3), (3, 1), (1, 1))
+"""Degrees of the series in x and y and in ln F. The first ones with `CONTACTS_PER_TERM` are used."""
+
+CONTACTS_PER_TERM = 2.0
+"""Least number of contacts for each coefficient of a series."""
+
+LEAST_MISFIT = 0.5
+"""Root mean square of the misfit by one standard deviation of a direction, over the noise, below which the direction is
+left out. The misfits of a trained network have errors of this size, which smaller directions would explain."""
+
+MAX_DIRECTIONS = 16
+"""Largest number of directions; it limits the time that a touch takes."""
+
+LEAST_VARIANCE = 1e-12
+"""Share of the largest variance of an unknown below which a combination of unknowns counts as known exactly."""
+
+
+def film_directions(result: CalibrationResult) -> FilmDirections:
+    """Compute the directions of the uncertainty that a calibrated film has when it is used."""
+    problem = result.problem
+    estimate = result.posterior.drifted(problem.prior)
+    pretension = problem.prior.index("pretension")
+    covariance = estimate.unknown_covariance
+    by_pretension = covariance[:, pretension] / covariance[pretension, pretension]
+    root = _root(covariance - np.outer(by_pretension, covariance[pretension]))
+
+    sensitivity = result.sensitivity
+    unknowns = slice(0, len(covariance))
+    misfit = sensitivity.misfit[:, :, unknowns]
+    _, sizes, combinations = np.linalg.svd(misfit.reshape(-1, len(covariance)) @ root, full_matrices=False)
+    is_visible = sizes > LEAST_MISFIT * np.sqrt(len(misfit))
+    visible = combinations[is_visible][:MAX_DIRECTIONS]
+    log_changes = np.einsum("neu,ku->nke", sensitivity.log_charge[:, :, unknowns], visible @ root.T)
+    mean_by_pretension = visible @ np.linalg.pinv(root) @ by_pretension
+    return FilmDirections(
+        coefficients=_fitted_series(problem.domain, sensitivity.contact, log_changes),
+        radius_mm=problem.domain.radius,
+        force_N=problem.domain.force_range,
+        by_pretension=mean_by_pretension / problem.prior.std[pretension],
+    )
+
+
+def _root(covariance: Array) -> Array:
+    """Return a matrix R with R R' equal to a covariance that may be singular, shape (n, m), m <= n."""
+    variances, axes = np.linalg.eigh(covariance)
+    is_uncertain = variances > LEAST_VARIANCE * variances[-1]
+    return np.asarray(axes[:, is_uncertain] * np.sqrt(variances[is_uncertain]))
+
+
+def _fitted_series(domain: Domain, contact: Array, log_changes: Array) -> Array:
+    """Fit the series of `FilmDirections` to changes of ln Q at contacts, shape (n, n_direction, n_electrode)."""
+    count = len(contact)
+    for degree, force_degree in DEGREES:
+        term_count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
+        if CONTACTS_PER_TERM * term_count <= count:
+            break
+    series = fit_series(domain.to_unit(contact), log_changes.reshape(count, -1), degree, force_degree)
+    return series.reshape(*series.shape[:3], *log_changes.shape[1:])
