@@ -137,6 +137,16 @@ def test_forward_map_with_one_force():
     assert errors(forward_map, np.array([[1.0, 2.0, 0.7], [0.0, -3.0, 0.7]])).max() < 1e-3
 
 
+@pytest.mark.slow
+def test_forward_map_reaches_40_mm_on_a_taut_film_of_45_mm():
+    """Near the clamp the fields change over the distance from the press to the clamp."""
+    sensor = load_sensor("eight-25um-biaxial-36mm")
+    forward_map = kept(ForwardMap.build, sensor, Circle(1.0), 40.0, (1.0, 1.0))
+    assert forward_map.error <= INTERPOLATION_ERROR
+    contact = np.array([[39.9, 0.9, 1.0], [-20.0, 34.2, 1.0], [0.7, -0.4, 1.0]])
+    assert errors(forward_map, contact).max() < 1e-3
+
+
 def test_zero_force_gives_zero_charges(three_map):
     """Contacts with zero force may have any position. They are counted in the index of an error message."""
     contact = np.array([[1.0, 0.0, 0.0], [50.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [2.0, 0.0, 1.0]])

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from isocharge.cli.shared.options import ForceRangeOption, JsonOption, NoiseOption, SensorArgument
+from isocharge.cli.shared.forward_maps import executor_for
+from isocharge.cli.shared.options import ForceRangeOption, JsonOption, NoiseOption, SensorArgument, WorkersOption
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show, show_json, shown_progress
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
@@ -49,6 +50,7 @@ def identify_command(
         Path | None,
         typer.Option("--output", "-o", metavar="DIR", help="New folder for pictures and numbers. (default: none)"),
     ] = None,
+    workers: WorkersOption = None,
     json: JsonOption = False,
 ) -> None:
     """Compute how well the charges determine a press: error limits over the film, ambiguities and working area.
@@ -63,9 +65,12 @@ def identify_command(
         refuse_existing(output)
     if not 0.0 < error < inf:
         raise InputError(f"--error: expected a positive number of mm, got {error}")
-    with shown_progress():
+    described_sensor = load_sensor(sensor)
+    footprint = parse_probe(probe)
+    noise_level = noise_model(noise)
+    with shown_progress(), executor_for(workers, None) as pool:
         identified = identify(
-            load_sensor(sensor), parse_probe(probe), noise_model(noise), force_range=force, radius=radius, error=error
+            described_sensor, footprint, noise_level, force_range=force, radius=radius, error=error, executor=pool
         )
     numbers = identified.to_dict()
     if output is not None:

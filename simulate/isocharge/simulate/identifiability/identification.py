@@ -33,8 +33,9 @@ from isocharge.simulate.numerics.disk import Rings
 from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
-MAX_SEARCH_RADIUS = 0.75
-"""Largest search radius in units of the film radius, dimensionless. The time of a solve increases towards the rim."""
+MAX_SEARCH_RADIUS = 0.9
+"""Largest search radius in units of the film radius, dimensionless. Farther out, forward maps need finer
+meshes."""
 
 RADIUS_REDUCTION = 0.9
 """Factor of the search radius if the charges cannot be interpolated, dimensionless."""
