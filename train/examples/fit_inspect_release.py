@@ -2,8 +2,8 @@
 How do I train a model of my sensor?
 ====================================
 
-``fit``, look at the errors, ``release`` if they are good. The quick settings here take half a minute and are twice as
-far from the truth as the usual ones, which take two.
+``fit``, look at the errors, ``release`` if they are good. The settings here take fewer steps and fewer charges
+for the misfit than the usual ones, and the errors are larger.
 """
 
 import tempfile
