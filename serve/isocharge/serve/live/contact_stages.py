@@ -5,7 +5,8 @@ The stages are, in this order:
 1. prediction: the contact that the model predicts, with the flags of its validity;
 2. film: the pretension of the film, followed from touch to touch (section `[follow]` of the device file);
 3. tracking: the contact followed from frame to frame (section `[track]`);
-4. charge scale: larger standard deviations where the charges have a common uncertainty (section `[memory]`).
+4. charge scale: larger standard deviations where the charges have a common uncertainty (section `[memory]`);
+5. touch offset: larger standard deviations where touches may have a common offset (section `[touch_offset]`).
 """
 
 from abc import ABC, abstractmethod
@@ -19,12 +20,16 @@ from isocharge.serve.prediction.contact import Contact, Sensitivity
 from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import NO_TRACKING, FollowedFilm, Tracking
 from isocharge.serve.signal_chain.chain import Reading
+from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.tracking.contact_mixture import contact_mixture
 from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule
 from isocharge.serve.tracking.tracker import Tracker
 
 CHARGE_SCALE_STEP = 0.01
 """Relative step of all touch charges by which the dependence of contacts on an error of their scale is computed."""
+
+TOUCH_OFFSET_STEP_pC = 1.0
+"""Common offset by which the dependence of contacts on an offset is computed."""
 
 LARGEST_FORCE_EXPONENT = 1.5
 """Largest exponent of the force as a power of all charges together: that of a film without pretension."""
@@ -185,6 +190,19 @@ class TrackingStage(ContactStage):
         self._tracker.reset()
 
 
+def _add_error(frame: ContactFrame, contact: Contact, shift: tuple[float, float, float]) -> None:
+    """Add an error to the standard deviations of the contact of a frame and of its tracked contact.
+
+    Args:
+        frame: The frame, which is changed.
+        contact: The contact of the frame.
+        shift: Changes of x and y, mm, and of the force, N, that one standard deviation of the error causes.
+    """
+    frame.contact = contact.widened(shift)
+    if frame.tracking is not None and frame.tracking.tracked is not None:
+        frame.tracking = structs.replace(frame.tracking, tracked=frame.tracking.tracked.widened(shift))
+
+
 class ChargeScaleStage(ContactStage):
     """Increases the standard deviations of a contact where all charges have an uncertain common scale.
 
@@ -203,9 +221,7 @@ class ChargeScaleStage(ContactStage):
         shift = self._shift(frame, frame.contact)
         if shift is None:
             return
-        frame.contact = frame.contact.widened(shift)
-        if frame.tracking is not None and frame.tracking.tracked is not None:
-            frame.tracking = structs.replace(frame.tracking, tracked=frame.tracking.tracked.widened(shift))
+        _add_error(frame, frame.contact, shift)
 
     def reset(self) -> None:
         """Discard the sensitivity of the previous contact."""
@@ -229,3 +245,52 @@ class ChargeScaleStage(ContactStage):
         return self._sensitivity.shift(
             contact, charge_scale_std, lambda: predictor.predict(charge_pC * (1.0 + CHARGE_SCALE_STEP))
         )
+
+
+class TouchOffsetRule(Rule, frozen=True, kw_only=True):
+    """Offset that all charges of a touch may have in common, such as a triboelectric or a pyroelectric charge.
+
+    Attributes:
+        std_pC: Standard deviation of the offset, pC. The offset is constant within a touch, and its mean is 0.
+    """
+
+    std_pC: Setting = 5.0
+
+
+class TouchOffsetStage(ContactStage):
+    """Increases the standard deviations of a contact because its touch may have a common offset.
+
+    An offset shifts light presses more than strong ones. A contact of the mixture keeps its standard deviations, since
+    no single model describes it.
+    """
+
+    def __init__(self, model: CurrentModel, rule: TouchOffsetRule, warming_ratio: Array | float) -> None:
+        """Begin without a sensitivity.
+
+        Args:
+            model: The current model, with which the sensitivity of the contact is computed.
+            rule: Settings.
+            warming_ratio: Charge of each electrode over the common offset, shape (n_electrode,), or one number for all.
+        """
+        self._model = model
+        self._rule = rule
+        self._warming_ratio = warming_ratio
+        self.reset()
+
+    def step(self, frame: ContactFrame) -> None:
+        """Increase the standard deviations of the contact and of the tracked contact."""
+        charge_pC = frame.model_charge_pC
+        contact = frame.contact
+        if contact is None or charge_pC is None or frame.is_mixture_contact:
+            return
+        predictor = self._model.predictor
+        if predictor is not self._sensitivity_predictor:
+            self.reset()
+        shifted_pC = charge_pC + TOUCH_OFFSET_STEP_pC * self._warming_ratio
+        shift = self._sensitivity.shift(contact, self._rule.std_pC, lambda: predictor.predict(shifted_pC))
+        _add_error(frame, contact, shift)
+
+    def reset(self) -> None:
+        """Discard the sensitivity of the previous contact."""
+        self._sensitivity = Sensitivity(TOUCH_OFFSET_STEP_pC)
+        self._sensitivity_predictor = self._model.predictor

@@ -23,9 +23,9 @@
     tau_s = {A = 10.0, B = 10.2, C = 9.9}
 
 The sections `[hum]`, `[tare]`, `[leak]`, `[memory]`, `[touch]` and `[common_mode]` contain the settings of the rules in
-`isocharge.serve.signal_chain`, and `[track]` and `[follow]` those of the rules in `isocharge.serve.tracking`. The key
-`on = false` switches the stage of a section off. Tare and touch are switched on without a section. An unknown key is an
-error.
+`isocharge.serve.signal_chain`, and `[track]` and `[follow]` those of the rules in `isocharge.serve.tracking`. The
+section `[touch_offset]` contains the settings of `TouchOffsetRule`. The key `on = false` switches the stage of a
+section off. Tare and touch are switched on without a section. An unknown key is an error.
 """
 
 from collections.abc import Mapping
@@ -40,6 +40,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.common.structs import Finite, Positive, Settings, WrongKey, convert, read_toml
 from isocharge.serve.frames.formats import AutoFrames, Frames
 from isocharge.serve.frames.frame import Parser
+from isocharge.serve.live.contact_stages import TouchOffsetRule
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.signal_chain.chain import Chain
 from isocharge.serve.signal_chain.contact import TouchRule
@@ -163,6 +164,7 @@ class DeviceSections(Settings, frozen=True):
     common_mode: CommonMode | None = None
     track: TrackRule | None = None
     follow: FollowRule | None = None
+    touch_offset: TouchOffsetRule | None = None
 
 
 class Device(DeviceSections, frozen=True):

@@ -18,6 +18,7 @@ from isocharge.serve.live.contact_stages import (
     CurrentModel,
     FilmStage,
     PredictionStage,
+    TouchOffsetStage,
     TrackingStage,
 )
 from isocharge.serve.live.device import ANY_BOARD, Device
@@ -161,6 +162,7 @@ class TouchStream:
         self._now_ns = now_ns
         self._given_name = frame_id
         self._follow_rule = device.follow
+        self._touch_offset_rule = device.touch_offset
         self._set_model(predictor)
 
     def _set_model(self, predictor: Predictor) -> None:
@@ -180,6 +182,8 @@ class TouchStream:
         if self._tracker is not None:
             stages.append(TrackingStage(self._tracker, predictor, is_film_followed=film_stage is not None))
         stages.append(ChargeScaleStage(model))
+        if self._touch_offset_rule is not None:
+            stages.append(TouchOffsetStage(model, self._touch_offset_rule, self._readings.warming_ratio))
 
         self._model = model
         self._stages = stages
