@@ -395,4 +395,4 @@ def test_demo_plays_the_working_area_of_the_released_model_of_the_sensor():
 
 def test_demo_refuses_an_unknown_sensor(refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    refused("demo", "--sensor", "no-such-sensor", said="no-such-sensor", code=2)
+    refused("demo", "--sensor", "no-such-sensor", message="no-such-sensor", code=2)
