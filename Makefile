@@ -41,6 +41,8 @@ docs: $(VENV)/installed
 bench: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_solve.py
 	$(BIN)/python tests/benchmarks/bench_model.py
+	$(BIN)/python tests/benchmarks/bench_whole_film.py
+	$(BIN)/python tests/benchmarks/bench_pairs.py
 	$(BIN)/python tests/benchmarks/bench_predictor.py
 	$(BIN)/python tests/benchmarks/bench_stream.py
 	$(BIN)/python tests/benchmarks/bench_touch.py
@@ -59,6 +61,8 @@ release: $(VENV)/installed
 	$(BIN)/isocharge train fit --sensor four-25um-biaxial-15mm --radius 15 -o models/four-25um-biaxial-15mm
 	$(BIN)/isocharge train fit --sensor three-25um-biaxial-12mm --radius 12 -o models/three-25um-biaxial-12mm
 	$(BIN)/isocharge train fit --sensor eight-25um-biaxial --radius 15 -o models/eight-25um-biaxial
+	$(BIN)/isocharge train fit --sensor six-25um-biaxial-30mm --radius 30 -o models/six-25um-biaxial-30mm
+	$(BIN)/isocharge train fit --sensor eight-25um-biaxial-36mm --radius 36 -o models/eight-25um-biaxial-36mm
 	$(BIN)/isocharge train fit --sensor four-25um-biaxial --films -o models/four-25um-biaxial-films
 	$(BIN)/isocharge train fit --sensor three-25um-biaxial --films -o models/three-25um-biaxial-films
 	$(BIN)/isocharge train fit --sensor four-25um-uniaxial --films --radius 7 -o models/four-25um-uniaxial-films

@@ -30,7 +30,8 @@ class PairShares:
         flagged: Share that carries a flag other than `stress`, %.
         misfit: Share that carries the flag `misfit`, %.
         unnoticed: Share without such a flag whose answer is wrong for both touches, %.
-        detectable: Share with charges that no single press in the working area has within the noise, %.
+        detectable: Share with charges that no single press in the working area has within the noise, %. NaN if it was
+            not computed.
         median_misfit: Median of the misfit of the model, in standard deviations.
     """
 
@@ -56,13 +57,14 @@ class PairStudy:
         self.radius_mm = round(inscribed_radius(metadata.working_area_mm), 3)
         self.probe = parse_probe(metadata.probes[0])
 
-    def shares(self, count: int, apart_mm: float, seed: int) -> PairShares:
+    def shares(self, count: int, apart_mm: float, seed: int, *, with_limit: bool) -> PairShares:
         """Solve random pairs, and count what the model answers.
 
         Args:
             count: Number of pairs.
             apart_mm: Smallest distance between both touches, mm.
             seed: Seed of the pairs and the noise.
+            with_limit: Whether to compute `detectable`, which needs an accurate forward map of the working area.
         """
         rng = np.random.default_rng(seed)
         first, second = self.contacts(rng, count, apart_mm)
@@ -76,17 +78,21 @@ class PairStudy:
         for contact in (first, second):
             is_wrong &= (np.abs(numbers[:, :3] - contact) > WRONG_STDS * numbers[:, 3:6]).any(axis=1)
 
-        force_range = self.predictor.metadata.force_range_N
-        inner_map = with_fast_derivatives(ForwardMap.build(self.sensor, self.probe, self.radius_mm, force_range))
-        _, residual = search(inner_map, noisy_charge, NOISE.sigma(noisy_charge))
         return PairShares(
             count,
             flagged=100.0 * float(flagged.mean()),
             misfit=100.0 * float(np.mean([MISFIT in flags for flags in words])),
             unnoticed=100.0 * float((is_wrong & ~flagged).mean()),
-            detectable=100.0 * float((np.linalg.norm(residual, axis=1) > DETECTABLE_SIGMAS).mean()),
+            detectable=self.detectable_share(noisy_charge) if with_limit else np.nan,
             median_misfit=float(np.median(numbers[:, 6])),
         )
+
+    def detectable_share(self, charge: Array) -> float:
+        """Return the share of charges, %, that no single press in the working area has within the noise."""
+        force_range = self.predictor.metadata.force_range_N
+        inner_map = with_fast_derivatives(ForwardMap.build(self.sensor, self.probe, self.radius_mm, force_range))
+        _, residual = search(inner_map, charge, NOISE.sigma(charge))
+        return 100.0 * float((np.linalg.norm(residual, axis=1) > DETECTABLE_SIGMAS).mean())
 
     def contacts(self, rng: np.random.Generator, count: int, apart_mm: float) -> tuple[Array, Array]:
         """Draw pairs of contacts in the working area, each of shape (count, 3), mm and N."""

@@ -22,7 +22,7 @@ from press_faults import RingShares, WholeFilmStudy
 
 RELEASED = (
     "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial,four-25um-biaxial-15mm,three-25um-biaxial-12mm,"
-    "eight-25um-biaxial"
+    "eight-25um-biaxial,six-25um-biaxial-30mm,eight-25um-biaxial-36mm"
 )
 RING_EDGES_mm = (8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 43.0)
 

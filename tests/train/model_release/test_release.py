@@ -46,6 +46,8 @@ LARGEST_RADIUS_mm = 15.001
 LARGEST_ERRORS = {
     "three-25um-biaxial-films": (0.10, 0.4, 0.36, 1.0),  # three charges carry less information on a film of 1.5 MPa
     "three-25um-biaxial-12mm": (0.14, 0.25, 0.18, 0.8),  # and in a large area
+    "six-25um-biaxial-30mm": (0.16, 0.43, 0.18, 1.2),  # most of the film
+    "eight-25um-biaxial-36mm": (0.15, 0.34, 0.22, 1.2),
 }
 """Largest errors of models: median and rms of the position error, its 95th percentile without noise, mm, and the rms
 error of the force, %."""
