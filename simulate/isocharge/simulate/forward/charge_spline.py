@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy  # scipy.interpolate is imported when it is used
-from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
+from scipy.sparse import csr_array, dia_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
 from isocharge.common.arrays import Array, Booleans
@@ -350,34 +350,41 @@ def _fit_patch(
         radius: Radius of the disk, mm.
         spacing: Largest distance between the knots, mm.
         coarse: Splines of all charges over the disk.
+
+    Returns:
+        One correction, or none.
     """
+    # rectangle around the electrode, outside of which its charge is smooth
     sensor = samples.forward_map.sensor
     corners = np.concatenate([sensor.calibration.place(part) for part in sensor.electrodes[electrode].parts])
     margin = samples.forward_map.probe.reach + PATCH_MARGIN
-    low = corners.min(axis=0) - margin
-    high = corners.max(axis=0) + margin
-    cells = np.clip(np.ceil((high - low) / spacing), MIN_CELLS, MAX_CELLS).astype(int)
-    knots = (_knots(low[0], high[0], cells[0]), _knots(low[1], high[1], cells[1]))
+    lower_left = corners.min(axis=0) - margin
+    upper_right = corners.max(axis=0) + margin
+    cells = np.clip(np.ceil((upper_right - lower_left) / spacing), MIN_CELLS, MAX_CELLS).astype(int)
+    x_knots, y_knots = (_knots(*axis) for axis in zip(lower_left, upper_right, cells, strict=True))
 
-    counts = np.ceil(np.sqrt(PRESSES_PER_CELL) * cells).astype(int)
-    x, y = np.meshgrid(*(np.linspace(*ends) for ends in zip(low, high, counts, strict=True)))
-    grid = np.stack([x.ravel(), y.ravel()], axis=1)
+    # fitted presses: a grid in the part of the rectangle inside the disk, and points on the edge of the disk
+    line_counts = np.ceil(np.sqrt(PRESSES_PER_CELL) * cells).astype(int)
+    x_line, y_line = (np.linspace(*axis) for axis in zip(lower_left, upper_right, line_counts, strict=True))
+    x_grid, y_grid = np.meshgrid(x_line, y_line)
+    grid = np.stack([x_grid.ravel(), y_grid.ravel()], axis=1)
     edge_count = int(PRESSES_PER_EDGE_CELL * 2.0 * np.pi * radius / spacing)
     edge_angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
     edge = radius * (1.0 - 1e-12) * np.stack([np.cos(edge_angle), np.sin(edge_angle)], axis=1)
-    edge = edge[((edge > low) & (edge < high)).all(axis=1)]
-    at = np.concatenate([grid[np.hypot(*grid.T) < radius], edge])
-    if not len(at):
+    is_in_rectangle = ((edge > lower_left) & (edge < upper_right)).all(axis=1)
+    is_in_disk = np.hypot(*grid.T) < radius
+    position = np.concatenate([grid[is_in_disk], edge[is_in_rectangle]])
+    if not len(position):
         return []
 
     is_needed = np.arange(len(sensor.electrodes)) == electrode
-    residual = (samples.at(at, is_needed) - coarse(at))[:, :, electrode]
-    table = _least_squares(at, residual, knots, fixed=2)
-    return [Patch(electrode, low, high, table)]
+    residual = (samples.at(position, is_needed) - coarse(position))[:, :, electrode]
+    table = _least_squares(position, residual, (x_knots, y_knots), fixed=2)
+    return [Patch(electrode, lower_left, upper_right, table)]
 
 
 def _knots(low: float, high: float, cells: int) -> Array:
-    """Return the knots of a cubic spline on an interval, shape (cells + 7,)."""
+    """Return the knots of a cubic spline on an interval that is divided into equal cells, shape (cells + 7,)."""
     return np.concatenate([[low] * 3, np.linspace(low, high, cells + 1), [high] * 3])
 
 
@@ -390,37 +397,57 @@ def _least_squares(at: Array, values: Array, knots: tuple[Array, Array], fixed: 
         knots: Knots along x and along y.
         fixed: Number of coefficients at each end of each axis that are zero. With two such coefficients, the spline
             and its slopes are zero on the edges.
+
+    Returns:
+        The spline, whose values have the shape of `values` without the first axis.
     """
-    counts = tuple(each.size - 4 for each in knots)
+    x_count, y_count = (axis_knots.size - 4 for axis_knots in knots)  # numbers of coefficients along x and y
+
+    # Values at the positions and weighted third differences, as matrices that multiply the coefficients
     entries = scipy.interpolate.NdBSpline.design_matrix(at, knots, 3)  # has too few columns
-    design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(at), counts[0] * counts[1]))
-    third_differences = [
-        diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count)) for count in counts
-    ]
-    along_x = kron(third_differences[0], eye_array(counts[1]))
-    along_y = kron(eye_array(counts[0]), third_differences[1])
+    design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(at), x_count * y_count))
+    along_x = kron(_third_differences(x_count), eye_array(y_count))
+    along_y = kron(eye_array(x_count), _third_differences(y_count))
     smooth = SMOOTHING * vstack([along_x, along_y])
 
-    is_free = np.zeros(counts, dtype=bool)
-    is_free[fixed : counts[0] - fixed, fixed : counts[1] - fixed] = True
+    # Only the coefficients that are not fixed are unknown.
+    is_free = np.zeros((x_count, y_count), dtype=bool)
+    is_free[fixed : x_count - fixed, fixed : y_count - fixed] = True
     free = np.flatnonzero(is_free)
     design = design[:, free]
     smooth = smooth.tocsc()[:, free]
+
+    # Normal equations, whose matrix is positive definite and needs no pivoting
     normal = (design.T @ design + smooth.T @ smooth).tocsc()
     right = np.ascontiguousarray(design.T @ values.reshape(len(at), -1))
     factors = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     coefficients = np.zeros((is_free.size, right.shape[1]))
-    coefficients[free] = factors.solve(right)  # the matrix is positive definite and needs no pivoting
-    return scipy.interpolate.NdBSpline(knots, coefficients.reshape(*counts, *values.shape[1:]), 3)
+    coefficients[free] = factors.solve(right)
+    return scipy.interpolate.NdBSpline(knots, coefficients.reshape(x_count, y_count, *values.shape[1:]), 3)
+
+
+def _third_differences(count: int) -> dia_array:
+    """Return the matrix of the third differences of neighbouring coefficients, shape (count - 3, count)."""
+    return diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
 
 
 def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:
-    """Compute the largest relative error at evenly distributed presses that do not lie on the lattice of the fit."""
-    at = spline.domain.radius * sunflower(CHECK_COUNT)
-    number = np.arange(CHECK_COUNT)
-    low, high = spline.domain.force_range
-    force = np.clip(low * (high / low) ** (number * 0.618 % 1.0), low, high)
-    contact = np.stack([at.real, at.imag, force], axis=1)
-    truth = forward_map.charges(contact)
-    error = spline.charges(contact) - truth
-    return float((np.abs(error).max(axis=1) / np.abs(truth).max(axis=1)).max())
+    """Compute the largest relative error at evenly distributed presses that do not lie on the lattice of the fit.
+
+    Args:
+        spline: The spline.
+        forward_map: Forward map that the spline approximates.
+
+    Returns:
+        The largest error of a charge, relative to the largest charge of the same press.
+    """
+    position = spline.domain.radius * sunflower(CHECK_COUNT)
+    # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly.
+    force_share = np.arange(CHECK_COUNT) * 0.618 % 1.0
+    min_force, max_force = spline.domain.force_range
+    force = np.clip(min_force * (max_force / min_force) ** force_share, min_force, max_force)
+    contact = np.stack([position.real, position.imag, force], axis=1)
+    true_charge = forward_map.charges(contact)
+    error = np.abs(spline.charges(contact) - true_charge).max(axis=1)
+    largest_charge = np.abs(true_charge).max(axis=1)
+    return float((error / largest_charge).max())

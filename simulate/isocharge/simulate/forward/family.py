@@ -63,18 +63,24 @@ class Family:
             count: Number of distances and number of forces.
             period: Smallest rotation that maps the probe onto itself, rad; 0 for an axisymmetric probe.
             rotations: Smallest number of orientations of a probe that is not axisymmetric.
+
+        Returns:
+            The family. It has a single force if the range of forces is a single value.
         """
         distance_count, force_count = count
-        low, high = np.log(domain.force_range)
+        min_log, max_log = np.log(domain.force_range)
         force = np.array([domain.force_range[0]])
-        if high > low:
-            force = np.exp(chebyshev_nodes(force_count, low, high))
+        if max_log > min_log:
+            force = np.exp(chebyshev_nodes(force_count, min_log, max_log))
+
+        # The rotations cover a full turn, with the same number of rotations in each period of the probe.
         folds = 1
         n_rotation = 1
         if period > 0.0:
             folds = round(2.0 * np.pi / period)
             n_rotation = folds * math.ceil(rotations / folds)
         rotation = 2.0 * np.pi * np.arange(n_rotation) / n_rotation
+
         largest_coordinate = float(distance_coordinate(domain.radius / film_radius))
         distance = film_radius * np.tanh(chebyshev_nodes(distance_count, 0.0, largest_coordinate))
         return cls(domain, film_radius, distance, force, rotation, folds)
@@ -182,13 +188,14 @@ def check_presses(domain: Domain, count: int) -> list[CheckPress]:
         count: Number of presses.
     """
     distance_shares = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
-    low, high = np.log(domain.force_range)
+    min_log, max_log = np.log(domain.force_range)
     presses = []
-    for number, distance_share in enumerate([*distance_shares, 1.0]):
-        force_share = (0.5 + 0.618 * number) % 1.0
-        force = np.clip(np.exp(low + (high - low) * force_share), *domain.force_range)
+    for index, distance_share in enumerate([*distance_shares, 1.0]):
+        # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly.
+        force_share = (0.5 + 0.618 * index) % 1.0
+        force = np.clip(np.exp(min_log + (max_log - min_log) * force_share), *domain.force_range)
         distance = float(domain.radius * distance_share)
-        presses.append(CheckPress(distance, 2.4 * number, float(force), 0.7 * number))
+        presses.append(CheckPress(distance, angle=2.4 * index, force=float(force), rotation=0.7 * index))
     return presses
 
 

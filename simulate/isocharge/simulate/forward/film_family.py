@@ -148,29 +148,33 @@ class FilmFamily:
             sensor: Sensor with a film of the family.
             probe: Probe with a radius of the family.
 
+        Returns:
+            Forward map for the presses of the family, up to the same distance and forces.
+
         Raises:
             SceneError: If the film or the probe does not belong to the family.
         """
         film = sensor.film
-        a = film.radius
         groups = {
             "tension": film.pretension / film.young,
-            "thickness": film.thickness / a,
-            "reach": probe.radius / a,
+            "thickness": film.thickness / film.radius,
+            "reach": probe.radius / film.radius,
         }
         self._check_inside(sensor.coated_film, sensor.surface, groups)
         tension, thickness, reach = (self.grid.weights(name, value) for name, value in groups.items())
         # weight of every film of the grid: the product of its weights along the three axes
         film_weights = np.einsum("t,h,p->thp", tension, thickness, reach).ravel()
         n_distance, n_load, *_, n_mode = self.coefficients.shape
-        press_coefficients = film_weights @ self.coefficients.reshape(n_distance * n_load, -1, n_mode)
-        force_unit = film.young * film.thickness * a
-        low, high = self.limits["load"]
+        coefficients_by_press = self.coefficients.reshape(n_distance * n_load, -1, n_mode)
+        press_coefficients = film_weights @ coefficients_by_press  # shape (n_distance * n_load, n_mode)
+
+        force_unit = film.young * film.thickness * film.radius
+        min_load, max_load = self.limits["load"]
         _, largest_distance = self.limits["distance"]
         family = Family(
-            domain=Domain(largest_distance * a, (low * force_unit, high * force_unit)),
-            film_radius=a,
-            distance=self.grid.distance * a,
+            domain=Domain(largest_distance * film.radius, (min_load * force_unit, max_load * force_unit)),
+            film_radius=film.radius,
+            distance=self.grid.distance * film.radius,
             force=self.grid.load * force_unit,
             rotation=np.zeros(1),
             folds=1,
@@ -330,15 +334,25 @@ def _check_back(film: Film) -> None:
 
 
 def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) -> float:
-    """Compute the largest relative error of a charge with respect to direct solves, for presses on random films."""
+    """Compute the largest relative error of a charge with respect to direct solves, for presses on random films.
+
+    Args:
+        family: The family, from which the charges are interpolated.
+        prior: Distribution of the films.
+        domain: Presses on the films.
+
+    Returns:
+        The largest error of one press on each of `CHECK_COUNT` films.
+    """
     rng = np.random.default_rng(0)
-    low, high = domain.force_range
+    min_force, max_force = domain.force_range
     errors = []
-    for number, parameters in enumerate(prior.draw(rng, CHECK_COUNT)):
+    for index, parameters in enumerate(prior.draw(rng, CHECK_COUNT)):
         forward_map = family.forward_map(*prior.film(parameters))
-        distance = domain.radius * np.sqrt((number + 1.0) / CHECK_COUNT)
-        angle = 2.4 * number
-        force = float(low * (high / low) ** rng.random())
+        # The positions cover the disk evenly, and the forces are uniform in the logarithm.
+        distance = domain.radius * np.sqrt((index + 1.0) / CHECK_COUNT)
+        angle = 2.4 * index
+        force = float(min_force * (max_force / min_force) ** rng.random())
         check = CheckPress(float(distance), angle, force, rotation=0.0)
         direct = direct_charges(forward_map.sensor, forward_map.probe, forward_map.settings, check)
         errors.append(forward_map.relative_error(check, direct))

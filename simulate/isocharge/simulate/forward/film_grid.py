@@ -74,7 +74,12 @@ class FilmGrid:
 
 
 def _stretched(axis: str, value: Array | float) -> Any:
-    """Return the coordinate in which the values of an axis are interpolated by polynomials."""
+    """Return the coordinate in which the values of an axis are interpolated by polynomials.
+
+    Args:
+        axis: One of `AXES`.
+        value: Dimensionless values along this axis, any shape.
+    """
     if axis in ("load", "reach"):
         return np.log(value)
     if axis == "tension":
@@ -85,7 +90,12 @@ def _stretched(axis: str, value: Array | float) -> Any:
 
 
 def _unstretched(axis: str, value: Array) -> Array:
-    """Convert interpolation coordinates of an axis into values. This is the inverse of `_stretched`."""
+    """Convert interpolation coordinates of an axis into values. This is the inverse of `_stretched`.
+
+    Args:
+        axis: One of `AXES`.
+        value: Interpolation coordinates, any shape.
+    """
     if axis in ("load", "reach"):
         return np.exp(value)
     if axis == "tension":

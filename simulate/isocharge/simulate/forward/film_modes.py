@@ -308,15 +308,22 @@ class FilmModes:
         Args:
             film: Forward map of the film.
             field_numbers: Numbers of the fields, in the order of `FIELDS`.
+
+        Returns:
+            The map. Its table contains the values of all fields at one node, then those at the next node.
         """
         properties = film.sensor.film
         tension_weights = self.grid.weights("tension", properties.pretension / properties.young)
+        # weighted sum over the tensions t, for each distance d, load l and component m of the decomposition
         press_coefficients = np.einsum("t,dltm->dlm", tension_weights, self.coefficients[:, :, :, 0, 0])
+
         n_component = len(self.parts)
         mesh = template_for(film.probe, film.resolution)
-        parts = self.parts.reshape(n_component, IS_ODD.size, mesh.n_element, -1, 3)[:, list(field_numbers)]
-        node_values = np.moveaxis(parts, 1, 3).reshape(n_component, -1)
+        all_fields = self.parts.reshape(n_component, IS_ODD.size, mesh.n_element, -1, 3)
+        fields = all_fields[:, list(field_numbers)]
+        node_values = np.moveaxis(fields, 1, 3).reshape(n_component, -1)
         table = press_coefficients.reshape(-1, n_component) @ node_values
+
         force_unit = properties.young * properties.thickness * properties.radius
         family = Family(
             domain=Domain(film.domain.radius, film.domain.force_range),

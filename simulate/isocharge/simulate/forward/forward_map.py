@@ -328,13 +328,21 @@ class ForwardMap:
         return replace(self, family=family, table=stacked.astype(np.float32))
 
     def _unchecked_charges(self, contact: Array, orientation: Array) -> Array:
-        """Compute the charges of presses in the domain or a little outside, shape (n, n_electrode), pC."""
-        at = contact[:, 0] + 1j * contact[:, 1]
+        """Compute the charges of presses in the domain or a little outside, in chunks that fit into the memory.
+
+        Args:
+            contact: Presses (x, y, F), shape (n, 3), mm and N.
+            orientation: Further rotation of the probe, shape (n,), rad.
+
+        Returns:
+            Shape (n, n_electrode), pC.
+        """
+        position = contact[:, 0] + 1j * contact[:, 1]
         charge = np.empty((len(contact), len(self.electrodes)))
         with single_threaded_blas():
             for start in range(0, len(contact), CHUNK_SIZE):
                 chunk = slice(start, start + CHUNK_SIZE)
-                charge[chunk] = self._chunk_charges(at[chunk], contact[chunk, 2], orientation[chunk])
+                charge[chunk] = self._chunk_charges(position[chunk], contact[chunk, 2], orientation[chunk])
         return charge
 
     def _chunk_charges(self, at: Complexes, force: Array, orientation: Array) -> Array:
@@ -467,29 +475,45 @@ class _PressChunk:
         Returns:
             Charges over the unit of stress, shape (n_pair, n_field), pC/MPa.
         """
+        # Find the points in the mesh after the press has been rotated onto the positive x axis.
         mesh = self.mesh
         direction = self.direction[press_index]
-        position, mirrored = mesh.into_meshed_half(points * np.exp(-1j * direction)[:, None])
+        rotated_points = points * np.exp(-1j * direction)[:, None]
+        position, is_mirrored = mesh.into_meshed_half(rotated_points)
         element, xi, eta = locate_points(self.placement[press_index], mesh, position)
+
+        # Interpolate the three stress components of all fields from the nodes of the element of each point.
+        n_component = 3 * is_odd.size
+        basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel()).astype(self.field.dtype)
+        field_by_element = self.field.reshape(len(self.field), mesh.n_element, -1, n_component)
+        nodal = field_by_element[press_index[:, None], element].reshape(*basis_values.shape, n_component)
+        stress = np.matmul(basis_values[:, None, :], nodal).reshape(*position.shape, n_component)
+
         frame_angle = direction if mesh.half else direction + self.probe_angle[press_index]
-
-        values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel()).astype(self.field.dtype)
-        width = 3 * is_odd.size
-        nodal = self.field.reshape(len(self.field), mesh.n_element, -1, width)[press_index[:, None], element]
-        stress = np.matmul(values[:, None, :], nodal.reshape(*values.shape, width)).reshape(*position.shape, width)
-
         charge = np.empty((len(stress), is_odd.size))
-        for number, odd in enumerate(is_odd):
-            field_stress = stress[..., 3 * number : 3 * number + 3]
+        for field_index, odd in enumerate(is_odd):
+            field_stress = stress[..., 3 * field_index : 3 * field_index + 3]
+            # Reflection changes the sign of s12 of an even field, and of s11 and s22 of an odd field.
             sign_changes = slice(0, 2) if odd else slice(2, 3)
-            field_stress[mirrored, sign_changes] *= -1.0
-            rotated = rotate_stress(field_stress, frame_angle[:, None])
-            charge[:, number] = np.einsum("kpc,kpc->k", rotated, weights)
+            field_stress[is_mirrored, sign_changes] *= -1.0
+            film_stress = rotate_stress(field_stress, frame_angle[:, None])
+            # sum over the points p and the stress components c of each pair k
+            charge[:, field_index] = np.einsum("kpc,kpc->k", film_stress, weights)
         return charge
 
 
 def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check: CheckPress) -> Array:
-    """Compute the charges of one press by a direct solve, shape (n_electrode,), pC."""
+    """Compute the charges of one press by a direct solve, without interpolation.
+
+    Args:
+        sensor: The sensor.
+        probe: The probe.
+        settings: Settings of the solver.
+        check: The press.
+
+    Returns:
+        Shape (n_electrode,), pC.
+    """
     at = check.position
     rotated = probe.rotated(check.rotation)
     return touch_charge(sensor, press(sensor.film, rotated, at, check.force, settings))

@@ -221,11 +221,16 @@ class Search:
         return self._goal_values(np.concatenate([rows, self.kept_rows[which]], axis=1), which)
 
     def _goal_values(self, rows: Array, which: Integers | slice) -> Array:
-        """Compute the result of `_log_errors` from the rows of all electrodes, shape (n_press, n_electrode, 6)."""
-        squared = self.model.squared(rows)
+        """Compute the result of `_log_errors` from the charges and derivatives of all electrodes.
+
+        Args:
+            rows: Rows of the charge table, shape (n_press, n_electrode, 6).
+            which: Selection of presses.
+        """
+        squared_error = self.model.squared(rows)
         if self.case.goal != "worst":
-            squared = np.average(squared, weights=self.weights[which], keepdims=True)
-        return np.asarray(0.5 * np.log(squared))
+            squared_error = np.average(squared_error, weights=self.weights[which], keepdims=True)
+        return np.asarray(0.5 * np.log(squared_error))
 
     def _log_error_jacobian(self, positions: Array, which: Integers | slice) -> Array:
         """Compute the derivatives of `_log_errors` with respect to the coordinates by differences.
@@ -240,20 +245,25 @@ class Search:
             Shape (n_error, 2 n_new), 1/mm.
         """
         presses = self.presses[which]
-        side = self.case.square_side
-        kept = self.kept_rows[which]
+        kept_rows = self.kept_rows[which]
+        n_new = len(positions)
+
+        # rows of the new squares, and of the same squares moved along x and along y
         steps = DIFFERENCE_STEP * np.eye(2)
-        moved = (positions[:, None] + steps).reshape(-1, 2)
-        rows = self.table.rows(presses, np.concatenate([positions, moved]), side)
-        base_rows = rows[:, : len(positions)]
-        base = self._goal_values(np.concatenate([base_rows, kept], axis=1), which)
-        columns = []
-        for number in range(2 * len(positions)):
-            changed = base_rows.copy()
-            changed[:, number // 2] = rows[:, len(positions) + number]
-            values = self._goal_values(np.concatenate([changed, kept], axis=1), which)
-            columns.append((values - base) / DIFFERENCE_STEP)
-        return np.stack(columns, axis=1)
+        moved_positions = (positions[:, None] + steps).reshape(-1, 2)
+        all_positions = np.concatenate([positions, moved_positions])
+        all_rows = self.table.rows(presses, all_positions, self.case.square_side)
+        new_rows = all_rows[:, :n_new]
+        moved_rows = all_rows[:, n_new:]
+
+        log_error = self._goal_values(np.concatenate([new_rows, kept_rows], axis=1), which)
+        derivatives = []
+        for coordinate in range(2 * n_new):
+            changed_rows = new_rows.copy()
+            changed_rows[:, coordinate // 2] = moved_rows[:, coordinate]
+            changed_log_error = self._goal_values(np.concatenate([changed_rows, kept_rows], axis=1), which)
+            derivatives.append((changed_log_error - log_error) / DIFFERENCE_STEP)
+        return np.stack(derivatives, axis=1)
 
     def _clearance_jacobian(self, positions: Array) -> Array:
         """Compute the derivatives of all distance rules with respect to the coordinates by differences.
@@ -309,20 +319,22 @@ class Search:
             largest = np.argsort(-squared)[:MAX_ACTIVE]
             active = largest[squared[largest] >= ACTIVE_SHARE**2 * squared.max()]
 
-        # The variables are the coordinates, followed by the bound t of the log errors
+        # The variables are the coordinates, followed by a bound of the log errors, which is minimised.
         def constraints(variables: Array) -> Array:
+            """Return the values that must not be negative, of the log errors and of the distance rules."""
             moved = variables[:-1].reshape(-1, 2)
             bound = variables[-1]
             return np.concatenate([bound - self._log_errors(moved, active), self.case.all_clearances(moved)])
 
         def constraint_jacobian(variables: Array) -> Array:
+            """Return the derivatives of the constraints with respect to the variables."""
             moved = variables[:-1].reshape(-1, 2)
             log_error_jacobian = self._log_error_jacobian(moved, active)
             clearance_jacobian = self._clearance_jacobian(moved)
-            by_position = np.concatenate([-log_error_jacobian, clearance_jacobian])
-            by_bound = np.zeros((len(by_position), 1))
-            by_bound[: len(log_error_jacobian)] = 1.0
-            return np.concatenate([by_position, by_bound], axis=1)
+            coordinate_columns = np.concatenate([-log_error_jacobian, clearance_jacobian])
+            bound_column = np.zeros((len(coordinate_columns), 1))
+            bound_column[: len(log_error_jacobian)] = 1.0
+            return np.concatenate([coordinate_columns, bound_column], axis=1)
 
         start = np.append(positions, self._log_errors(positions, active).max())
         gradient = np.append(np.zeros(positions.size), 1.0)
