@@ -163,7 +163,7 @@ class FilmFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Go back to what is known before the first touch."""
+        """Return to the distribution before the first touch."""
         level_count = self._level_std.size
         level_probability = np.full(level_count, (1.0 - NO_OFFSET_PROBABILITY) / max(level_count - 1, 1))
         level_probability[0] = 1.0 - level_probability[1:].sum()
@@ -253,7 +253,7 @@ class FilmFilter:
         self._change_pretension(elapsed_s)
 
     def _relax_unknowns(self, elapsed_s: float) -> None:
-        """Let the linear unknowns relax towards their stationary distributions."""
+        """Move the distributions of the linear unknowns towards their stationary distributions, as the time passes."""
         layout = self._layout
         decay = np.empty(layout.size)
         decay[layout.gains] = math.exp(-elapsed_s / GAIN_TIME_CONSTANT_s)
@@ -394,7 +394,7 @@ class FilmFilter:
         return np.where(is_small, SMALLEST_OFFSET_STEP_pC, mean_offset_pC)
 
     def _residuals(self, misfit: Array, jacobian: Array, noise: Array) -> TouchResiduals:
-        """Return what the most likely offset level leaves of a touch's misfit."""
+        """Return the squared misfits that remain after the corrections of the most likely offset level."""
         level = self._likeliest_level
         mean = self._mean[level]
         by_offset = jacobian[level, :, :, self._layout.offset]

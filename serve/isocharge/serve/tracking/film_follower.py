@@ -187,7 +187,7 @@ class FilmFollower:
         self.reset()
 
     def reset(self) -> None:
-        """Go back to the film as it was calibrated, and follow it anew."""
+        """Return to the film as it was calibrated, and begin to follow it again."""
         self._filter.reset()
         self.predictor = self._calibrated
         self.is_lost = False
@@ -215,7 +215,7 @@ class FilmFollower:
     def observe_frame(
         self, charge_pC: Array | None, contact: Contact | None, flags: tuple[str, ...], clock_s: float
     ) -> None:
-        """Take a frame into account; a touch counts when it is over.
+        """Process a frame. The film is estimated again when a touch has ended.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
@@ -236,7 +236,7 @@ class FilmFollower:
             self._hardest = HardestFrame(contact, charge_pC)
 
     def _end_touch(self, clock_s: float) -> None:
-        """Use the touch that was under way, if there was one and none of its frames speaks against it."""
+        """Use the touch that has just ended, unless one of its frames had a flag that makes the touch unusable."""
         if self._hardest is not None and not self._is_spoiled:
             self.observe_touch(self._hardest, clock_s)
         self.discard_touch()
@@ -400,8 +400,8 @@ def followable_pretensions(predictor: Predictor) -> Pretensions:
 def _check_same_model(predictor: Predictor, pretensions: Pretensions) -> None:
     """Refuse weights of another model.
 
-    With the weights of the calibrated pretension the graph must answer as it does by itself, and with those of another
-    pretension it must answer differently.
+    With the weights of the calibrated pretension, the graph must compute the same contacts as with its own weights.
+    With the weights of another pretension, it must compute other contacts.
     """
     lowest_MPa, highest_MPa = pretensions.range_MPa
     other_MPa = highest_MPa if pretensions.calibrated_MPa == lowest_MPa else lowest_MPa
