@@ -102,7 +102,7 @@ def test_identify_without_noise_or_electrodes_raises_before_the_film_is_solved()
 def test_search_radius_covers_the_electrodes_but_not_the_rim():
     assert search_radius(SENSOR, Circle(1.0)) == pytest.approx(np.hypot(10.160254, 6.5))
     small = replace(SENSOR, film=replace(SENSOR.film, radius=14.0))
-    assert search_radius(small, Circle(1.0)) == pytest.approx(9.5)
+    assert search_radius(small, Circle(1.0)) == pytest.approx(11.6)
 
 
 def test_search_radius_is_reduced_if_charges_cannot_be_interpolated(monkeypatch):
