@@ -16,7 +16,7 @@ HERE = Path(__file__).parent
 
 
 def backends(pytriton: Path) -> Path:
-    """Create the folder of backends in this environment, and return it.
+    """Create a folder with the two backends that Triton needs, and return its path.
 
     It contains the Python backend of the wheel, the stub that starts the Python of this environment, and the backend
     `onnxruntime` of this folder.

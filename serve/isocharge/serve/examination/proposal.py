@@ -118,7 +118,10 @@ def propose(received: ReceivedData, electrodes: tuple[str, ...], gain: Mapping[s
 
 
 def _recognise_frames(received: ReceivedData) -> dict[str, Any] | None:
-    """Return the section `[frames]` for the bytes of a board, with its request; None if no format is recognised."""
+    """Return the section `[frames]` of a device file for received bytes; None if no format is recognised.
+
+    If the board needs a request for each frame, the section contains the request.
+    """
     frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
     request = received.request
     if frames is None or request is None:

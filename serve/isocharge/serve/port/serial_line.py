@@ -1,4 +1,4 @@
-"""Open lines to a board, and the requests that some boards need.
+"""Lines to a board that are open, and the requests that some boards need before they send a frame.
 
 A line is a serial port, opened by pyserial, or a UDP socket. Where the system has file descriptors for ports, a serial
 port is read with two system calls. Each datagram of a socket is one chunk. A board may send one line of text in each

@@ -141,8 +141,8 @@ def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
 def _synchronised(stream: Bytes) -> Iterator[Windows]:
     """Yield the divisions of a stream at bytes that repeat after the length of a frame.
 
-    For each length, the pair of bytes or the single byte is chosen whose repetitions cover the largest share of the
-    stream. The lengths with the largest shares are yielded; of about equal shares, the shorter length comes first.
+    For each length, the pair of bytes or the single byte that is repeated in the largest share of the stream is
+    chosen. The lengths with the largest shares are yielded; of about equal shares, the shorter length comes first.
 
     Args:
         stream: Bytes of the stream, shape (n,).

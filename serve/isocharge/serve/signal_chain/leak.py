@@ -107,7 +107,9 @@ def undo_leak(
 
 
 def in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) -> Leak:
-    """Return the state of a frame in contact: the inflow is the trusted one, and its estimate pauses.
+    """Return the state after a frame in contact.
+
+    During a contact, the inflow is not estimated. The last reliable estimate is used instead.
 
     Args:
         leak: State after the previous frame.

@@ -216,7 +216,7 @@ class FilmFilter:
 
     @property
     def offset_pC(self) -> Array:
-        """Mean offset of the most likely level at the mean pretension, for each electrode, shape (n_electrode,), pC."""
+        """Estimated offset of each electrode at the most likely level of offsets, shape (n_electrode,), pC."""
         return np.asarray(self._mean_offset_pC * self._offset_ratio)
 
     @property
@@ -297,8 +297,8 @@ class FilmFilter:
     def _change_pretension(self, elapsed_s: float) -> None:
         """Let the pretension drift, and jump to any other pretension with a small probability.
 
-        The linear unknowns move with the probability: their means and covariances are averaged over the pretensions
-        from which the film may have come.
+        Means and covariances of the linear unknowns at a pretension are averaged over the pretensions that the film may
+        have had before, weighted by their probabilities.
 
         Args:
             elapsed_s: Time since the latest touch, s.

@@ -90,11 +90,16 @@ def _nodes(count: int) -> Array:
 
 
 def _automorphism(distance: float, probe_radius: float) -> tuple[float, float]:
-    """Return c of the automorphism (z + c) / (1 + c z), and the ring that becomes the edge of the probe.
+    """Return the map of the unit disk onto itself that moves a circle about the centre to the edge of the probe.
+
+    The map is (z + c) / (1 + c z).
 
     Args:
         distance: Distance of the probe from the centre, in film radii.
         probe_radius: Radius of the probe, in film radii.
+
+    Returns:
+        The parameter c of the map, and the radius of the circle.
     """
     outer_edge = np.arctanh(distance + probe_radius)
     inner_edge = np.arctanh(distance - probe_radius)

@@ -108,7 +108,7 @@ def singular_values(scaled: Array) -> Array:
 
 @dataclass(frozen=True)
 class Folds:
-    """Folds of a charge map under one force, and the positions where the map is nearest to a fold.
+    """Folds of a charge map at one force, and the positions that are closest to a fold.
 
     Attributes:
         points: Positions on folds, ordered by the distance from the centre, shape (n, 2), mm. With three electrodes

@@ -71,7 +71,7 @@ class Coat:
     layers: tuple[tuple[tuple[tuple[float, float], ...], ...], ...]
 
     def __repr__(self) -> str:
-        """Return the stiffness and the number of parts, without the corners."""
+        """Return a short text with the stiffness and the number of parts; the corners would fill pages."""
         return f"Coat({self.stiffness:.4g} N/mm, {len(self.layers[0])} parts)"
 
 

@@ -198,7 +198,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 
 
 def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
-    """Solve the film before the contact, under the static pressure alone, and add it to the equilibrium of a press.
+    """Add the film before the contact, under the static pressure alone, to the equilibrium of a press.
 
     Args:
         equilibrium: Equilibrium of the press.

@@ -105,7 +105,7 @@ class FilmCharges:
 
     @cached_property
     def _is_uneven_tension(self) -> Booleans:
-        """Which modes lower the tension to second order, shape (n_mode,)."""
+        """Which modes are an uneven tension, shape (n_mode,). To second order, they act like a lower mean tension."""
         return np.array([MODES[name].is_uneven_tension for name in self.modes], dtype=bool)
 
     @property

@@ -178,7 +178,10 @@ def refit_film(
 
 
 def _degrees_of_freedom(data: PressData) -> Array:
-    """Return how many numbers were measured for each press beyond the three of its contact, shape (n,)."""
+    """Return the number of redundant measurements of each press, shape (n,).
+
+    Three measured charges or coordinates are needed to determine the contact; the others are redundant.
+    """
     return np.asarray(np.maximum(data.measured.sum(axis=1) - 3.0, 0.0))
 
 

@@ -188,7 +188,10 @@ class Connection(asyncio.Protocol):
         return self._is_half_closed and self._transport.can_write_eof()
 
     def pause_writing(self) -> None:
-        """Stop reading, because the client does not read its responses, and give it `body_seconds` to continue."""
+        """Stop reading requests, because the client does not read its responses.
+
+        The connection is closed if the client does not continue within `body_seconds`.
+        """
         self._set_deadline(self._limits.body_seconds)
         self._is_blocked = True
         self._transport.pause_reading()
@@ -358,7 +361,10 @@ class Connection(asyncio.Protocol):
             self._refuse(error_response(error))
 
     def on_message_complete(self) -> None:
-        """Answer the complete request, unless it was refused, or must be parsed again without its upgrade."""
+        """Answer the complete request, unless it was refused.
+
+        A request for a protocol upgrade is not answered here, because it is parsed again without the upgrade.
+        """
         if self._is_refused or self._transport.is_closing() or self._parser.should_upgrade():
             return
         self._phase = Phase.IDLE
@@ -388,9 +394,9 @@ class Connection(asyncio.Protocol):
         self.deadline = math.inf
 
     async def _answer_later(self, head: Head, body: bytes) -> None:
-        """Answer a request in another thread, and then the requests that arrived later, in their order.
+        """Answer a request in another thread, and then the requests that arrived meanwhile, in their order.
 
-        If one of the later requests needs another thread as well, the requests after it wait again.
+        If one of these also needs another thread, the remaining requests wait until it is answered.
         """
         response = await asyncio.to_thread(
             self._handler.answer, head.method, head.path, head.headers, body, self._client
