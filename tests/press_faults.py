@@ -266,7 +266,8 @@ class WholeFilmStudy:
 
     def ring(self, inner_mm: float, outer_mm: float) -> RingShares:
         """Press a ring, and count what the model answers."""
-        contact = contacts_between(self.rng, inner_mm, outer_mm, self.presses, WHOLE_FILM_FORCES_N)
+        reachable_mm = min(outer_mm, self.film_map.domain.radius)
+        contact = contacts_between(self.rng, inner_mm, reachable_mm, self.presses, WHOLE_FILM_FORCES_N)
         is_inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.inner_map.domain.radius
         clean_charge = self.film_map.charges(contact)
         clean_charge[is_inside] = self.inner_map.charges(contact[is_inside])

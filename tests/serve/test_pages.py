@@ -14,6 +14,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame, device_from_table, encode_frame, flags
 from isocharge.serve.frames.stuffing import cobs_decode
 from isocharge.serve.frames.text import TextParser
+from isocharge.serve.live.contact_stages import TouchOffsetRule
 from isocharge.serve.live.device import CommonMode
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
@@ -154,6 +155,7 @@ def test_every_default_of_a_stage_is_the_rule_s():
     """Numbers in the tables are those of the code."""
     rules = {"hum": HumRule, "tare": TareRule, "leak": LeakRule, "memory": MemoryRule, "touch": TouchRule}
     rules |= {"track": TrackRule, "follow": FollowRule, "common_mode": CommonMode}
+    rules["touch_offset"] = TouchOffsetRule
     section = PAGES["device_file.md"].partition("The stages.")[2].partition("\n#")[0]
     assert section.count("| `") > 15
     for line in section.splitlines():

@@ -62,6 +62,10 @@ SKIP_RATIO = 10.0
 """Ratio of the error to `INTERPOLATION_ERROR` above which the next numbers of nodes would not suffice either and are
 skipped, dimensionless."""
 
+MAX_RING_RATIO = 2.0
+"""Largest ratio of the radii of successive rings of the mesh for which the stress is smooth enough across an electrode
+that the rule for far electrodes can be used, dimensionless. Meshes that are chosen automatically have about 1.9."""
+
 CHECK_COUNT = 10
 """Number of direct solves with which a forward map is compared."""
 
@@ -434,8 +438,14 @@ class ForwardMap:
         that use it, shape (n, n_electrode)."""
         near = self._is_near(at)
         parts = [(np.abs(at[:, None] - centre) / radius).min(axis=1) for centre, radius in self.sensor.part_circles]
-        far = ~near & (np.stack(parts, axis=1) > FAR_DISTANCE)
+        far = ~near & (np.stack(parts, axis=1) > FAR_DISTANCE) & self._has_smooth_far_field
         return (self._fine_readout, near), (self._coarse_readout, ~near & ~far), (self._far_readout, far)
+
+    @cached_property
+    def _has_smooth_far_field(self) -> bool:
+        """Whether the mesh is fine enough for the integration with few points over electrodes far from the probe."""
+        ring_ratio = (self.sensor.film.radius / self.probe.reach) ** (1.0 / self.resolution.rings)
+        return bool(ring_ratio <= MAX_RING_RATIO)
 
     def _is_near(self, at: Complexes) -> Booleans:
         """Return whether each electrode is so near to each press that it needs the fine rule, shape (n,
