@@ -89,7 +89,7 @@ def check_commands(example, folder, printed):
 def on_free_ports(example):
     """The example with ports that nobody uses, on this machine only."""
     with ExitStack() as stack:
-        for port in ("8000", "8001", "8443", "8444"):
+        for port in ("8000", "8001", "8002", "8443", "8444"):
             free = stack.enter_context(socket.socket())
             free.bind(("127.0.0.1", 0))
             example = example.replace(port, str(free.getsockname()[1]))

@@ -20,7 +20,7 @@ MEANINGS = {
     TARE: "no tare yet, so no contact either",
     OUTSIDE: "the position is outside the working area, or the force outside the range, that the model was trained for",
     BEYOND: "more than three times as far or as hard as the model knows: the numbers are no measurement",
-    MISFIT: "the charges fit no single contact: misfit above 5, and above what one good press in a thousand has",
+    MISFIT: "the charges fit no single contact: misfit above the larger of 5 and the 99.9 % quantile of good presses",
     GAP: "frames are missing before this one",
     REPEAT: "this frame has the number of the one before",
     RESTART: "the frame numbers went back: the device was restarted",
@@ -31,6 +31,6 @@ MEANINGS = {
     RECONNECTED: "the first frame after the port was away; the film is tared again",
     INVALID: "the device sent a charge that is not a number; nothing was computed",
     STRESS: "the press stresses the film beyond 45 MPa, where PVDF yields: a dent stays",
-    FILM: "the last touches fit this film at no pretension (a wrong gain, warmth): it is not followed now",
+    FILM: "no pretension explains the last touches (a wrong gain, warm fingers): the film is not followed now",
 }
 """Every word, and what it says."""
