@@ -257,7 +257,7 @@ def test_the_errors_of_a_model_of_measured_presses_are_those_on_held_out_presses
     off = np.stack(Predictor(model.folder).predict_batch(charge[held]), axis=1)[:, :2] - contact[held, :2]
     assert errors["measured_presses"] == held.sum()
     assert errors["position_median_mm"] == pytest.approx(np.median(np.hypot(*off.T)), rel=1e-3)
-    assert f"## Errors on {held.sum()} measured presses that training never saw" in card
+    assert f"## Errors on {held.sum()} measured presses that were not used in the training" in card
     assert "The model was trained on measurements of one film" in card
     assert "These figures compare with the simulator" not in card
     assert not [name for name in errors if name.startswith("clean_")]

@@ -53,7 +53,7 @@ def test_the_errors_are_what_serve_check_says_of_presses_that_nobody_trained_on(
 def test_card_and_metadata_say_that_it_was_fitted_to_measurements(model):
     card = (model.folder / "card.md").read_text("utf-8")
     errors = model.metadata.errors
-    assert f"## Errors on {errors['measured_presses']:.0f} measured presses that training never saw" in card
+    assert f"## Errors on {errors['measured_presses']:.0f} measured presses that were not used in the training" in card
     assert "places of the presses are known to 0.05 mm and the forces to 0.5 %" in card
     measurement = model.metadata.made_with["measured"]
     assert measurement["trained_on"] + measurement["held_out"] == 300

@@ -200,9 +200,9 @@ It can be used before a calibration; its errors are then those of the right colu
 | shift along x and y, each; rotation | {spread.shift:g} mm; {np.rad2deg(spread.rotation):.3g} degrees |
 | probe radius | {films.prior.std[films.prior.names.index("probe_radius")]:g} mm |
 
-## Measured on 64 films and 256 presses of each, none of them in the training
+## Errors on 64 films with 256 presses each, which were not used in the training
 
-Forces log-uniform, positions uniform over the working area, noise as above.
+The forces are log-uniform, the positions are uniform over the working area, and the noise is the one named above.
 
 | error | the film is known | `model.onnx`, the film is unknown |
 |---|---|---|

@@ -50,8 +50,8 @@ learned the mean of their answers, whose errors are slightly smaller. The standa
 """
     return f"""# {metadata.name}, version {metadata.version}
 
-Charges of the sensor `{metadata.sensor["name"]}` in, place and force of one press out. Fitted to measured presses
-alone, without a simulator.
+Estimates the position and the force of one press from the charges of the sensor `{metadata.sensor["name"]}`. The model
+was fitted to measured presses alone, without a simulator.
 
 | | |
 |---|---|

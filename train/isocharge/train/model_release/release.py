@@ -74,8 +74,8 @@ No noise was added to these presses. The errors include those of the places and 
 
 LIMITS = """\
 - The model assumes one press at a time, inside its working area and its range of forces. The answer to any other press
-  is finite and wrong. If the electrodes lie on one circle of a biaxial film, four of five presses outside the working
-  area have the charges of a press inside it, so that the misfit is small and the answer carries no flag.
+  is finite and wrong. It carries a flag only if the charges differ enough from those of every press inside the working
+  area and the range of forces.
 - The standard deviations are valid for the noise named above. Gains that are wrong by 1 % cause larger errors than this
   noise.
 """
@@ -129,7 +129,8 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     if isinstance(fitted.sensor, MeasuredSensor):
         return measured_card(metadata)
     if fitted.test.measured:
-        errors = fitted.provenance.card + measured_errors(metadata.errors, "that training never saw", NO_NOISE)
+        measured_section = measured_errors(metadata.errors, "that were not used in the training", NO_NOISE)
+        errors = fitted.provenance.card + measured_section
         truth = MEASURED_TRUTH
     else:
         errors = _errors_section(metadata.errors, len(fitted.test))
@@ -155,7 +156,7 @@ def yield_text(metadata: ModelMetadata) -> str:
         return ""
     return (
         f"; beyond {metadata.yield_force_N:g} N the film is stressed to more than {DEFAULT_STRESS_LIMIT:g} MPa: PVDF "
-        "yields, and a dent stays (flag `stress`)"
+        "yields, and a dent remains (flag `stress`)"
     )
 
 
@@ -165,16 +166,17 @@ def _interface_section(metadata: ModelMetadata, fitted: Fitted) -> str:
     noise = metadata.noise
     teacher = metadata.made_with.get("teacher")
     electrodes = ", ".join(metadata.electrodes)
-    teacher_text = f"\nA small network that learned the answers of `{teacher}`." if teacher else ""
+    sensor_name = metadata.sensor["name"]
+    teacher_text = f"\nThe model is a small network that learned the answers of `{teacher}`." if teacher else ""
     requested = fitted.requested_domain
     domain_text = ""
     if requested != fitted.domain:
-        domain_text = f" (of {requested.radius:g} mm asked for: beyond, two contacts give the same charges)"
+        domain_text = f" ({requested.radius:g} mm were requested; farther out two contacts can have the same charges)"
     correlation = ", `contact_correlation` (xy, xF, yF)" if fitted.network.n_angle else ""
-    probe_text = "; which of them presses is not known to the model" if len(metadata.probes) > 1 else ""
+    probe_text = "; the model does not distinguish them" if len(metadata.probes) > 1 else ""
     return f"""# {metadata.name}, version {metadata.version}
 
-Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of one press out.{teacher_text}
+Estimates the position and the force of one press from the touch charges of the sensor `{sensor_name}`.{teacher_text}
 
 | | |
 |---|---|
@@ -189,9 +191,9 @@ Touch charges of the sensor `{metadata.sensor["name"]}` in, place and force of o
 
 def _errors_section(errors: Mapping[str, float], n_press: int) -> str:
     """Return the section of the card with the errors on simulated presses."""
-    return f"""## Measured on {n_press} presses that training never saw
+    return f"""## Errors on {n_press} presses that were not used in the training
 
-Forces log-uniform, positions uniform over the working area.
+The forces are log-uniform, and the positions are uniform over the working area.
 
 | error | with that noise | clean charges |
 |---|---|---|
@@ -232,7 +234,9 @@ def _misfit_section(metadata: ModelMetadata, fitted: Fitted) -> str:
             f"An alarm at {errors['misfit_p99']:g} finds {gain_percent:.3g} % of the presses of about 1 N with one\n"
             f"gain that is wrong by 20 %, and {dead_percent:.3g} % of those with one dead electrode."
         )
-    meaning_text = "Charges that disagree with each other (a wrong gain, a dead electrode, two presses) raise it."
+    meaning_text = (
+        "The misfit is large if the charges do not belong to one press (a wrong gain, a dead electrode, two presses)."
+    )
     if len(metadata.electrodes) == 3:
         meaning_text = (
             "Because there are three charges and three unknowns, nearly all charges fit some contact. The misfit is\n"
