@@ -45,6 +45,7 @@ def test_a_thicker_and_a_tauter_film_give_less_charge(run):
     assert (np.diff(by_thickness, axis=1) < 0.0).all()
 
 
+@pytest.mark.slow
 def test_effects_of_the_bench_agree_with_an_independent_linear_inverse(run):
     """Position errors by another solver: 1.4, 3.2, 5.1 mm for a closed cavity, 0.24, 1.7, 0.9 mm for a kelvin."""
     lines = run("simulate/examples/bench_effects.py").splitlines()

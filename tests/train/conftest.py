@@ -1,10 +1,14 @@
 """One small dataset and one short fit, shared by the tests of this folder."""
 
+from functools import partial
+
 import pytest
 
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Sweep, load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
+from isocharge.simulate.forward.whole_film import whole_film_map
 from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, TrainingData, fit
+from isocharge.train.data import outside_presses
 from isocharge.train.training import fit as fit_module
 from isocharge.train.training.fit import train_network
 from kept import kept
@@ -13,6 +17,14 @@ QUICK = FitConfig(
     network=NetworkConfig(hidden=(32, 32), misfit_hidden=(24, 24)),
     training=TrainingConfig(steps=400, misfit_steps=600, misfit_charges=4_000, batch=256),
 )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_map_of_the_whole_film():
+    """Solve the coarse map of a whole film once for all trainings of a film, because it takes several seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(outside_presses, "whole_film_map", partial(kept, whole_film_map))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,7 @@ PRESSES = [
 """Distance from the centre, mm, force, N, and largest relative error of a charge."""
 
 
-@pytest.mark.parametrize("pretension", [0.0, 0.8])
+@pytest.mark.parametrize("pretension", [pytest.param(0.0, marks=pytest.mark.slow), 0.8])
 def test_coarse_map_agrees_with_direct_solves_up_to_the_clamp(pretension):
     sensor = replace(SENSOR, film=replace(SENSOR.film, pretension=pretension))
     coarse = kept(whole_film_map, sensor, Circle(1.0), (0.05, 2.0))

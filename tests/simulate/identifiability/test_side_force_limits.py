@@ -47,6 +47,7 @@ def side_force_map(forward_map) -> SideForceMap:
     return kept(SideForceMap.build, forward_map)
 
 
+@pytest.mark.slow
 def test_side_force_limit_equals_that_of_direct_solves(forward_map, side_force_map):
     """The Jacobian of (x, y, ln F, Fx / F, Fy / F) by differences of direct solves, at one position of the rings."""
     sensor = forward_map.sensor

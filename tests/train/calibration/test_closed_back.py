@@ -41,11 +41,13 @@ def test_vented_back_is_not_taken_for_a_closed_back(layout, pretension):
     assert not has_closed_back(presses_with(layout, None, pretension), layout.charges)
 
 
+@pytest.mark.slow
 def test_calibration_names_a_closed_back(problem):
     result = calibrate(presses_with(problem, CAVITY, 1.1), problem)
     assert any("vent the back and press again" in sentence for sentence in result.cautions)
 
 
+@pytest.mark.slow
 def test_calibration_of_a_uniaxial_film_with_a_closed_back_is_refused():
     problem = CalibrationProblem.of(load_sensor("four-25um-uniaxial"), Circle(1.0))
     with pytest.raises(PressError, match="air is trapped behind the film; vent the back and press again"):
