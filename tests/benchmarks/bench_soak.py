@@ -25,7 +25,7 @@ from bench_http import Connection, binary_request, free_port, http_request, json
 from shared import options, print_results
 
 from isocharge.serve import Predictor, find_model
-from isocharge.serve.network.grpc.service import METHODS, SERVICE
+from isocharge.serve.network.grpc.messages import METHODS, SERVICE
 
 KINDS = 1000
 ROUNDS = 10

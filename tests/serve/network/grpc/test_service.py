@@ -21,7 +21,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from isocharge.common.errors import InputError
 from isocharge.serve.network.address import ServerLimits, Tls, Token
 from isocharge.serve.network.grpc import grpc_server
-from isocharge.serve.network.grpc.service import METHODS, SERVICE
+from isocharge.serve.network.grpc.messages import METHODS, SERVICE
 from isocharge.serve.network.protocol import Handler
 
 PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inference.proto"

@@ -6,6 +6,6 @@ May import: network.protocol, network.
 from isocharge.common.extras import require
 
 with require("grpc"):
-    from isocharge.serve.network.grpc.service import grpc_server
+    from isocharge.serve.network.grpc.server import grpc_server
 
 __all__ = ["grpc_server"]

@@ -1,139 +1,29 @@
-"""gRPC server: `inference.GRPCInferenceService` with the models, limits, token and certificate of the HTTP server.
+"""Answers to the calls of `inference.GRPCInferenceService`, with the models, limits and token of the HTTP server.
 
-The server runs in its own event loop, and an open call needs no thread, so that idle calls do not delay other clients.
 All methods are declared as streams of messages from the client. The token and the limits can therefore be checked
 before the first message arrives. If the largest number of calls is open, a new call replaces the call that has waited
 longest for a message from its client.
-
-The message classes are built from the compiled `inference.proto` in a separate descriptor pool, so that a program may
-also use another implementation of the protocol, whose messages have the same names.
 """
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from importlib.resources import files
-from threading import Thread
 from typing import Any
 
 import grpc
 import grpc.aio
-import uvloop
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.json_format import ParseDict
 from google.protobuf.message import DecodeError, Message
-from google.protobuf.message_factory import GetMessageClass
 
-from isocharge.common.errors import ListenError, RequestError, TooMany
-from isocharge.serve.network.address import ServerLimits, Tls
-from isocharge.serve.network.model_store import LoadedVersion
+from isocharge.common.errors import RequestError, TooMany
+from isocharge.serve.network.grpc.messages import METHODS, SERVICE, read_request, write_response
 from isocharge.serve.network.protocol import Handler, describe
-from isocharge.serve.network.protocol.inference import (
-    FLAGS,
-    InferAnswer,
-    InferRequest,
-    answer_inference,
-    binary_tensor,
-    parse_request,
-)
+from isocharge.serve.network.protocol.inference import answer_inference
 from isocharge.serve.network.protocol.response import client_message, statuses
 from isocharge.serve.network.traffic import Exchange
-
-SERVICE = "inference.GRPCInferenceService"
-"""Full name of the service."""
-
-
-def _service_descriptor() -> Any:
-    """Return the descriptor of the service from the compiled protocol file."""
-    compiled = files("isocharge.serve.network.grpc").joinpath("inference.binpb").read_bytes()
-    pool = DescriptorPool()
-    for file in FileDescriptorSet.FromString(compiled).file:
-        pool.Add(file)
-    return pool.FindServiceByName(SERVICE)
-
-
-METHODS: dict[str, tuple[type[Any], type[Any]]] = {
-    method.name: (GetMessageClass(method.input_type), GetMessageClass(method.output_type))
-    for method in _service_descriptor().methods
-}
-"""Classes of the request and of the response of each method, by its name."""
-
-CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
-"""Field of a tensor's contents that holds the numbers, by number type."""
-
-
-def read_request(message: Any, loaded: LoadedVersion, batch: int) -> InferRequest:
-    """Parse a ModelInferRequest, and return the charges and the requested outputs.
-
-    If the charges are raw contents, the outputs are sent as raw contents, too.
-
-    Args:
-        message: The message.
-        loaded: The model.
-        batch: Largest number of presses in one request.
-
-    Raises:
-        RequestError: If the message is not a request for this model.
-        ChargeError: If a charge is not finite.
-        TooLarge: If there are more presses than `batch`.
-    """
-    raw_contents = message.raw_input_contents
-    if len(raw_contents) > 1:
-        raise RequestError(f"expected one input tensor, got {len(raw_contents)} raw contents")
-    raw = raw_contents[0] if raw_contents else None
-    content = {
-        "id": message.id,
-        "inputs": [_input_object(tensor, raw) for tensor in message.inputs],
-        "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
-        "parameters": {"binary_data_output": raw is not None},
-    }
-    return parse_request(content, raw or b"", loaded, batch)
-
-
-def _input_object(tensor: Any, raw: bytes | None) -> dict[str, Any]:
-    """Return an input tensor as the JSON object of the HTTP protocol.
-
-    Args:
-        tensor: Message with the name, the number type and the shape of the tensor, and possibly its numbers.
-        raw: Raw content of the message, which follows the JSON text in the HTTP protocol; None if there is none.
-    """
-    parameters: dict[str, Any] = _unsupported_parameters(tensor)
-    content = {"name": tensor.name, "datatype": tensor.datatype, "shape": list(tensor.shape), "parameters": parameters}
-    if raw is not None:
-        parameters["binary_data_size"] = len(raw)
-    if tensor.HasField("contents") or raw is None:
-        field = CONTENT_FIELDS.get(tensor.datatype, "fp32_contents")
-        content["data"] = list(getattr(tensor.contents, field))
-    return content
-
-
-def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
-    """Return the parameters of a tensor that this server must refuse, because they change the meaning of a request."""
-    return {name: True for name in ("shared_memory_region", "classification") if name in tensor.parameters}
-
-
-def write_response(answer: InferAnswer) -> Any:
-    """Return the outputs of a model as a ModelInferResponse."""
-    _, response_type = METHODS["ModelInfer"]
-    message = response_type()
-    message.model_name = answer.name
-    message.model_version = answer.version
-    message.id = answer.id
-    for name, rows in answer.outputs.items():
-        is_text = name == FLAGS
-        tensor = message.outputs.add(name=name, datatype="BYTES" if is_text else "FP32", shape=rows.shape)
-        if name in answer.binary:
-            message.raw_output_contents.append(binary_tensor(rows))
-        elif is_text:
-            tensor.contents.bytes_contents.extend(text.encode() for text in rows[:, 0].tolist())
-        else:
-            tensor.contents.fp32_contents.extend(rows.ravel().tolist())
-    return message
-
 
 METHODS_WITHOUT_TOKEN = ("ServerLive", "ServerReady")
 """Methods that need no token."""
@@ -393,112 +283,3 @@ def _authorization(context: grpc.aio.ServicerContext) -> bytes:
     """Return the value of the metadata field `authorization`; empty if the client did not send this field."""
     value = dict(context.invocation_metadata() or ()).get("authorization", "")
     return value.encode() if isinstance(value, str) else bytes(value)
-
-
-GRACE_SECONDS = 10
-"""Time that requests which have begun have to finish when the server stops, s."""
-
-MAX_CALLS_PER_CONNECTION = 100
-"""Largest number of open calls of one connection, which is the smallest number that HTTP/2 recommends. Further calls
-wait on the side of the client."""
-
-
-@contextmanager
-def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> Iterator[str]:
-    """Run a gRPC server while the block runs.
-
-    Args:
-        handler: Handler of the HTTP server, whose models, limits and token are used. Clients send the token as metadata
-            `authorization`.
-        host: Name or address on which to listen.
-        port: TCP port; 0 selects a free port.
-        tls: Certificate and key; None for no TLS.
-
-    Yields:
-        The address, `grpc://host:port` or `grpcs://host:port`.
-
-    Raises:
-        ListenError: If the address is in use or cannot be used.
-        InputError: If a TLS file cannot be used.
-    """
-    with _event_loop() as loop:
-
-        def run(coroutine: Coroutine[Any, Any, Any]) -> Any:
-            """Run a coroutine in the event loop of the server, and return its result."""
-            return asyncio.run_coroutine_threadsafe(coroutine, loop).result()
-
-        url_host = f"[{host}]" if ":" in host else host
-        server, actual_port = run(_start(handler, f"{url_host}:{port}", tls))
-        scheme = "grpcs" if tls else "grpc"
-        try:
-            yield f"{scheme}://{url_host}:{actual_port}"
-        finally:
-            run(server.stop(GRACE_SECONDS))
-
-
-@contextmanager
-def _event_loop() -> Iterator[asyncio.AbstractEventLoop]:
-    """Run an event loop in its own thread while the block runs."""
-    loop = uvloop.new_event_loop()
-    thread = Thread(target=loop.run_forever, name="grpc")
-    thread.start()
-    try:
-        yield loop
-    finally:
-        asyncio.run_coroutine_threadsafe(loop.shutdown_default_executor(), loop).result()
-        loop.call_soon_threadsafe(loop.stop)
-        thread.join()
-        loop.close()
-
-
-async def _start(handler: Handler, address: str, tls: Tls | None) -> tuple[grpc.aio.Server, int]:
-    """Start a server, and return it with the port on which it listens.
-
-    Args:
-        handler: Handler of the HTTP server.
-        address: `host:port`; the port 0 selects a free port.
-        tls: Certificate and key; None for no TLS.
-    """
-    limits = handler.limits
-    server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=2 * limits.connections)
-    server.add_generic_rpc_handlers((Service(handler).handlers(),))
-    port = _listen(server, address, tls)
-    await server.start()
-    return server, port
-
-
-def _options(limits: ServerLimits) -> list[tuple[str, int]]:
-    """Return the options of grpcio that apply the limits of a server."""
-    return [
-        ("grpc.max_receive_message_length", limits.body_bytes),
-        ("grpc.max_metadata_size", limits.header_bytes),
-        ("grpc.absolute_max_metadata_size", limits.header_bytes),
-        ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
-        ("grpc.max_allowed_incoming_connections", limits.connections),
-        ("grpc.server_handshake_timeout_ms", round(1e3 * limits.header_seconds)),
-        ("grpc.max_connection_idle_ms", round(1e3 * limits.idle_seconds)),
-        ("grpc.so_reuseport", 0),
-    ]
-
-
-def _listen(server: grpc.aio.Server, address: str, tls: Tls | None) -> int:
-    """Let a server listen on `host:port`, and return the port on which it listens.
-
-    Args:
-        server: The server, which has not been started.
-        address: `host:port`; the port 0 selects a free port.
-        tls: Certificate and key; None for no TLS.
-
-    Raises:
-        ListenError: If the address is in use or cannot be used.
-        InputError: If a TLS file cannot be used.
-    """
-    try:
-        if tls is None:
-            return int(server.add_insecure_port(address))
-        credentials = grpc.ssl_server_credentials([tls.key_and_certificate()])
-        return int(server.add_secure_port(address, credentials))
-    except RuntimeError as error:
-        raise ListenError(
-            f"cannot listen on {address} for gRPC: {error}; choose another --grpc-port or --host"
-        ) from error
