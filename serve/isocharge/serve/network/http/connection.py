@@ -13,17 +13,14 @@ slices, and after `TURN_SECONDS` the event loop continues with the other connect
 import asyncio
 import math
 import time
-import urllib.parse
 from collections import deque
 from collections.abc import Iterable
 from enum import Enum
-from functools import lru_cache
-from http import HTTPStatus
-from typing import NamedTuple
 
 import httptools
 
 from isocharge.common.errors import TooLarge
+from isocharge.serve.network.http.messages import Head, request_path, response_bytes
 from isocharge.serve.network.protocol import Handler, Response
 from isocharge.serve.network.protocol.response import error_response, refusal
 from isocharge.serve.network.traffic import Client
@@ -40,12 +37,6 @@ TURN_SECONDS = 250e-6
 LINGER_SECONDS = 2.0
 """Time for which the connection of a refused client stays open, s, so that the client can read the reason."""
 
-STATUS_LINES = {status.value: b"HTTP/1.1 %d %s\r\n" % (status, status.phrase.encode()) for status in HTTPStatus}
-"""Status line for each status code."""
-
-CLOSING_HEADER = b"connection: close\r\n\r\n"
-"""End of the headers of the last response of a connection."""
-
 
 class Phase(Enum):
     """What a connection is waiting for. The values are used in error messages."""
@@ -53,22 +44,6 @@ class Phase(Enum):
     IDLE = "a request"
     HEADERS = "the end of the headers"
     BODY = "the end of the body"
-
-
-class Head(NamedTuple):
-    """Request line and headers of a complete request.
-
-    Attributes:
-        method: Method in capitals.
-        path: Path without query, with percent signs decoded.
-        headers: Names in lower case, and values.
-        is_last: Whether the client asks to close the connection after the response.
-    """
-
-    method: str
-    path: str
-    headers: list[tuple[bytes, bytes]]
-    is_last: bool
 
 
 class Connection(asyncio.Protocol):
@@ -371,7 +346,7 @@ class Connection(asyncio.Protocol):
         self.has_completed_request = True
         method = self._parser.get_method().decode("latin-1")
         is_last = not self._parser.should_keep_alive()
-        head = Head(method, _path(self._url), self._headers, is_last)
+        head = Head(method, request_path(self._url), self._headers, is_last)
         body = bytes(self._body)
         self._head = head
         if self._answering:
@@ -432,7 +407,7 @@ class Connection(asyncio.Protocol):
         if self._is_refused or self._transport.is_closing():
             return
         is_last = self._is_stopping or head.is_last
-        self._transport.write(_response_bytes(response, is_last=is_last, with_body=head.method != "HEAD"))
+        self._transport.write(response_bytes(response, is_last=is_last, with_body=head.method != "HEAD"))
         if is_last:
             self._transport.close()
         elif self._is_blocked and self._transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
@@ -464,36 +439,12 @@ class Connection(asyncio.Protocol):
         self._is_refused = True
         self._unparsed.clear()
         self._handler.refused(response, self._client)
-        self._transport.write(_response_bytes(response, is_last=True))
+        self._transport.write(response_bytes(response, is_last=True))
         if self._transport.can_write_eof():
             self._transport.write_eof()
             self._set_deadline(LINGER_SECONDS)
         else:
             self._transport.close()
-
-
-def _response_bytes(response: Response, *, is_last: bool, with_body: bool = True) -> bytes:
-    """Return a response as the bytes that are sent.
-
-    Args:
-        response: The response.
-        is_last: Whether the connection is closed after the response, which the headers then state.
-        with_body: Whether the body is sent. The response to a HEAD request has none.
-    """
-    parts = [STATUS_LINES[response.status]]
-    for name, value in response.headers:
-        parts += (name, b": ", value, b"\r\n")
-    parts.append(CLOSING_HEADER if is_last else b"\r\n")
-    if with_body:
-        parts.append(response.body)
-    return b"".join(parts)
-
-
-@lru_cache(64)
-def _path(url: bytes) -> str:
-    """Return the path in the target of a request line, with percent signs decoded."""
-    path = httptools.parse_url(url).path or b"/"
-    return urllib.parse.unquote_to_bytes(path).decode("utf-8", "replace")
 
 
 def close_overdue(connections: Iterable[Connection], now: float) -> None:
