@@ -5,15 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import block_diag
 from scipy.optimize import least_squares
-from scipy.stats import chi2, multivariate_normal
+from scipy.stats import chi2
 from tests.train.calibration.conftest import presses_of, rig
 
 from isocharge.common.errors import ModelError, PressError, SceneError
 from isocharge.simulate import Circle, Polygon, load_sensor, press, touch_charge
-from isocharge.simulate.forward.film_modes import MODES
-from isocharge.simulate.sensor.film_prior import SHARED
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.simulate.solver.stress_limit import largest_stress
 from isocharge.train import CalibrationProblem, calibrate, next_presses
@@ -32,43 +29,6 @@ def data_of(problem, presses) -> PressData:
 
 def fit(problem, presses):
     return fit_film(problem.charges, data_of(problem, presses), problem.before)
-
-
-def test_derivatives_are_those_of_the_charges(layout):
-    """Every column against central differences of the forward map of a film built from its parameters."""
-    charges = layout.charges
-    rng = np.random.default_rng(3)
-    parameters = layout.prior.draw(rng, 1)[0]
-    at = draw_contacts(rng, layout.domain.within(7.0), 6)
-    by_contact = charges.by_contact(parameters, at)
-    by_parameter = charges.by_parameter(parameters, at, by_contact)
-    size = np.abs(charges.charges(parameters, at)).max(axis=1)[:, None]
-    for number, std in enumerate(layout.prior.std):
-        step = np.zeros_like(parameters)
-        step[number] = 0.01 * std
-        change = charges.charges(parameters + step, at) - charges.charges(parameters - step, at)
-        np.testing.assert_allclose(by_parameter[:, :, number] / size, change / 0.02 / size, atol=1e-3)
-    by_map = charges.forward_map(parameters).derivatives(at)
-    np.testing.assert_allclose(by_contact / size[:, :, None], by_map / size[:, :, None], atol=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("names", "besides"),
-    [(("pretension", "young", "thickness"), [1.5, -1.0, 1.5]), (SHARED, [0.0] * len(MODES) + [0.2, 0.9, -0.1] * 4)],
-    ids=["modes", "traces"],
-)
-def test_derivatives_contain_what_a_parameter_does_to_the_rest(problem, names, besides):
-    charges = problem.charges
-    rng = np.random.default_rng(4)
-    film = problem.before.parameters
-    at = draw_contacts(rng, problem.domain.within(7.0), 6)
-    unknowns = np.pad(np.append(film, besides), (0, charges.n_coefficient - len(besides)))
-    size = charges.charges(unknowns, at)
-    found = charges.by_parameter(unknowns, at, charges.by_contact(unknowns, at))
-    for number, name in enumerate(names):
-        change = np.pad(0.01 * np.diag(charges.prior.std)[number], (0, charges.n_coefficient))
-        expected = (charges.charges(unknowns + change, at) - charges.charges(unknowns - change, at)) / 0.02
-        np.testing.assert_allclose(found[:, :, number] / size, expected / size, atol=1e-3, err_msg=name)
 
 
 @pytest.mark.parametrize(("count", "seed"), [(4, 11), (6, 2)], ids=["inside", "on a bound"])
@@ -100,89 +60,6 @@ def test_it_is_the_minimum_of_the_joint_problem(count, seed, problem, monkeypatc
     assert np.abs(apart).max() < 0.1
     joint_covariance = np.linalg.inv(joint.jac.T @ joint.jac)[: truth.size, : truth.size]
     np.testing.assert_allclose(std, np.sqrt(np.diag(joint_covariance)), rtol=0.05)
-
-
-def test_evidence_and_posterior_of_a_linear_model():
-    """The evidence is SciPy's density of the residuals; the posterior is that of Gaussian conditioning on them."""
-    rng = np.random.default_rng(2)
-    jacobian = rng.normal(size=(12, 5))
-    residual = rng.normal(size=12)
-    prior_covariance = np.diag([1.0, 0.25, 4.0, 1.0, 0.0])  # the last unknown is excluded
-    model = hypotheses.LinearModel.of(jacobian, residual, np.zeros(5))
-    mean, covariance = model.posterior(prior_covariance)
-
-    residual_covariance = np.eye(12) + jacobian @ prior_covariance @ jacobian.T
-    log_density = multivariate_normal(np.zeros(12), residual_covariance).logpdf(residual) + 6.0 * np.log(2.0 * np.pi)
-    assert model.log_evidence(prior_covariance) == pytest.approx(log_density, rel=1e-9)
-    gain = prior_covariance @ jacobian.T @ np.linalg.inv(residual_covariance)
-    np.testing.assert_allclose(mean, -gain @ residual, rtol=1e-9)
-    np.testing.assert_allclose(covariance, prior_covariance - gain @ jacobian @ prior_covariance, atol=1e-12)
-
-
-def test_mixture_has_the_mean_and_second_moments_of_its_hypotheses():
-    """Each hypothesis is weighted by the product of its evidence and its prior probability."""
-    rng = np.random.default_rng(4)
-    model = hypotheses.LinearModel.of(rng.normal(size=(12, 3)), rng.normal(size=12), np.zeros(3))
-    prior_covariances = {
-        hypotheses.Hypothesis(prior_probability=0.7): np.eye(3),
-        hypotheses.Hypothesis(discrepancy=1.0, prior_probability=0.3): np.eye(3) / 4,
-    }
-    log_evidences = [model.log_evidence(each) for each in prior_covariances.values()]
-    posteriors = [model.posterior(each) for each in prior_covariances.values()]
-    weights = np.exp(log_evidences) * [0.7, 0.3]
-    weights /= weights.sum()
-    second_moments = [covariance + np.outer(mean, mean) for mean, covariance in posteriors]
-
-    mixture = hypotheses.mix_hypotheses({0.0: model}, prior_covariances.get, prior_covariances)
-    np.testing.assert_allclose(mixture.mean, weights @ [mean for mean, _ in posteriors])
-    found_second_moment = mixture.covariance + np.outer(mixture.mean, mixture.mean)
-    np.testing.assert_allclose(found_second_moment, np.einsum("h,hij->ij", weights, second_moments))
-    assert list(mixture.probabilities.values()) == pytest.approx(weights)
-
-
-def test_scatter_of_forces_is_noise_along_one_direction_of_each_press():
-    """Three presses of four residuals, compared with SciPy's density for the full covariance of the residuals."""
-    rng = np.random.default_rng(5)
-    jacobian = rng.normal(size=(3, 4, 2))
-    residual = rng.normal(size=(3, 4))
-    direction = rng.normal(size=(3, 4))
-    direction /= np.linalg.norm(direction, axis=1)[:, None]
-    noise_variance = np.array([0.0, 0.5, 9.0])
-    at_mean = np.zeros(2)
-
-    jacobian_along = np.einsum("nk,nku->nu", direction, jacobian)
-    residual_along = (direction * residual).sum(axis=1)
-    model = hypotheses.LinearModel.of(jacobian.reshape(12, 2), residual.ravel(), at_mean)
-    noisy_model = model.with_added_noise(jacobian_along, residual_along, at_mean, noise_variance)
-
-    press_noises = [
-        np.eye(4) + variance * np.outer(unit_vector, unit_vector)
-        for variance, unit_vector in zip(noise_variance, direction, strict=True)
-    ]
-    residual_covariance = block_diag(*press_noises) + jacobian.reshape(12, 2) @ jacobian.reshape(12, 2).T
-    distribution = multivariate_normal(np.zeros(12), residual_covariance)
-    log_density = distribution.logpdf(residual.ravel()) + 6.0 * np.log(2.0 * np.pi)
-    assert noisy_model.log_evidence(np.eye(2)) == pytest.approx(log_density, rel=1e-9)
-
-
-@pytest.mark.parametrize(("pretension", "force"), [(0.8, 0.2), (1.6, 0.1)])
-def test_an_uneven_tension_acts_as_a_lower_one(problem, pretension, force):
-    """To second order on all charges alike: against full solves, where first order gives nothing."""
-    charges = problem.charges
-    at = np.array([[2.0, 1.0, force]])
-    parameters = np.append(pretension, problem.prior.mean[1:])
-    solved = []
-    known = []
-    sensor, probe = problem.prior.film(parameters)
-    for share in (0.0, 0.4, -0.4):
-        uneven = replace(sensor, film=replace(sensor.film, deviator=(0.0, share * pretension)))
-        modes = np.zeros(charges.n_coefficient)
-        modes[charges.modes.index("tension_shear")] = share * pretension / MODES["tension_shear"].std
-        solved.append(np.log(touch_charge(uneven, press(uneven.film, probe, (2.0, 1.0), force))).mean())
-        known.append(np.log(charges.charges(np.concatenate([parameters, modes]), at)).mean())
-    second = [0.5 * (values[1] + values[2]) - values[0] for values in (solved, known)]
-    assert second[0] > 0.005
-    assert second[1] == pytest.approx(second[0], rel=0.15)
 
 
 def on_a_film(problem, change, count, seed):
