@@ -418,7 +418,7 @@ def test_parts_of_runs_with_faults(tmp_path, attack):
 
         def read_array(data):
             run.save("solve-0000.npy", data)
-            assert len(list(in_order(run.keeping("solve"), lambda job: np.zeros(job), [2]))) == 1
+            assert len(list(in_order(run.storing_executor("solve"), lambda job: np.zeros(job), [2]))) == 1
 
         def read_state(data):
             run.save("weights", data)

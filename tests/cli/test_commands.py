@@ -103,7 +103,7 @@ def test_a_stopped_sweep_says_how_to_go_on_and_leaves_no_process(tmp_path):
     _, err = process.communicate(timeout=60)
     assert process.returncode not in (0, None)
     assert "Traceback" not in err
-    assert "stopped; what is done is kept in presses.part, and the same command" in err
+    assert "stopped; the finished parts are kept in presses.part, and the same command" in err
     assert [path.name for path in tmp_path.iterdir()] == ["presses.part"]
     with pytest.raises(ProcessLookupError):
         ends(lambda: os.killpg(process.pid, 0) is None)  # no process of the session is left

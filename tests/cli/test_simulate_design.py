@@ -36,7 +36,7 @@ def test_a_design_is_a_folder_that_other_commands_read(command, tmp_path, monkey
         patch.setattr(search_module.Search, "refine", lambda *_: exec("raise KeyboardInterrupt"))
         code, _, err = command(*words)
         assert code == 130
-        assert f"what is done is kept in {draft}" in " ".join(err.split()).replace("- ", "-")
+        assert f"the finished parts are kept in {draft}" in " ".join(err.split()).replace("- ", "-")
     solved = {path: path.stat().st_mtime_ns for path in (draft / "parts").glob("*.npy")}
     assert len(solved) == 2
     code, out, err = command(*words)

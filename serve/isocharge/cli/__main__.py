@@ -1,4 +1,4 @@
-"""`python -m isocharge.cli`."""
+"""Entry point of `python -m isocharge.cli`."""
 
 from isocharge.cli.main import main
 

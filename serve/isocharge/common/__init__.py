@@ -1,4 +1,4 @@
 """Modules that simulate, train, serve and the commands share: errors, files, tables, progress and resumable runs.
 
-May import: nothing else of isocharge.
+These modules do not import any other package of isocharge.
 """

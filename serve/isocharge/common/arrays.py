@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-"""Float64 array; each docstring gives shape, unit and sign."""
+"""Float64 array. The docstring of each function gives the shape, the unit and the sign."""
 
 Singles = NDArray[np.float32]
-"""Float32 array, the number type of every model tensor."""
+"""Float32 array. All tensors of the models have this number type."""
 
 Reals = NDArray[np.floating[Any]]
 """Array of float64 or float32."""

@@ -32,7 +32,7 @@ class ChargeFeatures:
         return self.typical_pC.size
 
     def evaluate(self, charge_pC: Array) -> Array:
-        """Compute the features of charges with NumPy, shape (..., n_electrode), pC."""
+        """Compute the features of charges (pC) of shape (..., n_electrode). The features have the same shape."""
         ratio = np.clip(charge_pC, self.low_pC, self.high_pC) / self.typical_pC
         if self.mean is None:
             return np.asarray(np.log(ratio))

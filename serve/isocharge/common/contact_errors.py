@@ -1,4 +1,4 @@
-"""Statistics of the errors of estimated contacts: the same figures for cards, reports, the Bayes limit and the demo."""
+"""Statistics of the errors of estimated contacts, which model cards, reports, the Bayes limit and the demo share."""
 
 from dataclasses import dataclass
 

@@ -6,9 +6,9 @@ maps rings around the origin to rings around the probe,
     z -> (z + c) / (1 + c z),  c = tanh((atanh(p + r) + atanh(p - r)) / 2),
 
 where z = x + i y is a point, p is the distance of the probe from the centre and r is the radius of the probe, all in
-film radii. The deflection is smooth
-on these rings, so that a few hundred numbers describe it. Between two forces, the deflection divided by the cube root
-of the force, which is constant for a membrane, is interpolated over the logarithm of the force. The package `simulate`
+film radii. The deflection is smooth on these rings, so that a few hundred numbers describe the deflection of one press.
+The deflection of a membrane is proportional to the cube root of the force. Between two forces of the table, the ratio
+of the deflection to this cube root is therefore interpolated over the logarithm of the force. The package `simulate`
 writes the file, and the live page of `serve` shows the deflection.
 """
 
@@ -34,7 +34,7 @@ FILM_KEYS = ("radius_mm", "thickness_um", "young_GPa", "poisson", "pretension_MP
 """Properties of a film on which its deflection depends."""
 
 N_STEPS = (1 << 16) - 1
-"""Number of steps into which the largest deflection is divided."""
+"""Number of steps into which the largest deflection is divided, because the file stores 16-bit integers."""
 
 MAX_NUMBERS = 1 << 18
 """Largest number of deflections in a table."""
@@ -67,7 +67,7 @@ class DeflectionField:
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of the file."""
-        scale_mm = float(np.max(self.deflection_mm)) or 1.0
+        scale_mm = float(np.max(self.deflection_mm)) or 1.0  # any positive scale for a field of zeros
         steps = np.round(np.clip(self.deflection_mm / scale_mm, 0.0, 1.0) * N_STEPS).astype("<u2")
         return {
             "isocharge_deflection": VERSION,
@@ -83,18 +83,20 @@ class DeflectionField:
 
 
 def is_same_film(film: Any, properties: Mapping[str, float]) -> bool:
-    """Return whether a film has some properties.
+    """Return whether the properties of a film are equal to expected properties, up to rounding.
 
     Args:
-        film: The film as a sensor file describes it.
-        properties: The properties by `FILM_KEYS`.
+        film: The film as a sensor file describes it. The result is False for anything that is not a table.
+        properties: Expected properties by `FILM_KEYS`.
     """
-    given = {"pretension_MPa": 0.0, **film} if isinstance(film, Mapping) else {}
-    return all(_is_close(given.get(key), properties[key]) for key in FILM_KEYS)
+    if not isinstance(film, Mapping):
+        return False
+    film_properties = {"pretension_MPa": 0.0, **film}
+    return all(_is_close(film_properties.get(key), properties[key]) for key in FILM_KEYS)
 
 
 def _is_close(given: object, value: float) -> bool:
-    """Return whether a value is a number that equals another number up to rounding."""
+    """Return whether `given` is a number that is equal to `value` up to rounding."""
     return isinstance(given, int | float) and math.isclose(given, value, rel_tol=1e-6, abs_tol=1e-12)
 
 

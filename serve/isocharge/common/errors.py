@@ -1,8 +1,8 @@
 """The exceptions of isocharge. Each class also inherits from the built-in exception with the most similar meaning.
 
-A message states what was expected, what was given, where, and what to do. The command line maps the exceptions to exit
-codes in `isocharge.cli.main` (2 for wrong input, 1 for everything else), the servers map them to HTTP and gRPC statuses
-in `isocharge.serve.network.protocol.response`.
+A message states what was expected, what was given, where, and what to do. `isocharge.cli.main` maps the exceptions to
+exit codes: 2 for wrong input, and 1 for everything else. `isocharge.serve.network.protocol.response` maps them to HTTP
+and gRPC statuses.
 """
 
 from collections.abc import Iterator
@@ -15,14 +15,14 @@ MAX_VALUE_CHARACTERS = 200
 
 
 def cut(text: str) -> str:
-    """Return a text for a message: printable, and cut after `MAX_VALUE_CHARACTERS` characters."""
+    """Cut a text after `MAX_VALUE_CHARACTERS` characters, and make it printable, for an error message."""
     if len(text) <= MAX_VALUE_CHARACTERS:
         return printable(text)
     return printable(text[:MAX_VALUE_CHARACTERS]) + "..."
 
 
 def shown(value: object) -> str:
-    """Return the repr of a value for a message, cut after `MAX_VALUE_CHARACTERS` characters."""
+    """Return the repr of a value for an error message, cut after `MAX_VALUE_CHARACTERS` characters."""
     try:
         return cut(repr(value))
     except (RecursionError, ValueError):  # nested too deeply, or an int with more digits than Python prints
@@ -62,7 +62,7 @@ class PressError(InputError):
 
 
 class DeviceError(InputError):
-    """The description of a device is wrong: unknown key, frame whose parts do not add up, unknown checksum."""
+    """The description of a device is wrong: unknown key, unknown checksum, fields that do not fill the frame."""
 
 
 class RecordingError(InputError):
@@ -150,7 +150,7 @@ class PortError(IsochargeError, ConnectionError):
 
 
 class PortLost(PortError):
-    """A port went away while it was read."""
+    """A port was disconnected while frames were read from it."""
 
 
 class NoFramesError(PortError):
@@ -158,11 +158,11 @@ class NoFramesError(PortError):
 
 
 class PressCheckError(IsochargeError, RuntimeError):
-    """The presses of a check did not come, or do not tell the channels apart."""
+    """The expected presses of a check were not made, or do not distinguish the channels."""
 
 
 class TareError(IsochargeError, RuntimeError):
-    """The film was not left alone while it was tared."""
+    """The film was touched while its tare was measured."""
 
 
 class MissingExtra(IsochargeError, ImportError):
@@ -171,7 +171,7 @@ class MissingExtra(IsochargeError, ImportError):
 
 @contextmanager
 def error_prefix(where: str, kind: type[IsochargeError]) -> Iterator[None]:
-    """Put `where` before the messages of the errors of a kind that the block raises."""
+    """Put the text `where` before the message of each error of the class `kind` that the block raises."""
     try:
         yield
     except kind as error:

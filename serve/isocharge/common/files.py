@@ -35,7 +35,7 @@ def open_regular(path: Path) -> BinaryIO:
     """Open a regular file for reading, without waiting for the writer of a pipe.
 
     Raises:
-        OSError: If the file cannot be opened or is a pipe, a device or a folder; `strerror` says which.
+        OSError: If the file cannot be opened, or is a pipe, a device or a folder. Its `strerror` states the reason.
     """
     descriptor = os.open(path, READ_FLAGS)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -52,7 +52,8 @@ def read_whole(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
         max_bytes: Largest size, bytes.
 
     Raises:
-        OSError: If the file cannot be read, is not a regular file, or is larger; `strerror` states the reason.
+        OSError: If the file cannot be read, is not a regular file, or is larger than `max_bytes`. Its `strerror` states
+            the reason.
     """
     too_large = OSError(errno.EFBIG, f"larger than {max_bytes} bytes", str(path))
     with open_regular(path) as file:
@@ -72,7 +73,7 @@ def bounded_lines(file: TextIO, max_characters: int = MAX_LINE_CHARACTERS) -> It
         max_characters: Largest number of characters of a line.
 
     Raises:
-        ValueError: If a line is longer, or cannot be decoded.
+        ValueError: If a line is longer than `max_characters`, or cannot be decoded.
     """
     while line := file.readline(max_characters + 1):
         if len(line) > max_characters:
@@ -96,7 +97,7 @@ def read_needed(path: Path, error: type[IsochargeError], advice: str, max_bytes:
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise OutputExists if a file or folder exists at the path."""
+    """Raise OutputExists if a file or a folder exists at the path."""
     if path.exists():
         raise OutputExists(f"{path} is already there and is not overwritten; choose another output or remove it")
 
@@ -140,7 +141,10 @@ class AtomicWriter:
         self._size = 0
 
     def write(self, data: bytes) -> int:
-        """Append data. After an OSError the file is unchanged, and data of an interrupted call are overwritten."""
+        """Append data to the file. If an OSError is raised, the file is unchanged.
+
+        Data of an earlier call that was interrupted, for example by Ctrl-C, are overwritten.
+        """
         unwritten = memoryview(data)
         try:
             os.lseek(self._descriptor, self._size, os.SEEK_SET)
@@ -168,6 +172,9 @@ class AtomicWriter:
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """Create a file under a temporary name, and rename it at the end of the block. After an error nothing remains.
+
+    Args:
+        path: The final path of the file.
 
     Yields:
         The temporary path in the same folder, at which the block creates a file or a folder.

@@ -1,4 +1,4 @@
-"""Conversion of values for JSON, which has no notation for NaN and infinity. Such numbers become None."""
+"""Conversion of values for JSON. NaN and infinity become None, because JSON has no notation for them."""
 
 import math
 

@@ -1,10 +1,15 @@
 """Measured presses: charges of a film under presses whose position or force, or both, are known.
 
 A file of presses is CSV or Parquet with the columns `x_mm`, `y_mm`, `force_N` and one column for each electrode (pC),
-in any order. An empty cell is unknown. The optional columns `position_std_mm` and `force_std` (a share: 0.01 is 1 %)
-state how exactly the rig knows position and force, and `temperature_C` is the temperature of the ring of the film, and
-`film_temperature_C` that of the film itself or of the air at its surface.
-Further columns are ignored if the electrodes are named. `isocharge serve predict` reads these files, too.
+in any order. An empty cell stands for an unknown value. A file may have four further columns:
+
+    position_std_mm      standard deviation of x and of y, mm
+    force_std            standard deviation of the force relative to the force: 0.01 is 1 %
+    temperature_C        temperature of the ring of the film, degrees Celsius
+    film_temperature_C   temperature of the film itself, or of the air at its surface, degrees Celsius
+
+All other columns are ignored if the names of the electrodes are given. `isocharge serve predict` reads these files,
+too.
 """
 
 from collections.abc import Collection, Sequence
@@ -27,12 +32,12 @@ from isocharge.common.tables.number_table import (
 from isocharge.common.tables.table_file import open_table, write_columns
 
 POSITION_STD_MM = 0.1
-"""Standard deviation of a position if nothing else is stated, mm: that of a stage that is set by hand."""
+"""Default standard deviation of a position, mm. It is typical of a stage that is set by hand."""
 
 FORCE_STD = 0.01
-"""Standard deviation of a force if nothing else is stated, as a share of the force: that of a simple load cell."""
+"""Default standard deviation of a force relative to the force, dimensionless. It is typical of a simple load cell."""
 
-MOST_ROWS = 1_000_000
+MAX_ROWS = 1_000_000
 """Largest number of presses in a file."""
 
 CONTACT = ("x_mm", "y_mm", "force_N")
@@ -83,12 +88,12 @@ class MeasuredPresses:
     Two objects are equal if their numbers and electrodes are equal, even if they come from different lines of a file.
 
     Attributes:
-        contact: x_mm, y_mm, force_N, shape (n, 3); NaN if unknown. x and y are known both or not at all.
-        charge_pC: Touch charges, shape (n, electrodes), pC; NaN if unknown, but one charge of each press is known.
+        contact: x_mm, y_mm and force_N, shape (n, 3); NaN if unknown. Either both x and y are known, or neither.
+        charge_pC: Touch charges, shape (n, electrodes), pC; NaN if unknown. At least one charge of each press is known.
         position_std_mm: Standard deviation of x and of y, shape (n,), mm.
-        force_std: Standard deviation of the force as a share of the force, shape (n,).
-        electrodes: Names, in the order of the charges.
-        lines: Number of each press in its file, for messages: the line of a CSV file, the row of a Parquet file. If
+        force_std: Standard deviation of the force relative to the force, shape (n,), dimensionless.
+        electrodes: Names of the electrodes, in the order of the charges.
+        lines: Number of each press in its file, for messages: the line of a CSV file, or the row of a Parquet file. If
             there is no file, the presses are numbered from 1.
         ignored: Columns of the file that were not read.
         temperature_C: Temperature of the ring of the film, shape (n,), degrees Celsius; NaN if unknown, None if it is
@@ -98,7 +103,8 @@ class MeasuredPresses:
         row_noun: What `lines` counts, for messages: "line", "row" or "press".
 
     Raises:
-        PressError: If shapes disagree or a value is impossible; the line and the column are named.
+        PressError: If the shapes do not fit each other, or a value is not allowed. The message names the line and the
+            column.
     """
 
     contact: Array
@@ -121,17 +127,17 @@ class MeasuredPresses:
         return len(self.lines)
 
     def __getitem__(self, rows: int | slice | Sequence[int] | Integers | Booleans) -> "MeasuredPresses":
-        """Return some of the presses, by their indices or by a mask; a single one for an integer."""
-        chosen = np.atleast_1d(np.arange(len(self))[rows])
+        """Return some of the presses, which are given by an index, by several indices, by a slice or by a mask."""
+        indices = np.atleast_1d(np.arange(len(self))[rows])
         return replace(
             self,
-            contact=self.contact[chosen],
-            charge_pC=self.charge_pC[chosen],
-            position_std_mm=self.position_std_mm[chosen],
-            force_std=self.force_std[chosen],
-            temperature_C=None if self.temperature_C is None else self.temperature_C[chosen],
-            film_temperature_C=None if self.film_temperature_C is None else self.film_temperature_C[chosen],
-            lines=tuple(self.lines[row] for row in chosen),
+            contact=self.contact[indices],
+            charge_pC=self.charge_pC[indices],
+            position_std_mm=self.position_std_mm[indices],
+            force_std=self.force_std[indices],
+            temperature_C=None if self.temperature_C is None else self.temperature_C[indices],
+            film_temperature_C=None if self.film_temperature_C is None else self.film_temperature_C[indices],
+            lines=tuple(self.lines[index] for index in indices),
         )
 
     @property
@@ -253,11 +259,11 @@ def read_presses(
 
     Args:
         path: CSV in UTF-8, with or without byte order mark; or Parquet, if its name ends in `.parquet`. It may have up
-            to `MOST_ROWS` presses.
-        electrodes: Names of the electrodes, in the order in which the charges are wanted. If absent, all columns
-            without another meaning are electrodes.
+            to `MAX_ROWS` presses.
+        electrodes: Names of the electrodes, in the requested order of the charges. If absent, all columns without
+            another meaning are electrodes.
         position_std_mm: Standard deviation of x and of y where the file has none, mm.
-        force_std: Standard deviation of a force where the file has none, as a share of the force.
+        force_std: Standard deviation of a force where the file has none, relative to the force.
 
     Raises:
         PressError: If the file cannot be used. The message names file, line and column, what was expected, what was
@@ -278,7 +284,7 @@ def read_presses(
         with error_prefix(f"{path}: ", PressError):
             _check_electrodes(names)
         chosen = table.choose_columns(dict.fromkeys(names, CHARGE_RULE), PRESS_RULES)
-        columns = table.read(chosen, MOST_ROWS)
+        columns = table.read(chosen, MAX_ROWS)
         ignored = tuple(name for name in table.header if name not in chosen)
     count = len(columns.row_numbers)
     if not count:
@@ -306,10 +312,11 @@ def read_presses(
 
 
 def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
-    """Return the columns without another meaning, which are taken for electrodes.
+    """Return the names of the columns without another meaning, which are assumed to be electrodes.
 
     Raises:
-        PressError: If a column of more than one character is named almost as a column of `PRESS_RULES`.
+        PressError: If the name of a column has several characters and is similar to a name in `PRESS_RULES`. The
+            column is then probably misspelt.
     """
     electrodes = tuple(name for name in table.header if name and name not in PRESS_RULES)
     long_names = [name for name in electrodes if len(name) > 1]
@@ -318,28 +325,29 @@ def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
 
 
 def read_press_list(path: Path) -> Array:
-    """Read the presses that a machine is to make, in their order.
+    """Read the presses that a machine makes, in their order.
 
     Args:
-        path: CSV or Parquet with x_mm, y_mm and force_N, as `read_presses` reads them; further columns are ignored.
+        path: CSV or Parquet file with the columns x_mm, y_mm and force_N; see `read_presses`. Other columns are
+            ignored.
 
     Returns:
         (x_mm, y_mm, force_N) of each press, shape (n, 3), mm and N; NaN where the file has an empty cell.
 
     Raises:
-        PressError: If the file cannot be read, or a row is not a press; line and column are named.
+        PressError: If the file cannot be read, or a row is not a press. The message names the line and the column.
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     path = Path(path)
     with open_table(path, CONTACT, PressError, f"a header with {', '.join(CONTACT)}") as table:
         chosen = table.choose_columns({name: PRESS_RULES[name] for name in CONTACT})
-        columns = table.read(chosen, MOST_ROWS)
+        columns = table.read(chosen, MAX_ROWS)
     count = len(columns.row_numbers)
     if not count:
         raise PressError(f"{path}: expected one press or more below the header, got none")
     contact = np.column_stack([columns.values[name] for name in CONTACT])
     with error_prefix(f"{path}, ", PressError):
-        # `MeasuredPresses` checks the contacts; the other numbers are arbitrary valid ones.
+        # The object is created only because it checks the contacts. Its other values are arbitrary valid values.
         MeasuredPresses(
             contact=contact,
             charge_pC=np.zeros((count, 1)),
@@ -353,19 +361,19 @@ def read_press_list(path: Path) -> Array:
 
 
 def write_presses(path: Path, presses: MeasuredPresses) -> None:
-    """Write presses so that `read_presses` reads the same numbers; the file appears whole and replaces an older one.
+    """Write presses to a file from which `read_presses` reads the same numbers. An existing file is replaced.
 
     Args:
-        path: Parquet, if its name ends in `.parquet`; else CSV.
+        path: The file. Its format is Parquet if its name ends in `.parquet`, and otherwise CSV.
         presses: The presses.
 
     Raises:
-        PressError: If there are no presses or more than `MOST_ROWS`.
-        OutputError: If the file system refuses.
-        MissingExtra: If the file is to be Parquet and pyarrow is not installed.
+        PressError: If there are no presses, or more than `MAX_ROWS` presses.
+        OutputError: If the file cannot be written.
+        MissingExtra: If the format is Parquet and pyarrow is not installed.
     """
-    if not 0 < len(presses) <= MOST_ROWS:
-        raise PressError(f"{path}: expected 1 to {MOST_ROWS:,} presses to write, got {len(presses):,}")
+    if not 0 < len(presses) <= MAX_ROWS:
+        raise PressError(f"{path}: expected 1 to {MAX_ROWS:,} presses to write, got {len(presses):,}")
     write_columns(Path(path), presses.columns)
 
 
@@ -375,12 +383,12 @@ def presses_text(presses: MeasuredPresses) -> str:
 
 
 def row_words(rows: Sequence[int], row_noun: str, most: int = 10) -> str:
-    """Return the numbers of presses in words, as in "line 3" or "rows 3, 4 and 12 more".
+    """List the numbers of presses for a message, as in "line 3" or "rows 3, 4 and 12 more".
 
     Args:
         rows: Numbers of the presses in their file.
         row_noun: What the numbers count, such as "line", "row" or "press".
-        most: Largest number of presses that are listed.
+        most: Largest number of presses that are listed. The message only counts the others.
     """
     plural = f"{row_noun}es" if row_noun.endswith("s") else f"{row_noun}s"
     noun = row_noun if len(rows) == 1 else plural
@@ -391,7 +399,7 @@ def row_words(rows: Sequence[int], row_noun: str, most: int = 10) -> str:
 
 
 def _check_electrodes(electrodes: Collection[str]) -> None:
-    """Raise PressError if names of electrodes cannot be names of columns that are read back."""
+    """Raise PressError if names of electrodes cannot be the names of columns in a file of presses."""
     are_different = len(set(electrodes)) == len(electrodes)
     are_named = all(name != "" for name in electrodes)
     if not (electrodes and are_different and are_named):

@@ -1,4 +1,4 @@
-"""Arrays of an npz file that somebody else may have made.
+"""Reader of the arrays of an npz file that may come from an untrusted source.
 
 An npz file is a zip archive with one entry in NumPy's npy format for each array. Before anything is decompressed, the
 declared sizes, the compression method and the size of the LZMA dictionary are checked, so that a small file cannot
@@ -27,16 +27,19 @@ MAX_HEADER_CHARACTERS = 4096
 """Longest header of an array, characters."""
 
 MAX_LZMA_DICTIONARY_BYTES = 16 << 20
-"""Largest dictionary of an entry that is compressed with LZMA, bytes; Python's default is half of it."""
+"""Largest dictionary of an entry that is compressed with LZMA, bytes. The default of Python is 8 MiB."""
 
 READ_BYTES = 4096
 """Number of bytes that are decompressed at a time, because a decompressor may return far more than was requested."""
 
 COMPRESSION_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA)
-"""Compression methods that are accepted: those that NumPy and this project write."""
+"""Compression methods that are accepted. NumPy and this project use no others."""
 
 _LOCAL_HEADER = struct.Struct("<26xHH")
+"""Header of an entry. Of its fields, only the lengths of the name and of the extra field are read."""
+
 _LZMA_PROPERTIES = struct.Struct("<HHBI")
+"""First bytes of an LZMA entry: version, length of the properties, a byte of options, and size of the dictionary."""
 
 DAMAGED_FILE_ERRORS = (
     OSError,
@@ -80,7 +83,7 @@ def npz_arrays(data: bytes, names: Iterable[str] | None = None) -> dict[str, np.
         for name in selected:
             if entries[name].compress_type == zipfile.ZIP_LZMA:
                 _check_lzma_dictionary(data, entries[name])
-            arrays[name] = _array_of(_unpacked(archive, entries[name]), name)
+            arrays[name] = _parse_npy(_decompress(archive, entries[name]), name)
         return arrays
 
 
@@ -113,12 +116,12 @@ def finite_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int |
 
 
 def finite_number(arrays: Mapping[str, np.ndarray], name: str) -> float:
-    """Return a finite number that a file holds as an array without dimensions; raise ValueError if it holds none."""
+    """Return a finite number that a file contains as an array without dimensions; raise ValueError if there is none."""
     return float(finite_array(arrays, name, ()))
 
 
 def text_item(arrays: Mapping[str, np.ndarray], name: str) -> str:
-    """Return a text that a file holds as an array without dimensions.
+    """Return a text that a file contains as an array without dimensions.
 
     Args:
         arrays: Arrays of the file, by name.
@@ -136,7 +139,11 @@ def text_item(arrays: Mapping[str, np.ndarray], name: str) -> str:
 
 
 def _checked_entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Return the entries of an archive by the name of their array, after a check of names and compression."""
+    """Return the entries of an archive by the names of their arrays.
+
+    Raises:
+        ValueError: If there are too many entries, two entries with the same name, or an unknown compression method.
+    """
     infos = archive.infolist()
     if len(infos) > MAX_ENTRIES:
         raise ValueError(f"expected at most {MAX_ENTRIES} arrays, got {len(infos)}")
@@ -164,15 +171,15 @@ def _check_lzma_dictionary(data: bytes, entry: zipfile.ZipInfo) -> None:
         ValueError: If the dictionary is too large.
     """
     name_length, extra_length = _LOCAL_HEADER.unpack_from(data, entry.header_offset)
-    start = entry.header_offset + _LOCAL_HEADER.size + name_length + extra_length
-    _, _, _, dictionary_bytes = _LZMA_PROPERTIES.unpack_from(data, start)
+    content_offset = entry.header_offset + _LOCAL_HEADER.size + name_length + extra_length
+    _, _, _, dictionary_bytes = _LZMA_PROPERTIES.unpack_from(data, content_offset)
     if dictionary_bytes > MAX_LZMA_DICTIONARY_BYTES:
         raise ValueError(
             f"an LZMA dictionary of {dictionary_bytes} bytes; at most {MAX_LZMA_DICTIONARY_BYTES} are accepted"
         )
 
 
-def _unpacked(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytearray:
+def _decompress(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytearray:
     """Decompress an entry, and check that it is not longer than the archive declares.
 
     Args:
@@ -180,18 +187,18 @@ def _unpacked(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytearray:
         entry: The entry.
 
     Raises:
-        ValueError: If the entry is longer. Decompression stops at this length.
+        ValueError: If the entry is longer than declared. Decompression stops at the declared length.
     """
-    unpacked = bytearray()
+    content = bytearray()
     with archive.open(entry) as file:
         while piece := file.read(READ_BYTES):
-            unpacked += piece
-            if len(unpacked) > entry.file_size:
+            content += piece
+            if len(content) > entry.file_size:
                 raise ValueError(f"an entry is longer than the {entry.file_size} bytes that the archive declares")
-    return unpacked
+    return content
 
 
-def _array_of(content: bytearray, name: str) -> np.ndarray:
+def _parse_npy(content: bytearray, name: str) -> np.ndarray:
     """Return the array in the bytes of an npy file, without a copy of its numbers.
 
     Args:

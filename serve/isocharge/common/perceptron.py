@@ -77,7 +77,7 @@ def evaluate_output_layer(perceptron: Perceptron[Any], hidden_output: Values, in
 
     Args:
         perceptron: The perceptron.
-        hidden_output: What `evaluate_hidden_layers` returns, shape (..., n_hidden).
+        hidden_output: Result of `evaluate_hidden_layers`, shape (..., n_hidden).
         inputs: Inputs of the perceptron, shape (..., n_input).
 
     Returns:
@@ -88,6 +88,14 @@ def evaluate_output_layer(perceptron: Perceptron[Any], hidden_output: Values, in
 
 
 def evaluate(perceptron: Perceptron[Any], inputs: Values) -> Values:
-    """Evaluate a perceptron with NumPy: inputs of shape (..., n_input) to outputs of shape (..., n_output)."""
+    """Evaluate a perceptron with NumPy.
+
+    Args:
+        perceptron: The perceptron.
+        inputs: Shape (..., n_input).
+
+    Returns:
+        Outputs, shape (..., n_output).
+    """
     hidden_output = evaluate_hidden_layers(perceptron.hidden, perceptron.activation, inputs)
     return evaluate_output_layer(perceptron, hidden_output, inputs)

@@ -1,9 +1,9 @@
 """Text that is safe to print on a terminal.
 
 Names and units from boards, headers of files, metadata of models and contents of recordings may contain characters that
-a terminal obeys or hides: escape sequences that move the cursor or change the title of the window, marks that reverse
-the direction of writing, characters without width. Such characters are replaced by their escape sequences in JSON, as
-in `\\u001b`, so that JSON remains valid.
+a terminal executes or hides. Examples are escape sequences that move the cursor or change the title of the window,
+marks that reverse the direction of writing, and characters without width. Such characters are replaced by their escape
+sequences in JSON, as in `\\u001b`, so that JSON remains valid.
 """
 
 IGNORABLE_RANGES = (
@@ -18,7 +18,8 @@ IGNORABLE_RANGES = (
 )
 """First and last code point of characters that `str.isprintable` accepts although they are invisible.
 
-They have the property Default_Ignorable_Code_Point (Unicode 15, DerivedCoreProperties.txt), but are letters or marks.
+These characters have the property Default_Ignorable_Code_Point (Unicode 15, DerivedCoreProperties.txt), but they are
+letters or marks, which `str.isprintable` accepts.
 """
 
 INVISIBLE = frozenset(chr(code) for first, last in IGNORABLE_RANGES for code in range(first, last + 1))
@@ -29,14 +30,14 @@ SHORT_ESCAPES = {"\n": r"\n", "\r": r"\r", "\t": r"\t"}
 
 
 def is_printable(text: str) -> bool:
-    """Return whether a text has no character that a terminal obeys or hides."""
+    """Return whether a text contains no character that a terminal executes or hides."""
     return text.isprintable() and INVISIBLE.isdisjoint(text)
 
 
 def printable(text: str) -> str:
-    """Escape all characters of a text that a terminal would obey or hide, line feeds included.
+    """Escape all characters of a text that a terminal would execute or hide, including line feeds.
 
-    Use it for foreign text within a line, such as the name of a channel.
+    Use this function for text from other sources within a line, such as the name of a channel.
 
     Example:
         >>> print(printable("A\\x1b[2J\\u202e"))
@@ -48,12 +49,12 @@ def printable(text: str) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Escape all characters of a text that a terminal would obey or hide, except for line feeds."""
+    """Escape all characters of a text that a terminal would execute or hide, except for line feeds."""
     return "\n".join(map(printable, text.split("\n")))
 
 
 def _escape(character: str) -> str:
-    """Return the escape sequence of a character in JSON, which consists of two sequences for one beyond U+FFFF."""
+    """Return the escape sequence of a character in JSON. A character beyond U+FFFF has two sequences, as in UTF-16."""
     if character in SHORT_ESCAPES:
         return SHORT_ESCAPES[character]
     utf16 = character.encode("utf-16-be", "surrogatepass")

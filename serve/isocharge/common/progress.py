@@ -1,7 +1,7 @@
 """Progress of long computations.
 
-A computation reports its progress to a listener in a context variable, so that the functions between them need no
-additional argument.
+A computation reports its progress to a listener. The listener is stored in a context variable, so that the functions on
+the way to the computation do not need an additional argument.
 """
 
 from collections.abc import Callable, Iterable, Iterator

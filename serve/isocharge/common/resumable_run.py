@@ -4,7 +4,7 @@
         run.json           settings of the run; a run with other settings does not use the folder
         lock               locked by the running process; the operating system unlocks it if the process is killed
         parts/<name>       finished part, and <name>.sha256
-        data/<name>        file of the final folder; its checksum is in parts/
+        data/<name>        file of the final folder, whose checksum is in parts/
 
 A part is used only if its checksum exists and matches. All other parts are computed again.
 """
@@ -72,7 +72,7 @@ class ResumableRun:
             OutputError: If the part cannot be written. Parts that were saved before remain.
         """
         with output_errors(self.target):
-            write_whole(self._place(name, final), data)
+            write_whole(self._path(name, final), data)
             write_whole(self._parts / f"{name}.sha256", sha256_of(data).encode())
 
     def load(self, name: str, decode: Callable[[bytes], Content], *, final: bool = False) -> Content | None:
@@ -91,7 +91,7 @@ class ResumableRun:
             checksum = read_whole(self._parts / f"{name}.sha256").decode()
         except (OSError, UnicodeDecodeError):
             return None
-        path = self._place(name, final)
+        path = self._path(name, final)
         try:
             data = read_whole(path, MAX_PART_BYTES)
             if sha256_of(data) != checksum:
@@ -101,7 +101,7 @@ class ResumableRun:
             _log.warning("%s is damaged: %s; computed again", path, cut(str(error) or type(error).__name__))
             return None
 
-    def keeping(self, name: str, executor: Executor | None = None) -> Executor:
+    def storing_executor(self, name: str, executor: Executor | None = None) -> Executor:
         """Return an executor that stores the results of its tasks as parts of the run, and loads finished parts.
 
         The results must be arrays of numbers. The tasks are numbered in the order in which they are submitted, so that
@@ -117,7 +117,8 @@ class ResumableRun:
         """Return whether no part is finished."""
         return not any(self._parts.glob("*.sha256"))
 
-    def _place(self, name: str, final: bool) -> Path:
+    def _path(self, name: str, final: bool) -> Path:
+        """Return the path of a part; see `save` for the arguments."""
         return (self.data if final else self._parts) / name
 
     def prepare(self) -> None:
@@ -129,12 +130,15 @@ class ResumableRun:
                     incomplete.unlink()
 
     def publish(self) -> None:
-        """Rename the data to the target, so that the renaming survives a power failure, and remove the draft."""
+        """Rename the folder `data` to the target, and remove the draft.
+
+        The folders are flushed to disk, so that the data and the renaming survive a power failure.
+        """
         with output_errors(self.target):
             sync_folder(self.data)
             refuse_existing(self.target)
             self.data.rename(self.target)
-            with suppress(OSError):  # the data are complete; only the renaming might not survive a power failure
+            with suppress(OSError):  # an error here does not matter, because the target is complete
                 sync_folder(self.target.parent)
         self.remove()
 
@@ -144,7 +148,7 @@ class ResumableRun:
 
 
 class _StoringExecutor(Executor):
-    """Executor of `ResumableRun.keeping`."""
+    """Executor of `ResumableRun.storing_executor`."""
 
     def __init__(self, run: ResumableRun, name: str, executor: Executor | None) -> None:
         self._run = run
@@ -210,15 +214,15 @@ def _encode_array(array: Array) -> bytes:
 
 def draft_of(target: Path) -> Path:
     """Return the draft folder of a target."""
-    named = target if target.name else target.absolute()  # the path "." has no name
-    return named.parent / f"{named.name}.part"
+    path_with_name = target if target.name else target.absolute()  # the path "." has no name
+    return path_with_name.parent / f"{path_with_name.name}.part"
 
 
 def refuse_finished(target: Path) -> None:
     """Raise OutputExists if the target exists.
 
-    A draft whose data have already become the target is removed. It remains if its process is killed between the
-    renaming of the data and the removal of the draft.
+    If a process is killed after it has renamed its data to the target, the rest of its draft remains. This function
+    removes the rest.
     """
     draft = ResumableRun(target)
     if target.exists() and (draft.folder / "run.json").is_file() and not draft.data.exists():
@@ -303,7 +307,7 @@ def _claim(draft: ResumableRun, identity: dict[str, Any], fresh: bool) -> Iterat
 
 def output_errors(target: Path) -> AbstractContextManager[None]:
     """Convert an OSError of the block to an OutputError, whose message states how to resume the run."""
-    return as_output_errors(target, f"the same command goes on with what {draft_of(target)} has, or choose another")
+    return as_output_errors(target, f"repeat the command to resume from {draft_of(target)}, or choose another output")
 
 
 @contextmanager

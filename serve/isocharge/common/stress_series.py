@@ -12,8 +12,8 @@ s11 + s22, the sum of the two normal stresses, is a smooth function on either si
     ln(s11 + s22) = sum c_ijkm T_i(p') T_j(l') T_k(u) T_m(cos(arg z)),
 
 where T are Chebyshev polynomials, p' is the distance and l' is the logarithm of the force, both scaled to [-1, 1].
-The argument u is 2 (|z| / s0)^2 - 1 under the probe, and the logarithm of |z|, scaled to [-1, 1] between s0 and
-`max_ring`, outside of the probe. An electrode of area A on a film with d31 = d32 then collects the charge
+The argument u is 2 (|z| / s0)^2 - 1 under the probe. Outside of the probe, u is the logarithm of |z|, scaled to [-1, 1]
+between s0 and `max_ring`. An electrode of area A on a film with d31 = d32 collects the charge
 d31 * A * mean(s11 + s22). The package `simulate` writes the file, and the playground computes charges from it.
 """
 

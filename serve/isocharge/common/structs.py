@@ -46,7 +46,8 @@ MAX_JSON_BYTES = 1 << 22
 """Largest size of a JSON file, bytes."""
 
 MAX_EXAMINED_ITEMS = 1000
-"""Number of items of a list in which an error is searched. For later items, the message of msgspec is used."""
+"""Number of items of a list that are examined for an error. For errors in later items, the message of msgspec is
+used."""
 
 _KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
 _DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY_PART}\.[ \t]*+){{32}}")
@@ -102,7 +103,15 @@ def read_json(path: Path, what: str, error: type[InputError], kind: type[T]) -> 
 
 
 def _text(path: Path, max_bytes: int, what: str, language: str, error: type[InputError]) -> str:
-    """Read a text file in UTF-8."""
+    """Read a text file in UTF-8.
+
+    Args:
+        path: The file.
+        max_bytes: Largest size of the file.
+        what: Description of the expected file for error messages, such as "a device file".
+        language: "TOML" or "JSON", for error messages.
+        error: Class of the error if the file cannot be read.
+    """
     data = read_needed(path, error, f"expected {what} in {language}", max_bytes)
     try:
         return data.decode("utf-8")
@@ -176,7 +185,7 @@ def _first_mistake(value: object, kind: Any, cause: Exception) -> str:
 
 
 def _mistakes(value: object, expected_type: Any, path: str) -> Iterator[str]:
-    """Yield descriptions of the mistakes in a value. Mistakes in the parts of a value precede those of the value.
+    """Yield descriptions of the mistakes in a value: first those in its keys or items, then those of the whole value.
 
     Args:
         value: Value from TOML or JSON.
@@ -201,7 +210,12 @@ def _mistakes(value: object, expected_type: Any, path: str) -> Iterator[str]:
 
 
 def _expected_value(expected_type: Any, first_member: Any) -> str:
-    """Return a description of the values of a type."""
+    """Describe the values that a type allows, for error messages.
+
+    Args:
+        expected_type: The type.
+        first_member: The type itself, or the first member of a union, without annotations.
+    """
     if get_origin(first_member) is Literal:
         return _one_of(get_args(first_member))  # in the declared order, which msgspec does not keep
     return _describe_type(inspect.type_info(expected_type))
@@ -311,7 +325,7 @@ def _union_members(kind: Any) -> Iterator[Any]:
 
 
 def _join(path: str, key: str) -> str:
-    """Return the path to a key of the table at `path`, such as "film.radius_mm"."""
+    """Join the path of a table and the name of one of its keys, as in "film.radius_mm". The path may be empty."""
     return cut(f"{path}.{key}" if path else str(key))
 
 
@@ -350,13 +364,16 @@ _NOUNS: tuple[tuple[Any, str], ...] = (
     ((inspect.TupleType, inspect.CollectionType), "list"),
     (inspect.BytesType, "text in base64"),
 )
-"""Types of msgspec and the noun for their values."""
+"""Pairs of a type of msgspec and the noun for its values."""
 
 
 def _noun(kind: inspect.Type) -> str:
     """Return the noun for the values of a type."""
-    plain = kind.type if isinstance(kind, inspect.Metadata) else kind
-    return next((noun for kinds, noun in _NOUNS if isinstance(plain, kinds)), "value")
+    type_without_metadata = kind.type if isinstance(kind, inspect.Metadata) else kind
+    for kinds, noun in _NOUNS:
+        if isinstance(type_without_metadata, kinds):
+            return noun
+    return "value"
 
 
 def _one_of(words: Iterable[object]) -> str:
@@ -391,5 +408,5 @@ def _describe_number(noun: str, above: float | None, minimum: float | None, maxi
 
 
 def _bound_text(bound: float) -> str:
-    """Return a bound as a text, with six digits if it is a float, and with all digits if it is a whole number."""
+    """Return a bound as a text. A float is rounded to six digits, and a whole number keeps all digits."""
     return f"{bound:g}" if isinstance(bound, float) else str(bound)

@@ -1,4 +1,4 @@
-"""The version of the installed package. It is looked up only when it is needed, because the import is slow."""
+"""The version of the installed package, which is looked up when it is first used, because the lookup is slow."""
 
 from collections.abc import Callable
 from functools import cache

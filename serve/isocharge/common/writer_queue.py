@@ -1,7 +1,7 @@
 """A queue with a thread that writes its items, so that the caller never waits for a slow consumer.
 
-The thread writes the items that wait, the oldest first. If the consumer is so slow that too many items wait, the oldest
-are dropped and counted: the next item that the consumer gets is as new as possible.
+The thread writes the oldest item first. If the consumer is so slow that more than `MAX_WAITING` items wait, the oldest
+items are dropped and counted. The items that the consumer gets are therefore as new as possible.
 """
 
 import threading
@@ -13,17 +13,18 @@ from typing import Generic, Self, TypeVar
 T = TypeVar("T")
 
 MAX_WAITING = 10_000
-"""Number of items that may wait: ten seconds of records at 1 kHz, about 10 MB."""
+"""Largest number of waiting items. Records of ten seconds at 1 kHz occupy about 10 MB."""
 
 CLOSE_TIMEOUT_s = 1.0
-"""Time at the end in which a consumer has to take at least one item; otherwise the rest counts as lost."""
+"""Longest time that `close` waits for the consumer to take the next item, s. After this time, the waiting items count
+as lost."""
 
 
 class WriterQueue(Generic[T]):
     """A bounded queue and the thread that writes its items; a context manager.
 
     Attributes:
-        lost: Number of items that were never written, the oldest of those that waited.
+        lost: Number of items that were dropped and never written.
     """
 
     def __init__(self, write: Callable[[T], object], is_ready: Callable[[], bool] = lambda: True) -> None:
@@ -59,10 +60,10 @@ class WriterQueue(Generic[T]):
         return self._is_closed and self._thread.is_alive()
 
     def put(self, item: T) -> None:
-        """Append an item; the oldest one is dropped if too many wait.
+        """Append an item. If too many items wait, the oldest item is dropped.
 
         Raises:
-            Exception: What `write` has raised in the thread.
+            Exception: The exception that `write` has raised in the thread.
         """
         with self._change:
             self._raise_error()
@@ -76,7 +77,7 @@ class WriterQueue(Generic[T]):
         """Write the waiting items for as long as the consumer accepts them, and count the rest as lost.
 
         Raises:
-            Exception: What `write` has raised in the thread, unless `put` has raised it already.
+            Exception: The exception that `write` has raised in the thread, unless `put` has raised it already.
         """
         with self._change:
             while self._waiting and self._thread.is_alive():
@@ -114,7 +115,10 @@ class WriterQueue(Generic[T]):
                 self._change.notify_all()
 
     def _next(self) -> T | None:
-        """Wait until the consumer would accept an item, and return the oldest item; None if the queue has ended."""
+        """Wait until the consumer accepts an item, and return the oldest item.
+
+        The result is None if the queue is closed and empty.
+        """
         while True:
             with self._change:
                 self._change.wait_for(lambda: self._waiting or self._is_closed)

@@ -105,6 +105,6 @@ def __dir__() -> list[str]:
     return list(__all__)
 
 
-if not TYPE_CHECKING:  # a type checker would take every misspelt name for a text
+if not TYPE_CHECKING:  # with `__getattr__`, a type checker would accept every misspelt name
     __getattr__ = version_attribute(__name__)
     del TYPE_CHECKING

@@ -142,7 +142,7 @@ def test_wrong_press_files_are_refused(read, text, message):
 
 
 def test_press_file_with_too_many_presses_is_refused(monkeypatch, read):
-    monkeypatch.setattr(measured_presses, "MOST_ROWS", 3)
+    monkeypatch.setattr(measured_presses, "MAX_ROWS", 3)
     assert len(read(HEADER + "\n1,2,3,4,5,6" * 3)) == 3
     with pytest.raises(PressError, match="expected at most 3 presses, got more; split the file"):
         read(HEADER + "\n1,2,3,4,5,6" * 4)
@@ -236,7 +236,7 @@ def test_presses_that_would_not_be_read_are_not_written(suffix, tmp_path, monkey
     path = tmp_path / f"p.{suffix}"
     with pytest.raises(PressError, match=r"expected 1 to 1,000,000 presses to write, got 0"):
         write_presses(path, presses[:0])
-    monkeypatch.setattr(measured_presses, "MOST_ROWS", 1)
+    monkeypatch.setattr(measured_presses, "MAX_ROWS", 1)
     with pytest.raises(PressError, match=r"expected 1 to 1 presses to write, got 2"):
         write_presses(path, presses)
     assert not path.exists()

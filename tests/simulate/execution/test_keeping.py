@@ -21,7 +21,7 @@ def test_error_of_a_task_is_raised_and_not_saved(tmp_path):
     with resume_parts(tmp_path / "out", {}) as run, ThreadPoolExecutor(1) as pool:
         for executor in (None, pool):
             with pytest.raises(ZeroDivisionError):
-                next(in_order(run.keeping("solve", executor), refuse, [1]))
+                next(in_order(run.storing_executor("solve", executor), refuse, [1]))
         assert run.is_empty()
 
 
@@ -30,7 +30,7 @@ def test_cancel_of_a_saving_future_cancels_the_task_and_shutdown_of_the_pool_rai
         pool = ThreadPoolExecutor(1)
         gate = threading.Event()
         pool.submit(gate.wait)
-        saving_executor = run.keeping("solve", pool)
+        saving_executor = run.storing_executor("solve", pool)
         calls = []
         assert saving_executor.submit(calls.append, 1).cancel()
 

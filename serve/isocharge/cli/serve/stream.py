@@ -32,7 +32,7 @@ from isocharge.cli.shared.live_page import (
     page_tls,
 )
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption
-from isocharge.cli.shared.port_hints import doctor_is_named, no_frames_hint
+from isocharge.cli.shared.port_hints import no_frames_advice_added, no_frames_hint
 from isocharge.cli.shared.terminal import (
     on_signal,
     say,
@@ -190,7 +190,7 @@ def stream_command(
         records = stack.enter_context(closing(recorded.follow(source)))  # closed before the recorder
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
-            with doctor_is_named(port, device):
+            with no_frames_advice_added(port, device):
                 write_records(islice(records, count), writers, latencies)
         finally:
             if source.is_live:

@@ -15,7 +15,7 @@ from isocharge.cli.shared.forward_maps import ROUNDING_MARGIN
 from isocharge.cli.shared.options import SensorArgument
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import announce, say, shown_progress, until_stopped
-from isocharge.cli.shared.virtual_sensor import film_charges, film_charges_per_K, measuring, random_script
+from isocharge.cli.shared.virtual_sensor import film_charges, film_charges_per_K, measure_function, random_script
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
@@ -126,7 +126,7 @@ def virtual_command(
     player = VirtualSensor(
         lambda _: np.zeros((0, electrode_count)),
         _untouched_frame(rate),
-        noise=measuring(amplifier, rate),
+        noise=measure_function(amplifier, rate),
         seed=seed,
         encode=_encoder(frames, device),
         faults=settings.faults,

@@ -1,4 +1,4 @@
-"""Shared parts of commands that compute forward maps: workers, progress, the radius of a sweep, and its presses."""
+"""Functions that commands with forward maps share: workers, progress, radius of a sweep, and simulated presses."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
@@ -27,7 +27,8 @@ from isocharge.simulate.identifiability.identification import map_to_search
 from isocharge.simulate.solver.stress_limit import stress_caution
 
 ROUNDING_MARGIN = 1.0 + 1e-6
-"""Factor on the radius and the force of a forward map, because rounding may move the outermost presses outside."""
+"""Factor by which the radius and the largest force of a forward map are increased, because rounding may move the
+outermost presses beyond them."""
 
 
 def executor_for(workers: int | None, cluster: str | None) -> AbstractContextManager[Executor | None]:
@@ -54,7 +55,7 @@ def shown_run(target: Path) -> Iterator[None]:
     except KeyboardInterrupt:
         draft = draft_of(target)
         if draft.exists():
-            say(f"stopped; what is done is kept in {draft}, and the same command goes on from there")
+            say(f"stopped; the finished parts are kept in {draft}, and the same command resumes the run")
         raise
 
 
@@ -103,7 +104,7 @@ def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit:
 
 
 N_SIMULATED_PRESSES = 24_000
-"""Number of presses of `simulated_presses`."""
+"""Number of presses that `simulated_presses` returns."""
 
 
 def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, force: tuple[float, float]) -> Dataset:

@@ -1,4 +1,4 @@
-"""Options and reading of files of measured presses in commands."""
+"""Options for files of measured presses, and the reader of such files for commands."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands have, and the conversion of their values."""
+"""Arguments and options that several commands share, and the conversion of their values."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -39,14 +39,19 @@ StressLimitOption = Annotated[
 WorkersOption = Annotated[
     int | None,
     typer.Option(
-        "--workers", min=1, max=64, help="Processes; the results do not depend on them. (default: one per core)"
+        "--workers",
+        min=1,
+        max=64,
+        help="Number of processes, on which the results do not depend. (default: one per core)",
     ),
 ]
 
 ClusterOption = Annotated[
     str | None,
     typer.Option(
-        "--cluster", metavar="ADDRESS", help="Dask scheduler to use instead, like tcp://10.0.0.1:8786. (default: no)"
+        "--cluster",
+        metavar="ADDRESS",
+        help="Dask scheduler whose workers are used instead, such as tcp://10.0.0.1:8786. (default: none)",
     ),
 ]
 
@@ -60,7 +65,8 @@ NoiseOption = Annotated[
 ]
 
 FreshOption = Annotated[
-    bool, typer.Option("--fresh", help="Delete what a stopped run left, and begin again. (default: go on from there)")
+    bool,
+    typer.Option("--fresh", help="Delete the saved parts of a stopped run, and begin again. (default: resume the run)"),
 ]
 
 ConfigOption = Annotated[
@@ -95,10 +101,10 @@ def refuse(mistakes: Mapping[str, object]) -> None:
     """Refuse contradictory options before anything is computed.
 
     Args:
-        mistakes: Whether each mistake was made, by the error message.
+        mistakes: Each key is the error message of a mistake, and its value is true if the mistake was made.
 
     Raises:
-        InputError: For the first mistake that was made.
+        InputError: If a mistake was made. The message is that of the first one.
     """
     for message, was_made in mistakes.items():
         if was_made:

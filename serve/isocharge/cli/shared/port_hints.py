@@ -10,7 +10,7 @@ from isocharge.serve.port.source import STDIN
 
 
 @contextmanager
-def doctor_is_named(port: str, device: Path | None) -> Iterator[None]:
+def no_frames_advice_added(port: str, device: Path | None) -> Iterator[None]:
     """Add advice to the error message if the bytes of a port contain no frames.
 
     Args:

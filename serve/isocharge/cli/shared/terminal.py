@@ -1,8 +1,8 @@
-"""Output of the commands and their end: results, messages, progress, standard streams and signals.
+"""Output and termination of the commands: results, messages, progress, standard streams and signals.
 
-All text that a command prints passes through this module, which escapes the characters that a terminal obeys or hides.
-Messages go to stderr, and progress bars only if stderr is a terminal. If a stream is closed, full or slow, a command
-neither fails nor writes to another file.
+All text that a command prints passes through this module, which escapes the characters that a terminal executes or
+hides. Messages are printed on stderr. Progress bars are only shown if stderr is a terminal. If a stream is closed, full
+or slow, a command neither fails nor writes to another file.
 """
 
 import io
@@ -46,7 +46,7 @@ def open_closed_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free file descriptor, which is `number`
     if sys.stdin is None:
         sys.stdin = open(0, closefd=False)  # noqa: SIM115
     if sys.stdout is None:
@@ -56,7 +56,7 @@ def open_closed_streams() -> None:
 
 
 def discard_output(number: int) -> None:
-    """Redirect a stream to the null device, because Python would otherwise fail at exit when it flushes the stream.
+    """Redirect a standard stream to the null device. Otherwise Python would fail when it flushes the stream at exit.
 
     Args:
         number: File descriptor of the stream.

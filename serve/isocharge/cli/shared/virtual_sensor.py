@@ -24,17 +24,19 @@ def virtual_sensor(forward_map: ForwardMap, noise: str, seed: int, rate_Hz: floa
         rate_Hz: Frames per second, Hz.
     """
     script = random_script(forward_map, seed, rate_Hz, DEFAULT_PLAYED_FORCE_RANGE[1])
-    return VirtualSensor(film_charges(forward_map), script, noise=measuring(load_amplifier(noise), rate_Hz), seed=seed)
+    return VirtualSensor(
+        film_charges(forward_map), script, noise=measure_function(load_amplifier(noise), rate_Hz), seed=seed
+    )
 
 
 def random_script(forward_map: ForwardMap, seed: int, rate_Hz: float, max_force_N: float) -> Script:
     """Return a script of presses that wander over the whole area of a forward map.
 
     Args:
-        forward_map: Its domain bounds the presses.
+        forward_map: Forward map, to whose domain the presses are restricted.
         seed: Seed of the presses.
         rate_Hz: Frames per second, Hz.
-        max_force_N: Largest force, N. A smaller largest force of the forward map takes precedence.
+        max_force_N: Largest force, N. It is reduced to the largest force of the forward map if necessary.
     """
     domain = forward_map.domain
     max_force_N = min(domain.force_range[1], max_force_N)
@@ -51,8 +53,8 @@ def random_script(forward_map: ForwardMap, seed: int, rate_Hz: float, max_force_
 def film_charges(forward_map: ForwardMap) -> Charges:
     """Return the function from contacts, shape (n, 3), mm and N, to charges, shape (n, electrodes), pC.
 
-    Below the smallest force of the forward map, the charges of a contact fall with the force to the power of 2/3, as
-    those of a membrane.
+    Below the smallest force of the forward map, the charges of a contact are proportional to the force to the power of
+    2/3, as on a membrane.
     """
     return partial(_charges, forward_map.charges, forward_map.domain.force_range[0])
 
@@ -87,13 +89,13 @@ def _charges(map_charges: Callable[[Array], Array], min_force_N: float, contact:
         Charges, shape (n, electrodes), pC.
     """
     force_N = contact[:, 2]
-    charge_share = (force_N.clip(max=min_force_N) / min_force_N) ** (2.0 / 3.0)  # 1 from the smallest force on
+    charge_factor = (force_N.clip(max=min_force_N) / min_force_N) ** (2.0 / 3.0)  # 1 for forces in the domain
     contact_in_domain = contact.copy()
     contact_in_domain[:, 2] = force_N.clip(min=min_force_N)
-    return map_charges(contact_in_domain) * charge_share[:, None]
+    return map_charges(contact_in_domain) * charge_factor[:, None]
 
 
-def measuring(amplifier: Amplifier, rate_Hz: float) -> Callable[..., Any]:
+def measure_function(amplifier: Amplifier, rate_Hz: float) -> Callable[..., Any]:
     """Return the amplifier as the function that the virtual sensor calls to measure charges.
 
     Args:

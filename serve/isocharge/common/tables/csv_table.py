@@ -1,7 +1,7 @@
 """Columns of numbers as CSV text.
 
-A line that begins with # is a comment, unless it is inside a quoted cell. Blank lines and blanks around a name or a
-number do not matter. A number has a decimal point and possibly an exponent; `nan` and `inf` are not accepted.
+A line that begins with # is a comment, unless it is inside a quoted cell. Blank lines, and blanks around a name or a
+number, are ignored. Numbers are written with a decimal point. The texts `nan` and `inf` are not accepted.
 """
 
 import codecs
@@ -20,7 +20,8 @@ from isocharge.common.number_text import parse_number
 from isocharge.common.tables.number_table import ColumnRule, NumberColumns, NumberTable
 
 _SEPARATORS = {";": "tr ',;' '.,'", "\t": r"tr '\t' ','"}
-"""Other separators of spreadsheets, and the command that turns such a file into CSV with decimal points."""
+"""Separators other than the comma that spreadsheets use. The value is the command that converts such a file into CSV
+with decimal points."""
 
 _OTHER_FORMATS = {
     codecs.BOM_UTF32_LE: "the file is UTF-32: save it as UTF-8, as with: iconv -f UTF-32 -t UTF-8 FILE > NEW.csv",
@@ -30,7 +31,8 @@ _OTHER_FORMATS = {
     b"PAR1": "the file is Parquet: rename it so that its name ends in .parquet",
     b"\x1f\x8b": "the file is compressed: unpack it, as with: gunzip < FILE > NEW.csv",
 }
-"""What a file is that is not text in UTF-8, and what to do, by its first bytes. UTF-32 begins as UTF-16 does."""
+"""Advice for files that are not text in UTF-8, by their first bytes. UTF-32 precedes UTF-16, because the first bytes of
+UTF-32 begin with those of UTF-16."""
 
 BYTE_ORDER_MARK = "\ufeff"
 
@@ -61,6 +63,7 @@ class CsvTable(NumberTable):
         if header is None:
             raise error(f"{where}: empty; expected {expected}")
         if any("\0" in name for name in header):
+            # The high byte of an ASCII letter is zero. It is the first byte in UTF-16BE, and the second in UTF-16LE.
             encoding = "UTF-16BE" if header[0].startswith("\0") else "UTF-16LE"
             raise error(
                 f"{where}: the header has null characters: the file seems to be UTF-16 without a byte order mark; save "
@@ -68,14 +71,14 @@ class CsvTable(NumberTable):
             )
         super().__init__(header, names, where, error, expected)
 
-    def _read_columns(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
+    def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Convert the cells of the requested columns to numbers, row by row; see `NumberTable.read`."""
         positions = {name: self.header.index(name) for name in rules}
         line_numbers = array("q")
-        numbers = array("d")  # the chosen columns of one row after another
+        numbers = array("d")  # the requested cells of the first row, then those of the second row, and so on
         for line_number, cells in self._rows:
-            if len(line_numbers) == most_rows:
-                self._refuse_row_count(most_rows)
+            if len(line_numbers) == max_rows:
+                self._refuse_row_count(max_rows)
             self._check_cell_count(line_number, cells)
             line_numbers.append(line_number)
             for name, position in positions.items():
@@ -129,8 +132,8 @@ class _LinesWithoutComments:
     """Iterator of the lines of a CSV text, in which each comment line is replaced by a blank line.
 
     Attributes:
-        at_row_start: Whether the next line begins a row; otherwise it continues a quoted cell and is no comment. The
-            reader of the rows sets it after each row.
+        at_row_start: Whether the next line begins a row. Otherwise the line continues a quoted cell and cannot be a
+            comment. The reader of the rows sets this attribute after each row.
     """
 
     def __init__(self, lines: Iterable[str], names: Collection[str]) -> None:
@@ -187,7 +190,7 @@ def _numbered_rows(
 
 
 def _decoding_advice(cause: UnicodeDecodeError, lines_before: int) -> str:
-    """Return the end of an error message about bytes that are not UTF-8: the place, the reason and what to do.
+    """Return the end of an error message about bytes that are not UTF-8: the line, the reason and what to do.
 
     Args:
         cause: The error, which contains the piece of the file that was being decoded.

@@ -1,4 +1,4 @@
-"""Advice for headers whose columns are named almost as expected: in another case, another language, or another unit."""
+"""Advice for columns whose names differ from the expected names by their case, their language or their unit."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -11,17 +11,18 @@ OTHER_UNITS = {
     "N": ("mN", "kN", "g", "kg", "gf", "kgf", "lbf"),
     "pC": ("fC", "nC", "µC", "μC", "uC", "C", "V", "mV"),
 }
-"""Units of the same quantity that are not accepted, by the unit that is."""
+"""Units that are not accepted, by the accepted unit of the same quantity."""
 
 GENERAL_WORDS = frozenset(
     {"position", "pos", "coordinate", "koordinate", "in"}
     | {"charge", "ladung", "carga", "carica", "q"}
     | {"electrode", "elektrode", "channel", "kanal", "canal", "ch"}
 )
-"""Words of a header that do not change which column is meant."""
+"""Words that may be added to the name of a column without changing its meaning."""
 
 MAX_COLUMN_CHARACTERS = 100
-"""Largest number of characters of a column for which advice is given; a longer one is no name of a quantity."""
+"""Largest number of characters of a column name for which advice is given. A longer text is not the name of a
+quantity."""
 
 _LABEL_AND_UNIT = re.compile(r"(.*?)(?:\s*[\[(]\s*([^\[\]()]+?)\s*[\])]|[\s_/]+([^\s_/\[\]()]+))")
 
@@ -33,8 +34,8 @@ class ColumnMeaning:
     Attributes:
         noun: What the column is, for messages: "column" or "electrode".
         unit: Unit of its numbers; empty if it has none.
-        words: Words of which one is in a header that means this column, in lower case.
-        is_known_by_unit: Whether a header with this unit in brackets means this column, whatever its words are.
+        words: Words in lower case. A column name that contains one of these words probably means this column.
+        is_known_by_unit: Whether any column name with this unit in brackets means this column.
     """
 
     noun: str = "column"
@@ -98,7 +99,14 @@ def _advice(column: str, name: str, meaning: ColumnMeaning) -> str:
 
 
 def _is_named(words: frozenset[str], meaning: ColumnMeaning) -> bool:
-    """Return whether the words of a header name a quantity, or all words of an electrode's name."""
+    """Return whether the words of a column name identify a column.
+
+    The words must contain all words of the name of an electrode, or at least one word of any other column.
+
+    Args:
+        words: Words of the column name in the file.
+        meaning: Meaning of the expected column.
+    """
     if meaning.noun == "electrode":
         return bool(meaning.words) and meaning.words <= words
     return bool(meaning.words & words)

@@ -1,8 +1,8 @@
 """Named columns of numbers from a file: the checks of names, values and rows that all formats share.
 
-A format is a subclass of `NumberTable`. It reads the header and turns the requested columns into float64 arrays with
-NaN for an empty cell. Everything that can be checked after that is checked here, so that the same fault gets the same
-message in every format.
+Each format is a subclass of `NumberTable`. The subclass reads the header and converts the requested columns to float64
+arrays with NaN for an empty cell. All further checks are in this module, so that the same fault gets the same message
+in every format.
 """
 
 from abc import ABC, abstractmethod
@@ -21,7 +21,8 @@ MAX_COLUMNS = 1_000
 """Largest number of columns of a file."""
 
 LARGEST = float(np.finfo(np.float32).max)
-"""Largest magnitude of a number in a file; it is the largest number of the models' tensors."""
+"""Largest magnitude of a number in a file. It is the largest float32 number, because the tensors of the models are
+float32."""
 
 MAX_LISTED_NAMES = 10
 """Largest number of column names that an error message lists."""
@@ -32,12 +33,12 @@ class ColumnRule:
     """The numbers that a column may hold.
 
     Attributes:
-        description: The expected cell, for messages, as in "a force in N".
+        description: Description of the expected cell for messages, such as "a force in N".
         minimum: Smallest number that is accepted.
         maximum: Largest number that is accepted.
         is_positive: Whether only numbers above zero are accepted.
         may_be_empty: Whether empty cells are accepted.
-        meaning: How other programs may call the column, for advice on a header.
+        meaning: Names that other programs use for the column, for advice about a header.
     """
 
     description: str
@@ -85,7 +86,7 @@ class NumberColumns:
             error: Class of the error.
 
         Raises:
-            error: At the first row with a value that breaks a rule; row, column, rule and value are named.
+            error: If a value breaks a rule. The message names the first such row, the column, the rule and the value.
         """
         violations = [rules[name].violations(column) for name, column in self.values.items()]
         rows_and_columns = np.argwhere(np.column_stack(violations))
@@ -125,10 +126,10 @@ class NumberTable(ABC):
     def __init__(
         self, header: Sequence[str], names: Collection[str], where: str, error: type[InputError], expected: str
     ) -> None:
-        """Check the number of columns and keep their names.
+        """Check the number of columns and store their names.
 
         Args:
-            header: Names of the columns as the file has them.
+            header: Names of the columns in the file.
             names: Names that have a meaning. Blanks at the ends of all other names are removed.
             where: The file, for messages.
             error: Class of the error that is raised for anything that is wrong with the file.
@@ -147,11 +148,15 @@ class NumberTable(ABC):
     def choose_columns(
         self, required: Mapping[str, ColumnRule], optional: Mapping[str, ColumnRule] | None = None
     ) -> dict[str, ColumnRule]:
-        """Return the rules of the columns to read: the required columns, then the optional ones that the file has.
+        """Return the rules of the columns to read: all required columns, and the optional columns that the file has.
+
+        Args:
+            required: Rules of the required columns, by name.
+            optional: Rules of the optional columns, by name.
 
         Raises:
-            error: If a required column is missing, if an optional column is named almost as expected, or if the file
-                has one of the columns twice. The message says which column to rename.
+            error: If a required column is missing, if the name of a column is similar to that of an absent optional
+                column, or if the file has one of the columns twice. The message states which column to rename.
         """
         allowed = {**required, **(optional or {})}
         chosen = {name: rule for name, rule in allowed.items() if name in self.header or name in required}
@@ -168,39 +173,44 @@ class NumberTable(ABC):
         return chosen
 
     def refuse_similar_names(self, columns: Iterable[str], optional: Mapping[str, ColumnRule]) -> None:
-        """Raise `error` if columns are named almost as optional columns that the file does not have."""
+        """Raise `error` if the names of columns are similar to those of optional columns that the file does not have.
+
+        Args:
+            columns: Names of the columns.
+            optional: Rules of the optional columns, by name.
+        """
         absent = {name: rule.meaning for name, rule in optional.items() if name not in self.header}
         advice = list(islice(header_advice(columns, absent), MAX_LISTED_NAMES))
         if advice:
             self._refuse_header(f"{'; '.join(advice)}; or remove the column")
 
-    def read(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
+    def read(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Read columns and check their values.
 
         Args:
-            rules: The rules of the columns to read, in the wanted order; names from `choose_columns`.
-            most_rows: Largest number of rows that is accepted.
+            rules: Rules of the columns to read, in the requested order, as `choose_columns` returns them.
+            max_rows: Largest number of rows that is accepted.
 
         Raises:
-            error: If the file is damaged or has more rows, or if a cell is not a number that its rule accepts.
+            error: If the file is damaged or has more than `max_rows` rows, or if a cell breaks the rule of its column.
         """
-        columns = self._read_columns(rules, most_rows)
+        columns = self._read_columns(rules, max_rows)
         columns.check(rules, f"{self.where}, ", self.error)
         return columns
 
     @abstractmethod
-    def _read_columns(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
-        """Convert the columns of the format to arrays, as `read` describes, without checking the values."""
+    def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
+        """Convert the requested columns to arrays without checking the values; see `read` for the arguments."""
 
     def _refuse_header(self, reason: str) -> NoReturn:
         raise self.error(f"{self.where}: expected {self.expected}, got the header {shown(list(self.header))}; {reason}")
 
-    def _refuse_row_count(self, most_rows: int) -> NoReturn:
-        raise self.error(f"{self.where}: expected at most {most_rows:,} presses, got more; split the file")
+    def _refuse_row_count(self, max_rows: int) -> NoReturn:
+        raise self.error(f"{self.where}: expected at most {max_rows:,} presses, got more; split the file")
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names for a message, with the number of those that are not listed."""
+    """List names for a message. If there are more than `MAX_LISTED_NAMES` names, the message only counts the others."""
     listed = ", ".join(map(shown, names[:MAX_LISTED_NAMES]))
     if len(names) <= MAX_LISTED_NAMES:
         return listed
@@ -208,5 +218,10 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def ignored_words(where: str, names: Sequence[str]) -> str:
-    """Return the sentence that names the columns of a file that are not read."""
+    """Return a message that lists the ignored columns of a file.
+
+    Args:
+        where: Name of the file.
+        names: Names of the ignored columns.
+    """
     return f"{where}: ignored columns: {shown(list(names))}"

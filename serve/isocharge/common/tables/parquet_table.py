@@ -1,8 +1,8 @@
 """Columns of numbers as Parquet.
 
 Only the requested columns are decoded, after their types and the number of rows were checked in the metadata of the
-file. Integers and floating-point numbers of any width and decimals are accepted; null and NaN are empty
-cells. Other columns may have any type.
+file. Their types may be integers, floating-point numbers and decimals of any width. Null and NaN stand for empty cells.
+All other columns may have any type.
 """
 
 import io
@@ -34,7 +34,7 @@ ROWS_PER_BATCH = 1 << 16
 """Number of rows of a column that are decoded at a time."""
 
 FIRST_INEXACT_INTEGER = 2**53
-"""Smallest positive integer from which on float64 does not hold every integer exactly."""
+"""Smallest positive integer that may be the result of rounding in float64, because 2^53 + 1 is rounded to 2^53."""
 
 
 class ParquetTable(NumberTable):
@@ -62,18 +62,18 @@ class ParquetTable(NumberTable):
         from pyarrow.parquet import ParquetFile
 
         _check_ends(file, where, error)
-        with _damage_explained(where, error):
+        with _pyarrow_errors_converted(where, error):
             self._parquet = ParquetFile(file)
             self._metadata = self._parquet.metadata
             self._schema = self._parquet.schema_arrow
             header = self._schema.names
         super().__init__(header, names, where, error, expected)
 
-    def _read_columns(self, rules: Mapping[str, ColumnRule], most_rows: int) -> NumberColumns:
+    def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Decode the requested columns; see `NumberTable.read`."""
         row_count = self._metadata.num_rows
-        if row_count > most_rows:
-            self._refuse_row_count(most_rows)
+        if row_count > max_rows:
+            self._refuse_row_count(max_rows)
         values = {name: self._read_column(name, rule) for name, rule in rules.items()}
         row_numbers = np.arange(1, row_count + 1, dtype=np.intp)
         return NumberColumns(values, row_numbers, self.row_noun)
@@ -96,7 +96,7 @@ class ParquetTable(NumberTable):
                 f"{self.where}, column {shown(name)}: expected numbers ({rule.description}), got a column of type "
                 f"{cut(str(field.type))}; convert it to float64"
             )
-        with _damage_explained(self.where, self.error):
+        with _pyarrow_errors_converted(self.where, self.error):
             numbers = self._decode(self._leaf_index(field.name), name)
         if is_integer(field.type):
             self._check_integers(numbers, name)
@@ -106,7 +106,7 @@ class ParquetTable(NumberTable):
         """Return one column as float64, shape (n,), decoded in batches of rows.
 
         Args:
-            index: Number of the column among the columns as Parquet stores them.
+            index: Index under which Parquet stores the column.
             name: Name of the column, for error messages.
         """
         row_count = self._metadata.num_rows
@@ -127,7 +127,7 @@ class ParquetTable(NumberTable):
         return numbers
 
     def _leaf_index(self, field_name: str) -> int:
-        """Return the number of a column that is not nested among the columns as Parquet stores them."""
+        """Return the index under which Parquet stores a column that is not nested."""
         schema = self._parquet.schema
         indices = [index for index in range(len(schema)) if schema.column(index).path == field_name]
         if len(indices) != 1:
@@ -200,8 +200,13 @@ def _check_ends(file: BinaryIO, where: str, error: type[InputError]) -> None:
 
 
 @contextmanager
-def _damage_explained(where: str, error: type[InputError]) -> Iterator[None]:
-    """Convert exceptions of pyarrow in the block, which differ for each kind of damage, to `error`."""
+def _pyarrow_errors_converted(where: str, error: type[InputError]) -> Iterator[None]:
+    """Convert the exceptions of pyarrow in the block to `error`. Each kind of damage raises a different exception.
+
+    Args:
+        where: Name of the file, for the error message.
+        error: Class of the error that is raised.
+    """
     from pyarrow import ArrowException
 
     try:

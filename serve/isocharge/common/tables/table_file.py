@@ -1,4 +1,4 @@
-"""Files with columns of numbers: Parquet if the name ends in `.parquet`, else CSV."""
+"""Files with columns of numbers. A file is Parquet if its name ends in `.parquet`, and otherwise CSV."""
 
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,7 +22,7 @@ def open_table(path: Path, names: Collection[str], error: type[InputError], expe
     """Open a file and read its header.
 
     Args:
-        path: Parquet, which has to be a regular file; or CSV in UTF-8 with or without byte order mark.
+        path: A Parquet file, which must be a regular file, or CSV in UTF-8 with or without a byte order mark.
         names: Names of columns that have a meaning.
         error: Class of the error that is raised for anything that is wrong with the file.
         expected: The expected header, for messages.
@@ -33,19 +33,26 @@ def open_table(path: Path, names: Collection[str], error: type[InputError], expe
     """
     if is_parquet(path):
         require_pyarrow()
-        with _read_errors_explained(path, error, "a Parquet file"), open_regular(path) as data:
+        with _os_errors_converted(path, error, "a Parquet file of presses"), open_regular(path) as data:
             yield ParquetTable(data, names, str(path), error, expected)
     else:
-        with _read_errors_explained(path, error, "a CSV file"), path.open(encoding="utf-8-sig", newline="") as text:
+        with (
+            _os_errors_converted(path, error, "a CSV file of presses"),
+            path.open(encoding="utf-8-sig", newline="") as text,
+        ):
             yield CsvTable(bounded_lines(text), names, str(path), error, expected)
 
 
 def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
-    """Write columns of shape (n,) to a file, which appears whole and replaces an older one.
+    """Write columns to a file. An existing file is replaced.
+
+    Args:
+        path: The file.
+        columns: Columns by name, each of shape (n,).
 
     Raises:
-        OutputError: If the file system refuses.
-        MissingExtra: If the file is to be Parquet and pyarrow is not installed.
+        OutputError: If the file cannot be written.
+        MissingExtra: If the format is Parquet and pyarrow is not installed.
     """
     data = parquet_bytes(columns) if is_parquet(path) else csv_text(columns).encode()
     with as_output_errors(path):
@@ -53,7 +60,7 @@ def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
 
 
 @contextmanager
-def _read_errors_explained(path: Path, error: type[InputError], expected: str) -> Iterator[None]:
+def _os_errors_converted(path: Path, error: type[InputError], expected: str) -> Iterator[None]:
     """Convert the errors of the file system in the block to `error`.
 
     Args:
@@ -64,6 +71,6 @@ def _read_errors_explained(path: Path, error: type[InputError], expected: str) -
     try:
         yield
     except OSError as cause:
-        if isinstance(cause, IsochargeError):
+        if isinstance(cause, IsochargeError):  # some classes, such as OutputError, inherit from OSError
             raise
-        raise error(f"{path}: cannot be read ({cause.strerror or cause}); expected {expected} of presses") from cause
+        raise error(f"{path}: cannot be read ({cause.strerror or cause}); expected {expected}") from cause

@@ -1,1 +1,1 @@
-"""`isocharge simulate ...`: one module a command."""
+"""Commands of `isocharge simulate`, one module for each command."""

@@ -1,4 +1,4 @@
-"""Commands of `isocharge simulate`, each in its own module."""
+"""The command group `isocharge simulate`. The module of a command is imported when the command is called."""
 
 from isocharge.cli.shared.lazy import LazyCommand, lazy_group
 

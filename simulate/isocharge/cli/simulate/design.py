@@ -72,7 +72,7 @@ def design_command(
     workers: WorkersOption = None,
     fresh: FreshOption = False,
 ) -> None:
-    """Search the electrode positions with the smallest position errors, and write sensor file, drawings and numbers.
+    """Search the electrode positions with the smallest position errors. Write a sensor file, drawings and the errors.
 
     The errors are Cramer-Rao limits in mm, with probe radius, pretension and gains as nuisance parameters. If the
     search is interrupted, the same command resumes it.
@@ -97,6 +97,7 @@ def design_command(
         seed=seed,
     )
     warn_of_stress(case.sensor.film, [footprint], force, stress_limit)
+    # An interrupted search is only resumed if all of these values are unchanged.
     identity = {
         "made_by": code_fingerprint(),
         "sensor": sensor_to_dict(case.sensor),
@@ -108,36 +109,39 @@ def design_command(
         resume_parts(output, identity, fresh=fresh) as run,
         executor_for(workers, None) as pool,
     ):
-        found = design(case, executor=run.keeping("design", pool))
-        write_design(found, output)
-    show(_table(found))
-    caution = "" if found.unambiguous else "caution: "
-    say(f"{caution}{found.summary}; {straight_leads(found.sensor).summary}; files in {output}")
+        result = design(case, executor=run.storing_executor("design", pool))
+        write_design(result, output)
+    show(_table(result))
+    caution = "" if result.unambiguous else "caution: "
+    say(f"{caution}{result.summary}; {straight_leads(result.sensor).summary}; files in {output}")
 
 
-def _table(found: Design) -> str:
+def _table(result: Design) -> str:
     """Return a table of the electrode positions, and of the errors before and after the design.
 
     Args:
-        found: Result of the design. It has no errors before the design if the initial sensor has fewer than three
+        result: Result of the search. It has no errors before the design if the initial sensor has fewer than three
             electrodes.
     """
     lines = []
-    for electrode in found.sensor.electrodes:
+    for electrode in result.sensor.electrodes:
         x, y = electrode.centre
         lines.append(f"{electrode.name:<10} {x:9.3f} {y:9.3f} mm")
     lines.append("position error limit, mm     worst      rms")
-    for name, errors in (("before", found.before), ("after", found.after)):
+    for name, errors in (("before", result.before), ("after", result.after)):
         if errors is None:
             continue
         for condition, statistics in errors.to_dict().items():
             title = f"{name}, {condition.replace('_', ' ')}"
-            worst = _error_text(statistics["worst_mm"], found.case.radius)
-            rms = _error_text(statistics["rms_mm"], found.case.radius)
+            worst = _error_text(statistics["worst_mm"], result.case.radius)
+            rms = _error_text(statistics["rms_mm"], result.case.radius)
             lines.append(f"{title:<26} {worst:>7} {rms:>8}")
     return "\n".join(lines)
 
 
 def _error_text(error: float, radius: float) -> str:
-    """Format an error (mm). An error of the size of the disk means that the charges do not determine the position."""
+    """Format a position error (mm) within a disk of a radius (mm).
+
+    If the error reaches the radius, the charges do not determine the position, because the charge map folds.
+    """
     return f"{error:.3f}" if error < radius else "folds"

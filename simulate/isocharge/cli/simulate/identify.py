@@ -25,8 +25,8 @@ PICTURE = "identify.png"
 MIRROR_PICTURE = "mirror.png"
 """File name of the picture of the mirror region in the output folder."""
 
-NUMBERS = "identify.json"
-"""File name of the numbers in the output folder."""
+RESULTS = "identify.json"
+"""File name of the numerical results in the output folder."""
 
 
 def identify_command(
@@ -56,8 +56,8 @@ def identify_command(
     """Compute how well the charges determine a press: error limits over the film, ambiguities and working area.
 
     The errors are Cramer-Rao limits, in mm for the position and in percent for the force. No unbiased method has
-    smaller errors. The mirror region is the part of the film outside the working area where a press has the charges
-    of a press inside it, so that it cannot be noticed.
+    smaller errors. The mirror region is the part of the film outside the working area where a press has the same
+    charges as a press inside the working area, so that the charges do not show that the press is outside.
 
     Example: isocharge simulate identify three-25um-biaxial --probe circle:1.0 --error 0.5 -o limits
     """
@@ -69,40 +69,44 @@ def identify_command(
     footprint = parse_probe(probe)
     noise_level = noise_model(noise)
     with shown_progress(), executor_for(workers, None) as pool:
-        identified = identify(
+        identification = identify(
             described_sensor, footprint, noise_level, force_range=force, radius=radius, error=error, executor=pool
         )
-    numbers = identified.to_dict()
+    results = identification.to_dict()
     if output is not None:
         with new_folder(output) as folder:
-            (folder / PICTURE).write_bytes(picture_bytes(identification_picture(identified)))
-            if identified.mirror is not None:
-                (folder / MIRROR_PICTURE).write_bytes(picture_bytes(mirror_picture(identified, identified.mirror)))
-            (folder / NUMBERS).write_bytes(json_module.dumps(numbers, indent=1).encode())
+            (folder / PICTURE).write_bytes(picture_bytes(identification_picture(identification)))
+            if identification.mirror is not None:
+                picture = mirror_picture(identification, identification.mirror)
+                (folder / MIRROR_PICTURE).write_bytes(picture_bytes(picture))
+            (folder / RESULTS).write_bytes(json_module.dumps(results, indent=1).encode())
     if json:
-        show_json(numbers)
+        show_json(results)
     else:
-        show(_table(numbers))
-    say(identified.summary)
-    if identified.mirror is not None:
-        say(identified.mirror.summary)
+        show(_table(results))
+    say(identification.summary)
+    if identification.mirror is not None:
+        say(identification.mirror.summary)
 
 
-def _table(numbers: dict[str, Any]) -> str:
+def _table(results: dict[str, Any]) -> str:
     """Return the error statistics within the working area as a table with one line for each force.
 
     Args:
-        numbers: Result of `Identification.to_dict`.
+        results: Result of `Identification.to_dict`.
     """
-    radius_mm = numbers["working_area"]["radius_mm"]
+    radius_mm = results["working_area"]["radius_mm"]
     lines = [f"within {radius_mm:g} mm    position, mm: median    rms  worst    force, %: median    rms  worst"]
-    for limits in numbers["limits_in_working_area"]:
-        position_text = (
-            f"{limits['position_median_mm']:25.3f} {limits['position_rms_mm']:6.3f} {limits['position_worst_mm']:6.3f}"
-        )
-        force_text = (
-            f"{limits['force_median_percent']:18.2f} {limits['force_rms_percent']:6.2f} "
-            f"{limits['force_worst_percent']:6.2f}"
-        )
-        lines.append(f"{limits['force_N']:8g} N {position_text} {force_text}")
+    for errors in results["limits_in_working_area"]:
+        force = f"{errors['force_N']:8g} N"
+
+        # The widths align the numbers with the words median, rms and worst of the header.
+        position_median = f"{errors['position_median_mm']:25.3f}"
+        position_rms = f"{errors['position_rms_mm']:6.3f}"
+        position_worst = f"{errors['position_worst_mm']:6.3f}"
+        force_median = f"{errors['force_median_percent']:18.2f}"
+        force_rms = f"{errors['force_rms_percent']:6.2f}"
+        force_worst = f"{errors['force_worst_percent']:6.2f}"
+        columns = [force, position_median, position_rms, position_worst, force_median, force_rms, force_worst]
+        lines.append(" ".join(columns))
     return "\n".join(lines)

@@ -84,26 +84,32 @@ def point_command(
     """
     if not 1e-8 <= accuracy <= 1.0:
         raise InputError(f"--accuracy: expected a relative error from 1e-8 to 1, got {accuracy}")
+
     film_sensor = warmed(load_sensor(sensor), temperature)
     footprint = parse_probe(probe)
     if theory == "auto":
         selected_theory = theory_for(film_sensor, footprint, (force, force), accuracy)
     else:
         selected_theory = theory_by_name(theory, film_sensor.film)
+
     if side_force is not None and friction is not None:
         raise InputError("--side-force and --friction: expected one of them, because friction gives the side force")
     if friction is not None:
         check_friction(friction)
     applied_side_force = (0.0, 0.0) if side_force is None else parse_side_force(side_force)
     if theory == "auto" and (friction is not None or any(applied_side_force)):
+        # A side force stretches the film, so a linear theory without stretching does not describe it.
         selected_theory = replace(selected_theory, stretching=True)
+
     settings = SolveSettings(accuracy=accuracy, theory=selected_theory)
     film = film_sensor.coated_film
     position = parse_position(at)
     equilibrium = press(film, footprint, position, force, settings, side_force=applied_side_force)
     if friction:
+        # The friction force follows from the slope of the film in the press without a side force.
         applied_side_force = friction_force(equilibrium, friction)
         equilibrium = press(film, footprint, position, force, settings, side_force=applied_side_force)
+
     charge = touch_charge(film_sensor, equilibrium) + thermal_charge(film_sensor, temperature)
     charge_pC = dict(zip(film_sensor.electrode_names, charge.tolist(), strict=True))
     report = {"charge_pC": charge_pC, **summary(equilibrium)}
@@ -118,32 +124,28 @@ def point_command(
 
 
 def _cautions(equilibrium: Equilibrium, accuracy: float) -> list[str]:
-    """Return warnings if the required accuracy was not reached."""
+    """Return a warning if the estimated error of the charges exceeds the required accuracy; otherwise no warnings."""
     error = estimated_error(equilibrium)
     if not isfinite(error):
         return [f"a {equilibrium.theory.name} does not describe this film at all; omit --theory"]
     if error > accuracy:
-        return [f"expected an error of the charges of at most {accuracy:.2g}, as --accuracy says, got {error:.2g}"]
+        return [f"expected an error of the charges of at most {accuracy:.2g} (--accuracy), got {error:.2g}"]
     return []
 
 
 def _table(report: dict[str, Any]) -> str:
-    """Format the charges, the deflection and the state of the solver."""
-    charges = [f"charge {name:<10} {charge:10.2f} pC" for name, charge in report["charge_pC"].items()]
-    side_force = []
+    """Return the report of a press as lines for people: charges, side force, deflection, theory and solver."""
+    lines = [f"charge {name:<10} {charge:10.2f} pC" for name, charge in report["charge_pC"].items()]
     if "side_force_N" in report:
         side_x, side_y = report["side_force_N"]
-        side_force = [f"side force        ({side_x:.4g}, {side_y:.4g}) N"]
-    return "\n".join(
-        [
-            *charges,
-            *side_force,
-            f"deflection        {report['deflection_mm']:10.4f} mm",
-            f"theory            {report['theory']}, estimated error {_percent(report['estimated_error'])}",
-            f"solver            {report['status']} in {report['iterations']} steps, residual "
-            f"{report['residual']:.1e}, {report['seconds']:.3f} s CPU",
-        ]
+        lines.append(f"side force        ({side_x:.4g}, {side_y:.4g}) N")
+    lines.append(f"deflection        {report['deflection_mm']:10.4f} mm")
+    lines.append(f"theory            {report['theory']}, estimated error {_percent(report['estimated_error'])}")
+    lines.append(
+        f"solver            {report['status']} in {report['iterations']} steps, residual {report['residual']:.1e}, "
+        f"{report['seconds']:.3f} s CPU"
     )
+    return "\n".join(lines)
 
 
 def _percent(error: float | None) -> str:

@@ -23,7 +23,7 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAU
 from isocharge.common.errors import InputError, OutputExists
 from isocharge.common.extras import require
 from isocharge.common.files import refuse_existing
-from isocharge.common.measured_presses import MOST_ROWS
+from isocharge.common.measured_presses import MAX_ROWS
 from isocharge.common.resumable_run import refuse_finished
 from isocharge.serve import MeasuredPresses, write_presses
 from isocharge.simulate import Dataset, Sweep, load_sensor, parse_probe, read_dataset, run_sweep
@@ -97,38 +97,58 @@ def sweep_command(
     """
     film_sensor = load_sensor(sensor)
     probes = [parse_probe(text) for text in probe or ["circle:1.0"]]
-    table = output if output.suffix.lower() in TABLES else None
-    if table:
-        refuse_existing(table)
-        output = output.with_suffix("")
-        if len(probes) > 1 or orientation is Orientation.random:
-            raise InputError(
-                f"{table}: a table of presses has one probe in one orientation; give a folder, -o {output}"
-            )
-        if output.exists():
-            raise OutputExists(
-                f"{output}, the dataset that belongs beside {table}, is already there and is not overwritten; choose "
-                "another name, or write its table as simulate/docs/datasets.md does"
-            )
-        if samples > MOST_ROWS:
-            raise InputError(
-                f"{table}: a table has at most {MOST_ROWS:,} presses, got --samples {samples}; give a folder, -o "
-                f"{output}"
-            )
-        if table.suffix.lower() == ".parquet":
-            with require("parquet"):  # raises before the sweep if the package is missing
-                import pyarrow  # noqa: F401
-    refuse_finished(output)
-    warn_of_stress(film_sensor.film, probes, force[1], stress_limit)
-    with shown_run(output), executor_for(workers, cluster) as executor:
+    folder = output
+    table = None
+    if output.suffix.lower() in TABLES:
+        table = output
+        folder = output.with_suffix("")
+        has_one_orientation = len(probes) == 1 and orientation is Orientation.fixed
+        _check_table(table, folder, samples, has_one_orientation=has_one_orientation)
+    refuse_finished(folder)
+
+    _, max_force = force
+    warn_of_stress(film_sensor.film, probes, max_force, stress_limit)
+    with shown_run(folder), executor_for(workers, cluster) as executor:
         largest_distance = sweep_radius(radius, film_sensor, probes, force)
         sweep = Sweep(largest_distance, force, samples, seed, orientation.value, sampling.value)
-        run_sweep(output, film_sensor, probes, sweep, executor=executor, fresh=fresh)
-    if table:
-        write_presses(table, _presses(read_dataset(output)))
-    count = json_module.loads((output / "manifest.json").read_text())["samples"]
-    written = f"{output} and {table}" if table else f"{output}"
+        run_sweep(folder, film_sensor, probes, sweep, executor=executor, fresh=fresh)
+    if table is not None:
+        write_presses(table, _presses(read_dataset(folder)))
+
+    count = json_module.loads((folder / "manifest.json").read_text())["samples"]
+    written = f"{folder} and {table}" if table is not None else f"{folder}"
     say(f"{count} presses in {written}")
+
+
+def _check_table(table: Path, folder: Path, samples: int, *, has_one_orientation: bool) -> None:
+    """Check before the sweep that its presses can be written as a table.
+
+    Args:
+        table: CSV or Parquet file.
+        folder: Folder of the dataset beside the table.
+        samples: Number of presses.
+        has_one_orientation: Whether all presses have the same probe in the same orientation.
+
+    Raises:
+        OutputExists: If the table or the folder exists.
+        InputError: If a table cannot contain the presses.
+        MissingExtra: If the table is Parquet and pyarrow is not installed.
+    """
+    refuse_existing(table)
+    if not has_one_orientation:
+        raise InputError(f"{table}: a table of presses has one probe in one orientation; give a folder, -o {folder}")
+    if folder.exists():
+        raise OutputExists(
+            f"{folder}, the dataset that belongs beside {table}, is already there and is not overwritten; choose "
+            "another name, or write its table as simulate/docs/datasets.md does"
+        )
+    if samples > MAX_ROWS:
+        raise InputError(
+            f"{table}: a table has at most {MAX_ROWS:,} presses, got --samples {samples}; give a folder, -o {folder}"
+        )
+    if table.suffix.lower() == ".parquet":
+        with require("parquet"):
+            import pyarrow  # noqa: F401
 
 
 def _presses(dataset: Dataset) -> MeasuredPresses:

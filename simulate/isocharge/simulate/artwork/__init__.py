@@ -1,1 +1,1 @@
-"""Drawings of a layout to scale as DXF and SVG, straight leads, electrodes from DXF files, folder of a design."""
+"""Drawings of electrode layouts as DXF and SVG files, straight leads, and the reader of electrodes in DXF files."""

@@ -1,4 +1,4 @@
-"""Folder of a design: the sensor file, the drawings, the numbers and a picture."""
+"""Writer of the folder of a design: the sensor file, the drawings, the numerical results and a picture."""
 
 import json
 from pathlib import Path
@@ -33,12 +33,12 @@ def write_design(design: Design, folder: Path) -> None:
         f"lower limit of the position error {errors['worst_mm']:.3f} mm at worst, {errors['rms_mm']:.3f} mm rms.",
     ]
     drawing = draw_layout(design.sensor, leads)
-    numbers = {**design.to_dict(), "leads": leads.summary}
+    results = {**design.to_dict(), "leads": leads.summary}
     files = {
         "sensor.toml": sensor_to_toml(design.sensor, comment).encode(),
         "layout.svg": to_svg(drawing).encode(),
         "layout.dxf": to_dxf(drawing).encode(),
-        "design.json": (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode(),
+        "design.json": (json.dumps(results, indent=1, allow_nan=False) + "\n").encode(),
         "design.png": picture_bytes(error_maps_picture(design)),
     }
     with new_folder(folder) as draft:

@@ -60,13 +60,16 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
         document.layers.add(name, color=colour)
     space = document.modelspace()
     space.add_circle((0.0, 0.0), sensor.film.radius, dxfattribs={"layer": "FILM"})
+
     for path in leads.paths.values():
         space.add_lwpolyline(path.tolist(), dxfattribs={"layer": "LEADS", "const_width": leads.width})
+    # Electrodes may share the metal of the back, so equal polygons are drawn once.
     back_polygons = dict.fromkeys(polygon for electrode in sensor.electrodes for polygon in electrode.back)
     if back_polygons:
         document.layers.add("BACK", color=BACK_COLOUR)
     for polygon in back_polygons:
         space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "BACK"})
+
     for electrode in sensor.electrodes:
         for polygon in electrode.front:
             space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "ELECTRODES"})
@@ -120,9 +123,9 @@ def to_svg(document: Drawing) -> str:
 def _fixed_metadata() -> Iterator[None]:
     """Write fixed dates and identifiers instead of current ones, so that equal drawings give equal files."""
     options: Any = ezdxf.options  # type: ignore[attr-defined]
-    before = options.write_fixed_meta_data_for_testing
+    previous_setting = options.write_fixed_meta_data_for_testing
     options.write_fixed_meta_data_for_testing = True
     try:
         yield
     finally:
-        options.write_fixed_meta_data_for_testing = before
+        options.write_fixed_meta_data_for_testing = previous_setting

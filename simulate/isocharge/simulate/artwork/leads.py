@@ -13,8 +13,8 @@ SAMPLE_DISTANCE = 0.1
 _DEGREES = np.arange(1.0, 90.0)
 
 TRIED_ANGLES = np.deg2rad(np.concatenate([[0.0], np.stack([_DEGREES, -_DEGREES], axis=1).ravel()]))
-"""Angles of the leads that are tried, relative to the outward radial direction, rad. They are ordered by size, so the
-first angle without a conflict deviates least from the radial direction."""
+"""Angles of the leads that are tried, relative to the outward radial direction, rad. The angles are ordered by
+magnitude, so that the first lead without a conflict deviates least from the radial direction."""
 
 
 @dataclass(frozen=True)
@@ -111,9 +111,9 @@ def _clearance(path: Array, width: float, electrodes: list[Electrode], leads: li
 
 def _distance_from_boxes(points: Array, electrode: Electrode) -> float:
     """Return the smallest distance of points, shape (n, 2), from the bounding boxes of an electrode, mm."""
-    low, high = (corners[:, None] for corners in electrode.boxes)
-    outside = np.maximum(np.maximum(low - points, points - high), 0.0)
-    return float(np.linalg.norm(outside, axis=2).min())
+    low, high = (corners[:, None] for corners in electrode.boxes)  # each of shape (n_box, 1, 2)
+    offset = np.maximum(np.maximum(low - points, points - high), 0.0)  # zero for coordinates within the box
+    return float(np.linalg.norm(offset, axis=2).min())
 
 
 def _distance_from_lead(points: Array, lead: Array) -> float:
@@ -125,6 +125,6 @@ def _distance_from_lead(points: Array, lead: Array) -> float:
     """
     start, end = lead
     direction = end - start
-    share_of_length = np.clip((points - start) @ direction / (direction @ direction), 0.0, 1.0)
-    nearest_points = start + share_of_length[:, None] * direction
+    fraction_of_length = np.clip((points - start) @ direction / (direction @ direction), 0.0, 1.0)
+    nearest_points = start + fraction_of_length[:, None] * direction
     return float(np.hypot(*(points - nearest_points).T).min())

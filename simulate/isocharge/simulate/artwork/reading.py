@@ -58,14 +58,17 @@ def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") ->
     if back:
         back_corners = tuple(polygon.corners for polygon in _polygons(document, back, scale, path))
     electrodes = []
-    for name, (pad, *others) in zip(_names(document, groups, scale), groups, strict=False):
-        more = tuple(polygon.corners for polygon in others)
-        electrodes.append(Electrode(name, pad.corners, more=more, back=back_corners))
+    for name, (first_polygon, *other_polygons) in zip(_names(document, groups, scale), groups, strict=False):
+        more = tuple(polygon.corners for polygon in other_polygons)
+        electrodes.append(Electrode(name, first_polygon.corners, more=more, back=back_corners))
     return tuple(electrodes)
 
 
 def _touching_groups(polygons: list[Electrode]) -> list[list[Electrode]]:
-    """Group polygons that touch or overlap, directly or through other polygons; in the order of their first polygon."""
+    """Group polygons that touch or overlap, directly or through other polygons of the group.
+
+    The groups are returned in the order of their first polygons.
+    """
     groups: list[list[Electrode]] = []
     for polygon in polygons:
         touching = []
@@ -80,13 +83,19 @@ def _touching_groups(polygons: list[Electrode]) -> list[list[Electrode]]:
 
 
 def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list[Electrode]:
-    """Read the polygons of a layer, each as an electrode of its own. Closed lines precede traces.
+    """Read the polygons of a layer, each as an electrode of its own.
 
     Args:
         document: DXF document.
         layer: Name of the layer.
-        scale: Unit of the drawing, mm.
+        scale: Length of a unit of the drawing, mm.
         path: File name for error messages.
+
+    Returns:
+        The closed lines, followed by the traces. The name of each electrode describes its line for error messages.
+
+    Raises:
+        SensorError: If the layer has no lines, or an object of the layer cannot be an electrode.
     """
     shapes = [shape for shape in document.modelspace() if shape.dxftype() not in TEXT_TYPES]
     pads = []
@@ -102,6 +111,7 @@ def _polygons(document: Any, layer: str, scale: float, path: str | Path) -> list
         corners = tuple((scale * point.x, scale * point.y) for point in outline.flattening(ARC_TOLERANCE / scale))
         width = scale * _width(shape)
         if is_closed:
+            # The last point repeats the first one and is omitted. Clockwise polygons are reversed.
             corners = corners[:-1] if area_of(np.array(corners)) > 0.0 else corners[:0:-1]
             check_polygon(where, corners)
             pads.append(Electrode(where, corners))
@@ -120,15 +130,17 @@ def _width(line: Any) -> float:
     """Return the width of a polyline in the unit of the drawing, or 0 if the line has no width or a varying width."""
     if line.dxftype() != "LWPOLYLINE":
         return 0.0
-    widths = {line.dxf.const_width or width for width in chain(*line.get_points("se"))}
-    return float(widths.pop()) if len(widths) == 1 else 0.0
+    start_and_end_widths = chain(*line.get_points("se"))
+    different_widths = {line.dxf.const_width or width for width in start_and_end_widths}
+    return float(different_widths.pop()) if len(different_widths) == 1 else 0.0
 
 
 def _names(document: Any, groups: list[list[Electrode]], scale: float) -> list[str]:
     """Return the names of groups of polygons, each of which becomes an electrode.
 
     The name of a group is the text of the drawing that is nearest to the first polygon of the group. If two groups have
-    the same text, or there are no texts, letters and numbers are returned instead.
+    the same text, or the drawing has no texts, the names are the letters from A to Z, followed by numbers. There may
+    then be more names than groups.
 
     Args:
         document: The drawing.

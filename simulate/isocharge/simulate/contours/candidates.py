@@ -3,7 +3,7 @@
 The module `triangulation` improves several candidates for each of many presses at once.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import scipy  # loads each of its subpackages on first use
@@ -42,17 +42,25 @@ class Candidates:
 
     @classmethod
     def begin(cls, press: Integers, contact: Array) -> "Candidates":
-        """Create candidates from the starting points of a search."""
+        """Create candidates from the starting points of a search.
+
+        Args:
+            press: Number of the press of each starting point, shape (n,).
+            contact: Starting points (x, y, F), shape (n, 3), mm and N.
+        """
         return cls(press, contact, np.full(press.size, np.inf))
 
-    def __getitem__(self, part: np.ndarray) -> "Candidates":
-        """Return the candidates of a mask or of row numbers."""
-        return Candidates(*(getattr(self, column.name)[part] for column in fields(self)))
+    def __getitem__(self, rows: np.ndarray) -> "Candidates":
+        """Return some of the candidates, which are given by a mask or by row numbers."""
+        return Candidates(self.press[rows], self.contact[rows], self.spread[rows])
 
     def joined(self, other: "Candidates") -> "Candidates":
         """Return these candidates followed by other candidates."""
-        pairs = ((getattr(self, column.name), getattr(other, column.name)) for column in fields(self))
-        return Candidates(*(np.concatenate(pair) for pair in pairs))
+        return Candidates(
+            press=np.concatenate([self.press, other.press]),
+            contact=np.concatenate([self.contact, other.contact]),
+            spread=np.concatenate([self.spread, other.spread]),
+        )
 
     def improved(self, contact: Array, spread: Array) -> "Candidates":
         """Replace the contacts of those candidates for which the new contact has a smaller spread.
@@ -81,6 +89,7 @@ class Candidates:
         for candidate_rank in range(1, int(rank.max(initial=0)) + 1):
             # Compare the candidates of this rank, of all presses together, with those of each better rank.
             rows = np.flatnonzero(rank == candidate_rank)
+            # Candidates of one press are in consecutive rows, so the better candidates are in the rows before.
             for better_rows in rows - 1 - np.arange(candidate_rank)[:, None]:
                 offset = (ordered.contact[rows] - ordered.contact[better_rows])[:, :2]
                 is_near = np.linalg.norm(offset, axis=1) <= tolerance
@@ -96,25 +105,27 @@ class SeedGrid:
         position: Positions of the nodes, shape (n_node, 2), mm.
         index: Index of each node in the flattened square grid, shape (n_node,).
         side: Number of nodes along a side of the square grid.
-        logs: Logarithms of the forces (N), ascending, shape (n_force,).
-        nodal: Charges, shape (n_force, n_node, n_electrode), pC.
+        log_forces: Logarithms of the forces (N), ascending, shape (n_force,).
+        node_charges: Charges, shape (n_force, n_node, n_electrode), pC.
         slope: Magnitude of the gradient of each charge with respect to the position at the middle force, bounded below
             by `MIN_SLOPE`, shape (n_node, n_electrode), pC/mm.
-        size: Root mean square of all charges at each force relative to that at the middle force, shape (n_force,).
+        relative_size: Root mean square of all charges at each force, relative to that at the middle force, shape
+            (n_force,), dimensionless.
     """
 
     position: Array
     index: Integers
     side: int
-    logs: Array
-    nodal: Array
+    log_forces: Array
+    node_charges: Array
     slope: Array
-    size: Array
+    relative_size: Array
 
     @classmethod
     def of(cls, charge_map: ChargeMap) -> "SeedGrid":
         """Create the grid over the domain of a charge map, including the edge of the disk."""
-        # The nodes of a square grid that lie on the disk or slightly outside; the latter are moved onto its edge.
+        # Select the nodes of a square grid that lie within the disk or slightly outside, and move the nodes outside
+        # onto the edge of the disk.
         radius = charge_map.domain.radius
         side = 2 * max(4, int(np.ceil(radius / NODE_SPACING))) + 1
         line = np.linspace(-radius, radius, side)
@@ -124,21 +135,29 @@ class SeedGrid:
 
         min_force, max_force = charge_map.domain.force_range
         n_force = FORCES if max_force > min_force else 1
-        logs = np.linspace(np.log(min_force), np.log(max_force), n_force)
-        forces = np.clip(np.exp(logs), min_force, max_force)
+        log_forces = np.linspace(np.log(min_force), np.log(max_force), n_force)
+        forces = np.clip(np.exp(log_forces), min_force, max_force)
         contacts = [np.column_stack([position, np.full(len(position), force)]) for force in forces]
-        nodal = np.stack([charge_map.charges(contact) for contact in contacts])
+        node_charges = np.stack([charge_map.charges(contact) for contact in contacts])
 
         middle = forces.size // 2
-        position_derivatives = charge_map.derivatives(contacts[middle])[..., :2]
-        slope = np.linalg.norm(position_derivatives, axis=2)
-        slope = np.maximum(slope, MIN_SLOPE * np.median(slope, axis=0))
-        rms_charge = np.sqrt(np.mean(nodal**2, axis=(1, 2)))
-        return cls(position, index, side, logs, nodal, slope, rms_charge / rms_charge[middle])
+        gradient = charge_map.derivatives(contacts[middle])[..., :2]  # with respect to x and y
+        gradient_length = np.linalg.norm(gradient, axis=2)
+        median_length = np.median(gradient_length, axis=0)
+        rms_charge = np.sqrt(np.mean(node_charges**2, axis=(1, 2)))
+        return cls(
+            position=position,
+            index=index,
+            side=side,
+            log_forces=log_forces,
+            node_charges=node_charges,
+            slope=np.maximum(gradient_length, MIN_SLOPE * median_length),
+            relative_size=rms_charge / rms_charge[middle],
+        )
 
     def growth(self, force: Array) -> Array:
         """Interpolate the relative size of the charges at forces (N) of any shape; the result is dimensionless."""
-        return np.interp(np.log(force), self.logs, self.size)
+        return np.interp(np.log(force), self.log_forces, self.relative_size)
 
     def charge(self, force: Array) -> Array:
         """Interpolate the charges at all nodes.
@@ -150,13 +169,14 @@ class SeedGrid:
             Charges, shape (n, n_node, n_electrode), pC.
         """
         # Linear interpolation in ln F between the tabulated forces below and above
-        fractional_index = np.interp(np.log(force), self.logs, np.arange(self.logs.size))
-        index_below = np.minimum(fractional_index.astype(int), max(self.logs.size - 2, 0))
-        index_above = np.minimum(index_below + 1, self.logs.size - 1)
+        n_force = self.log_forces.size
+        fractional_index = np.interp(np.log(force), self.log_forces, np.arange(n_force))
+        index_below = np.minimum(fractional_index.astype(int), max(n_force - 2, 0))
+        index_above = np.minimum(index_below + 1, n_force - 1)
         node = np.arange(len(self.position))
         weight_above = (fractional_index - index_below)[..., None]
-        charge_below = self.nodal[index_below, node]
-        charge_above = self.nodal[index_above, node]
+        charge_below = self.node_charges[index_below, node]
+        charge_above = self.node_charges[index_above, node]
         return np.asarray((1.0 - weight_above) * charge_below + weight_above * charge_above)
 
     def matching_force(self, charge: Array) -> Array:
@@ -168,11 +188,11 @@ class SeedGrid:
         Returns:
             Forces, shape (n, n_node), N.
         """
-        nodal_total = self.nodal.sum(axis=2)
         total = charge.sum(axis=1)
-        sign = np.sign(nodal_total.sum())  # with negative coefficients the charges decrease with the force
-        columns = [np.interp(sign * total, sign * column, self.logs) for column in nodal_total.T]
-        return np.asarray(np.exp(np.stack(columns, axis=1)))
+        node_totals = self.node_charges.sum(axis=2)  # shape (n_force, n_node)
+        sign = np.sign(node_totals.sum())  # with negative coefficients the charges decrease with the force
+        log_forces = [np.interp(sign * total, sign * node_total, self.log_forces) for node_total in node_totals.T]
+        return np.asarray(np.exp(np.stack(log_forces, axis=1)))
 
     def distance(self, charge: Array, force: Array) -> Array:
         """Estimate the root mean square distance of each node from the contours of given charges.
@@ -198,28 +218,35 @@ class SeedGrid:
         Returns:
             Numbers of the presses and numbers of the nodes, each of shape (m,).
         """
-        flat = np.full((len(distance), self.side**2), np.inf)
-        flat[:, self.index] = distance
-        square = flat.reshape(-1, self.side, self.side)
-        neighbourhood_minimum = scipy.ndimage.minimum_filter(square, (1, 3, 3), mode="constant", cval=np.inf)
-        is_minimum = (square == neighbourhood_minimum).reshape(len(distance), -1)[:, self.index]
-        ranked = np.where(is_minimum, distance, np.inf)
-        node = np.argpartition(ranked, max_count, axis=1)[:, :max_count]
-        press, column = np.nonzero(np.isfinite(np.take_along_axis(ranked, node, axis=1)))
+        n_press = len(distance)
+        flat_grid = np.full((n_press, self.side**2), np.inf)
+        flat_grid[:, self.index] = distance
+        square_grid = flat_grid.reshape(-1, self.side, self.side)
+        neighbourhood_minimum = scipy.ndimage.minimum_filter(square_grid, (1, 3, 3), mode="constant", cval=np.inf)
+        is_minimum = (square_grid == neighbourhood_minimum).reshape(n_press, -1)[:, self.index]
+
+        # Take the `max_count` nodes with the smallest distances of each press, and remove those that are no minimum.
+        distance_of_minimum = np.where(is_minimum, distance, np.inf)
+        node = np.argpartition(distance_of_minimum, max_count, axis=1)[:, :max_count]
+        selected_distance = np.take_along_axis(distance_of_minimum, node, axis=1)
+        press, column = np.nonzero(np.isfinite(selected_distance))
         return press, node[press, column]
 
     def is_out_of_range(self, charge: Array, force: Array | None) -> Booleans:
-        """Return whether presses have a charge that no node has.
+        """Return which presses have a charge outside the range of the charges of all nodes.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
-            force: Force of each press, shape (n,), N. If it is None, the charges are compared with those of all forces.
+            force: Force of each press, shape (n,), N. If it is None, the range includes the charges at all forces.
 
         Returns:
             Shape (n,).
         """
-        nodal = self.nodal.reshape(1, -1, charge.shape[1]) if force is None else self.charge(force[:, None])
-        low = nodal.min(axis=1)
-        high = nodal.max(axis=1)
+        if force is None:
+            node_charges = self.node_charges.reshape(1, -1, charge.shape[1])
+        else:
+            node_charges = self.charge(force[:, None])
+        low = node_charges.min(axis=1)
+        high = node_charges.max(axis=1)
         margin = RANGE_MARGIN * (high - low)
         return np.asarray(((charge < low - margin) | (charge > high + margin)).any(axis=1))

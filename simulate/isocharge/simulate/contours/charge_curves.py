@@ -1,7 +1,8 @@
-"""Charge against distance on lines from an electrode: the mapping scheme of Mirbagheri et al. (2007, Fig. 2, 4 and 7).
+"""Charge as a function of the distance along lines from an electrode (Mirbagheri et al. 2007, Fig. 2, 4 and 7).
 
-Lines start at the centre of an electrode at equal angles, with presses at equal distances. The paper fits a polynomial
-to the charge along each line, and `graphical_method` draws contours through the roots of these polynomials.
+This is the mapping scheme of the paper. The lines start at the centre of an electrode at equal angles, and the presses
+on a line have equal distances. The paper fits a polynomial to the charge along each line. The module `graphical_method`
+draws contours through the roots of these polynomials.
 """
 
 from collections.abc import Sequence
@@ -55,7 +56,8 @@ class Mapping:
         step: float = STEP,
         length: float = LENGTH,
     ) -> "Mapping":
-        """Create lines at equal angles. The last angle always has a line, even if it is not a multiple of the step.
+        """Create lines at equal angles. The last angle always has a line, even if its distance to the previous line is
+        smaller than the step.
 
         Args:
             sensor: Sensor, whose calibration determines the positions of the electrodes.
@@ -83,7 +85,7 @@ class Mapping:
                 f"mm in steps of {step:g} mm"
             )
         angle = np.append(np.arange(first_angle, last_angle - 1e-9, angle_step), last_angle)
-        presses_per_line = int(length / step * (1.0 + 1e-9))
+        presses_per_line = int(length / step * (1.0 + 1e-9))  # the factor allows for rounding of the quotient
         distance: Array = step * np.arange(1.0, presses_per_line + 1.0)
         return cls(electrode, (float(x), float(y)), angle, distance)
 
@@ -99,7 +101,7 @@ class Mapping:
         return float(np.linalg.norm(self.points, axis=-1).max())
 
     def finer(self, count: int) -> "Mapping":
-        """Return the same lines with `count` presses between the first and the last press of this mapping."""
+        """Return the same lines with `count` equally spaced presses from the first to the last press of each line."""
         distance = np.linspace(self.distance[0], self.distance[-1], count)
         return Mapping(self.electrode, self.origin, self.angle, distance)
 

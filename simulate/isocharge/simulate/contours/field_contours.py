@@ -100,8 +100,8 @@ class ContourField:
         return radius * disk_x, radius * disk_y
 
     @cached_property
-    def _every_charge(self) -> Array:
-        """Charges on the grid, shape (n, n, n_electrode), pC."""
+    def _grid_charges(self) -> Array:
+        """Charges of all electrodes on the grid, shape (n, n, n_electrode), pC."""
         x, y = self._grid
         contact = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, self.force)])
         return self.charge_map.charges(contact).reshape(*x.shape, -1)
@@ -111,4 +111,4 @@ class ContourField:
         names = self.charge_map.electrodes
         if electrode not in names:
             raise SensorError(f"no electrode {electrode!r}: the map has {', '.join(names)}")
-        return np.asarray(self._every_charge[..., names.index(electrode)])
+        return np.asarray(self._grid_charges[..., names.index(electrode)])

@@ -1,16 +1,17 @@
 """Contours and triangulation by the graphical method of Mirbagheri et al. (2007).
 
 A polynomial is fitted to the charge along each line of a mapping scheme. The root of the polynomial is one point of the
-contour, and the points are joined by a spline (the SPLINE of AutoCAD: a cubic spline through its points with free ends
-and the chord length as its parameter). Contours are intersected as splines, and the position is the mean of the three
-crossings that are nearest to each other. The modules `field_contours` and `triangulation` compute contours and
-positions directly from the charge map, without the errors of the drawing.
+contour. The points are joined by a cubic spline with free ends and the chord length as its parameter, like the SPLINE
+of AutoCAD. Contours are intersected as splines, and the position is the mean of the three crossings that are nearest to
+each other. The modules `field_contours` and `triangulation` compute contours and positions directly from the charge
+map, without the errors of the drawing.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, product
+from typing import NamedTuple
 
 import numpy as np
 import scipy  # loads each of its subpackages on first use
@@ -106,13 +107,13 @@ def _chord_crossings(first: Array, second: Array) -> Integers:
     second_chord = np.diff(second, axis=0)[None]
     start_difference = second[None, :-1] - first[:-1, None]
 
-    # The crossing lies at these shares of the lengths of both chords (Cramer's rule).
+    # The crossing lies at these fractions of the lengths of both chords (Cramer's rule).
     with np.errstate(divide="ignore", invalid="ignore"):  # parallel chords do not cross
         determinant = _cross_product(first_chord, second_chord)
-        first_share = _cross_product(start_difference, second_chord) / determinant
-        second_share = _cross_product(start_difference, first_chord) / determinant
-        is_on_first = (first_share >= 0.0) & (first_share < 1.0)
-        is_on_second = (second_share >= 0.0) & (second_share < 1.0)
+        first_fraction = _cross_product(start_difference, second_chord) / determinant
+        second_fraction = _cross_product(start_difference, first_chord) / determinant
+        is_on_first = (first_fraction >= 0.0) & (first_fraction < 1.0)
+        is_on_second = (second_fraction >= 0.0) & (second_fraction < 1.0)
         return np.argwhere(is_on_first & is_on_second)
 
 
@@ -161,6 +162,20 @@ def _root(polynomial: np.polynomial.Polynomial, charge: float, distance: Array) 
     return float(inside.min()) if inside.size else np.nan
 
 
+class _Location(NamedTuple):
+    """Location of one press, or of the meeting of three contours.
+
+    Attributes:
+        position: Position (x, y), shape (2,), mm; NaN if there is none.
+        spread: Largest distance of a crossing from the mean of its triple, mm; NaN if there is no position.
+        status: Result of the search.
+    """
+
+    position: Array
+    spread: float
+    status: Meeting
+
+
 @dataclass(frozen=True)
 class DrawnTriangulation:
     """Triangulation with contours of the graphical method.
@@ -184,8 +199,11 @@ class DrawnTriangulation:
         return tuple(curves.mapping.electrode for curves in self.curves)
 
     def contours(self, charge: Array) -> tuple[DrawnContour | None, ...]:
-        """Draw the contour of each charge, shape (n_electrode,), pC. Contours that cannot be drawn are None."""
-        return tuple(draw_contour(c, float(q), self.degree) for c, q in zip(self.curves, charge, strict=True))
+        """Draw the contour of each charge, shape (n_electrode,), pC. A contour that cannot be drawn is None."""
+        return tuple(
+            draw_contour(curves, float(electrode_charge), self.degree)
+            for curves, electrode_charge in zip(self.curves, charge, strict=True)
+        )
 
     def locate(self, charge: Array) -> Fix:
         """Locate presses whose force is that of the curves.
@@ -197,41 +215,58 @@ class DrawnTriangulation:
             ChargeError: If the charges are not finite, or their number is not that of the electrodes.
         """
         charge = as_charges(charge, self.electrodes)
-        rows = [self._locate_one(row) for row in charge]
-        at, spread, status = (np.array([row[i] for row in rows]) for i in range(3))
-        contact = np.column_stack([at.reshape(-1, 2), np.full(len(charge), self.curves[0].force)])
-        return Fix(contact, spread, status.astype(np.intp))
+        locations = [self._locate_one(press_charge) for press_charge in charge]
+        position = np.array([location.position for location in locations]).reshape(-1, 2)
+        force = np.full(len(charge), self.curves[0].force)
+        return Fix(
+            contact=np.column_stack([position, force]),
+            spread=np.array([location.spread for location in locations]),
+            status=np.array([location.status for location in locations], dtype=np.intp),
+        )
 
-    def _locate_one(self, charge: Array) -> tuple[Array, float, Meeting]:
-        """Locate one press from its charges, shape (n_electrode,), pC: position (mm), spread (mm) and status."""
+    def _locate_one(self, charge: Array) -> _Location:
+        """Locate one press from its charges, shape (n_electrode,), pC.
+
+        The position is the mean over all triples of contours that meet, and the spread is the largest of their spreads.
+        """
         contours = [contour for contour in self.contours(charge) if contour is not None]
         if len(contours) < len(charge):
-            return NOWHERE, np.nan, Meeting.no_contour
-        pairs = {(i, j): contours[i].crossings(contours[j]) for i, j in combinations(range(len(contours)), 2)}
-        triples = combinations(range(len(contours)), 3)
-        meetings = [self._meeting([pairs[pair] for pair in combinations(triple, 2)]) for triple in triples]
-        good = [(mean, spread) for mean, spread, status in meetings if status is Meeting.met]
-        if not good:
-            return NOWHERE, np.nan, max(status for _, _, status in meetings)  # `twice` has priority over `apart`
-        return np.mean([mean for mean, _ in good], axis=0), max(spread for _, spread in good), Meeting.met
+            return _Location(NOWHERE, np.nan, Meeting.no_contour)
 
-    def _meeting(self, pairs: list[Array]) -> tuple[Array, float, Meeting]:
+        indices = range(len(contours))
+        crossings = {(i, j): contours[i].crossings(contours[j]) for i, j in combinations(indices, 2)}
+        meetings = []
+        for triple in combinations(indices, 3):
+            crossings_of_pairs = [crossings[pair] for pair in combinations(triple, 2)]
+            meetings.append(self._meeting(crossings_of_pairs))
+
+        met = [meeting for meeting in meetings if meeting.status is Meeting.met]
+        if not met:
+            status = max(meeting.status for meeting in meetings)  # `twice` has priority over `apart`
+            return _Location(NOWHERE, np.nan, status)
+        mean_position = np.mean([meeting.position for meeting in met], axis=0)
+        largest_spread = max(meeting.spread for meeting in met)
+        return _Location(mean_position, largest_spread, Meeting.met)
+
+    def _meeting(self, crossings_of_pairs: list[Array]) -> _Location:
         """Find the three crossings, one for each pair of contours, that are nearest to each other.
 
         Args:
-            pairs: Crossings of each of the three pairs of contours, each of shape (m, 2), mm.
+            crossings_of_pairs: Crossings of each of the three pairs of contours, each of shape (m, 2), mm.
 
         Returns:
-            Mean of the three crossings (mm), their largest distance from the mean (mm), and the status.
+            Mean of the three crossings, their largest distance from the mean, and the status.
         """
-        corners = np.array([*product(*pairs)]).reshape(-1, 3, 2)
-        means = corners.mean(axis=1)
-        spreads = np.linalg.norm(corners - means[:, None], axis=2).max(axis=1)
-        if spreads.min(initial=np.inf) > self.tolerance:
-            return NOWHERE, np.nan, Meeting.apart
-        best = spreads.argmin()
-        is_elsewhere = np.linalg.norm(means - means[best], axis=1) > MIN_DISTANCE
-        second_best = spreads[is_elsewhere].min(initial=np.inf)
-        if second_best <= AMBIGUOUS_RATIO * spreads[best]:
-            return NOWHERE, np.nan, Meeting.twice
-        return means[best], float(spreads[best]), Meeting.met
+        # All combinations of one crossing of each pair, shape (n_combination, 3, 2)
+        combined_crossings = np.array(list(product(*crossings_of_pairs))).reshape(-1, 3, 2)
+        mean = combined_crossings.mean(axis=1)
+        spread = np.linalg.norm(combined_crossings - mean[:, None], axis=2).max(axis=1)
+        if spread.min(initial=np.inf) > self.tolerance:
+            return _Location(NOWHERE, np.nan, Meeting.apart)
+
+        best = spread.argmin()
+        is_elsewhere = np.linalg.norm(mean - mean[best], axis=1) > MIN_DISTANCE
+        second_smallest_spread = spread[is_elsewhere].min(initial=np.inf)
+        if second_smallest_spread <= AMBIGUOUS_RATIO * spread[best]:
+            return _Location(NOWHERE, np.nan, Meeting.twice)
+        return _Location(mean[best], float(spread[best]), Meeting.met)

@@ -205,7 +205,8 @@ class Triangulation:
     def _second_seeds(self, closest: Candidates, *, fixed: bool) -> Candidates:
         """Create starting points for a second meeting across a fold.
 
-        They lie on both sides of each meeting in the direction in which the distances from the contours change least.
+        Two starting points lie on opposite sides of each meeting, in the direction in which the distances from the
+        contours change least.
 
         Args:
             closest: Meetings of the contours that have been found.
@@ -223,7 +224,7 @@ class Triangulation:
         forward = Candidates.begin(closest.press, self._moved(closest.contact, step))
         return backward.joined(forward)
 
-    # From the starting points to the meeting
+    # Search from the starting points
 
     def _approach(self, charge: Array, seeds: Candidates, *, fixed: bool) -> Candidates:
         """Minimise the mean square distance from the contours by the Gauss-Newton method.
@@ -296,7 +297,7 @@ class Triangulation:
             active = active[is_moving]
             if active.size == 0:
                 break
-            step = gauss_newton_step(pair_slopes[is_moving], pair_distances[is_moving])
+            step = gauss_newton_step(pair_slopes[is_moving], pair_distances[is_moving])  # two equations: Newton's step
             contact[active] = self._moved(contact[active], step)
         return crossing
 

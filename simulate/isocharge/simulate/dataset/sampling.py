@@ -105,7 +105,7 @@ class Sweep:
 
     def contacts(self) -> Array:
         """Return the contacts (x, y, F) of a sweep with one probe, shape (n, 3), mm and N."""
-        return self._of_probe(0, 1, FULL_TURN).contact
+        return self._presses_of_probe(0, 1, FULL_TURN).contact
 
     def over(self, probes: Sequence[Probe]) -> SweepPresses:
         """Return the presses of a sweep with several probes, which alternate.
@@ -120,30 +120,35 @@ class Sweep:
             raise SceneError("probes: expected at least one, got none")
         if self.sampling == "grid" and self.samples < len(probes):
             raise SceneError(f"samples: expected at least one for each of {len(probes)} probes, got {self.samples}")
-        parts = [self._of_probe(number, len(probes), probe.period) for number, probe in enumerate(probes)]
-        order = np.argsort(np.concatenate([np.arange(len(part)) for part in parts]), kind="stable")
+        n_probe = len(probes)
+        parts = [self._presses_of_probe(number, n_probe, probe.period) for number, probe in enumerate(probes)]
         presses = SweepPresses(
             probe=np.concatenate([part.probe for part in parts]),
             contact=np.concatenate([part.contact for part in parts]),
             rotation=np.concatenate([part.rotation for part in parts]),
         )
+        # Take the first press of each probe, then the second press of each probe, and so on.
+        number_within_probe = np.concatenate([np.arange(len(part)) for part in parts])
+        order = np.argsort(number_within_probe, kind="stable")
         return presses[order]
 
-    def _of_probe(self, number: int, probes: int, period: float) -> SweepPresses:
+    def _presses_of_probe(self, number: int, n_probe: int, period: float) -> SweepPresses:
         """Return the presses of one probe.
 
         Args:
             number: Number of the probe.
-            probes: Number of probes in the sweep.
+            n_probe: Number of probes in the sweep.
             period: Smallest rotation that maps the probe onto itself, rad.
         """
         if self.sampling == "grid":
-            position, force, rotation = self._grid(self.samples // probes, period)
+            position, force, rotation = self._grid(self.samples // n_probe, period)
         else:
-            unit = self._unit_cube(len(range(number, self.samples, probes)), number)
-            position = self.radius * np.sqrt(unit[:, 0]) * np.exp(1j * FULL_TURN * unit[:, 1])
-            force = self._force(unit[:, 2])
-            rotation = FULL_TURN * unit[:, 3] if self.orientation == "random" else np.zeros(len(unit))
+            count = len(range(number, self.samples, n_probe))  # every n_probe-th press of the sweep
+            distance_fraction, angle_fraction, force_fraction, rotation_fraction = self._unit_cube(count, number).T
+            distance = self.radius * np.sqrt(distance_fraction)  # uniform over the area of the disk
+            position = distance * np.exp(1j * FULL_TURN * angle_fraction)
+            force = self._force(force_fraction)
+            rotation = FULL_TURN * rotation_fraction if self.orientation == "random" else np.zeros(count)
         contact = np.stack([position.real, position.imag, force], axis=1)
         return SweepPresses(np.full(position.size, number), contact, rotation)
 
@@ -164,10 +169,10 @@ class Sweep:
         log2_count = int(np.ceil(np.log2(max(count, 2))))
         return np.asarray(scipy.stats.qmc.Sobol(4, rng=rng).random_base2(log2_count)[:count])
 
-    def _force(self, share: Array) -> Array:
-        """Return the forces (N) at shares (0 to 1) of the range in ln F."""
+    def _force(self, fraction: Array) -> Array:
+        """Return the forces (N) at fractions of the logarithmic range: 0 for the smallest force, 1 for the largest."""
         low, high = np.log(self.force_range)
-        return np.asarray(np.clip(np.exp(low + (high - low) * share), *self.force_range))
+        return np.asarray(np.clip(np.exp(low + (high - low) * fraction), *self.force_range))
 
     def _grid(self, max_count: int, period: float) -> tuple[Complexes, Array, Array]:
         """Return the presses of a grid.
@@ -193,8 +198,8 @@ class Sweep:
         # The lattice may have fewer positions than requested, so the number of forces is computed from it.
         positions: Complexes = self.radius * lattice(max_count // (n_rotation * initial_n_force))
         n_force = max_count // (positions.size * n_rotation) if has_forces else 1
-        force_shares = np.linspace(0.0, 1.0, n_force) if n_force > 1 else np.array([0.5])
-        forces = self._force(force_shares)
+        force_fractions = np.linspace(0.0, 1.0, n_force) if n_force > 1 else np.array([0.5])
+        forces = self._force(force_fractions)
         rotations: Array = period * np.arange(n_rotation) / n_rotation
 
         # All combinations of positions, forces and rotations

@@ -216,10 +216,11 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
 
 
 def _flat(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the entries of nested tables, with the names of nested keys joined by a space."""
+    """Yield the keys and values of nested tables. The keys that lead to a value are joined by spaces."""
     for key, value in table.items():
         if isinstance(value, dict):
-            yield from ((f"{key} {inner}", deep) for inner, deep in _flat(value))
+            for inner_keys, inner_value in _flat(value):
+                yield f"{key} {inner_keys}", inner_value
         else:
             yield key, value
 
@@ -241,12 +242,13 @@ def _check_samples(samples: Samples, n_electrode: int, where: str) -> None:
     if shapes != expected or count == 0:
         raise DatasetError(f"{where}: expected columns of shapes {expected}, at least one sample, got {shapes}")
     for name, column in samples.columns().items():
-        kinds = "U" if name == "probe" else "fiu"
-        if column.dtype.kind not in kinds:
+        is_text = name == "probe"
+        expected_kinds = "U" if is_text else "fiu"  # kinds of NumPy types: Unicode; float, signed, unsigned
+        if column.dtype.kind not in expected_kinds:
             raise DatasetError(
-                f"{where}: column {name}: expected {'text' if kinds == 'U' else 'numbers'}, got {column.dtype}"
+                f"{where}: column {name}: expected {'text' if is_text else 'numbers'}, got {column.dtype}"
             )
-        if name != "probe" and not np.isfinite(column).all():
+        if not is_text and not np.isfinite(column).all():
             row = int(np.argwhere(~np.isfinite(column))[0][0])
             raise DatasetError(f"{where}: column {name} holds {column[row]} in row {row}; every number must be finite")
 
@@ -263,32 +265,33 @@ def read_dataset(folder: Path, sensor: Sensor | None = None) -> Dataset:
             incomplete. The message names the file and a remedy.
     """
     folder = Path(folder)
-    expected = sensor
+    manifest_path = f"{folder}/manifest.json"
     manifest, checksum = _read_manifest(folder)
+    checked_manifest = convert(manifest, _Manifest, manifest_path, DatasetError)
     try:
-        listed = convert(manifest, _Manifest, f"{folder}/manifest.json", DatasetError)
-        sensor = sensor_from_dict(listed.sensor, f"{folder}/manifest.json")
-        if expected is not None and expected != sensor:
-            raise DatasetError(
-                f"{folder}/manifest.json: expected the sensor {expected.name!r}, got {_differs(sensor, expected)}; use "
-                "its own dataset, or make one"
-            )
-        if listed.electrodes != list(sensor.electrode_names):
-            raise DatasetError(
-                f"{folder}/manifest.json: electrodes: expected the sensor's electrodes in its order, "
-                f"{list(sensor.electrode_names)}, got {shown(listed.electrodes)}"
-            )
-        shards = [_read_shard(folder, entry, sensor) for entry in listed.shards]
+        dataset_sensor = sensor_from_dict(checked_manifest.sensor, manifest_path)
     except SensorError as error:
         raise DatasetError(str(error)) from error
+    if sensor is not None and sensor != dataset_sensor:
+        raise DatasetError(
+            f"{manifest_path}: expected the sensor {sensor.name!r}, got {_difference(dataset_sensor, sensor)}; use its "
+            "own dataset, or make one"
+        )
+    if checked_manifest.electrodes != list(dataset_sensor.electrode_names):
+        raise DatasetError(
+            f"{manifest_path}: electrodes: expected the sensor's electrodes in its order, "
+            f"{list(dataset_sensor.electrode_names)}, got {shown(checked_manifest.electrodes)}"
+        )
+
+    shards = [_read_shard(folder, entry, dataset_sensor) for entry in checked_manifest.shards]
     if not shards:
-        raise DatasetError(f"{folder}/manifest.json: lists no shards")
-    joined = {name: np.concatenate([getattr(shard, name) for shard in shards]) for name in COLUMNS}
-    return Dataset(sensor, Samples(**joined), manifest, checksum)
+        raise DatasetError(f"{manifest_path}: lists no shards")
+    columns = {name: np.concatenate([getattr(shard, name) for shard in shards]) for name in COLUMNS}
+    return Dataset(dataset_sensor, Samples(**columns), manifest, checksum)
 
 
-def _differs(sensor: Sensor, expected: Sensor) -> str:
-    """Return a text for an error message that says how a sensor differs from the expected sensor.
+def _difference(sensor: Sensor, expected: Sensor) -> str:
+    """Describe how a sensor differs from the expected sensor, for an error message.
 
     Args:
         sensor: Sensor that was given.
@@ -322,7 +325,11 @@ class _Manifest(Struct):
 
 
 def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
-    """Read the manifest and compute its checksum, and check the format version."""
+    """Read the manifest of a dataset and check its format version.
+
+    Returns:
+        Content of the manifest, and its checksum.
+    """
     path = folder / "manifest.json"
     if not path.is_file():
         raise DatasetError(
@@ -366,12 +373,12 @@ def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
         raise DatasetError(
             f"{path} is damaged: expected sha256 {expected[:12]}..., got {checksum[:12]}...; make the dataset again"
         )
-    samples = _unpacked(data, str(path))
+    samples = _unpack(data, str(path))
     _check_samples(samples, len(sensor.electrodes), str(path))
     return samples
 
 
-def _unpacked(data: bytes, where: str) -> Samples:
+def _unpack(data: bytes, where: str) -> Samples:
     """Convert the bytes of a shard into samples without executing any code in them.
 
     Args:

@@ -82,7 +82,8 @@ def run_sweep(
     folder = Path(folder)
     probes = tuple(probes)
     refuse_finished(folder)
-    presses = sweep.over(probes)  # before files are written, because SciPy ignores an interrupt here
+    # The presses are computed before files are written, because SciPy ignores an interrupt in this step.
+    presses = sweep.over(probes)
     identity = {
         "made_by": code_fingerprint(),
         "sensor": sensor_to_dict(sensor),
@@ -99,7 +100,7 @@ def run_sweep(
                 sweep.radius,
                 sweep.force_range,
                 settings,
-                executor=run.keeping(f"solve-{number:02d}", executor),
+                executor=run.storing_executor(f"solve-{number:02d}", executor),
             )
             for number, probe in enumerate(probes)
         ]
@@ -213,7 +214,7 @@ def _samples(
         shards: Presses of each shard.
         executor: Executor that computes the charges; this process if None.
     """
-    # The tasks are consumed earlier than the results, so both have an iterator over the shards of their own.
+    # Tasks are submitted before the samples of earlier shards are yielded, so each loop has its own iterator.
     shards, shards_for_tasks = tee(shards)
     tasks = (
         (maps[probe], presses.contact[rows], presses.rotation[rows])

@@ -1,1 +1,1 @@
-"""Execution of long computations in this process, in worker processes or on a Dask cluster; code fingerprint."""
+"""Execution of long computations in this process, in worker processes or on a Dask cluster."""

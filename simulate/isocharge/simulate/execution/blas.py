@@ -10,8 +10,8 @@ _CONTROLLER = ThreadpoolController()
 def single_threaded_blas() -> AbstractContextManager[object]:
     """Return a context manager within which BLAS uses one thread.
 
-    Operations on many small matrices are faster with one thread. Several threads wait for each other in busy loops,
-    which takes many times longer if other processes occupy the remaining cores.
+    Operations on many small matrices are faster with one thread. Several threads would wait for each other in busy
+    loops, and these waits are long if other processes occupy the remaining cores.
     """
     limiter: AbstractContextManager[object] = _CONTROLLER.limit(limits=1, user_api="blas")
     return limiter

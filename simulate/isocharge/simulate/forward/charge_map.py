@@ -1,4 +1,4 @@
-"""The protocol of maps from contacts to charges, their domains, and checks of contacts and charges."""
+"""Protocol of charge maps, which compute charges from contacts; their domains; checks of contacts and charges."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +11,9 @@ from isocharge.common.errors import ChargeError, SceneError
 
 STEPS = (0.05, 0.05, 1e-3)
 """Steps of the central differences in x and y (mm) and in ln F (dimensionless)."""
+
+MIN_LOG_FORCE_HALF_WIDTH = 0.05
+"""Lower bound for the half width of a domain in ln F, dimensionless. It allows a domain with a single force."""
 
 LIMIT_TOLERANCE = 1.0 + 1e-9
 """Factor by which a contact may exceed the limits of a domain because of rounding."""
@@ -38,7 +41,7 @@ class Domain:
     def scale(self) -> Array:
         """Half width of the domain in (x, y, ln F), shape (3,), mm and logarithm of N."""
         low, high = np.log(self.force_range)
-        return np.array([self.radius, self.radius, max(0.5 * (high - low), 0.05)])
+        return np.array([self.radius, self.radius, max(0.5 * (high - low), MIN_LOG_FORCE_HALF_WIDTH)])
 
     def is_outside(self, contact: Array) -> Booleans:
         """Return which contacts are farther from the centre than the radius, or have a force outside the range.
@@ -82,7 +85,7 @@ class Domain:
         return Domain(radius, self.force_range)
 
     def contains(self, contact: Array) -> Booleans:
-        """Return whether contacts lie in the domain. Contacts with NaN do not.
+        """Return which contacts lie in the domain, up to rounding. A contact with NaN lies outside.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -165,14 +168,19 @@ class ChargeMap(Protocol):
 
 @runtime_checkable
 class LinearisedMap(ChargeMap, Protocol):
-    """A charge map that computes charges and derivatives together in less time."""
+    """A charge map that computes charges and derivatives together in less time than one after the other."""
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Compute the results of `charges` and `derivatives` together."""
+        """Return the results of `charges` and `derivatives` for contacts (x, y, F), shape (n, 3), mm and N."""
 
 
 def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
-    """Compute charges and derivatives of contacts, together if the map supports it; see `ChargeMap`."""
+    """Return the results of `ChargeMap.charges` and `ChargeMap.derivatives`, computed together if the map supports it.
+
+    Args:
+        charge_map: The map.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+    """
     if isinstance(charge_map, LinearisedMap):
         return charge_map.linearised(contact)
     return charge_map.charges(contact), charge_map.derivatives(contact)
@@ -276,8 +284,9 @@ def check_forces(force: Array | float, force_range: tuple[float, float], source:
 
 
 def _are_within(force: Array, force_range: tuple[float, float]) -> Booleans:
-    """Return whether forces lie in a range, both in N. NaN does not."""
-    return np.asarray((force >= force_range[0] / LIMIT_TOLERANCE) & (force <= force_range[1] * LIMIT_TOLERANCE))
+    """Return which forces (N) lie in a range (N), up to rounding. NaN lies outside."""
+    low, high = force_range
+    return np.asarray((force >= low / LIMIT_TOLERANCE) & (force <= high * LIMIT_TOLERANCE))
 
 
 def check_radius(radius: float, largest: float, source: str) -> None:
@@ -304,7 +313,7 @@ def check_determined(electrodes: int) -> None:
     if electrodes < 3:
         raise SceneError(
             f"expected at least three electrodes, got {electrodes}: x, y and the force are three unknowns, so with "
-            "fewer charges a whole line of contacts has the same ones; add an electrode"
+            "fewer charges a whole line of contacts has the same charges; add an electrode"
         )
 
 

@@ -13,7 +13,7 @@ import typer
 
 from isocharge.cli.shared.measured_presses import ForceStdOption, PositionStdOption
 from isocharge.cli.shared.options import DeviceOption, ModelsOption, StressLimitOption
-from isocharge.cli.shared.port_hints import doctor_is_named
+from isocharge.cli.shared.port_hints import no_frames_advice_added
 from isocharge.cli.shared.probe_option import ProbeOption
 from isocharge.cli.shared.terminal import say, show_json
 from isocharge.cli.train.press_dialogue import Dialogue, OnTaken, Screen
@@ -206,7 +206,7 @@ def _open_events(port: SensorPort, problem: CalibrationProblem) -> Iterator[Pres
     stream = ReadingStream(problem.electrodes, board, reader=f"sensor {problem.sensor.name}")
     watch = PressWatch(problem.electrodes)
     with (
-        doctor_is_named(port.url, port.device),
+        no_frames_advice_added(port.url, port.device),
         open_source(port.url, baud=port.baud, reconnect=port.reconnects, request=board.request) as source,
         PressEvents(source, stream, watch, port.keyboard) as events,
     ):

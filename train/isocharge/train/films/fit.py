@@ -152,7 +152,7 @@ def fit_films(
 
     def saving_executor(name: str) -> Executor | None:
         """Return an executor that saves the results of its tasks in the run, if there is a run."""
-        return executor if run is None else run.keeping(name, executor)
+        return executor if run is None else run.storing_executor(name, executor)
 
     with threads_and_seed(1, config.seed):
         domain = Domain(config.radius, config.force_range)

@@ -73,7 +73,7 @@ def write_report(
     with resume_folder(folder, run_identity, fresh=fresh) as run, threads_and_seed(1, settings.seed):
         sections = []
         for file_stem, evaluation in zip(file_stems, evaluations, strict=True):
-            section = evaluation.measure(run.keeping(file_stem))
+            section = evaluation.measure(run.storing_executor(file_stem))
             picture_files = section.save_pictures(run.data, file_stem)
             sections.append({**section.content, "pictures": picture_files})
         page = report_page({**header, "datasets": sections})

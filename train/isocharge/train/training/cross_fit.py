@@ -116,7 +116,7 @@ def fit_presses(
         distillation = _distillation_stage(network, members, labelled, noise, training)
         train_perceptron(distillation, network.contact, settings, run)
         draw = partial(_misfit_examples, labelled, domain, noise, training)
-        examples = draw() if run is None else run.keeping("misfit-charges").submit(draw).result()
+        examples = draw() if run is None else run.storing_executor("misfit-charges").submit(draw).result()
         train_perceptron(misfit_stage(network, examples, training), network.misfit_vector, settings, run)
 
     cross_validated = Answers(

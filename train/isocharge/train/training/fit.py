@@ -386,7 +386,7 @@ def _misfit_examples(
     draw = partial(draw, noise, config.misfit_charges, config.seed)
     if run is None:
         return draw()
-    return run.keeping("misfit-charges").submit(draw).result()
+    return run.storing_executor("misfit-charges").submit(draw).result()
 
 
 def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:
