@@ -1,4 +1,4 @@
-"""The page of all commands, from the same declarations as `--help`."""
+"""Generation of the page that lists all commands, from the declarations that `--help` uses."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,7 +33,7 @@ def write_page(path: Path) -> None:
 
 
 def _commands(group: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield the words and the command of each command in a group and in its groups."""
+    """Yield each command of a group and of its subgroups, with the words that call the command."""
     for name in group.list_commands(None):
         _, command, _ = group.resolve_command(None, [name])
         if hasattr(command, "list_commands"):

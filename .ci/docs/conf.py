@@ -1,8 +1,10 @@
-"""The site: the pages as they are, scripts that run with their pictures, and the reference of every module.
+"""Configuration of the site, which contains the pages, the example scripts with their pictures, and a reference of all
+modules.
 
     python -m sphinx -W --keep-going -c .ci/docs . build/docs
 
-The folder of the project is the source, so links between pages hold here and where the code is hosted.
+The source folder of the site is the folder of the project. Links between pages therefore work both on the site and
+where the code is hosted.
 """
 
 import shutil
@@ -63,7 +65,7 @@ sphinx_gallery_conf = {
 
 
 def add_contents(_app: Any, page: str, source: list[str]) -> None:
-    """Put the contents of the site under the first page, and links to the playground into its page."""
+    """Append the table of contents to the first page, and insert links to the playground into its page."""
     if page == HOME:
         source[0] += (ROOT / ".ci" / "docs" / "contents.md").read_text("utf-8")
     if page == PLAYGROUND:
@@ -71,7 +73,7 @@ def add_contents(_app: Any, page: str, source: list[str]) -> None:
 
 
 def add_whole_pages(app: Any, error: Exception | None) -> None:
-    """Add the first page under the name that servers look for, and the playground."""
+    """Add the playground to the site, and a copy of the first page with the file name that web servers expect."""
     if error is None:
         folder = Path(app.outdir)
         shutil.copy(folder / f"{HOME}.html", folder / "index.html")
@@ -79,7 +81,7 @@ def add_whole_pages(app: Any, error: Exception | None) -> None:
 
 
 def setup(app: Any) -> None:
-    """Write the pages of the reference, and ask to be called."""
+    """Write the pages of the reference, and connect the functions of this module to the events of Sphinx."""
     names = reference.modules()
     reference.check_docstrings(names)
     reference.write_pages(names, ROOT / REFERENCE)

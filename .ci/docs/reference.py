@@ -1,4 +1,4 @@
-"""The reference of every module, from its docstrings."""
+"""Generation of the reference of all modules from their docstrings."""
 
 import re
 import sys
@@ -35,7 +35,7 @@ def check_docstrings(names: list[str]) -> None:
 
 
 def write_pages(names: list[str], folder: Path) -> None:
-    """A page for each module, and a list of all of them.
+    """Each module has a page, and one page lists all modules.
 
     The pages of the modules are in no table of contents, because each page of the site repeats the tables.
     """
@@ -61,19 +61,25 @@ def write_pages(names: list[str], folder: Path) -> None:
 
 
 def _write(path: Path, lines: list[str]) -> None:
-    """Write lines unless they are there: what did not change is not read again."""
+    """Write lines into a file unless the file already contains them. Sphinx does not read unchanged files again."""
     text = "\n".join(lines) + "\n"
     if not path.exists() or path.read_text("utf-8") != text:
         path.write_text(text, "utf-8")
 
 
 def is_of_scikit_learn(_app: Any, _kind: str, name: str, _object: Any, skip: bool, _options: Any) -> bool:
-    """Whether a member is left out: those that scikit-learn makes are explained there."""
+    """Return whether a member is omitted from the reference.
+
+    Members that scikit-learn generates are omitted, because scikit-learn documents them.
+    """
     return skip or (name.startswith("set_") and name.endswith("_request"))
 
 
 def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
-    """Take a docstring for plain text with names in backticks; what is indented after an empty line is code."""
+    """Convert a docstring from plain text with names in backticks to reStructuredText.
+
+    Indented lines after a blank line become code.
+    """
     shown, code = [], False
     for before, line in zip(["", *lines], lines, strict=False):
         if line.strip():
@@ -89,8 +95,8 @@ def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, li
 def list_attributes(_app: Any, _kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
     """Write the attributes of a class as a list of names with their descriptions.
 
-    Napoleon writes a field `:ivar NAMES: text` for each attribute, and Sphinx takes the first of several names, as in
-    `x_mm, y_mm`, for a type. The types, in fields `:vartype NAME:`, are left out.
+    Napoleon writes a field `:ivar NAMES: text` for each attribute. If there are several names, as in `x_mm, y_mm`,
+    Sphinx would interpret the first name as a type. The fields `:vartype NAME:`, which contain the types, are omitted.
     """
     shown: list[str] = []
     in_attributes = False

@@ -71,7 +71,7 @@ def position_degrees(degree: int) -> tuple[Integers, Integers]:
 
 
 def chebyshev_terms(coordinates: Array, degree: int, force_degree: int) -> tuple[Array, Array]:
-    """Evaluate the polynomials of which a series consists.
+    """Evaluate all products of Chebyshev polynomials that occur in a series.
 
     Args:
         coordinates: Scaled coordinates, shape (n, 3). Coordinates outside [-1, 1] are clipped.

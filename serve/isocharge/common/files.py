@@ -1,4 +1,4 @@
-"""Reading and writing of files, so that a file or folder exists either completely or not at all."""
+"""Reading and writing of files. A written file or folder exists either completely or not at all."""
 
 import errno
 import hashlib
@@ -177,7 +177,7 @@ def new_file(path: Path) -> Iterator[Path]:
         path: The final path of the file.
 
     Yields:
-        The temporary path in the same folder, at which the block creates a file or a folder.
+        Temporary path in the same folder, where the block creates a file or a folder.
 
     Raises:
         OutputExists: If `path` exists already, or another process creates it in the meantime.
@@ -254,7 +254,7 @@ def remove_empty(folders: Iterable[Path]) -> None:
 def sync_folder(folder: Path) -> None:
     """Flush a folder or a file to disk, so that renames or contents survive a power failure.
 
-    Nothing is done on Windows, which cannot open folders.
+    The function does nothing on Windows, where a folder cannot be opened.
     """
     if not hasattr(os, "O_DIRECTORY"):
         return

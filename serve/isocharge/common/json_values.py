@@ -6,7 +6,7 @@ import numpy as np
 
 
 def finite_or_none(value: float | None) -> float | None:
-    """Return a number as a float; None if it is NaN, infinite or None."""
+    """Convert a number to a float. NaN, infinity and None become None."""
     if value is None or not math.isfinite(value):
         return None
     return float(value)

@@ -242,7 +242,7 @@ class MeasuredPresses:
         )
 
     def _refuse_first(self, refused: Booleans, reason: str) -> None:
-        """Raise PressError for the first press of a mask, if there is one."""
+        """Raise PressError for the first press that a mask selects, if it selects any."""
         rows = np.flatnonzero(refused)
         if rows.size:
             raise PressError(f"{self.row_noun} {self.lines[rows[0]]}: {reason}")

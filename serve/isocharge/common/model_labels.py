@@ -1,8 +1,8 @@
 """Names and labels of models.
 
 A name is safe in paths, URLs, pages and config.pbtxt. A label is `NAME/VERSION`, as prediction records carry it. A
-label has one slash and no `..`, so it cannot name a path outside of the user's repositories. A file from somebody else
-that contains a label can therefore only select one of the models that the user has.
+label has one slash and no `..`, so it cannot name a path outside of the user's repositories. A foreign file that
+contains a label can therefore only select one of the user's own models.
 """
 
 import re

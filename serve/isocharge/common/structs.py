@@ -46,8 +46,10 @@ MAX_JSON_BYTES = 1 << 22
 """Largest size of a JSON file, bytes."""
 
 MAX_EXAMINED_ITEMS = 1000
-"""Number of items of a list that are examined for an error. For errors in later items, the message of msgspec is
-used."""
+"""Number of items of a list that are examined for an error.
+
+For errors in later items, the message of msgspec is used.
+"""
 
 _KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
 _DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY_PART}\.[ \t]*+){{32}}")
@@ -268,7 +270,7 @@ def _mistakes_in_parts(value: object, expected_type: Any, path: str) -> Iterator
 def _mistakes_in_keys(table: Mapping[str, Any], struct: type[Struct], path: str) -> Iterator[str]:
     """Yield unknown keys, missing keys, and mistakes in the values of the keys.
 
-    Nothing is yielded if the tag of the table selects another struct.
+    The function yields nothing if the tag of the table selects another struct.
 
     Args:
         table: The table.
@@ -314,7 +316,10 @@ def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
 
 
 def _union_members(kind: Any) -> Iterator[Any]:
-    """Yield the members of a union without their annotations. A type that is no union is its only member."""
+    """Yield the members of a union without their annotations.
+
+    If the type is not a union, the function yields the type itself.
+    """
     if get_origin(kind) is Annotated:
         yield from _union_members(get_args(kind)[0])
     elif get_origin(kind) in (Union, UnionType):

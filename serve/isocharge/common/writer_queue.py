@@ -16,12 +16,14 @@ MAX_WAITING = 10_000
 """Largest number of waiting items. Records of ten seconds at 1 kHz occupy about 10 MB."""
 
 CLOSE_TIMEOUT_s = 1.0
-"""Longest time that `close` waits for the consumer to take the next item, s. After this time, the waiting items count
-as lost."""
+"""Longest time that `close` waits for the consumer to take the next item, s.
+
+After this time, the waiting items count as lost.
+"""
 
 
 class WriterQueue(Generic[T]):
-    """A bounded queue and the thread that writes its items; a context manager.
+    """Bounded queue with a thread that writes its items. The object is a context manager.
 
     Attributes:
         lost: Number of items that were dropped and never written.
@@ -56,7 +58,7 @@ class WriterQueue(Generic[T]):
 
     @property
     def is_stuck(self) -> bool:
-        """Whether the thread still runs after `close`, because the consumer does not take the last item."""
+        """Whether the thread is still running after `close`, because the consumer has not accepted the last item."""
         return self._is_closed and self._thread.is_alive()
 
     def put(self, item: T) -> None:
@@ -98,7 +100,7 @@ class WriterQueue(Generic[T]):
         return self._taken > taken or self._error is not None
 
     def _raise_error(self) -> None:
-        """Raise the error of the thread, if there is one that was not raised yet."""
+        """Raise the error of the thread, unless there is none or it was raised before."""
         error = self._error
         self._error = None
         if error is not None:

@@ -81,7 +81,7 @@ def demo_command(
 
 
 def _write_playground(path: Path) -> None:
-    """Write the playground, and print how it is opened.
+    """Write the playground, and print how to open it.
 
     Args:
         path: Path of the HTML file. Missing folders are made.

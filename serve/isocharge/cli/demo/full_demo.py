@@ -1,4 +1,4 @@
-"""The demo that uses every part once: simulate a film, train a model, follow a virtual sensor, draw the results."""
+"""Complete demo: simulate a film, train a model, follow a virtual sensor, and draw the results."""
 
 import time
 from collections.abc import Iterator
@@ -182,7 +182,10 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
 
 
 def _contact_of(record: PredictionRecord) -> tuple[float, float, float]:
-    """Return x, y (mm) and force (N) of a record. A value that the record does not contain is returned as 0."""
+    """Return x, y (mm) and force (N) of a record.
+
+    The function returns 0 for a value that the record does not contain.
+    """
     return record.x_mm or 0.0, record.y_mm or 0.0, record.force_N or 0.0
 
 
@@ -207,7 +210,10 @@ def _test_presses(forward_map: ForwardMap, predictor: Predictor, sweep: Sweep) -
 
 
 def _position_error(presses: Array) -> Array:
-    """Compute the distances between true and estimated positions, mm. Each row ends with both contacts, (x, y, F)."""
+    """Compute the distances between true and estimated positions, mm.
+
+    Each row ends with the true and the estimated contact, (x, y, F).
+    """
     return position_error(presses[:, -3:], presses[:, -6:-3])
 
 

@@ -1,4 +1,4 @@
-"""A virtual sensor on the live page, whose contacts are estimated by the released model."""
+"""Demo of the live page with a virtual sensor and a released model."""
 
 from contextlib import ExitStack, closing
 

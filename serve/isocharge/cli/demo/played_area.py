@@ -1,4 +1,4 @@
-"""Sensor and area of the presses that the demo plays."""
+"""Sensor of the demo, and the area in which its virtual presses lie."""
 
 import numpy as np
 
@@ -13,8 +13,8 @@ DEFAULT_SENSOR = "three-25um-biaxial"
 def played_radius_mm(sensor: str) -> float:
     """Return the largest distance of a press from the centre of the film, mm.
 
-    It is the radius of the largest disk in the working area of the released model with the name of the sensor, or
-    `DEFAULT_RADIUS` if there is no such model.
+    If there is a released model with the name of the sensor, the distance is the radius of its working area. Otherwise,
+    it is `DEFAULT_RADIUS`.
 
     Args:
         sensor: Name of the sensor.

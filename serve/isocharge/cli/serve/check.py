@@ -87,7 +87,7 @@ def _press_lines(check: PressCheck) -> Iterator[str]:
 
 
 def _press_line(row: dict[str, Any]) -> str:
-    """Return the line of one press from the values of `PressErrors.row`."""
+    """Format the values of `PressErrors.row` as the line of one press."""
     numbers = [
         _number_cell(row["x_mm"], width=9, decimals=2),
         _number_cell(row["y_mm"], width=9, decimals=2),
@@ -102,7 +102,7 @@ def _press_line(row: dict[str, Any]) -> str:
 
 
 def _number_cell(value: float, width: int, decimals: int) -> str:
-    """Return a number aligned to the right; a dash for NaN."""
+    """Format a number aligned to the right. NaN is formatted as a dash."""
     text = "-" if math.isnan(value) else f"{value:.{decimals}f}"
     return text.rjust(width)
 

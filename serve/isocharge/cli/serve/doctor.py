@@ -1,4 +1,4 @@
-"""`isocharge serve doctor`: what a port sends, as text or as JSON, and the device file that fits the board."""
+"""`isocharge serve doctor`: examine what a port sends, and write the device file of the board."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -178,7 +178,8 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
 
 
 def port_lines() -> Iterator[str]:
-    """Yield a line for each serial port of this machine: its description, and what came within a second."""
+    """Yield a line for each serial port of this machine, with its description and the frames received within one
+    second."""
     for port in sorted(list_ports.comports()):
         try:
             examination = examine(port.device, seconds=1.0)
@@ -192,7 +193,7 @@ def port_lines() -> Iterator[str]:
 
 
 def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
-    """Yield the names of the models with so many electrodes. Models that cannot be read are left out."""
+    """Yield the names of the models with the given number of electrodes. Models that cannot be read are omitted."""
     for name in dict.fromkeys(name for root in repositories(models) for name in model_names(root)):
         with suppress(IsochargeError):
             if len(Predictor(name, models=models).metadata.electrodes) == electrodes:
@@ -200,7 +201,7 @@ def _models_of(electrodes: int, models: Path | None) -> Iterator[str]:
 
 
 def _setting(key: str, text: str) -> Any:
-    """Return the value of an option of the gain: a number, or a number for each electrode.
+    """Parse an option that describes the gain, and return one number or a number for each electrode.
 
     Args:
         key: Key of the setting in a device file, such as `pc_per_unit`, from which the name of the option follows.
@@ -220,7 +221,7 @@ def _setting(key: str, text: str) -> Any:
 
 
 def _request(text: str | None, rate_Hz: float) -> Request | None:
-    """Return the request of `--request`, whose text may contain escape sequences.
+    """Convert the text of `--request` to bytes. The text may contain escape sequences.
 
     Raises:
         InputError: If the text is empty, or an escape sequence is wrong.
@@ -261,7 +262,7 @@ def _write(path: Path, examination: Examination, model: str) -> None:
 
 
 def report_lines(examination: Examination) -> Iterator[str]:
-    """Yield the lines of the report about a port: the frames, a table of the channels, and what is missing.
+    """Yield the lines of the report on a port: the frames, a table of the channels, and the missing settings.
 
     Args:
         examination: Result of the port check.
@@ -303,7 +304,7 @@ VOLT_DECIMALS = (5, 6, 5, 5, 5)
 
 
 def _numbering_line(examination: Examination) -> str:
-    """Return what the numbers of the frames and the clock of the device show."""
+    """Describe the sequence numbers of the frames and the clock of the device."""
     clock = "a device clock" if examination.device_clock else "no device clock"
     if examination.lost is None:
         return f"frames have no numbers; {clock}"

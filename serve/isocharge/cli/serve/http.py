@@ -96,7 +96,7 @@ def http_command(
 
 @contextmanager
 def _traffic(log: LogFormat, token: str | None) -> Iterator[Traffic]:
-    """Yield the counters of the servers and, for JSON, set up the log on stderr, which is written by another thread.
+    """Yield the counters of the servers. If the log is JSON, a thread writes it to stderr while the context is open.
 
     Args:
         log: Value of `--log`.
@@ -132,7 +132,7 @@ def _report(traffic: Traffic, level: str, event: str, message: str) -> None:
 
 
 def _grpc(handler: Handler, host: str, port: int | None, tls: Tls | None) -> AbstractContextManager[str]:
-    """Return a context in which the gRPC server runs, and which yields the address of the server.
+    """Return a context manager that runs the gRPC server and yields its address.
 
     Args:
         handler: Handler of the HTTP server, whose models, limits and token are used.

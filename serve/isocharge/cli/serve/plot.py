@@ -137,7 +137,7 @@ def traces_of(records: Iterator[Any], where: str) -> dict[str, Array]:
 
 
 class _Groups(NamedTuple):
-    """Groups of neighbouring records, each of which is drawn as one.
+    """Groups of neighbouring records. Each group is drawn as a single point.
 
     Attributes:
         start: Position of the first record of each group, shape (n_group,).
@@ -225,7 +225,7 @@ def recording_picture(
 
 
 def _draw_with_std(axes: Any, groups: _Groups, traces: dict[str, Array], name: str, colour: str) -> None:
-    """Draw a number over time with a band of two standard deviations."""
+    """Draw a quantity over time, with a band of two standard deviations."""
     values = traces[name]
     spread = 2.0 * traces[name.replace("_", "_std_")]
     groups.draw_band(axes, values - spread, values + spread, color=colour, alpha=0.25, lw=0.0)

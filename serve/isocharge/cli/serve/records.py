@@ -99,7 +99,7 @@ def say_missing_records(outputs: Outputs) -> None:
 
 
 def summary(touch: TouchStream, latencies: deque[float]) -> str:
-    """Return the counts of frames and faults, and percentiles of the latency, as a text.
+    """Format the numbers of frames and faults, and percentiles of the latency.
 
     Args:
         touch: The stream.

@@ -1,4 +1,4 @@
-"""`isocharge serve stream` and `serve replay`: prediction records from a port as they come, or from a recording."""
+"""`isocharge serve stream` and `serve replay`: compute prediction records from a live port or from a recording."""
 
 import signal
 from collections import deque

@@ -108,7 +108,9 @@ N_SIMULATED_PRESSES = 24_000
 
 
 def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, force: tuple[float, float]) -> Dataset:
-    """Simulate presses with the default settings of a sweep. One process is enough, because this takes a few seconds.
+    """Simulate presses with the default settings of a sweep.
+
+    The simulation uses a single process, because it takes only a few seconds.
 
     Args:
         sensor: The sensor.

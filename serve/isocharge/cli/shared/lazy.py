@@ -1,6 +1,6 @@
 """Groups of commands whose modules are imported only when a command is called.
 
-The help of a group therefore does not wait for the imports of its commands.
+Therefore the help of a group is printed without importing its commands.
 """
 
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer
     """
 
     class LazyGroup(TyperGroup):
-        """A group with the names and the summaries of the commands."""
+        """A group that stores only the names and the summaries of its commands."""
 
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
@@ -66,7 +66,7 @@ def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer
 
 
 def load_command(command: LazyCommand) -> TyperCommand:
-    """Import the function of a command, and return the command that Typer makes of it.
+    """Import the function of a command, and return the Typer command for this function.
 
     Raises:
         MissingExtra: If the extra of the command is not installed.

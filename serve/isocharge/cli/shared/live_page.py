@@ -80,7 +80,7 @@ TlsKeyOption = Annotated[
 
 
 def given_tls(certificate: Path | None, key: Path | None) -> Tls | None:
-    """Return the TLS files of the options; None without a certificate.
+    """Return the TLS files that the options name, or None if they name no certificate.
 
     Args:
         certificate: Value of `--tls-cert`; None if the option is not given.
@@ -97,7 +97,7 @@ def given_tls(certificate: Path | None, key: Path | None) -> Tls | None:
 
 
 def page_tls(live: str | None, certificate: Path | None, key: Path | None) -> Tls | None:
-    """Return the TLS files of the live page; None without a certificate.
+    """Return the TLS files of the live page, or None if there is no certificate.
 
     Raises:
         InputError: If the key is given without a certificate, or a certificate without a page.
@@ -109,9 +109,10 @@ def page_tls(live: str | None, certificate: Path | None, key: Path | None) -> Tl
 
 
 def given_token(token: str | None) -> str | None:
-    """Return the token of the option or of the environment.
+    """Return the token that the option or the environment contains.
 
-    An empty token in the environment is returned as it is, although Typer treats it as absent.
+    If the environment contains an empty token, the function returns an empty text, although Typer treats this case as a
+    missing token.
     """
     return os.environ.get("ISOCHARGE_TOKEN") if token is None else token
 
@@ -190,7 +191,7 @@ class PageFeed:
     """
 
     def __init__(self, link: ReaderEnd, touch: TouchStream, live: RecordedStream | None = None) -> None:
-        """Begin without records; the arguments are described in the class."""
+        """Initialise without records. The class docstring describes the arguments."""
         self._link = link
         self._touch = touch
         self._live = live

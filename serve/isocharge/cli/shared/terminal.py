@@ -1,8 +1,8 @@
 """Output and termination of the commands: results, messages, progress, standard streams and signals.
 
 All text that a command prints passes through this module, which escapes the characters that a terminal executes or
-hides. Messages are printed on stderr. Progress bars are only shown if stderr is a terminal. If a stream is closed, full
-or slow, a command neither fails nor writes to another file.
+hides. Messages are printed on stderr. Progress bars are only shown if stderr is a terminal. If a standard stream is
+closed, full or slow, the command does not fail, and its text does not reach another file.
 """
 
 import io
@@ -40,7 +40,8 @@ class ClosedOutput(io.TextIOBase):
 def open_closed_streams() -> None:
     """Replace standard streams that are closed.
 
-    Otherwise the next file that is opened would get the number of a closed stream, and printed text would go into it.
+    Without this replacement, the next file that is opened would get the file descriptor of stdout, and printed text
+    would be written into that file.
     """
     for number in (0, 1, 2):
         try:
@@ -80,7 +81,10 @@ def show_json(value: Any) -> None:
 
 
 def announce(line: str) -> None:
-    """Print a line on stdout for programs that wait for it. A server continues if stdout is closed."""
+    """Print a line on stdout and flush it, for programs that wait for this line.
+
+    A server continues if stdout is closed.
+    """
     try:
         print(printable(line), flush=True)
     except OSError:
@@ -147,7 +151,7 @@ def until_stopped() -> Iterator[None]:
 
 @contextmanager
 def stop_after(seconds: float | None) -> Iterator[None]:
-    """Interrupt the block after some time, as Ctrl-C does, also while the command waits for a port.
+    """Interrupt the block after the given time in the same way as Ctrl-C, even while the command waits for a port.
 
     Args:
         seconds: Time, s; None for no limit.
@@ -175,7 +179,8 @@ def on_signal(number: signal.Signals, act: Callable[[], object]) -> Iterator[Non
 
 
 def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
-    """Return a handler of SIGHUP, which the system also sends if the terminal of a command is closed.
+    """Return a handler of the signal SIGHUP. The system also sends this signal if the terminal of the command is
+    closed.
 
     Args:
         act: Function that the handler calls if the terminal is open. Otherwise the handler stops the command like
@@ -184,7 +189,7 @@ def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
     terminals = [descriptor for descriptor in (0, 1, 2) if os.isatty(descriptor)]
 
     def act_or_stop() -> None:
-        """Call `act`, or stop the command if its terminal was closed."""
+        """Call `act`, or stop the command if its terminal has been closed."""
         is_open = all(map(os.isatty, terminals))
         if not is_open:
             raise KeyboardInterrupt

@@ -20,8 +20,10 @@ from isocharge.common.number_text import parse_number
 from isocharge.common.tables.number_table import ColumnRule, NumberColumns, NumberTable
 
 _SEPARATORS = {";": "tr ',;' '.,'", "\t": r"tr '\t' ','"}
-"""Separators other than the comma that spreadsheets use. The value is the command that converts such a file into CSV
-with decimal points."""
+"""Separators other than the comma that spreadsheets use.
+
+The value is the command that converts such a file into CSV with decimal points.
+"""
 
 _OTHER_FORMATS = {
     codecs.BOM_UTF32_LE: "the file is UTF-32: save it as UTF-8, as with: iconv -f UTF-32 -t UTF-8 FILE > NEW.csv",
@@ -31,8 +33,10 @@ _OTHER_FORMATS = {
     b"PAR1": "the file is Parquet: rename it so that its name ends in .parquet",
     b"\x1f\x8b": "the file is compressed: unpack it, as with: gunzip < FILE > NEW.csv",
 }
-"""Advice for files that are not text in UTF-8, by their first bytes. UTF-32 precedes UTF-16, because the first bytes of
-UTF-32 begin with those of UTF-16."""
+"""Advice for files that are not text in UTF-8, by their first bytes.
+
+UTF-32 precedes UTF-16, because the first bytes of UTF-32 begin with those of UTF-16.
+"""
 
 BYTE_ORDER_MARK = "\ufeff"
 
@@ -137,7 +141,7 @@ class _LinesWithoutComments:
     """
 
     def __init__(self, lines: Iterable[str], names: Collection[str]) -> None:
-        """Store the lines, and the names that have a meaning as in `CsvTable`."""
+        """Store the lines, and the names of columns that are no comment even if they begin with #."""
         self.at_row_start = True
         self._lines = iter(lines)
         self._names = names
@@ -148,7 +152,7 @@ class _LinesWithoutComments:
         return self
 
     def __next__(self) -> str:
-        """Return the next line; a blank line for a comment."""
+        """Return the next line, or a blank line in place of a comment."""
         line = next(self._lines)
         if self._at_first_line:
             line = line.removeprefix(BYTE_ORDER_MARK)
@@ -221,7 +225,7 @@ def _other_format(data: bytes) -> str | None:
 
 
 def _is_comment(line: str, names: Collection[str]) -> bool:
-    """Return whether a line begins with # and its first cell is none of the names."""
+    """Return whether a line begins with # and its first cell is not one of the names."""
     first_cell = line.partition(",")[0].strip()
     return first_cell.startswith("#") and first_cell not in names
 

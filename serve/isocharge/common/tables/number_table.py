@@ -21,8 +21,10 @@ MAX_COLUMNS = 1_000
 """Largest number of columns of a file."""
 
 LARGEST = float(np.finfo(np.float32).max)
-"""Largest magnitude of a number in a file. It is the largest float32 number, because the tensors of the models are
-float32."""
+"""Largest magnitude of a number in a file.
+
+It is the largest float32 number, because the tensors of the models are float32.
+"""
 
 MAX_LISTED_NAMES = 10
 """Largest number of column names that an error message lists."""
@@ -49,7 +51,7 @@ class ColumnRule:
     meaning: ColumnMeaning = field(default_factory=ColumnMeaning)
 
     def violations(self, values: Array) -> Booleans:
-        """Return which of the values break the rule, shape (n,). NaN stands for an empty cell."""
+        """Return which values violate the rule, shape (n,). NaN stands for an empty cell."""
         is_empty = np.isnan(values)
         is_outside = (values < self.minimum) | (values > self.maximum)
         if self.is_positive:

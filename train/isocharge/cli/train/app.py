@@ -1,4 +1,4 @@
-"""`isocharge train ...`: its commands, one module each."""
+"""Commands of `isocharge train`, each in its own module."""
 
 from isocharge.cli.shared.lazy import LazyCommand, lazy_group
 

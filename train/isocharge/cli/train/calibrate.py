@@ -81,8 +81,9 @@ def calibrate_command(
 ) -> None:
     """Calibrate a film: estimate its parameters from measured presses, and write a model of this film.
 
-    Three presses help much, eight are good; of each, the place, the force, or both are known. --next proposes presses,
-    also before the first press. The command names the parameters that the presses do not determine.
+    Three presses are useful, and eight are recommended. The position of each press must be known, or its force, or
+    both. --next proposes presses, also before the first press. The command names the parameters that the presses do not
+    determine.
 
     `isocharge train press` guides presses at a port, and writes their file.
 

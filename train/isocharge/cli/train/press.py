@@ -118,8 +118,9 @@ def press_command(
 ) -> None:
     """Guide presses on a film at a port, and write them to a file of measured presses.
 
-    The command proposes a press, takes it when it is steady, and asks whether it was made there. After each press it
-    reports how well the film is known. The session ends when the film is known well enough, or when q is typed.
+    The command proposes a press, records the press when the charges are steady, and asks whether it was made at the
+    proposed place. After each press, the command reports how accurately the film is known. The session ends when the
+    film is known accurately enough, or when you type q.
 
     The file is complete after each press. If the session is interrupted, the same command continues it.
 
@@ -182,7 +183,7 @@ def _open_session(
 
 
 def _check_list(contacts: Array, session: PressSession, name: str) -> None:
-    """Raise PressError, with the number of the row, if no calibration accepts a press of a machine's list."""
+    """Raise PressError if a calibration would refuse a press of a machine's list. The message names the row."""
     for number, contact in enumerate(contacts, start=1):
         with error_prefix(f"{name}, press {number}: ", PressError):
             session.check(contact)
@@ -236,7 +237,7 @@ def _ignore_press(session: PressSession, press: SteadyPress) -> None:
 
 
 def _print_press(session: PressSession, press: SteadyPress) -> None:
-    """Print the last press, and how well the film is known since, as a line of JSON."""
+    """Print a line of JSON with the last press and the accuracy with which the film is known after this press."""
     show_json(_press_table(session, press) | {"next": None})
 
 
@@ -247,7 +248,7 @@ def _print_proposing(session: PressSession, press: SteadyPress) -> None:
 
 
 def _press_table(session: PressSession, press: SteadyPress) -> dict[str, object]:
-    """Return the last press of a session, and how well the film is known since, for JSON."""
+    """Return the last press of a session and the accuracy with which the film is known after it, for JSON."""
     electrodes = session.presses.electrodes
     result = session.result
     return {

@@ -1,6 +1,7 @@
-"""Dialogue of a press session: propose a press, take it when it is steady, and ask whether it was made there.
+"""Dialogue of a press session: propose a press, record it when it is steady, and ask whether it was made at the
+proposed place.
 
-A machine that makes the presses of a list is asked nothing: its presses are taken in the order of the list.
+If a machine makes the presses of a list, no questions are asked, and the presses are recorded in the order of the list.
 """
 
 from collections.abc import Callable
@@ -37,7 +38,7 @@ OnTaken = Callable[[PressSession, SteadyPress], None]
 
 
 class Screen:
-    """Messages for a person on stderr: sentences, and about once a second the charges of a press that settles."""
+    """Messages for a person on stderr: sentences, and about once a second the charges while a press settles."""
 
     def __init__(self, electrodes: tuple[str, ...]) -> None:
         """Set up the screen.
@@ -100,7 +101,7 @@ class Dialogue:
         self._on_taken = on_taken
 
     def guide_person(self, *, asks: bool = True) -> None:
-        """Propose presses and take them until the film is known well enough, or the person quits.
+        """Propose and record presses until the film is known accurately enough, or the person quits.
 
         Args:
             asks: Whether to ask after each press where it was made. Otherwise each press counts as made where it was
@@ -139,9 +140,9 @@ class Dialogue:
             ) from end
 
     def _follow_press(self, number: int, contact: Array) -> None:
-        """Wait for the press of one row of a machine's list, and take it.
+        """Wait for the press of one row of a machine's list, and record it.
 
-        A press that is refused is left out, because the machine has moved to the next row.
+        A refused press is omitted, because the machine has already moved to the next row.
 
         Args:
             number: Number of the row.
@@ -173,7 +174,7 @@ class Dialogue:
             self._screen.show_phase(event)
 
     def _guide_press(self, *, asks: bool) -> None:
-        """Propose a press, and return when it is taken or when another press is to be proposed."""
+        """Propose a press, and return when it has been recorded or when another press must be proposed."""
         proposed = self._session.proposed
         press: SteadyPress | None = None
         self._screen.say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")

@@ -18,16 +18,18 @@ class SessionEnd(Exception):
 
 
 class PressEvents:
-    """Events of a port and a keyboard in the order in which they happen; a context manager that starts and stops it.
+    """Events of a port and a keyboard, in the order in which they happen.
 
-    The port is also read while a person answers and while a fit runs. No reading is lost, and the watch detects that
-    the probe was lifted in the meantime.
+    The object is a context manager that starts and stops the reading threads.
+
+    The port is also read while a person answers and while a fit runs. No reading is lost, so the watch also detects a
+    probe that is lifted while a question is answered.
     """
 
     def __init__(
         self, chunks: Iterable[Chunk], stream: ReadingStream, watch: PressWatch, keyboard: int | None = None
     ) -> None:
-        """Set up the events; nothing is read before the context is entered.
+        """Initialise the events. Reading starts when the context is entered.
 
         Args:
             chunks: Bytes of an open port.
@@ -80,8 +82,8 @@ class PressEvents:
     def _read_port(self) -> None:
         """Read the port until its end, and put the events of the readings into the queue.
 
-        Each event has the number of times that the watch was armed before it, so that events from before the last
-        `arm` can be discarded. This method runs in a thread of its own.
+        Each event contains the number of earlier calls of `arm`, so that events from before the last call can be
+        discarded. This method runs in a thread of its own.
         """
         arm_count = self._arm_count
         try:

@@ -69,8 +69,8 @@ def report_command(
     option --probe states the probe that made the presses of PRESSES.csv.
 
     The report takes some minutes for a dataset of 24,000 presses. Durations are measured, so do not run other programs
-    at the same time. A report that was stopped leaves DIR.part with its solves and limits, and the same command
-    continues it. The option --json prints report.json.
+    at the same time. If the report is interrupted, its finished solves and limits remain in DIR.part, and the same
+    command continues it. The option --json prints report.json.
 
     Example: isocharge train report presses -o report
     """

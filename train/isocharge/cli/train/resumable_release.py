@@ -118,7 +118,7 @@ def _errors_sentence(metadata: ModelMetadata) -> str:
 def _measured_presses_words(metadata: ModelMetadata) -> str:
     """Return the part of a sentence that describes the presses on which the errors were measured.
 
-    It is empty if the presses were simulated.
+    The text is empty if the presses were simulated.
 
     Args:
         metadata: Metadata of the model.
