@@ -15,8 +15,8 @@ from isocharge.train.training import correlation
 def coarse():
     """Errors over fewer contacts, fewer places to press, correlations from fewer examples: a fourth of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contact_error, "CONTACTS", 50)
-        patch.setattr(contact_error, "PLACES", 30)
+        patch.setattr(contact_error, "N_CONTACTS", 50)
+        patch.setattr(contact_error, "N_CANDIDATE_POSITIONS", 30)
         patch.setattr(correlation, "N_EXAMPLES", 3_000)
         yield
 

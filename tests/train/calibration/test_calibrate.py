@@ -17,7 +17,7 @@ from isocharge.train import CalibrationProblem, calibrate, next_presses
 from isocharge.train.calibration import hypotheses
 from isocharge.train.calibration.contact_error import ContactSensitivity, information_of
 from isocharge.train.calibration.contacts import with_force
-from isocharge.train.calibration.diagnosis import OFFSET, PRETENSIONS, find_mistakes, misfit
+from isocharge.train.calibration.diagnosis import OFFSET_STD, PRETENSIONS, find_mistakes, misfit
 from isocharge.train.calibration.film_fit import fit_film
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.data.presses import draw_contacts
@@ -198,7 +198,7 @@ def test_the_error_left_is_near_the_linearised_limit(layout):
         at_truth = ContactSensitivity.at(layout, truth)
         information = np.eye(truth.size) + information_of(layout, truth, presses.contact).sum(axis=0)
         limit = at_truth.contact_error(np.linalg.inv(information))
-        wrong = at_truth.by_parameter @ ((result.posterior.parameters - truth) / layout.prior.std)
+        wrong = at_truth.contact_jacobian @ ((result.posterior.parameters - truth) / layout.prior.std)
         ratios.append(np.sqrt((wrong[:, :2] ** 2).sum(axis=1).mean()) / limit.position_mm)
     assert np.median(ratios) < 1.25
     assert max(ratios) < 2.5
@@ -275,7 +275,7 @@ def test_a_factor_of_all_charges_alone_is_the_misfit(problem):
     film = np.append(min(PRETENSIONS) * problem.prior.spread.pretension, problem.prior.mean[1:])
     at = draw_contacts(np.random.default_rng(3), problem.domain.within(6.0), 10)
     presses = presses_of(problem, at, 3.0 * problem.charges.charges(film, at))
-    assert misfit(presses, problem.charges) == pytest.approx((np.log(3.0) / OFFSET) ** 2)
+    assert misfit(presses, problem.charges) == pytest.approx((np.log(3.0) / OFFSET_STD) ** 2)
 
 
 @pytest.mark.parametrize("name", IMPOSSIBLE)

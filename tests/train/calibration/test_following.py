@@ -61,7 +61,8 @@ def calibrated_files(sensor: str, seed: int) -> dict[str, bytes]:
     contact *= np.exp([0.0, 0.0, 0.01] * rng.standard_normal((20, 3)))
     contact[:, :2] += 0.1 * rng.standard_normal((20, 2))
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contact_error, "CONTACTS", 200)  # the directions of the film need more contacts than `coarse` has
+        # The directions of the film need more contacts than the fixture `coarse` sets.
+        patch.setattr(contact_error, "N_CONTACTS", 200)
         path = Path(folder) / "mine"
         write_calibration(calibrate(presses_of(problem, contact, charge), problem), path)
         return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}

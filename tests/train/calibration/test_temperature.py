@@ -14,7 +14,7 @@ from isocharge.simulate import Circle, load_sensor, press, touch_charge
 from isocharge.train import calibrate, read_earlier, write_calibration
 from isocharge.train.calibration.folder import read_moved, result_table
 from isocharge.train.calibration.press_data import temperatures
-from isocharge.train.calibration.problem import DRIFT, THERMOMETER
+from isocharge.train.calibration.problem import CREEP, DRIFT
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
 
@@ -126,7 +126,7 @@ def test_a_pretension_drifts_less_where_both_temperatures_are_known(day, problem
         estimate.drifted(problem.prior, knows_temperature=knows) for estimate in (before, unknown) for knows in (1, 0)
     ]
     wider = [float(estimate.covariance[0, 0] - before.covariance[0, 0]) for estimate in after]
-    assert wider == pytest.approx([THERMOMETER**2, *[DRIFT["pretension"] ** 2] * 3])
+    assert wider == pytest.approx([CREEP**2, *[DRIFT["pretension"] ** 2] * 3])
 
 
 @pytest.mark.parametrize(

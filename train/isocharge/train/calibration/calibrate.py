@@ -16,7 +16,16 @@ from isocharge.simulate import Circle, Sensor
 from isocharge.train.calibration.closed_back import CLOSED_BACK_CAUTION, has_closed_back, refuse_closed_back
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
 from isocharge.train.calibration.cross_validation import HeldOutAnswers, cross_validate
-from isocharge.train.calibration.diagnosis import check_channels, check_places, explain, find_mistakes, misfit
+from isocharge.train.calibration.diagnosis import (
+    FAR_FROM_ALL_FILMS,
+    MOSTLY_OUTSIDE,
+    check_channels,
+    check_places,
+    find_mistakes,
+    large_residual,
+    misfit,
+    unexplained_error,
+)
 from isocharge.train.calibration.film_fit import MISTAKE_PROBABILITY, PROBABLE, FilmPosterior, fit_film
 from isocharge.train.calibration.hypotheses import Hypothesis
 from isocharge.train.calibration.nuisances import NUISANCES, NuisanceEstimate, film_warming_sentences
@@ -278,7 +287,7 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
     presses, domain_cautions = _within_domain(presses, problem)
     if misfit(presses, problem.charges) > MISLEADING_MISFIT and find_mistakes(presses, problem.charges):
         refuse_closed_back(presses, problem.charges)
-        raise explain(presses, problem.charges, np.nan)
+        raise unexplained_error(presses, problem.charges, FAR_FROM_ALL_FILMS)
     at_C = None
     if presses.knows_temperature:
         at_C = float(temperatures(presses).mean())
@@ -312,7 +321,7 @@ def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tup
     if is_outside.mean() > 0.5:
         if len(presses) == 1:
             raise PressError(sentence)
-        raise explain(presses, problem.charges, np.inf)
+        raise unexplained_error(presses, problem.charges, MOSTLY_OUTSIDE)
     return presses[~is_outside], [f"{sentence}; left out"]
 
 
@@ -398,7 +407,7 @@ def _refuse_unexplained(presses: MeasuredPresses, problem: CalibrationProblem, p
     if is_unexplained or film_probability < STRAINED_PROBABILITY or is_mistaken:
         refuse_closed_back(presses, problem.charges)
         worst = max(chi2 / max(degrees_of_freedom, 1.0), squared_distance / deviation.size)
-        raise explain(presses, problem.charges, float(np.sqrt(worst)))
+        raise unexplained_error(presses, problem.charges, large_residual(float(np.sqrt(worst))))
 
 
 def _with_unseen_mistakes(posterior: FilmPosterior, before: FilmEstimate) -> FilmPosterior:

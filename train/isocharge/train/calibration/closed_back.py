@@ -1,9 +1,10 @@
 """Recognition of a closed back: presses of a film behind which air is trapped.
 
-A calibration assumes a vented back. If the back is closed, the trapped air carries a part of the load, and the charges
-of the electrodes away from the probe are much smaller. No film of the prior has such charges. A calibration describes
-them by a large discrepancy, or refuses them. The presses are therefore compared with a few films with a closed back,
-which are solved directly. The comparison takes a few seconds and is made only if films with a vented back misfit.
+A calibration assumes that air can flow out of the space behind the film (a vented back). If the back is closed, the
+trapped air carries a part of the load, and the charges of the electrodes away from the probe are much smaller. No film
+of the prior has such charges, so a calibration describes them by a large discrepancy or refuses the presses. The
+presses are therefore also compared with a few films with a closed back, which are solved directly. This comparison
+takes a few seconds. It is made only if no film with a vented back agrees with the presses.
 """
 
 from dataclasses import replace
@@ -21,8 +22,8 @@ MIN_VENTED_MISFIT = 0.5
 """Misfit of films with a vented back, as `charge_misfit` returns it, below which the back is not examined."""
 
 CAVITY_DEPTH_mm = 20.0
-"""Depth of the cavity of the films that are compared. The air behind it is nearly incompressible, and that behind
-deeper cavities up to about 200 mm is, too."""
+"""Depth of the cavity behind the films that are compared. Up to a depth of about 200 mm, the trapped air is so stiff
+that the depth hardly matters."""
 
 INTERPOLATED_COUNT = 25
 """Number of pretensions between those of `PRETENSIONS` for which charges are interpolated."""
@@ -31,7 +32,7 @@ MAX_EXAMINED = 8
 """Largest number of presses that are compared."""
 
 ACCURACY = 5e-3
-"""Target of the relative error of a charge. It is far below the effect of a closed back."""
+"""Relative error of the solved charges, which is far below the effect of a closed back."""
 
 CLOSED_BACK_CAUTION = (
     "films with a closed back explain the presses far better than films with a vented back: air is probably trapped "
@@ -50,7 +51,8 @@ def has_closed_back(presses: MeasuredPresses, charges: FilmCharges) -> bool:
     placed = presses[presses.placed]
     if not len(placed):
         return False
-    examined = placed[np.unique(np.linspace(0, len(placed) - 1, MAX_EXAMINED).round().astype(int))]
+    evenly_spaced_rows = np.linspace(0, len(placed) - 1, MAX_EXAMINED).round().astype(int)
+    examined = placed[np.unique(evenly_spaced_rows)]
     vented_charges = _interpolated(expected_charges(charges, examined.contact))
     vented_misfit = charge_misfit(charges, examined.contact, examined.charge_pC, vented_charges)
     if not MIN_VENTED_MISFIT < vented_misfit < np.inf:

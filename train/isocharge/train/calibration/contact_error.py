@@ -1,17 +1,19 @@
-"""Error of contacts that the remaining uncertainty of a film causes, and the presses that would lower it most.
+"""Error of contacts that the remaining uncertainty of a film causes, and the presses that would reduce it most.
 
-An estimator that takes a film for another, whose parameters differ by dp, errs by the contact that explains the
-difference of the charges best,
+If an estimator assumes a film whose parameters differ by dp from those of the real film, the estimated contact is wrong
+by the change that compensates the difference of the charges best:
 
-    dc = -G dp,   G = (J' W J)^-1 J' W P,
+    dc = -G dp,   G = (J' W J)^-1 J' W P.
 
-with J and P the derivatives of the charges by contact and parameters, and W one over the noise variance. With the
-covariance C of the parameters, the covariance of the contacts is G C G'. Noise alone leaves (J' W J)^-1, the Cramer-Rao
-limit. The matrix J' W J includes the prior of a contact, which lies in the working area and the range of forces, so
-that the error stays finite where the map folds.
+J and P are the derivatives of the charges with respect to the contact and to the parameters, and W is the inverse of
+the noise variance. If the parameters have the covariance C, the errors of the contacts have the covariance G C G'.
+Noise alone causes errors with the covariance (J' W J)^-1, which is the Cramer-Rao limit. The matrix J' W J also
+contains the prior of a contact, which lies in the working area and in the range of forces. The errors are therefore
+finite where the charge map folds.
 
-A press adds information about the film, however it turns out, so the best next press is known before it is made.
-Presses are chosen one after the other, each the best given those before (A-optimal design, greedily; Pukelsheim 1993).
+The information that a press adds about the film depends on its contact and hardly on the charges that are measured.
+The best next press can therefore be chosen before it is made. Presses are chosen one after the other, each as the best
+one given the previous ones (a greedy A-optimal design, Pukelsheim 1993).
 """
 
 from dataclasses import dataclass
@@ -21,30 +23,33 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import FORCE_STD, POSITION_STD_MM
+from isocharge.simulate import Domain
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.train.calibration.contacts import derivatives_with_adjusted_contacts
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 
-CONTACTS = 200
-"""Contacts over which the error is taken."""
+N_CONTACTS = 200
+"""Number of contacts over which the errors are averaged."""
 
-PLACES = 80
-"""Places of presses that are compared."""
+N_CANDIDATE_POSITIONS = 80
+"""Number of positions that are compared for the next press."""
 
-FORCES = (0.15, 0.45, 0.95)
-"""Forces of presses that are compared, as shares of the range's logarithm from its lower end."""
+CANDIDATE_FORCES = (0.15, 0.45, 0.95)
+"""Forces that are compared for the next press: positions in the logarithm of the force range, from 0 to 1."""
 
-GOLDEN_SHARE = 0.6180339887
-"""Share of the range of forces from one contact to the next, the inverse of the golden ratio: neighbours differ."""
+GOLDEN_RATIO_INVERSE = 0.6180339887
+"""Step of the logarithm of the force from one contact to the next, relative to the force range.
 
-ROUND_MM = 0.5
-"""Distance of the grid on which the places of proposed presses lie, so that a person can make them."""
+The inverse of the golden ratio gives neighbouring contacts different forces."""
 
-ROUND_N = 0.05
-"""Distance of the forces of proposed presses."""
+POSITION_GRID_MM = 0.5
+"""Grid to which the coordinates of proposed presses are rounded, mm, so that a person can set them."""
 
-AVOIDED_MM = 1.0
-"""Distance from a place to avoid within which nothing is proposed, mm."""
+FORCE_GRID_N = 0.05
+"""Grid to which the forces of proposed presses are rounded, N."""
+
+AVOIDED_DISTANCE_MM = 1.0
+"""Distance from an avoided position within which no press is proposed, mm."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +57,8 @@ class ContactError:
     """Root-mean-square errors of contacts.
 
     Attributes:
-        position_mm: Root mean square over the contacts, mm.
-        force_percent: The same, % of the force.
+        position_mm: Root-mean-square position error over all contacts, mm.
+        force_percent: Root-mean-square force error over all contacts, % of the force.
         each_mm: Root-mean-square position error of each contact, shape (n,), mm.
     """
 
@@ -75,50 +80,55 @@ class ContactError:
 
 @dataclass(frozen=True)
 class ContactSensitivity:
-    """Response of contacts to noise and to a wrong film, linearised at one film.
+    """Effect of noise and of a wrong film on estimated contacts, linearised at one film.
+
+    The unknowns of the film are its parameters, in units of their prior standard deviations, and the coefficients of
+    the discrepancy if there is one.
 
     Attributes:
-        contact: (x, y, F), shape (n, 3), mm and N.
-        by_parameter: -G: (x, y, ln F) by the parameters over their prior standard deviations, and by the coefficients
-            of the discrepancy if there is one, shape (n, 3, n_unknown).
-        noise: Covariance of (x, y, ln F) by noise alone, shape (n, 3, 3).
-        misfit: Derivatives of the part of the charges that no contact explains, by the same unknowns, shape
-            (n, n_electrode, n_unknown), in units of the noise.
-        log_charge: Derivatives of ln Q at fixed contacts by the same unknowns, shape (n, n_electrode, n_unknown).
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        contact_jacobian: Derivatives of the estimated (x, y, ln F) with respect to the unknowns, the matrix -G of each
+            contact, shape (n, 3, n_unknown).
+        noise_covariance: Covariance of the estimated (x, y, ln F) that noise alone causes, shape (n, 3, 3).
+        misfit_jacobian: Derivatives of the part of the charges that no contact explains with respect to the unknowns,
+            shape (n, n_electrode, n_unknown), in units of the noise.
+        log_charge_jacobian: Derivatives of ln Q at fixed contacts with respect to the unknowns, shape
+            (n, n_electrode, n_unknown).
     """
 
     contact: Array
-    by_parameter: Array
-    noise: Array
-    misfit: Array
-    log_charge: Array
+    contact_jacobian: Array
+    noise_covariance: Array
+    misfit_jacobian: Array
+    log_charge_jacobian: Array
 
     @classmethod
     def at(cls, problem: CalibrationProblem, parameters: Array) -> "ContactSensitivity":
-        """Return the response of contacts spread over the domain, on one film.
+        """Compute the effects at contacts that are spread over the domain.
 
         Args:
             problem: The films.
-            parameters: The film, as `FilmCharges.film` takes it.
+            parameters: The film at which the charges are linearised, as `FilmCharges.film` takes it.
         """
         domain = problem.domain
-        low, high = domain.force_range
-        place = domain.radius * sunflower(CONTACTS)
-        force = low * (high / low) ** ((0.5 + np.arange(CONTACTS)) * GOLDEN_SHARE % 1.0)
-        contact = np.column_stack([place.real, place.imag, force])
+        contact = _contacts_over_domain(domain)
         contact_slopes, film_slopes = _whitened_slopes(problem, parameters, contact)
-        charge = problem.charges.charges(parameters, contact)
-        log_force_std = max(np.log(high / low), 0.1) / np.sqrt(12.0)
+
+        # Covariance of a contact by noise, from the information of the charges and of the prior
+        min_force, max_force = domain.force_range
+        log_force_std = max(np.log(max_force / min_force), 0.1) / np.sqrt(12.0)
         prior_std = np.array([0.5 * domain.radius, 0.5 * domain.radius, log_force_std])
-        precision = np.einsum("nki,nkj->nij", contact_slopes, contact_slopes) + np.diag(prior_std**-2)
-        noise = np.linalg.inv(precision)
-        by_parameter = -np.einsum("nij,nkj,nkp->nip", noise, contact_slopes, film_slopes)
+        charge_information = np.einsum("nki,nkj->nij", contact_slopes, contact_slopes)
+        noise_covariance = np.linalg.inv(charge_information + np.diag(prior_std**-2))
+
+        charge = problem.charges.charges(parameters, contact)
+        relative_noise = problem.noise.sigma(charge) / charge
         return cls(
             contact=contact,
-            by_parameter=by_parameter,
-            noise=noise,
-            misfit=derivatives_with_adjusted_contacts(film_slopes, contact_slopes),
-            log_charge=film_slopes * (problem.noise.sigma(charge) / charge)[:, :, None],
+            contact_jacobian=-np.einsum("nij,nkj,nkp->nip", noise_covariance, contact_slopes, film_slopes),
+            noise_covariance=noise_covariance,
+            misfit_jacobian=derivatives_with_adjusted_contacts(film_slopes, contact_slopes),
+            log_charge_jacobian=film_slopes * relative_noise[:, :, None],
         )
 
     def contact_error(self, covariance: Array) -> ContactError:
@@ -127,29 +137,54 @@ class ContactSensitivity:
 
     def contact_covariance(self, covariance: Array) -> Array:
         """Return the covariances of (x, y, ln F), shape (n, 3, 3), for a covariance of the film's unknowns."""
-        return np.asarray(self.by_parameter @ covariance @ self.by_parameter.swapaxes(1, 2))
+        return np.asarray(self.contact_jacobian @ covariance @ self.contact_jacobian.swapaxes(1, 2))
 
     @property
     def noise_error(self) -> ContactError:
-        """Errors by noise alone."""
-        return ContactError.of(self.noise)
+        """Errors that noise alone causes."""
+        return ContactError.of(self.noise_covariance)
 
-    def cost(self) -> Array:
-        """Return the matrix S with mean relative squared error tr(S C), shape (n_parameter, n_parameter).
+    def error_weights(self) -> Array:
+        """Return the matrix S for which the trace of S C is the mean squared error of the contacts.
 
-        Positions and forces count in units of their errors by noise alone.
+        C is the covariance of the film's unknowns. Errors of position and force are in units of the errors that noise
+        alone causes, so that the mean is dimensionless.
+
+        Returns:
+            Shape (n_unknown, n_unknown).
         """
         unit = self.noise_error
-        scaled = self.by_parameter / np.array([[unit.position_mm], [unit.position_mm], [0.01 * unit.force_percent]])
-        return np.asarray(np.einsum("nip,niq->pq", scaled, scaled) / len(scaled))
+        units = np.array([unit.position_mm, unit.position_mm, 0.01 * unit.force_percent])
+        scaled_jacobian = self.contact_jacobian / units[:, None]
+        return np.asarray(np.einsum("nip,niq->pq", scaled_jacobian, scaled_jacobian) / len(scaled_jacobian))
+
+
+def _contacts_over_domain(domain: Domain) -> Array:
+    """Return contacts (x, y, F) that cover the domain evenly, shape (N_CONTACTS, 3), mm and N."""
+    position = domain.radius * sunflower(N_CONTACTS)
+    min_force, max_force = domain.force_range
+    relative_log_force = (0.5 + np.arange(N_CONTACTS)) * GOLDEN_RATIO_INVERSE % 1.0
+    force = min_force * (max_force / min_force) ** relative_log_force
+    return np.column_stack([position.real, position.imag, force])
 
 
 def _whitened_slopes(problem: CalibrationProblem, parameters: Array, contact: Array) -> tuple[Array, Array]:
-    """Return the derivatives of the charges over their noise, by the contact and by the unknowns of the film."""
+    """Return the derivatives of the charges in units of their noise.
+
+    Args:
+        problem: The films.
+        parameters: The film, as `FilmCharges.film` takes it.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3), and derivatives with respect to the
+        unknowns of the film, shape (n, n_electrode, n_unknown).
+    """
     charges = problem.charges
-    by_contact = charges.by_contact(parameters, contact)
+    contact_slopes = charges.by_contact(parameters, contact)
+    film_slopes = charges.by_parameter(parameters, contact, contact_slopes)
     weight = 1.0 / problem.noise.sigma(charges.charges(parameters, contact))[:, :, None]
-    return weight * by_contact, weight * charges.by_parameter(parameters, contact, by_contact)
+    return weight * contact_slopes, weight * film_slopes
 
 
 def information_of(
@@ -159,26 +194,34 @@ def information_of(
     position_std_mm: float = POSITION_STD_MM,
     force_std: float = FORCE_STD,
 ) -> Array:
-    """Return the information of each press about the parameters over their prior standard deviations.
+    """Compute the information that each press adds about the unknowns of the film.
 
     Args:
         problem: The films.
-        parameters: Where the map is linearised, as `FilmCharges.film` takes it.
+        parameters: The film at which the charges are linearised, as `FilmCharges.film` takes it.
         contact: Presses (x, y, F), shape (n, 3), mm and N.
-        position_std_mm: Standard deviation of the place of a press, mm; infinite if the place is unknown.
-        force_std: Standard deviation of its force, a share.
+        position_std_mm: Standard deviation of the position of a press, mm; infinite if the position is unknown.
+        force_std: Standard deviation of the force of a press, relative to the force.
 
     Returns:
-        Fisher information, shape (n, n_unknown, n_unknown).
+        Fisher information about the parameters in units of their prior standard deviations and about the coefficients
+        of the discrepancy, shape (n, n_unknown, n_unknown).
     """
-    rows = _rows_of(problem, parameters, contact, position_std_mm, force_std)
-    return np.asarray(rows.swapaxes(1, 2) @ rows)
+    roots = _information_roots(problem, parameters, contact, position_std_mm, force_std)
+    return np.asarray(roots.swapaxes(1, 2) @ roots)
 
 
-def _rows_of(
+def _information_roots(
     problem: CalibrationProblem, parameters: Array, contact: Array, position_std_mm: float, force_std: float
 ) -> Array:
-    """Return the roots R of the information R' R, shape (n, n_electrode + 3, n_unknown)."""
+    """Compute a matrix R for each press whose product R' R is the information of the press.
+
+    The rows of R are the derivatives of the residuals of the charges and of the measured contact (x, y, ln F). The
+    arguments are those of `information_of`.
+
+    Returns:
+        Shape (n, n_electrode + 3, n_unknown).
+    """
     contact_slopes, film_slopes = _whitened_slopes(problem, parameters, contact)
     rig_weights = np.array([1.0 / position_std_mm, 1.0 / position_std_mm, 1.0 / force_std])
     rig_contact_slopes = np.broadcast_to(np.diag(rig_weights), (len(contact), 3, 3))
@@ -191,14 +234,14 @@ def _rows_of(
 
 @dataclass(frozen=True)
 class ProposedPress:
-    """A press to make.
+    """A press to make, and the errors that are expected after it.
 
     Attributes:
-        x_mm: Place along x, mm.
-        y_mm: Place along y, mm.
+        x_mm: Position along x, mm.
+        y_mm: Position along y, mm.
         force_N: Force, N.
-        position_mm: Expected root-mean-square position error by the film's uncertainty after the press, mm.
-        force_percent: The same error of the force, %.
+        position_mm: Root-mean-square position error that the uncertainty of the film still causes after the press, mm.
+        force_percent: Root-mean-square force error that the uncertainty of the film still causes after the press, %.
     """
 
     x_mm: float
@@ -222,33 +265,37 @@ def next_presses(
     force_std: float = FORCE_STD,
     avoid_mm: Array | None = None,
 ) -> list[ProposedPress]:
-    """Return the presses to make next, best first.
+    """Choose the presses to make next, the best one first.
 
     Args:
         problem: The films.
-        count: How many.
-        film: The present estimate, such as the posterior of a result; `problem.expected` if absent.
-        position_std_mm: Standard deviation that the presses' places will have, mm.
-        force_std: Standard deviation that their forces will have, a share.
-        avoid_mm: Places that cannot be pressed, shape (n, 2), mm; nothing within `AVOIDED_MM` of them is proposed.
+        count: Number of presses.
+        film: The present estimate of the film, such as the posterior of a calibration; by default `problem.expected`.
+        position_std_mm: Standard deviation that the positions of the presses will have, mm.
+        force_std: Standard deviation that the forces of the presses will have, relative to the force.
+        avoid_mm: Positions that cannot be pressed, shape (n, 2), mm. No press is proposed within
+            `AVOIDED_DISTANCE_MM` of them.
 
     Raises:
-        PressError: If every place is to be avoided.
+        PressError: If all candidate positions are avoided.
         SceneError: If even the smallest force exceeds the stress limit.
     """
     film = film or problem.expected
     sensitivity = ContactSensitivity.at(problem, film.unknowns)
-    avoid_mm = np.empty((0, 2)) if avoid_mm is None else avoid_mm
+    if avoid_mm is None:
+        avoid_mm = np.empty((0, 2))
     candidates = _candidates(problem.domain.radius, problem.proposed_forces, avoid_mm)
-    offered = _rows_of(problem, film.unknowns, candidates, position_std_mm, force_std)
-    cost = sensitivity.cost()
+    roots = _information_roots(problem, film.unknowns, candidates, position_std_mm, force_std)
+    error_weights = sensitivity.error_weights()
     covariance = film.unknown_covariance
     proposed = []
     for _ in range(count):
-        # A press with the rows R lowers the covariance C by (R C)' (1 + R C R')^-1 (R C).
-        projection = offered @ covariance
-        innovation = np.eye(offered.shape[1]) + projection @ offered.swapaxes(1, 2)
-        benefit = np.einsum("nij,nji->n", np.linalg.inv(innovation), projection @ cost @ projection.swapaxes(1, 2))
+        # A press with the information R' R reduces the covariance C by (R C)' (1 + R C R')^-1 (R C). The benefit of
+        # the press is the reduction of the mean squared error, the trace of the error weights times this matrix.
+        projection = roots @ covariance
+        innovation = np.eye(roots.shape[1]) + projection @ roots.swapaxes(1, 2)
+        weighted_projection = projection @ error_weights @ projection.swapaxes(1, 2)
+        benefit = np.einsum("nij,nji->n", np.linalg.inv(innovation), weighted_projection)
         best = int(np.argmax(benefit))
         covariance = covariance - projection[best].T @ np.linalg.solve(innovation[best], projection[best])
         error = sensitivity.contact_error(covariance)
@@ -258,14 +305,33 @@ def next_presses(
 
 
 def _candidates(radius: float, force_range: tuple[float, float], avoid_mm: Array) -> Array:
-    """Return the presses to compare, on a grid that a person can set, shape (n, 3)."""
-    low, high = force_range
-    place = radius * sunflower(PLACES)
-    places = np.unique(np.round(np.column_stack([place.real, place.imag]) / ROUND_MM) * ROUND_MM, axis=0)
-    distance = np.hypot(*np.moveaxis(places[:, None] - avoid_mm, 2, 0))
-    places = places[(distance > AVOIDED_MM).all(axis=1) & (np.hypot(*places.T) <= radius)]
-    if not len(places):
+    """Return the presses that are compared, with rounded positions and forces that a person can set.
+
+    Args:
+        radius: Largest distance of a press from the centre, mm.
+        force_range: Smallest and largest force, N.
+        avoid_mm: Positions to avoid, shape (n_avoided, 2), mm.
+
+    Returns:
+        Presses (x, y, F), shape (n, 3), mm and N.
+
+    Raises:
+        PressError: If all positions are avoided.
+    """
+    spiral = radius * sunflower(N_CANDIDATE_POSITIONS)
+    coordinates = np.column_stack([spiral.real, spiral.imag])
+    positions = np.unique(np.round(coordinates / POSITION_GRID_MM) * POSITION_GRID_MM, axis=0)
+
+    is_inside = np.hypot(positions[:, 0], positions[:, 1]) <= radius
+    offset = positions[:, None] - avoid_mm  # shape (n_position, n_avoided, 2)
+    avoided_distance = np.hypot(offset[..., 0], offset[..., 1])
+    is_allowed = (avoided_distance > AVOIDED_DISTANCE_MM).all(axis=1)
+    positions = positions[is_inside & is_allowed]
+    if not len(positions):
         raise PressError(f"no place within {radius:.3g} mm of the centre is left to press; skip fewer")
-    rounded_forces = np.round(low * (high / low) ** np.array(FORCES) / ROUND_N) * ROUND_N
-    forces = np.unique(np.clip(np.maximum(rounded_forces, ROUND_N), low, high))
-    return np.array([(x, y, force) for x, y in places for force in forces])
+
+    min_force, max_force = force_range
+    exact_forces = min_force * (max_force / min_force) ** np.array(CANDIDATE_FORCES)
+    rounded_forces = np.round(exact_forces / FORCE_GRID_N) * FORCE_GRID_N
+    forces = np.unique(np.clip(np.maximum(rounded_forces, FORCE_GRID_N), min_force, max_force))
+    return np.array([(x, y, force) for x, y in positions for force in forces])

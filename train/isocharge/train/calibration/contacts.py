@@ -1,8 +1,8 @@
-"""Contacts of the presses of a calibration, adjusted to both the statements of the rig and the charges.
+"""Contacts of the presses of a calibration, adjusted to both the measurements of the rig and the charges.
 
-A rig measures the position and the force of a press with its own uncertainty, or does not measure one of them at all.
-For a given film, the adjusted contact is the one with the smallest sum of squared residuals of charges and rig. These
-residuals show how well the film explains the press.
+A rig measures the position and the force of a press with some uncertainty, or does not measure one of them at all. For
+a given film, the adjusted contact is the contact with the smallest sum of squared residuals of the charges and of the
+measurements of the rig. These residuals show how well the film explains the press.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,18 +42,19 @@ class AdjustedContacts(NamedTuple):
 
 
 def derivatives_with_adjusted_contacts(by_unknowns: Array, by_contact: Array) -> Array:
-    """Return the derivatives of the residuals with respect to unknowns if the contacts are adjusted to every film.
+    """Return the derivatives of the residuals of presses whose contacts are adjusted again when the unknowns change.
 
-    A small change of the unknowns moves the contact such that the sum of squares stays minimal. The part of the
-    derivatives that the contact can compensate disappears (Golub and Pereyra 1973).
+    A small change of the unknowns moves the adjusted contact, so that the sum of squared residuals stays minimal. The
+    part of the derivatives that this movement compensates is subtracted (Golub and Pereyra 1973).
 
     Args:
         by_unknowns: Derivatives at fixed contacts, shape (n, n_electrode + 3, n_unknown).
         by_contact: Derivatives with respect to the contacts, shape (n, n_electrode + 3, 3).
 
     Returns:
-        Shape (n, n_electrode + 3, n_unknown).
+        Derivatives of the residuals, shape (n, n_electrode + 3, n_unknown).
     """
+    # Least-squares solution for the movement of the contact with each unknown, by the normal equations
     transposed = by_contact.swapaxes(1, 2)
     contact_change = np.linalg.solve(transposed @ by_contact, transposed @ by_unknowns)
     return np.asarray(by_unknowns - by_contact @ contact_change)
@@ -65,11 +66,11 @@ def with_force(contact: Array) -> Array:
 
 
 def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, start: Array) -> AdjustedContacts:
-    """Return the contacts that fit the measured charges and the contacts stated by the rig best on one film.
+    """Find the contacts that agree best with both the measured charges and the contacts measured by the rig.
 
     Args:
         charges: The films.
-        unknowns: Unknowns of the film, as `FilmCharges.film` takes them.
+        unknowns: Unknowns of the film under the presses, as `FilmCharges.film` takes them.
         data: The presses.
         start: Contacts (x, y, ln F) at which the search begins, shape (n, 3).
     """
@@ -78,8 +79,8 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
     films, shares = neighbouring_films(charges, unknowns, data)
     forward_maps = [charges.forward_map(film[layout.parameters]) for film in films]
 
-    # The factor of imperfections and discrepancy changes slowly with the contact. It takes long to compute, so it is
-    # approximated as linear about the start.
+    # The factor of imperfections and discrepancy on the charges changes slowly with the contact. It takes long to
+    # compute, so it is approximated as a linear function of the contact.
     start_factor = np.ones_like(data.charge)
     factor_slopes = np.zeros((*data.charge.shape, 3))
     if unknowns[layout.coefficients].any():
@@ -99,8 +100,9 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
         contact = scaled_contact * domain.scale + domain.centre
         displacement = (contact - start[rows])[:, None]
         factor = start_factor[rows] + (factor_slopes[rows] * displacement).sum(axis=2)
-        on_films = [_values_and_slopes(forward_map.charges, with_force(contact)) for forward_map in forward_maps]
-        charge, charge_slopes = _interpolated(on_films, shares[rows])
+        film_charges = [_values_and_slopes(forward_map.charges, with_force(contact)) for forward_map in forward_maps]
+        charge, charge_slopes = _interpolated(film_charges, shares[rows])
+        # Derivatives of factor * charge by the product rule
         product_slopes = factor[:, :, None] * charge_slopes + charge[:, :, None] * factor_slopes[rows]
         presses = data[rows]
         slopes = presses.residual_slopes(product_slopes) * domain.scale
@@ -112,9 +114,9 @@ def adjust_contacts(charges: FilmCharges, unknowns: Array, data: PressData, star
 
 
 def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -> tuple[list[Array], Array]:
-    """Return films of different pretensions, between which the film under each press is interpolated.
+    """Return films with different pretensions, between which the charges of each press are interpolated.
 
-    The pretension may differ from press to press, for example with the temperature.
+    The pretension of the film may differ from press to press, for example because of the temperature.
 
     Args:
         charges: The films.
@@ -136,28 +138,37 @@ def neighbouring_films(charges: FilmCharges, unknowns: Array, data: PressData) -
     return films, shares
 
 
-def _interpolated(on_films: list[tuple[Array, Array]], shares: Array) -> tuple[Array, Array]:
-    """Return values and derivatives of presses, interpolated between neighbouring films.
+def _interpolated(film_values_and_slopes: list[tuple[Array, Array]], shares: Array) -> tuple[Array, Array]:
+    """Return values and derivatives at presses, interpolated between neighbouring films.
 
     Args:
-        on_films: Values and derivatives on each of k films.
+        film_values_and_slopes: Values and derivatives on each of k films, as `_values_and_slopes` returns them.
         shares: Weight of each film in each press, shape (n, k).
     """
-    values = weighted_sum([value for value, _ in on_films], shares)
-    slopes = weighted_sum([slope for _, slope in on_films], shares)
+    values = weighted_sum([film_values for film_values, _ in film_values_and_slopes], shares)
+    slopes = weighted_sum([film_slopes for _, film_slopes in film_values_and_slopes], shares)
     return values, slopes
 
 
 def weighted_sum(arrays: Sequence[Array], shares: Array) -> Array:
-    """Return the sum of k arrays of shape (n, ...), row by row multiplied by their shares, shape (n, k)."""
+    """Return the weighted sum of arrays, with different weights for each row.
+
+    Args:
+        arrays: The k arrays, each of shape (n, ...).
+        shares: Weight of each array in each row, shape (n, k).
+
+    Returns:
+        The sum, shape (n, ...).
+    """
     total = np.zeros_like(arrays[0])
     for array, share in zip(arrays, shares.T, strict=True):
-        total = total + array * share.reshape(-1, *(1,) * (array.ndim - 1))
+        trailing_axes = tuple(range(1, array.ndim))
+        total = total + array * np.expand_dims(share, trailing_axes)
     return total
 
 
 def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tuple[Array, Array]:
-    """Return values and derivatives of a function of the contact, by one-sided differences.
+    """Compute a function of the contact, and its derivatives by one-sided differences.
 
     Args:
         function: Function of contacts (x, y, F), shape (n, 3), that returns an array of shape (n, n_electrode).
@@ -182,16 +193,20 @@ def _values_and_slopes(function: Callable[[Array], Array], contact: Array) -> tu
 
 
 def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Array:
-    """Return the contacts (x, y, ln F) at which the search begins, shape (n, 3).
+    """Return the contacts at which the search for the adjusted contacts begins.
 
-    A press starts at the contact that the rig states. If its position is unknown, it starts at the position among
-    `CANDIDATE_POSITIONS` at which the ratios of its charges are closest to those of the film. These ratios hardly
-    depend on the stiffness and on the coefficients of the film, which are not known yet.
+    The search begins at the contact that the rig measured. If the position of a press is unknown, the search begins at
+    the one of `CANDIDATE_POSITIONS` positions at which the ratios between the charges of the film are closest to the
+    measured ratios. The ratios hardly depend on the stiffness and on the coefficients of the film, which are not known
+    yet.
 
     Args:
         charges: The films.
         unknowns: Unknowns of the film.
         data: The presses.
+
+    Returns:
+        Contacts (x, y, ln F), shape (n, 3).
     """
     start = data.contact.copy()
     is_position_unknown = ~data.has_place
@@ -199,11 +214,12 @@ def start_contacts(charges: FilmCharges, unknowns: Array, data: PressData) -> Ar
         return start
 
     lattice = charges.domain.radius * sunflower(CANDIDATE_POSITIONS)
-    force = np.exp(np.median(data.contact[is_position_unknown, 2]))
-    candidates = np.column_stack([lattice.real, lattice.imag, np.full(CANDIDATE_POSITIONS, force)])
+    typical_force = np.exp(np.median(data.contact[is_position_unknown, 2]))
+    candidates = np.column_stack([lattice.real, lattice.imag, np.full(CANDIDATE_POSITIONS, typical_force)])
     log_charge = np.log(np.maximum(data.charge[is_position_unknown], 1.0))
     log_measured = np.where(data.has_charge[is_position_unknown], log_charge, np.nan)
-    # The ratios agree if the logarithms of measured and computed charges differ by the same amount on all electrodes.
+    # The ratios agree if the logarithms of measured and computed charges differ by the same amount on all electrodes,
+    # so that the variance of these differences is zero.
     log_quotient = log_measured[:, None] - np.log(charges.charges(unknowns, candidates))
     closest = np.nanvar(log_quotient, axis=2).argmin(axis=1)
     start[is_position_unknown, :2] = candidates[closest, :2]

@@ -1,10 +1,11 @@
-"""Errors of a calibration on presses that it was not fitted to, by cross-validation over places.
+"""Errors of a calibration on presses to which it was not fitted, by cross-validation over the pressed places.
 
-The places are divided into folds. For each fold, the film is fitted again to the presses at all other places, and the
-network of that film answers the charges of the fold. The errors therefore contain what no parameter describes, the
-noise, and the errors of the measured places and forces.
+The places are divided into folds. For each fold, the film is fitted again to the presses at all other places. The
+network of this film then estimates the contacts of the fold from their charges. The differences from the measured
+contacts include effects that no parameter describes, the noise of the charges, and the errors of the rig.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -24,17 +25,17 @@ FOLD_COUNT = 5
 """Number of folds."""
 
 MAX_FITTED_PRESSES = 250
-"""Largest number of presses to which a film is fitted again; more take time and change the film little."""
+"""Largest number of presses to which a film is fitted again. More presses would take longer and hardly change it."""
 
 
 @dataclass(frozen=True)
 class HeldOutAnswers:
-    """Presses, and the answers of networks of films that were fitted without them.
+    """Measured presses, and the answers of networks for films that were fitted without these presses.
 
     Attributes:
-        presses: The presses as they were measured.
+        presses: The measured presses.
         answers: Contacts and misfits that the networks compute from the charges of the presses. The standard deviations
-            are those of the differences from the measured contacts: they contain those of the measured contacts.
+            include those of the measured contacts, so they describe the differences from the measured contacts.
     """
 
     presses: LabelledPresses
@@ -42,7 +43,7 @@ class HeldOutAnswers:
 
     @property
     def errors(self) -> dict[str, float]:
-        """Errors of position, mm, and force, percent, by name, as `evaluate` gives them."""
+        """Errors of the position, mm, and of the force, %, by the names of `model_release.evaluate`."""
         contact, std, _ = self.answers
         all_errors = contact_errors(contact, std, self.presses.contact)
         return {name: error for name, error in all_errors.items() if name not in ONLY_SIMULATED}
@@ -58,15 +59,15 @@ def cross_validate(
     """Answer measured presses with networks of films that were fitted without these presses.
 
     Args:
-        problem: Films that the sensor may be.
+        problem: Films that the sensor may have.
         presses: The presses to which the film was fitted.
-        posterior: Film that explains these presses. Presses that it leaves out are neither fitted nor judged.
+        posterior: Estimate of the film from these presses. Presses that were left out as bad are not used here either.
         network_of: Function that returns the network of a film.
         at_C: Temperature of the film, degrees Celsius; None if the temperatures of the presses are unknown.
 
     Returns:
-        The presses that can be judged and their answers; None if there are fewer than `FEWEST_MEASURED`. A press can be
-        judged if its place, force and charges are known, and the networks answer there.
+        The presses that can be judged and their answers; None if there are fewer than `FEWEST_MEASURED` of them. A
+        press can be judged if its place, force and charges are known, and if it lies in the domain of the networks.
     """
     is_judged = complete(presses) & ~posterior.bad & ~problem.domain.is_outside(presses.contact)
     if is_judged.sum() < FEWEST_MEASURED:
@@ -97,7 +98,7 @@ def cross_validate(
 def _thinned(chosen: Booleans) -> Booleans:
     """Return at most `MAX_FITTED_PRESSES` of the chosen presses, evenly spaced, shape (n,)."""
     rows = np.flatnonzero(chosen)
-    stride = max(1, -(-len(rows) // MAX_FITTED_PRESSES))
+    stride = max(1, math.ceil(len(rows) / MAX_FITTED_PRESSES))
     thinned = np.zeros_like(chosen)
     thinned[rows[::stride]] = True
     return thinned

@@ -1,10 +1,13 @@
-"""Mistakes by which presses fit no film: swapped columns, turned or mirrored axes, other units, a dead channel.
+"""Search for the mistake because of which no film explains the presses of a calibration.
 
-Presses that no film explains are compared with films again under each mistake: other orders of the columns, other axes,
-other units. The mistakes that explain them are named. The data are never changed.
+The mistakes that are considered are swapped columns, rotated or mirrored axes, and other units. The presses are
+corrected for each mistake in turn and compared with a few films. An error message names the mistakes whose correction
+makes the presses agree with a film. The data themselves are never changed. Positions off the film, dead channels and
+channels with the wrong sign are found before, by separate checks.
 """
 
 from collections.abc import Iterator
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -14,47 +17,70 @@ from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import MeasuredPresses
 from isocharge.train.calibration.film_charges import FilmCharges
 
-DEAD_SHARE = 0.02
-"""Typical charge of a channel over that of the others, below which it counts as dead; less where films give less."""
+MAX_DEAD_RATIO = 0.02
+"""Ratio of the median charge of a channel to that of the other channels, below which the channel counts as dead.
 
-REVERSED_SHARE = 0.3
-"""Typical charge of a channel over that of the others, above which a negative one is reversed."""
+The limit is smaller for channels on which films have smaller charges."""
 
-REVERSED = 0.8
-"""Share of negative charges above which a channel counts as reversed."""
+MIN_REVERSED_RATIO = 0.3
+"""Ratio of the median charge of a channel to that of the other channels, above which its sign is checked."""
 
-METRES_MM = 0.05
-"""Positions that differ, but by less than this in all, were hardly meant as mm."""
+MAX_NEGATIVE_FRACTION = 0.8
+"""Fraction of negative charges above which a channel counts as reversed."""
+
+MIN_POSITION_RANGE_MM = 0.05
+"""Range of the positions below which they were probably written in metres, mm."""
+
+
+class OtherUnit(NamedTuple):
+    """Unit in which values may have been written by mistake.
+
+    Attributes:
+        values: Name of the values.
+        expected: Expected unit.
+        written: Unit in which the values may have been written.
+        factor: Factor that converts the values to the expected unit.
+    """
+
+    values: Literal["forces", "positions", "charges"]
+    expected: str
+    written: str
+    factor: float
+
 
 OTHER_UNITS = (
-    ("forces", "N", "g", (1.0, 1.0, 9.80665e-3), 1.0),
-    ("forces", "N", "mN", (1.0, 1.0, 1e-3), 1.0),
-    ("forces", "N", "kg", (1.0, 1.0, 9.80665), 1.0),
-    ("forces", "N", "lbf", (1.0, 1.0, 4.4482216), 1.0),
-    ("positions", "mm", "m", (1e3, 1e3, 1.0), 1.0),
-    ("positions", "mm", "cm", (10.0, 10.0, 1.0), 1.0),
-    ("positions", "mm", "inch", (25.4, 25.4, 1.0), 1.0),
-    ("positions", "mm", "um", (1e-3, 1e-3, 1.0), 1.0),
-    ("charges", "pC", "nC", (1.0, 1.0, 1.0), 1e3),
-    ("charges", "pC", "C", (1.0, 1.0, 1.0), 1e12),
-    ("charges", "pC", "fC", (1.0, 1.0, 1.0), 1e-3),
+    OtherUnit("forces", "N", "g", 9.80665e-3),
+    OtherUnit("forces", "N", "mN", 1e-3),
+    OtherUnit("forces", "N", "kg", 9.80665),
+    OtherUnit("forces", "N", "lbf", 4.4482216),
+    OtherUnit("positions", "mm", "m", 1e3),
+    OtherUnit("positions", "mm", "cm", 10.0),
+    OtherUnit("positions", "mm", "inch", 25.4),
+    OtherUnit("positions", "mm", "um", 1e-3),
+    OtherUnit("charges", "pC", "nC", 1e3),
+    OtherUnit("charges", "pC", "C", 1e12),
+    OtherUnit("charges", "pC", "fC", 1e-3),
 )
-"""What is written, in which unit, in which one by mistake, and the factors on (x, y, F) and Q that put it right."""
+"""Units that are considered."""
 
 PRETENSIONS = (0.03, 0.25, 0.5, 1.0)
-"""Pretensions that are tried, over the largest of the prior."""
+"""Pretensions of the films that are compared, relative to the largest pretension of the prior."""
 
-SCATTER = 0.1
-OFFSET = 0.6
-"""Standard deviations of the logarithm of a charge over the expected one: among electrodes and presses, and in common.
-Gains, shift and coefficients explain this much."""
+SCATTER_STD = 0.1
+"""Standard deviation of the logarithm of measured over expected charges, among electrodes and presses.
+
+Gains and the shift of the electrodes cause such differences."""
+
+OFFSET_STD = 0.6
+"""Standard deviation of a common offset of the logarithm of measured over expected charges.
+
+The piezoelectric coefficients cause such an offset."""
 
 CLEARER = 0.25
-"""Mean squared misfit of the mistake over that of the data as they are, below which the mistake is named."""
+"""Ratio of the misfit with the correction of a mistake to that without it, below which the mistake is named."""
 
-AS_GOOD = 2.0
-"""Other mistakes are named too if their misfit is at most this much larger."""
-
+MAX_MISFIT_RATIO = 2.0
+"""Largest ratio of the misfit of a further mistake to the smallest one at which the further mistake is named, too."""
 
 AXES = (
     ("they are turned by 90 degrees", np.array([[0.0, -1.0], [1.0, 0.0]])),
@@ -65,7 +91,7 @@ AXES = (
     ("x and y are exchanged", np.array([[0.0, 1.0], [1.0, 0.0]])),
     ("x and y are exchanged and mirrored", np.array([[0.0, -1.0], [-1.0, 0.0]])),
 )
-"""In words, and the matrix from positions as written to positions on the film."""
+"""Rotations and reflections that are considered: a description, and the matrix that corrects written positions."""
 
 
 def check_places(presses: MeasuredPresses, radius: float) -> None:
@@ -76,7 +102,7 @@ def check_places(presses: MeasuredPresses, radius: float) -> None:
         radius: Radius of the film, mm.
 
     Raises:
-        PressError: If a position is off the film, or all positions lie within `METRES_MM` of each other.
+        PressError: If a position is off the film, or all positions lie within `MIN_POSITION_RANGE_MM` of each other.
     """
     places = presses.contact[:, :2]
     outside_rows = np.flatnonzero(np.hypot(*places.T) >= radius)
@@ -88,7 +114,7 @@ def check_places(presses: MeasuredPresses, radius: float) -> None:
         )
     measured_places = places[np.isfinite(places[:, 0])]
     spread = np.ptp(measured_places, axis=0).max() if len(measured_places) else 0.0
-    if 0.0 < spread < METRES_MM:
+    if 0.0 < spread < MIN_POSITION_RANGE_MM:
         raise PressError(
             f"all places lie within {spread:.3g} mm of each other; positions are in mm: were they written in metres?"
         )
@@ -99,38 +125,41 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
     Args:
         presses: The measured presses.
-        charges: Films of the calibration, which tell how small the charges of a channel may be.
+        charges: Charges of the films of the calibration. The charges of a channel may be as small as those of a film.
 
     Raises:
         PressError: If there is such a channel.
     """
     charge = presses.charge_pC
     placed = presses.contact[presses.placed]
-    for name, column in zip(presses.electrodes, charge.T, strict=True):
-        if np.isnan(column).all():
+    for name, channel_charge in zip(presses.electrodes, charge.T, strict=True):
+        if np.isnan(channel_charge).all():
             raise PressError(f"electrode {name!r}: no press has a charge of it; a calibration needs all electrodes")
-    shares = _shares(charge)
-    smallest_shares = np.ones_like(shares)
+    ratios = _charge_ratios(charge)
+    smallest_film_ratios = np.ones_like(ratios)
     if len(placed):
-        film_shares = [_shares(film_charge) for film_charge in expected_charges(charges, placed)]
-        smallest_shares = np.minimum(np.min(film_shares, axis=0), 1.0)
-    for name, column, share, smallest in zip(presses.electrodes, charge.T, shares, smallest_shares, strict=True):
-        if share < DEAD_SHARE * smallest:
+        film_ratios = [_charge_ratios(film_charge) for film_charge in expected_charges(charges, placed)]
+        smallest_film_ratios = np.minimum(np.min(film_ratios, axis=0), 1.0)
+    for channel, name in enumerate(presses.electrodes):
+        channel_charge = charge[:, channel]
+        ratio = ratios[channel]
+        if ratio < MAX_DEAD_RATIO * smallest_film_ratios[channel]:
             raise PressError(
-                f"electrode {name!r} is dead: half of its charges are below {np.nanmedian(np.abs(column)):.3g} pC, "
-                f"{100.0 * share:.2g} % of those of the others; check the channel, its cable and its amplifier"
+                f"electrode {name!r} is dead: half of its charges are below "
+                f"{np.nanmedian(np.abs(channel_charge)):.3g} pC, {100.0 * ratio:.2g} % of those of the others; check "
+                "the channel, its cable and its amplifier"
             )
-        negative = np.sum(column < 0.0)
-        measured = np.sum(np.isfinite(column))
-        # the charges of weak channels may be negative on taut uniaxial films
-        if negative > REVERSED * measured and share > REVERSED_SHARE:
+        negative_count = np.sum(channel_charge < 0.0)
+        measured_count = np.sum(np.isfinite(channel_charge))
+        # The charges of channels with a small ratio may be negative on taut uniaxial films.
+        if negative_count > MAX_NEGATIVE_FRACTION * measured_count and ratio > MIN_REVERSED_RATIO:
             raise PressError(
-                f"electrode {name!r}: {negative} of its {measured} charges are negative; a press gives a positive "
-                "charge: exchange its wires or its sign"
+                f"electrode {name!r}: {negative_count} of its {measured_count} charges are negative; a press gives a "
+                "positive charge: exchange its wires or its sign"
             )
 
 
-def _shares(charge: Array) -> Array:
+def _charge_ratios(charge: Array) -> Array:
     """Return the ratio of the median charge of each channel to that of the other channels.
 
     Args:
@@ -145,7 +174,15 @@ def _shares(charge: Array) -> Array:
 
 
 def expected_charges(charges: FilmCharges, contact: Array) -> Array:
-    """Return charges on the prior's mean film with each of `PRETENSIONS`, shape (n_pretension, n, n_electrode), pC."""
+    """Compute the charges of the mean film of the prior with each of `PRETENSIONS`.
+
+    Args:
+        charges: The films.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N. Contacts outside the domain are moved into it.
+
+    Returns:
+        Charges, shape (n_pretension, n, n_electrode), pC.
+    """
     prior = charges.prior
     contact = charges.into_domain(contact)
     expected = []
@@ -157,11 +194,11 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
 
 
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
-    """Find the mistakes that explain presses far better than the presses as they are written.
+    """Find the mistakes whose correction makes the presses agree far better with a film.
 
     Args:
         presses: The measured presses.
-        charges: Films of the calibration.
+        charges: Charges of the films of the calibration.
 
     Returns:
         One sentence for each mistake, the best explanation first; empty if no mistake explains the presses.
@@ -169,23 +206,25 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     placed = presses[presses.placed]
     if not len(placed):
         return []
-    sentences, contacts, measured = zip(*_corrected_presses(placed, charges), strict=True)
-    # the charges of all corrected contacts are computed together, which is faster
-    expected = np.split(expected_charges(charges, np.concatenate(contacts)), len(contacts), axis=1)
-    misfits = [
-        charge_misfit(charges, contact, charge, film_charges)
-        for contact, charge, film_charges in zip(contacts, measured, expected, strict=True)
-    ]
+    corrections = list(_corrected_presses(placed, charges))
+
+    # The charges of the films are computed for all corrected contacts at once, which is faster.
+    all_contacts = np.concatenate([correction.contact for correction in corrections])
+    film_charges = np.split(expected_charges(charges, all_contacts), len(corrections), axis=1)
+    misfits = {
+        correction.sentence: charge_misfit(charges, correction.contact, correction.charge, expected)
+        for correction, expected in zip(corrections, film_charges, strict=True)
+    }
     limit = CLEARER * misfit(presses, charges)
-    second_limit = AS_GOOD * min(misfits)
-    ranked = sorted(zip(misfits, sentences, strict=True))
-    return [sentence for its_misfit, sentence in ranked if its_misfit < limit and its_misfit <= second_limit]
+    best_first = sorted(misfits, key=lambda sentence: misfits[sentence])
+    largest = MAX_MISFIT_RATIO * misfits[best_first[0]]
+    return [sentence for sentence in best_first if misfits[sentence] < limit and misfits[sentence] <= largest]
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
-    """Return the distance of presses with place and force from those of any film, dimensionless.
+    """Return the misfit of all presses with a measured place and force; see `charge_misfit`.
 
-    A misfit of 1 is common, one of 20 is not.
+    A misfit of 1 is common, and a misfit of 20 is not.
     """
     placed = presses[presses.placed]
     if not len(placed):
@@ -194,12 +233,12 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
 
 
 def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected: Array) -> float:
-    """Return the distance of measured charges from the nearest of several films, dimensionless.
+    """Compute the difference between measured charges and those of the most similar of several films.
 
-    It is the mean squared logarithm of measured over expected charges, in units of the spread of films.
+    The difference is the mean squared logarithm of measured over expected charges, in units of the spread of the films.
 
     Args:
-        charges: The films of the calibration, whose domain the presses must not leave.
+        charges: The films of the calibration. If many contacts lie outside their domain, the misfit is infinite.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         charge: Measured charges, shape (n, n_electrode), pC.
         expected: Charges of each film, shape (n_film, n, n_electrode), pC.
@@ -207,24 +246,35 @@ def charge_misfit(charges: FilmCharges, contact: Array, charge: Array, expected:
     is_outside = (charges.into_domain(contact) != contact).any(axis=1)
     if is_outside.mean() > 0.2:
         return np.inf
-    # one offset and one mean squared deviation from it for each film; the limit of 4 bounds the effect of outliers
+    # For each film, the offset common to all charges, and the mean squared deviation from this offset. The limit of 4
+    # bounds the effect of outliers.
     log_ratio = np.log(np.maximum(charge, 1e-3)) - np.log(np.maximum(expected, 1e-3))
     offset = np.nanmedian(log_ratio, axis=(1, 2))
     squared_deviation = np.minimum((log_ratio - offset[:, None, None]) ** 2, 4.0)
     scatter = np.nanmean(squared_deviation, axis=(1, 2))
-    return float(np.min(scatter / SCATTER**2 + (offset / OFFSET) ** 2))
+    return float(np.min(scatter / SCATTER_STD**2 + (offset / OFFSET_STD) ** 2))
 
 
-def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str, Array, Array]]:
-    """Generate the presses without each of the mistakes that are considered.
+class Correction(NamedTuple):
+    """Presses without a mistake that they may have.
+
+    Attributes:
+        sentence: Description of the mistake.
+        contact: Corrected contacts (x, y, F), shape (n, 3), mm and N.
+        charge: Corrected charges, shape (n, n_electrode), pC.
+    """
+
+    sentence: str
+    contact: Array
+    charge: Array
+
+
+def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[Correction]:
+    """Yield the presses without each of the mistakes that are considered.
 
     Args:
         presses: The measured presses, with place and force.
-        charges: Films of the calibration, which are used to find the orders of the columns.
-
-    Yields:
-        A sentence that describes the mistake, the corrected contacts, shape (n, 3), and charges, shape
-        (n, n_electrode).
+        charges: Charges of the films of the calibration, from which possible orders of the columns follow.
     """
     contact = presses.contact
     charge = presses.charge_pC
@@ -232,18 +282,33 @@ def _corrected_presses(presses: MeasuredPresses, charges: FilmCharges) -> Iterat
     for order in _fitting_orders(presses, charges):
         swapped = ", ".join(electrodes[number] for number in order)
         sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {swapped}"
-        yield sentence, contact, charge[:, np.argsort(order)]
-    for turned, matrix in AXES:
+        yield Correction(sentence, contact, charge[:, np.argsort(order)])
+    for description, matrix in AXES:
         rotated = np.column_stack([contact[:, :2] @ matrix.T, contact[:, 2]])
-        yield f"the rig's axes are not the film's: {turned}", rotated, charge
-    for what, unit, other, of_contact, of_charge in OTHER_UNITS:
-        yield f"the {what} are in {other}, not {unit}", contact * of_contact, charge * of_charge
+        yield Correction(f"the rig's axes are not the film's: {description}", rotated, charge)
+    for unit in OTHER_UNITS:
+        position_factor = unit.factor if unit.values == "positions" else 1.0
+        force_factor = unit.factor if unit.values == "forces" else 1.0
+        charge_factor = unit.factor if unit.values == "charges" else 1.0
+        yield Correction(
+            f"the {unit.values} are in {unit.written}, not {unit.expected}",
+            contact * [position_factor, position_factor, force_factor],
+            charge * charge_factor,
+        )
 
 
 def _fitting_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
-    """Return other orders of the electrodes that fit the columns best, one for each of `PRETENSIONS` at most.
+    """Find the orders of the electrodes with which the charge columns agree best with films.
 
-    The logarithms of every column are compared with those of every electrode, and the best assignment is taken.
+    For each film with one of `PRETENSIONS`, the columns are assigned to the electrodes such that the squared
+    differences of the logarithms of the charges are smallest.
+
+    Args:
+        presses: The measured presses, with place and force.
+        charges: Charges of the films of the calibration.
+
+    Returns:
+        For each order, the index of the electrode that each column holds. The order as written is not among them.
     """
     orders = set()
     log_measured = np.log(np.maximum(presses.charge_pC, 1e-3))
@@ -258,25 +323,42 @@ def _fitting_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple
     return orders - {as_written}
 
 
-def explain(presses: MeasuredPresses, charges: FilmCharges, times_noise: float) -> PressError:
-    """Return the error for presses that no film of this sensor explains.
+FAR_FROM_ALL_FILMS = "their charges are very different from those of its films"
+"""Reason why presses are refused before a film is fitted to them."""
+
+MOSTLY_OUTSIDE = "most of them lie outside the places and forces of a calibration"
+"""Reason why presses are refused if few of them remain for a fit."""
+
+
+def large_residual(residual_over_noise: float) -> str:
+    """Return the reason why presses are refused after a fit.
 
     Args:
-        presses: As they are written.
-        charges: The films.
-        times_noise: Root-mean-square residual of the best film over the noise; infinite if most presses lie
-            outside, NaN if none was tried.
+        residual_over_noise: Root-mean-square residual of the best film, in units of the noise.
     """
-    best = f"the best misses them by {times_noise:.2g} times the noise"
-    if not np.isfinite(times_noise):
-        best = "most of them lie outside the places and forces of a calibration"
-    if np.isnan(times_noise):
-        best = "as they are written, they are nothing like its charges"
-    begin = f"no film of {charges.prior.sensor.name!r} explains these {len(presses)} presses: {best}"
-    if mistakes := find_mistakes(presses, charges):
-        sentences = "; or ".join(mistakes[:3])
-        return PressError(f"{begin}, but it would explain them if {sentences}. Nothing was changed: put the file right")
+    return f"the charges of the best film differ from theirs by {residual_over_noise:.2g} times the noise"
+
+
+def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: str) -> PressError:
+    """Return the error for presses that no film of the sensor explains.
+
+    The message names up to three mistakes that would explain the presses. If none is found, it asks for a check of the
+    setup.
+
+    Args:
+        presses: The presses as they are written in the file.
+        charges: Charges of the films of the calibration.
+        reason: Reason why no film explains the presses: one of the texts above.
+    """
+    sensor_name = charges.prior.sensor.name
+    statement = f"no film of {sensor_name!r} explains these {len(presses)} presses: {reason}"
+    mistakes = find_mistakes(presses, charges)
+    if mistakes:
+        alternatives = "; or ".join(mistakes[:3])
+        return PressError(
+            f"{statement}. A film would explain them if {alternatives}. Nothing was changed: correct the file"
+        )
     return PressError(
-        f"{begin}; is it this layout and this probe ({charges.prior.probe.notation}), are places and forces those "
-        "of these rows, and are charges touch charges (reading under load minus reading without)?"
+        f"{statement}; is it this layout and this probe ({charges.prior.probe.notation}), do the places and forces "
+        "belong to these rows, and are the charges touch charges (reading under load minus reading without load)?"
     )

@@ -6,9 +6,10 @@ the logarithm l of the force:
 
     ln Q_e = ln Q_e(map) + sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= degree, m <= 2.
 
-The coefficients have the mean zero and the standard deviation s FADING^(i + j + m). A further part, which is COMMON
-times as large, is the same for all electrodes: where a film is stiffer than its parameters imply, all charges are
-smaller. The size s is unknown, and `hypotheses` computes the probabilities of several sizes from the presses.
+The coefficients have the mean zero and the standard deviation s FADING^(i + j + m). A further part is the same for all
+electrodes, because all charges are smaller where a film is stiffer than its parameters imply. The standard deviation of
+this part is COMMON times as large. The size s is unknown. The module `hypotheses` computes the probabilities of several
+sizes from the presses.
 """
 
 from functools import cache
@@ -29,19 +30,21 @@ FADING = 0.5
 """Ratio of the standard deviations of terms of successive degrees. It is below 1 because the discrepancy is smooth."""
 
 COMMON = 1.0
-"""Ratio of the standard deviation of the part that all electrodes share to that of the part of each electrode. Both
-parts are of similar size in full simulations of imperfect films. The shared part causes errors of the force."""
+"""Ratio of the standard deviation of the part that all electrodes share to that of the part of each electrode.
+
+Both parts are of similar size in full simulations of imperfect films. The shared part causes errors of the force."""
 
 TRACE_ANGLES = (-45.0, 0.0, 45.0)
-"""Directions of the lines along which the trace of an electrode may lie, degrees from the outward direction. For
-presses within the working area, the effect of a trace in between is a sum of the effects of these lines, with an error
-below the noise."""
+"""Directions of the lines along which the trace of an electrode may lie, degrees from the outward direction.
+
+The effect of a trace between these lines is a weighted sum of the effects of the lines. For presses within the working
+area, the error of this approximation is below the noise."""
 
 
 def terms(contact: Array, domain: Domain) -> Array:
     """Compute the polynomials of the discrepancy, times the standard deviations of their coefficients for s = 1.
 
-    A contact beyond the domain has the values of the nearest contact of the domain.
+    For a contact outside the domain, the values at the nearest contact of the domain are returned.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.

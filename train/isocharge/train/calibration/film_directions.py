@@ -1,12 +1,12 @@
-"""Directions in which a calibrated film remains uncertain, for following the film live.
+"""Directions in which a calibrated film remains uncertain, for a service that follows the film.
 
 The result is written as `film_directions.npz`; see `serve.model.film_directions`.
 
 At a given pretension, the other unknowns of a film have the covariance C = R R'. Let M be the derivative of the misfit
-vectors by the unknowns, in units of the noise. The right singular vectors of M R are combinations of the unknowns that
-are independent before any touch, and whose effects on the misfits of touches are orthogonal (the likelihood-informed
-directions of Cui et al. 2014). Touches hardly identify a combination with a small singular value. Such a combination is
-left out.
+vectors with respect to the unknowns, in units of the noise. The right singular vectors of M R are combinations of the
+unknowns that are independent before any touch, and whose effects on the misfits of touches are orthogonal (the
+likelihood-informed directions of Cui et al. 2014). Touches hardly identify a combination with a small singular value.
+Such a combination is left out.
 """
 
 import numpy as np
@@ -45,11 +45,11 @@ def film_directions(result: CalibrationResult) -> FilmDirections:
 
     sensitivity = result.sensitivity
     unknowns = slice(0, len(covariance))
-    misfit = sensitivity.misfit[:, :, unknowns]
+    misfit = sensitivity.misfit_jacobian[:, :, unknowns]
     _, sizes, combinations = np.linalg.svd(misfit.reshape(-1, len(covariance)) @ root, full_matrices=False)
     is_visible = sizes > LEAST_MISFIT * np.sqrt(len(misfit))
     visible = combinations[is_visible][:MAX_DIRECTIONS]
-    log_changes = np.einsum("neu,ku->nke", sensitivity.log_charge[:, :, unknowns], visible @ root.T)
+    log_changes = np.einsum("neu,ku->nke", sensitivity.log_charge_jacobian[:, :, unknowns], visible @ root.T)
     mean_by_pretension = visible @ np.linalg.pinv(root) @ by_pretension
     return FilmDirections(
         coefficients=_fitted_series(problem.domain, sensitivity.contact, log_changes),

@@ -34,8 +34,8 @@ SUSPICIOUS_PROBABILITY = 0.01
 """Probability of the residuals, if all presses are good, below which bad presses are searched for."""
 
 MAX_BAD_SHARE = 0.34
-"""Largest share of presses that are left out. If more presses disagree, all are kept, because it is uncertain which
-presses are wrong."""
+"""Largest fraction of the presses that is left out. If more presses disagree, all presses are kept, because it is then
+uncertain which of them are wrong."""
 
 MIN_PRESSES_TO_JUDGE = 4
 """Smallest number of presses from which it can be determined which of them are bad."""
@@ -58,7 +58,7 @@ class FilmPosterior(FilmEstimate):
     Attributes:
         contact: Contacts of the presses adjusted to this film, (x, y, F), shape (n, 3), mm and N.
         chi2: Sum of squared residuals of each press, shape (n,). For a good press it is about `degrees_of_freedom`.
-        degrees_of_freedom: Measured numbers beyond three for each press, shape (n,).
+        degrees_of_freedom: Number of redundant measurements of each press, shape (n,); see `_degrees_of_freedom`.
         bad: Which presses were left out, shape (n,).
         nuisances: Estimate of each nuisance of the session, by its name.
         force_scatter: Relative standard deviation of the forces in addition to that of the rig.
@@ -104,27 +104,30 @@ class FilmPosterior(FilmEstimate):
         return replace(self, covariance=self.covariance * factor, joint=self.joint * factor, warming=warming)
 
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> FilmEstimate:
-        """Return the estimate after the film may have drifted; see `FilmEstimate.drifted`.
+        """Return the estimate for a later time; see `FilmEstimate.drifted`.
 
-        The coefficients are only kept if the film probably has imperfections or a discrepancy.
+        If the film probably has neither imperfections nor a discrepancy, the coefficients of these effects are removed
+        from the unknowns, and only the parameters of the film remain.
         """
         if self.imperfect:
             return super().drifted(prior, knows_temperature=knows_temperature)
         warming = self.warming
         if warming is not None:
-            warming = warming.with_unknowns(len(self.parameters))
-        estimate = FilmEstimate(self.parameters, self.covariance, warming=warming)
-        return estimate.drifted(prior, knows_temperature=knows_temperature)
+            n_parameter = len(self.parameters)
+            warming = warming.with_unknowns(n_parameter)  # the parameters are the first unknowns
+        parameters_only = FilmEstimate(self.parameters, self.covariance, warming=warming)
+        return parameters_only.drifted(prior, knows_temperature=knows_temperature)
 
 
 def fit_film(charges: FilmCharges, data: PressData, initial: FilmEstimate, at_C: float | None = None) -> FilmPosterior:
-    """Return the estimate of the film from presses, of which some may be bad.
+    """Estimate the film from presses, of which some may be bad.
 
     Args:
         charges: The films.
         data: The presses.
         initial: Estimate of the film before the presses.
-        at_C: Temperature for which both estimates hold, degrees Celsius; None if temperatures were not measured.
+        at_C: Temperature for which the initial estimate and the result hold, degrees Celsius; None if temperatures were
+            not measured.
     """
     problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None)
     degrees_of_freedom = _degrees_of_freedom(data)
@@ -136,8 +139,8 @@ def fit_film(charges: FilmCharges, data: PressData, initial: FilmEstimate, at_C:
         solved = problem.solve(data[is_kept], is_kept[is_kept], start, Hypothesis())
     settled = problem.settle(data, is_kept, degrees_of_freedom, solved, Hypothesis())
 
-    # Presses that were left out may be right if the film has imperfections. This explanation is used if it is more
-    # probable than that these presses were recorded wrongly.
+    # If the film has imperfections, the presses that were left out may be good ones. The film is fitted to all presses
+    # if this is more probable than that these presses were recorded wrongly.
     if not settled.is_kept.all():
         unknowns = settled.solved.unknowns
         film_of_all = SolvedFilm(unknowns, problem.adjusted_contacts(unknowns, data))
@@ -149,28 +152,29 @@ def fit_film(charges: FilmCharges, data: PressData, initial: FilmEstimate, at_C:
 
 
 def refit_film(
-    charges: FilmCharges, data: PressData, initial: FilmEstimate, known: FilmPosterior, at_C: float | None = None
+    charges: FilmCharges, data: PressData, initial: FilmEstimate, previous: FilmPosterior, at_C: float | None = None
 ) -> FilmPosterior:
-    """Return the estimate of the film from presses, if the film is close to one that is known.
+    """Estimate the film from presses again, starting from a previous estimate from similar presses.
 
-    The search begins at the known film and its most probable hypothesis, so it takes less time than `fit_film`.
+    The search begins at the previous estimate with its most probable hypothesis, so it takes less time than
+    `fit_film`.
 
     Args:
         charges: The films.
         data: The presses. None of them is left out.
         initial: Estimate of the film before the presses.
-        known: The known film, which explains most of these presses.
-        at_C: Temperature for which the estimates hold, degrees Celsius; None if temperatures were not measured.
+        previous: Previous estimate, which explains most of these presses.
+        at_C: Temperature for which all estimates hold, degrees Celsius; None if temperatures were not measured.
     """
     problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None)
     layout = problem.layout
     start = np.zeros(layout.count)
-    start[layout.parameters] = known.parameters / charges.prior.std
-    start[layout.coefficients] = known.coefficients
-    start[layout.nuisances] = [known.nuisances[nuisance.name].value for nuisance in NUISANCES]
+    start[layout.parameters] = previous.parameters / charges.prior.std
+    start[layout.coefficients] = previous.coefficients
+    start[layout.nuisances] = [previous.nuisances[nuisance.name].value for nuisance in NUISANCES]
 
     every_press = np.ones(len(data), dtype=bool)
-    hypothesis = max(known.probabilities, key=lambda each: known.probabilities[each])
+    hypothesis = max(previous.probabilities, key=lambda each: previous.probabilities[each])
     solved = problem.solve(data, every_press, start, hypothesis)
     degrees_of_freedom = _degrees_of_freedom(data)
     settled = problem.settle(data, every_press, degrees_of_freedom, solved, Hypothesis())
@@ -180,14 +184,20 @@ def refit_film(
 def _degrees_of_freedom(data: PressData) -> Array:
     """Return the number of redundant measurements of each press, shape (n,).
 
-    Three measured charges or coordinates are needed to determine the contact; the others are redundant.
+    Three of the measured charges and coordinates determine the contact. All others are redundant.
     """
     return np.asarray(np.maximum(data.measured.sum(axis=1) - 3.0, 0.0))
 
 
 def _is_suspicious(chi2: Array, degrees_of_freedom: Array) -> bool:
-    """Return whether a press, or all of them together, have larger residuals than noise explains."""
+    """Return whether a single press or all presses together have larger residuals than noise explains.
+
+    Args:
+        chi2: Sum of squared residuals of each press, shape (n,).
+        degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
+    """
     press_probability = scipy.stats.chi2.sf(chi2, np.maximum(degrees_of_freedom, 1.0))
+    # The smallest of n probabilities is multiplied by n, because the worst press is selected among n (Bonferroni).
     worst_press_probability = press_probability.min() * len(chi2)
     total_probability = scipy.stats.chi2.sf(chi2.sum(), max(degrees_of_freedom.sum(), 1.0))
     return bool(min(worst_press_probability, total_probability) < SUSPICIOUS_PROBABILITY)
@@ -199,10 +209,10 @@ def _agreeing_presses(
     """Find the film with which most presses agree.
 
     Args:
-        problem: The problem.
+        problem: The least-squares problem.
         data: The presses.
         solved: The film that explains all presses best.
-        degrees_of_freedom: Measured numbers beyond three for each press, shape (n,).
+        degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
 
     Returns:
         Which presses agree with the film, shape (n,), and the unknowns of the film, shape (n_unknown,).
@@ -217,7 +227,8 @@ def _agreeing_presses(
 
     chi2 = solved.contacts.chi2
     degrees_of_freedom = np.maximum(degrees_of_freedom, 1.0)
-    # The residuals of typical presses may be larger than expected; bad presses are then judged relative to them.
+    # The residuals of all presses may be larger than expected. The limit for bad presses is then increased by the same
+    # factor.
     expected_median = np.maximum(scipy.stats.chi2.median(degrees_of_freedom), 0.1)
     typical_ratio = max(1.0, float(np.median(chi2 / expected_median)))
     limit = scipy.stats.chi2.isf(BAD_PROBABILITY / len(data), degrees_of_freedom) * typical_ratio
@@ -244,9 +255,9 @@ def _posterior(
     """Return the estimate of the film from a settled fit.
 
     Args:
-        problem: The problem.
+        problem: The least-squares problem.
         data: All presses.
-        degrees_of_freedom: Measured numbers beyond three for each press, shape (n,).
+        degrees_of_freedom: Number of redundant measurements of each press, shape (n,).
         settled: The settled fit.
         at_C: Temperature of the film, degrees Celsius; None if temperatures were not measured.
     """
@@ -262,8 +273,8 @@ def _posterior(
     warming = None
     if at_C is not None:
         change = nuisances[PRETENSION_PER_KELVIN.name]
-        place = layout.nuisance(PRETENSION_PER_KELVIN.name)
-        warming = Warming(change.value, change.std, at_C, mixture.covariance[place, layout.film])
+        row = layout.nuisance(PRETENSION_PER_KELVIN.name)
+        warming = Warming(change.value, change.std, at_C, mixture.covariance[row, layout.film])
     return FilmPosterior(
         parameters=unknowns[layout.parameters] * problem.charges.prior.std,
         covariance=joint[layout.parameters, layout.parameters],

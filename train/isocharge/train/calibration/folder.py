@@ -1,18 +1,18 @@
 """Folder of a calibrated film: its writer, and the reader of an earlier calibration.
 
-    FOLDER/config.pbtxt            for Triton
-    FOLDER/<version>/model.onnx    the model of this film, with golden.json and card.md as every model
+    FOLDER/config.pbtxt            configuration for Triton
+    FOLDER/<version>/model.onnx    the model of this film, with golden.json and card.md as in every model
     FOLDER/<version>/sensor.toml   the calibrated sensor
-    FOLDER/<version>/calibration.json    parameters, errors, correlations, what cannot be identified
-    FOLDER/<version>/presses.csv   the presses, unless it was moved to another temperature without any
+    FOLDER/<version>/calibration.json    parameters, errors, correlations, quantities that cannot be identified
+    FOLDER/<version>/presses.csv   the presses; missing if the calibration was only moved to another temperature
     FOLDER/<version>/pretensions.npz     weights for `serve stream --follow`, with four electrodes or more
-    FOLDER/<version>/film_directions.npz    what else is uncertain about the film, for the same command
-    FOLDER/<version>/calibration.png
-    FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the last version's
+    FOLDER/<version>/film_directions.npz    further uncertainty of the film, for `serve stream --follow`
+    FOLDER/<version>/calibration.png     picture of the calibration
+    FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the files of the last version
 
-A further calibration in the same folder is its next version, which a server loads when it reloads its models. Only the
-version folders are read. The copies above them are written again from the last version, so that they are correct even
-after a process was killed.
+A further calibration in the same folder becomes its next version. A server loads this version when it reloads its
+models. Programs only read the version folders. The copies above them are for people. They are written again from the
+last version before each calibration, so that they are also correct if a process was killed.
 """
 
 import json
@@ -20,7 +20,6 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -49,15 +48,28 @@ from isocharge.train.model_release.release import release
 from isocharge.train.training.fitted import Provenance
 
 RESULT = "calibration.json"
+"""File with the parameters and errors of the film."""
+
 SENSOR = "sensor.toml"
+"""File with the calibrated sensor."""
+
 PRESSES = "presses.csv"
+"""File with the presses of the calibration."""
+
 PICTURE = "calibration.png"
+"""Picture of the calibration."""
+
 CARD = "card.md"
-"""Names of the files."""
+"""File with a description of the calibrated model."""
 
 
 def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
-    """Raise ModelError if the name or the content of a folder does not allow a calibration in it."""
+    """Raise ModelError if a calibration cannot be written to a folder because of its name or its content.
+
+    Args:
+        folder: The folder, which need not exist.
+        electrodes: Names of the electrodes.
+    """
     versions = version_folders(folder)
     check_target(folder, max(versions, default=0) + 1, electrodes)
     if not folder.exists() or any((version / RESULT).is_file() for version in versions.values()):
@@ -68,10 +80,17 @@ def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
 
 @contextmanager
 def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[None]:
-    """Lock a folder for a calibration, and remove or complete what a killed process left in it.
+    """Lock a folder for a calibration in the block.
+
+    Before the block, unfinished files of a process that was killed are removed, and the copies of the last version are
+    written again.
+
+    Args:
+        folder: The folder.
+        problem: Problem of the calibration.
 
     Raises:
-        ModelError: As `check_calibration_folder`.
+        ModelError: If a calibration cannot be written to a folder with this name or content.
         OutputExists: If another process writes a calibration to the folder.
         OutputError: If the folder cannot be written.
     """
@@ -92,19 +111,28 @@ def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[No
 
 def _publish(folder: Path) -> None:
     """Copy the readable files of the last version to the folder above it, if they differ."""
-    calibrated = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
-    for version, name in product(calibrated[-1:], (SENSOR, PICTURE, CARD, RESULT)):
-        data = (version / name).read_bytes()
-        if not (folder / name).is_file() or (folder / name).read_bytes() != data:
-            write_whole(folder / name, data)
+    calibrated_versions = _calibrated_versions(folder)
+    if not calibrated_versions:
+        return
+    last_version = calibrated_versions[-1]
+    for name in (SENSOR, PICTURE, CARD, RESULT):
+        data = (last_version / name).read_bytes()
+        copy = folder / name
+        if not copy.is_file() or copy.read_bytes() != data:
+            write_whole(copy, data)
+
+
+def _calibrated_versions(folder: Path) -> list[Path]:
+    """Return the version folders that contain a calibration, the last version at the end."""
+    return [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
 
 
 def write_calibration(result: CalibrationResult, folder: Path, command: str = "") -> Path:
-    """Write a calibrated film as a version of a model folder, and copy its readable files to the folder itself.
+    """Write a calibrated film as the next version of a model folder, and copy its readable files to the folder itself.
 
     Args:
         result: The calibration.
-        folder: A new folder, or that of an earlier calibration.
+        folder: A new folder, or the folder of an earlier calibration.
         command: Command that makes this calibration again, for the card.
 
     Returns:
@@ -115,13 +143,14 @@ def write_calibration(result: CalibrationResult, folder: Path, command: str = ""
         OutputError: If the folder cannot be written.
     """
     check_calibration_folder(folder, result.problem.electrodes)
-    with threadpool_limits(1):  # many small matrices: a second thread only waits
+    with threadpool_limits(1):  # the matrices are small, so a second thread would only wait
         version = _release(result, folder, command)
     _publish(folder)
     return version
 
 
 def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
+    """Write the next version folder with all files of a calibration; see `write_calibration`."""
     files = {
         RESULT: json.dumps(plain_values(result_table(result)), indent=1, allow_nan=False).encode(),
         SENSOR: sensor_to_toml(result.film[0]).encode(),
@@ -130,7 +159,8 @@ def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
     if not result.moved:
         files[PRESSES] = presses_text(result.presses).encode()
     fitted = result.fitted
-    if (pretensions := pretensions_of(result, fitted.network)) is not None:
+    pretensions = pretensions_of(result, fitted.network)
+    if pretensions is not None:
         files[PRETENSIONS] = pretensions.to_bytes()
         files[DIRECTIONS] = film_directions(result).to_bytes()
     return release(
@@ -143,7 +173,7 @@ def _release(result: CalibrationResult, folder: Path, command: str) -> Path:
 
 
 def result_table(result: CalibrationResult) -> dict[str, Any]:
-    """Return a result for JSON: estimates, quantities, errors of contacts, and the presses that were left out."""
+    """Return a calibration as a table for JSON: estimates, quantities, errors, and the presses that were left out."""
     film = film_table(result.problem.prior, result.posterior)
     return {
         "format_version": film.pop("format_version"),
@@ -163,19 +193,19 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
 
 
 def held_out_table(result: CalibrationResult) -> dict[str, float] | None:
-    """Return the errors on presses that were held out, for JSON; None if there are too few presses."""
+    """Return the errors of the cross-validation for JSON; None if there are too few presses."""
     if result.held_out is None:
         return None
     return {"presses": len(result.held_out.presses), "folds": FOLD_COUNT, **result.held_out.errors}
 
 
 def error_table(error: ContactError) -> dict[str, float]:
-    """Return an error of contacts for JSON."""
+    """Return the root-mean-square errors of contacts for JSON."""
     return {"position_mm": error.position_mm, "force_percent": error.force_percent}
 
 
 def read_earlier(folder: Path, problem: CalibrationProblem, *, knows_temperature: bool = False) -> FilmEstimate:
-    """Return the film of an earlier calibration, with the uncertainty of its drift since.
+    """Read the film of an earlier calibration, and add the uncertainty of its drift since then.
 
     Args:
         folder: Folder that `write_calibration` wrote, or one of its version folders.
@@ -183,16 +213,22 @@ def read_earlier(folder: Path, problem: CalibrationProblem, *, knows_temperature
         knows_temperature: Whether the temperatures of the new presses are known.
 
     Raises:
-        PressError: If the folder has no calibration, or one of other parameters.
+        PressError: If the folder has no calibration, or a calibration with other parameters.
     """
     return _read(folder, problem)[1].drifted(problem.prior, knows_temperature=knows_temperature)
 
 
 def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> CalibrationResult:
-    """Return an earlier calibration at another temperature, degrees Celsius, without presses and without drift.
+    """Read an earlier calibration, and move it to another temperature without presses and without drift.
+
+    Args:
+        folder: Folder that `write_calibration` wrote, or one of its version folders.
+        problem: Films of the calibration.
+        to_C: The other temperature, degrees Celsius.
 
     Raises:
-        PressError: As `read_earlier`, and if the change of this film with temperature is unknown.
+        PressError: If the folder has no calibration or a calibration with other parameters, or if the change of this
+            film with temperature is unknown.
     """
     path, film = _read(folder, problem)
     if film.warming is None or not film.warming.identified:
@@ -206,9 +242,13 @@ def read_moved(folder: Path, problem: CalibrationProblem, to_C: float) -> Calibr
 
 
 def _read(folder: Path, problem: CalibrationProblem) -> tuple[Path, FilmEstimate]:
-    """Return the path of the file of an earlier calibration, and its film."""
-    calibrated = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
-    path = [folder, *calibrated][-1] / RESULT
+    """Return the path of the file of an earlier calibration, and the film in this file.
+
+    The file is that of the last version in the folder, or that in the folder itself if it is a version folder.
+    """
+    versions = _calibrated_versions(folder)
+    version_folder = versions[-1] if versions else folder
+    path = version_folder / RESULT
     return path, read_film(path, problem)
 
 

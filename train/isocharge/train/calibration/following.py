@@ -1,7 +1,7 @@
-"""Weights with which a calibrated model follows the pretension of its film live: the file `pretensions.npz`.
+"""Weights with which a service follows the pretension of a calibrated film: the file `pretensions.npz`.
 
-The network for all films is folded at some pretensions, with all other parameters as the calibration found them. Each
-network learns the film's discrepancy and the remaining uncertainty as the model itself does.
+The file contains networks of the film at several pretensions. All other parameters are those of the calibration. Each
+network is adapted to the discrepancy and to the remaining uncertainty of the film in the same way as the model itself.
 """
 
 from dataclasses import replace
@@ -19,19 +19,19 @@ from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, draw_con
 from isocharge.train.model_release.onnx_graph import write_graph
 from isocharge.train.training.folded_network import MISFIT_UNIT, FoldedNetwork
 
-NODES = 6
-"""Number of pretensions at which weights are given."""
+N_NODES = 6
+"""Number of pretensions for which the file has weights."""
 
-REACH = 1.4
-"""Largest distance of a pretension from that of the calibration, MPa; three or four degrees of temperature."""
+MAX_PRETENSION_CHANGE_MPa = 1.4
+"""Largest difference from the calibrated pretension, MPa, which corresponds to three or four degrees of temperature."""
 
-TOUCHES = 300
+N_TOUCHES = 300
 """Number of simulated touches from which the typical misfit is computed."""
 
 SEED = 21
 """Seed of the simulated touches."""
 
-ROUGH = 1.5
+MAX_TYPICAL_MISFIT = 1.5
 """Root mean square of the misfits of good touches, in units of the noise, above which a film cannot be followed."""
 
 
@@ -43,8 +43,8 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
         network: The network of the model.
 
     Returns:
-        The weights; None if three electrodes leave no charge for the pretension, or if the misfits of the network are
-        too inaccurate on this film.
+        The weights; None if the pretension cannot be followed. This is the case with three electrodes, whose charges
+        only suffice for the contact, and if the misfits of the network are too inaccurate on this film.
     """
     problem = result.problem
     posterior = result.posterior
@@ -55,8 +55,8 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
     calibrated_MPa = float(posterior.parameters[pretension])
     lower, upper = (float(bound[pretension]) for bound in prior.bounds)
     nodes = _nodes(calibrated_MPa, lower, upper)
-    arrays_at_nodes = [_arrays(each) for each in _networks_at(nodes, result, network)]
-    weights = [np.stack(arrays) for arrays in zip(*arrays_at_nodes, strict=True)]
+    arrays_of_networks = [_arrays(node_network) for node_network in _networks_at(nodes, result, network)]
+    weights = [np.stack(arrays) for arrays in zip(*arrays_of_networks, strict=True)]
     drifted_std = np.sqrt(np.diag(posterior.drifted(prior).covariance)) * prior.std
     pretensions = Pretensions(
         node_MPa=nodes,
@@ -71,7 +71,7 @@ def pretensions_of(result: CalibrationResult, network: FoldedNetwork) -> Pretens
         weights=dict(zip(_constants(network), weights, strict=True)),
     )
     typical_misfit = _typical_misfit(pretensions, result)
-    if typical_misfit > ROUGH:
+    if typical_misfit > MAX_TYPICAL_MISFIT:
         return None
     return replace(pretensions, misfit_rms=max(typical_misfit, 1.0))
 
@@ -93,7 +93,7 @@ def _networks_at(pretensions_MPa: Array, result: CalibrationResult, network: Fol
         else:
             parameters = posterior.parameters.copy()
             parameters[pretension] = pretension_MPa
-            networks.append(_like(network, result.fitted_film(parameters).network))
+            networks.append(_with_correlations_of(network, result.fitted_film(parameters).network))
     return networks
 
 
@@ -106,7 +106,7 @@ def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> floa
     """
     problem = result.problem
     rng = np.random.default_rng(SEED)
-    touches = draw_contacts(rng, problem.domain, TOUCHES)
+    touches = draw_contacts(rng, problem.domain, N_TOUCHES)
     exact_charge = problem.charges.charges(result.posterior.unknowns, touches)
     charge = problem.noise.add(exact_charge, rng)
     calibrated_MPa = np.array([pretensions.calibrated_MPa])
@@ -115,25 +115,30 @@ def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> floa
 
 
 def _nodes(calibrated: float, lower: float, upper: float) -> Array:
-    """Return Chebyshev nodes around the calibrated pretension, MPa, shape (NODES,).
+    """Return Chebyshev nodes around the calibrated pretension, shape (N_NODES,), MPa.
 
-    The node closest to the calibrated pretension is moved onto it.
+    The node that is closest to the calibrated pretension is moved to the calibrated pretension.
 
     Args:
         calibrated: The calibrated pretension, MPa.
         lower: Smallest pretension that a film may have, MPa.
         upper: Largest pretension that a film may have, MPa.
     """
-    low = max(lower, calibrated - REACH)
-    high = min(upper, calibrated + REACH)
-    angle = np.pi * (np.arange(NODES) + 0.5) / NODES
+    low = max(lower, calibrated - MAX_PRETENSION_CHANGE_MPa)
+    high = min(upper, calibrated + MAX_PRETENSION_CHANGE_MPa)
+    angle = np.pi * (np.arange(N_NODES) + 0.5) / N_NODES
     nodes = 0.5 * (low + high) - 0.5 * (high - low) * np.cos(angle) / np.cos(angle[0])
     nodes[np.abs(nodes - calibrated).argmin()] = calibrated
     return np.asarray(nodes)
 
 
-def _like(network: FoldedNetwork, other: FoldedNetwork) -> FoldedNetwork:
-    """Return `other` with the correlations of `network`, which hardly change with the pretension."""
+def _with_correlations_of(network: FoldedNetwork, other: FoldedNetwork) -> FoldedNetwork:
+    """Return another network with the correlations of the model, which hardly change with the pretension.
+
+    Args:
+        network: Network of the model.
+        other: Network of the film with another pretension, without correlations.
+    """
     if not network.n_angle:
         return other
     columns = network.angle_columns
@@ -164,17 +169,21 @@ def _constants(network: FoldedNetwork) -> list[str]:
 
 
 def _floor(result: CalibrationResult) -> float:
-    """Return the standard deviation, MPa, of the change that very many touches show of a film that has not changed.
+    """Compute the standard deviation of the followed pretension that remains after very many touches, MPa.
 
-    Touches give the pretension that goes best with the other parameters. Both these parameters and the pretension of
-    the calibration have errors, which are correlated.
+    The followed pretension is the pretension that explains the touches best together with the other calibrated
+    parameters. These parameters have errors, which cause an error of the followed pretension even if the film has not
+    changed.
+
+    Args:
+        result: The calibration.
     """
     prior = result.problem.prior
     pretension = prior.index("pretension")
-    misfit = result.sensitivity.misfit
-    by_pretension = misfit[:, :, pretension]
-    # Change of the least-squares estimate of the pretension with each parameter p: a sum over all misfits k of all
-    # touches n, over the sum for the pretension itself.
-    weights = np.einsum("nk,nkp->p", by_pretension, misfit) / (by_pretension**2).sum()
+    misfit_jacobian = result.sensitivity.misfit_jacobian
+    pretension_slope = misfit_jacobian[:, :, pretension]
+    # Derivative of the least-squares estimate of the pretension with respect to each unknown p: a sum over the misfits
+    # k of all touches n, divided by the sum for the pretension itself.
+    weights = np.einsum("nk,nkp->p", pretension_slope, misfit_jacobian) / (pretension_slope**2).sum()
     relative_variance = weights @ result.posterior.joint @ weights
     return float(np.sqrt(relative_variance) * prior.std[pretension])

@@ -1,9 +1,10 @@
-"""Hypotheses about what affected the presses of a session besides the parameters of the film, and their probabilities.
+"""Hypotheses about effects on the presses of a session besides the parameters of the film, and their probabilities.
 
-The film may have imperfections (modes), a discrepancy of some size, and traces that nobody described. The session may
-have nuisances, and the stated forces may scatter. Each combination of these effects is a hypothesis; traces are only
-combined with modes and a discrepancy. The presses determine the probability of each hypothesis by the evidence of a
-linear model with Gaussian noise (MacKay 1992). The estimate is the mixture of the estimates of all hypotheses.
+The film may have imperfections (modes), a discrepancy of some size, and traces that are missing in the sensor file. The
+session may have nuisances, and the stated forces may scatter. Each combination of these effects is a hypothesis. Traces
+are only combined with modes and a discrepancy. The presses determine the probability of each hypothesis by the evidence
+of a linear model with Gaussian noise (MacKay 1992). The estimate of the film is the mixture of the estimates of all
+hypotheses.
 """
 
 import math
@@ -60,7 +61,14 @@ class Hypothesis:
     traces: float = 0.0
 
     def covariance(self, layout: UnknownLayout) -> Array:
-        """Return what the hypothesis adds to the covariance of the unknowns, shape (n_unknown, n_unknown)."""
+        """Return the covariance of the unknowns that describe the effects of the hypothesis, before the presses.
+
+        Args:
+            layout: Layout of the unknowns.
+
+        Returns:
+            Shape (n_unknown, n_unknown). It is zero for the parameters of the film.
+        """
         electrode_count = len(layout.electrode_names)
         # The coefficients of one term are correlated, because part of a discrepancy is common to all electrodes.
         electrode_covariance = np.eye(electrode_count) + COMMON**2
@@ -91,8 +99,9 @@ class Hypothesis:
 def hypotheses() -> Iterator[Hypothesis]:
     """Yield all hypotheses that are considered.
 
-    A hypothesis with modes always has a discrepancy as well, because the modes are computed to first order and never
-    explain the charges completely.
+    The first hypotheses are all combinations of modes, discrepancy, nuisances and force scatter. A hypothesis with
+    modes always has a discrepancy as well, because the modes are computed to first order and never explain the charges
+    completely. The last hypotheses have traces, together with modes and each size of the discrepancy.
     """
     nuisance_stds_and_probabilities = [nuisance.probabilities for nuisance in NUISANCES]
     combinations = product(
@@ -109,6 +118,7 @@ def hypotheses() -> Iterator[Hypothesis]:
             force_scatter=force_scatter,
             prior_probability=math.prod(probability for _, probability in combination),
         )
+
     for discrepancy, probability in DISCREPANCY_SIZES.items():
         if discrepancy > 0.0:
             yield Hypothesis(
@@ -142,7 +152,7 @@ class LinearModel(NamedTuple):
         Args:
             jacobian: Derivatives of the residuals with respect to the unknowns, shape (n, n_unknown).
             residual: Residuals in units of their standard deviations, shape (n,).
-            deviation: Unknowns at this point less their mean before the presses, shape (n_unknown,).
+            deviation: Difference of the unknowns at this point from their mean before the presses, shape (n_unknown,).
         """
         residual_at_mean = residual - jacobian @ deviation
         return cls(
@@ -191,8 +201,8 @@ class LinearModel(NamedTuple):
             prior_covariance: Covariance of the unknowns before the presses, shape (n_unknown, n_unknown).
 
         Returns:
-            The mean less the mean before the presses, shape (n_unknown,), and the covariance, shape (n_unknown,
-            n_unknown). Unknowns without a variance before the presses keep their mean.
+            Change of the mean by the presses, shape (n_unknown,), and covariance after the presses, shape (n_unknown,
+            n_unknown). The mean of unknowns without a variance before the presses does not change.
         """
         solution = self._solve(prior_covariance)
         active = solution.active
@@ -238,8 +248,8 @@ class Mixture(NamedTuple):
     """Estimate of the unknowns over all hypotheses.
 
     Attributes:
-        mean: Mean less the mean before the presses, shape (n_unknown,).
-        covariance: Covariance, shape (n_unknown, n_unknown).
+        mean: Change of the mean by the presses, shape (n_unknown,).
+        covariance: Covariance after the presses, shape (n_unknown, n_unknown).
         probabilities: Probability of each hypothesis after the presses.
         log_evidence: Logarithm of the evidence of the presses, except for a constant.
     """
@@ -268,21 +278,30 @@ def mix_hypotheses(
         considered: The hypotheses; by default all.
     """
     considered = list(considered or hypotheses())
-    log_weights = np.array(
-        [
-            models[each.force_scatter].log_evidence(prior_covariance(each)) + np.log(each.prior_probability)
-            for each in considered
-        ]
-    )
+    log_weights = []
+    for hypothesis in considered:
+        model = models[hypothesis.force_scatter]
+        log_weights.append(model.log_evidence(prior_covariance(hypothesis)) + np.log(hypothesis.prior_probability))
     log_evidence = float(logsumexp(log_weights))
-    probabilities = np.exp(log_weights - log_evidence)
+    probabilities = np.exp(np.array(log_weights) - log_evidence)
 
     relevant = np.flatnonzero(probabilities > NEGLIGIBLE_PROBABILITY)
-    relevant_hypotheses = [considered[number] for number in relevant]
-    estimates = [models[each.force_scatter].posterior(prior_covariance(each)) for each in relevant_hypotheses]
-    # Law of total covariance: covariance within each hypothesis plus covariance of the means.
-    mean = np.einsum("h,hu->u", probabilities[relevant], [each_mean for each_mean, _ in estimates])
+    means = []
+    covariances = []
+    for index in relevant:
+        hypothesis = considered[index]
+        hypothesis_mean, hypothesis_covariance = models[hypothesis.force_scatter].posterior(
+            prior_covariance(hypothesis)
+        )
+        means.append(hypothesis_mean)
+        covariances.append(hypothesis_covariance)
+
+    # Law of total covariance: mean of the covariances of the hypotheses plus covariance of their means
+    mean = np.einsum("h,hu->u", probabilities[relevant], means)
     covariance = np.zeros((len(mean), len(mean)))
-    for probability, (each_mean, each_covariance) in zip(probabilities[relevant], estimates, strict=True):
-        covariance += probability * (each_covariance + np.outer(each_mean - mean, each_mean - mean))
+    for probability, hypothesis_mean, hypothesis_covariance in zip(
+        probabilities[relevant], means, covariances, strict=True
+    ):
+        difference = hypothesis_mean - mean
+        covariance += probability * (hypothesis_covariance + np.outer(difference, difference))
     return Mixture(mean, covariance, dict(zip(considered, probabilities.tolist(), strict=True)), log_evidence)

@@ -1,4 +1,4 @@
-"""Problem of a calibration: the film as it is described, and the network for all films that fits its layout."""
+"""Problem of a calibration: the described film, and the network that was trained for all films of its layout."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -22,41 +22,42 @@ from isocharge.train.films.films_model import AddedVariance, FilmsModel
 from isocharge.train.training.fitted import Fitted
 
 DRIFT = {"pretension": 0.4, "d31": 0.05, "d32": 0.05, "gain": 0.1}
-"""Standard deviations of the changes since an earlier calibration, over those of the prior.
+"""Standard deviation of the change of some parameters since an earlier calibration, relative to the prior.
 
-The pretension changes by 0.35 MPa, by creep and a degree of temperature, coefficients by 1 % and gains by 0.5 %. All
-other parameters change by `REMOUNTED`. Presses of known force also show larger changes. Touches of unknown force can
-only follow the pretension."""
+The values correspond to 0.35 MPa of the pretension (creep and a degree of temperature), 1 % of the piezoelectric
+coefficients and 0.5 % of the gains. All other parameters change by `OTHER_DRIFT`. Presses with a known force can also
+reveal larger changes. Touches with an unknown force can only show a change of the pretension."""
 
-REMOUNTED = 0.03
-"""Standard deviation of the change of every other parameter, over that of the prior."""
+OTHER_DRIFT = 0.03
+"""Standard deviation of the change of each parameter that is not in `DRIFT`, relative to the prior."""
 
-UNSTEADY = 0.002
+COEFFICIENT_DRIFT_STD = 0.002
 """Standard deviation of the change of the coefficients of a discrepancy since an earlier calibration."""
 
-THERMOMETER = 0.1
-"""Standard deviation of the change of the pretension, over that of the prior, if the temperatures of both calibrations
-are known. The remaining change is creep."""
+CREEP = 0.1
+"""Standard deviation of the change of the pretension, relative to the prior, between two known temperatures.
+
+If both temperatures are known, the effect of the temperature is subtracted, and only creep remains."""
 
 LIKELY = Hypothesis(modes=0.5, discrepancy=0.01)
-"""Imperfections for which presses are planned: half of those that imperfect films have.
+"""Imperfections that are assumed when presses are planned: half of those of typical imperfect films.
 
-Plans for smaller imperfections leave errors on imperfect films that are half as large again. On a film without
-imperfections, this plan leaves the same error after eight presses, and 7 % more after five."""
+If smaller imperfections are assumed, the remaining errors on imperfect films are 1.5 times as large. On a film without
+imperfections, the assumption does not change the error after eight presses, and increases it by 7 % after five."""
 
 IDENTIFIED = 0.5
-"""Standard deviation after the presses over that before, below which a quantity counts as identified, dimensionless."""
+"""Largest ratio of the standard deviations after and before the presses at which a quantity counts as identified."""
 
 
 class Warming(NamedTuple):
     """Change of the pretension of a film with temperature.
 
     Attributes:
-        MPa_per_K: Change of the pretension.
-        std: Its standard deviation, MPa/K.
-        at_C: Temperature at which the film is given, degrees Celsius.
-        covariance: Of this change and the film's unknowns, parameters over their prior standard deviations, shape
-            (n_unknown,), MPa/K.
+        MPa_per_K: Change of the pretension per kelvin.
+        std: Standard deviation of this change, MPa/K.
+        at_C: Temperature of the film for which its parameters are given, degrees Celsius.
+        covariance: Covariance of this change with the unknowns of the film, shape (n_unknown,), MPa/K. Parameters are
+            in units of their prior standard deviations.
     """
 
     MPa_per_K: float
@@ -66,24 +67,30 @@ class Warming(NamedTuple):
 
     @property
     def identified(self) -> bool:
-        """Whether presses have at least halved its standard deviation."""
+        """Whether presses have at least halved the standard deviation of the change."""
         return self.std <= IDENTIFIED * PRETENSION_PER_KELVIN.std_with_temperatures
 
     def with_unknowns(self, count: int) -> "Warming":
-        """Return the change beside the first unknowns of a film, or beside more, which do not depend on it."""
-        return self._replace(covariance=np.pad(self.covariance, (0, count))[:count])
+        """Return the change with the covariances of another number of unknowns.
+
+        Args:
+            count: Number of unknowns. The last unknowns are removed, or unknowns without a covariance are added.
+        """
+        extended = np.pad(self.covariance, (0, count))
+        return self._replace(covariance=extended[:count])
 
 
 @dataclass(frozen=True)
 class FilmEstimate:
-    """Estimate of a film: a Gaussian about its best parameters.
+    """Estimate of a film: mean and covariance of a Gaussian distribution of its unknowns.
 
     Attributes:
-        parameters: Parameters, as in `FilmPrior`, shape (n_parameter,).
-        covariance: Covariance of the parameters over their prior standard deviations, shape (n_parameter, n_parameter).
+        parameters: Best parameters, as in `FilmPrior`, shape (n_parameter,).
+        covariance: Covariance of the parameters in units of their prior standard deviations, shape
+            (n_parameter, n_parameter).
         coefficients: Coefficients of the discrepancy, shape (n_coefficient,); empty if there is none.
-        joint: Covariance of parameters and coefficients, shape (n_parameter + n_coefficient,) twice; empty if there is
-            no discrepancy.
+        joint: Covariance of parameters and coefficients, shape (n_parameter + n_coefficient, n_parameter +
+            n_coefficient); empty if there is no discrepancy.
         warming: Change of the pretension with temperature; None if the temperatures of the presses are not known.
     """
 
@@ -104,19 +111,20 @@ class FilmEstimate:
         return self.joint if self.coefficients.size else self.covariance
 
     def drifted(self, prior: FilmPrior, *, knows_temperature: bool = False) -> "FilmEstimate":
-        """Return the estimate for a later time, whose covariance contains a possible drift of the film (`DRIFT`).
+        """Return the estimate for a later time. Its covariance includes the drift that the film may have had.
 
         Args:
             prior: Distribution of the films.
             knows_temperature: Whether the temperature at the later time is known.
         """
-        drift_std = np.array([DRIFT.get(name.partition(" ")[0], REMOUNTED) for name in prior.names])
+        kinds = [name.partition(" ")[0] for name in prior.names]  # "gain A" is of the kind "gain"
+        drift_std = np.array([DRIFT.get(kind, OTHER_DRIFT) for kind in kinds])
         if knows_temperature and self.warming is not None:
-            drift_std[prior.index("pretension")] = THERMOMETER
+            drift_std[prior.index("pretension")] = CREEP
         covariance = self.covariance + np.diag(drift_std**2)
         joint = self.joint
         if joint.size:
-            coefficient_std = np.full(self.coefficients.size, UNSTEADY)
+            coefficient_std = np.full(self.coefficients.size, COEFFICIENT_DRIFT_STD)
             joint = joint + np.diag(np.concatenate([drift_std, coefficient_std]) ** 2)
         parameters = np.clip(self.parameters, *prior.bounds)
         return FilmEstimate(parameters, covariance, self.coefficients, joint, self.warming)
@@ -124,8 +132,8 @@ class FilmEstimate:
     def at_temperature(self, at_C: float, prior: FilmPrior) -> "FilmEstimate":
         """Return the estimate of the film at another temperature.
 
-        Only the pretension changes with the temperature. The change is linear, so that the opposite change restores the
-        estimate. If `warming` is None, the temperature of the estimate is unknown, and the estimate is not changed.
+        Only the pretension changes, in proportion to the change of the temperature. If `warming` is None, the
+        temperature of the estimate is unknown, and the estimate is returned unchanged.
 
         Args:
             at_C: The other temperature, degrees Celsius.
@@ -146,7 +154,8 @@ class FilmEstimate:
                 f"at {at_C:g} C the pretension would be {parameters[pretension]:.2f} MPa; expected {lower:g} to "
                 f"{upper:g} MPa: a temperature nearer to that of the presses"
             )
-        # Covariance of the unknowns after adding the warming to the pretension, first in its row, then in its column
+        # The new pretension is the sum of the old pretension and the change. The covariances of this sum replace first
+        # the row and then the column of the pretension.
         scaled_change = change_K / prior.std[pretension]
         covariance = self.unknown_covariance.copy()
         warming_covariance = self.warming.covariance.copy()
@@ -165,10 +174,10 @@ class FilmEstimate:
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """Films that a sensor may have, and the contacts for which the calibration is needed.
+    """Films that a sensor may have, and the contacts for which the sensor is calibrated.
 
     Attributes:
-        sensor: The sensor as described.
+        sensor: The sensor as described in its file.
         probe: The probe as described.
         films: The network for all films of the layout.
         earlier: Estimate of the film from an earlier calibration, as `read_earlier` returns it; None for the sensor as
@@ -189,7 +198,7 @@ class CalibrationProblem:
 
     @classmethod
     def of(cls, sensor: Sensor, probe: Probe, models: Path | None = None) -> "CalibrationProblem":
-        """Return the problem of a sensor and a probe, with the installed network that fits them.
+        """Create the problem of a sensor and a probe with the installed network that fits them.
 
         Args:
             sensor: The sensor; see `films_for`.
@@ -214,7 +223,7 @@ class CalibrationProblem:
 
     @cached_property
     def prior(self) -> FilmPrior:
-        """Distribution of the films. Their electrodes are those of the sensor, with its traces."""
+        """Distribution of the films, with the electrodes and traces of the sensor."""
         return _with_electrodes(self.films.prior, self.sensor)
 
     @cached_property
@@ -232,16 +241,16 @@ class CalibrationProblem:
     ) -> Fitted:
         """Return the network of a film.
 
-        The network is adapted to the factor, and to the difference between the electrodes of the sensor and those of
-        the network for all films.
+        The network is adapted to the factor on the charges, and to the difference between the electrodes of the sensor
+        and those of the network for all films.
 
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
             added_variance: Variances that are added to those of the network.
             factor: Function that returns the factors on the charges, shape (n, n_electrode), at contacts (x, y, F),
                 shape (n, 3), mm and N.
-            release: Whether the network will be released. Only such a network learns correlations and gets presses
-                for measuring its errors.
+            release: Whether the network will be released. Only a network that will be released learns correlations and
+                gets presses on which its errors are measured.
         """
         options: dict[str, Any] = {} if release else {"correlation": False, "n_test": 0}
         sensor_map = self.charges.forward_map(parameters)
@@ -259,7 +268,7 @@ class CalibrationProblem:
 
     @property
     def domain(self) -> Domain:
-        """Contacts for which the calibration is needed."""
+        """Contacts for which the sensor is calibrated."""
         return self.films.domain
 
     @cached_property
@@ -269,8 +278,9 @@ class CalibrationProblem:
         Raises:
             SceneError: If the smallest force already exceeds the limit.
         """
-        domain = self.domain.force_range
-        return domain[0], force_within_stress(self.sensor.film, self.probe, self.stress_limit, domain)
+        force_range = self.domain.force_range
+        smallest_force, _ = force_range
+        return smallest_force, force_within_stress(self.sensor.film, self.probe, self.stress_limit, force_range)
 
     @property
     def noise(self) -> NoiseModel:
@@ -290,9 +300,9 @@ class CalibrationProblem:
 
     @cached_property
     def expected(self) -> FilmEstimate:
-        """Estimate of the film for a plan of presses.
+        """Estimate of the film with which presses are planned.
 
-        Without an earlier calibration, it includes the imperfections of `LIKELY`.
+        Without an earlier calibration, the estimate includes the imperfections of `LIKELY`.
         """
         if self.earlier:
             return self.before
@@ -303,11 +313,14 @@ class CalibrationProblem:
 
 
 def films_for(sensor: Sensor, probe: Circle, models: Path | None = None) -> FilmsModel:
-    """Find the network for all films of a sensor's layout by its electrodes. The name of the sensor does not matter.
+    """Find the network that was trained for all films with the electrodes of a sensor.
+
+    The name of the sensor does not matter.
 
     Args:
-        sensor: The sensor. Its pads, radius and readout must be those of a network. Everything else may differ within
-            the spread of the films, and the electrodes may have traces and patterned backs.
+        sensor: The sensor. Its pads, the radius of its film and its readout must be those for which the network was
+            trained. All other properties may differ within the spread of the films, and the electrodes may have traces
+            and patterned backs.
         probe: The probe. Its radius must be within the spread of the films.
         models: Folder of models that is searched first.
 
@@ -356,7 +369,12 @@ def _pads(sensor: Sensor) -> dict[str, list[list[float]]]:
 
 
 def _folders(models: Path | None, name: str) -> list[Path]:
-    """Return the version folders with a films file, those named after the sensor first."""
+    """Return the version folders that contain a network for films. Folders of models named after the sensor are first.
+
+    Args:
+        models: Folder of models that is searched first.
+        name: Name of the sensor.
+    """
     folders = [find_model((root / model).resolve()) for root in repositories(models) for model in model_names(root)]
     with_films = [folder for folder in folders if (folder / FILE).is_file()]
     return sorted(with_films, key=lambda folder: not folder.parent.name.startswith(name))
