@@ -14,7 +14,8 @@ import numpy as np
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.numerics.disk_least_squares import minimise
-from isocharge.train.calibration.film_charges import CONTACT_STEPS, FilmCharges
+from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.film_maps import CONTACT_STEPS
 from isocharge.train.calibration.press_data import PressData
 
 CANDIDATE_POSITIONS = 300

@@ -11,13 +11,14 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.simulate import Circle, Film, ForwardMap, Probe
+from isocharge.simulate import Film, ForwardMap, Probe
 from isocharge.simulate.forward.charge_map import Domain, FunctionMap, differences
 from isocharge.simulate.forward.film_family import FilmFamily
 from isocharge.simulate.forward.film_modes import MODES, ModeMap
 from isocharge.simulate.numerics.disk import onto_disk
-from isocharge.simulate.sensor.film_prior import PARAMETERS, SHARED, FilmPrior
+from isocharge.simulate.sensor.film_prior import SHARED, FilmPrior
 from isocharge.train.calibration.discrepancy import term_count, terms
+from isocharge.train.calibration.film_maps import CONTACT_STEPS, STEP, FilmMaps, log_force_derivative
 from isocharge.train.calibration.imperfections import (
     ModeCharges,
     log_unevenness,
@@ -28,21 +29,8 @@ from isocharge.train.calibration.imperfections import (
 )
 from isocharge.train.calibration.unknowns import UnknownLayout
 
-STEP = 0.005
-"""Step of the finite differences with respect to a parameter, in standard deviations of its prior."""
-
 LOAD_PARAMETERS = ("pretension", "young", "thickness")
 """Parameters that change the stress of the film under a load. The others move electrodes or scale charges."""
-
-STEPPED = tuple(parameter.name for parameter in PARAMETERS if parameter.derivative == "difference")
-"""Parameters whose derivatives are differences."""
-
-CONTACT_STEPS = (5e-3, 5e-3, 1e-3)
-"""Steps of the finite differences in x and y (mm) and in ln F. They are small, because the domain is reduced by a
-step."""
-
-CACHED_MAPS = 8
-"""Number of forward maps that are cached."""
 
 NEGLIGIBLE = 1e-3
 """Coefficient of the modes and traces below which they are not computed. The charges change by less than 1e-4."""
@@ -52,9 +40,6 @@ LARGEST_LOCAL_COEFFICIENT = 0.1
 
 MIN_FACTOR = 0.05
 """Lower bound for the factor of modes and traces. The first-order expansion is not valid for smaller factors."""
-
-EDGE = 1.0 - 1e-6
-"""Share of the radius and of the forces of the family within which presses are evaluated."""
 
 
 @dataclass(frozen=True)
@@ -70,23 +55,14 @@ class FilmCharges:
     family: FilmFamily
 
     @cached_property
+    def maps(self) -> FilmMaps:
+        """Forward maps of the films without modes, traces and discrepancy."""
+        return FilmMaps(self.prior, self.family)
+
+    @property
     def domain(self) -> Domain:
         """Contacts for which every film of the prior has charges, with a margin for the finite differences."""
-        film = self.prior.sensor.film
-        young = self.prior.index("young")
-        thickness = self.prior.index("thickness")
-        stiffness = film.young * film.thickness * film.radius
-        min_stiffness, max_stiffness = (
-            stiffness * np.exp(bound[young] + bound[thickness]) for bound in self.prior.bounds
-        )
-
-        # The family is limited in the distance over the radius, and in the load F / (E h a).
-        _, max_distance = self.family.limits["distance"]
-        min_load, max_load = self.family.limits["load"]
-        radius = EDGE * max_distance * film.radius - CONTACT_STEPS[0]
-        min_force = float(min_load * max_stiffness) * (2.0 - EDGE) * 1.01
-        max_force = float(max_load * min_stiffness) * EDGE / 1.01
-        return Domain(radius, (min_force, max_force))
+        return self.maps.domain
 
     @cached_property
     def modes(self) -> tuple[str, ...]:
@@ -136,23 +112,10 @@ class FilmCharges:
     def forward_map(self, parameters: Array) -> ForwardMap:
         """Return the forward map of one film without modes, traces and discrepancy.
 
-        Films that differ only in piezoelectric coefficients, gains and electrodes have the same stresses. The last few
-        stresses are cached.
-
         Args:
             parameters: Parameters of the film, shape (n_parameter,).
         """
-        sensor, probe = self.prior.film(parameters)
-        key = (sensor.film, probe)
-        if key not in self._maps:
-            if len(self._maps) >= CACHED_MAPS:
-                del self._maps[next(iter(self._maps))]
-            self._maps[key] = self.family.forward_map(sensor, probe)
-        return replace(self._maps[key], sensor=sensor)
-
-    @cached_property
-    def _maps(self) -> dict[tuple[Film, Circle], ForwardMap]:
-        return {}
+        return self.maps.forward_map(parameters)
 
     def film(self, unknowns: Array) -> FunctionMap:
         """Return the charges of one film as a function of the contact.
@@ -252,7 +215,7 @@ class FilmCharges:
         fields = replace(modes.fields, sensor=sensor) if modes.fields is not None else None
         mode_jacobian = replace(modes, film=forward_map, fields=fields).mode_jacobian(contact)
 
-        pretension_derivative = self._difference("pretension", parameters, contact, charge)
+        pretension_derivative = self.maps.difference("pretension", parameters, contact, charge)
         log_tension_derivative = self._pretension(parameters) * pretension_derivative / charge
         return ModeCharges(
             modes, sensor, contact, mode_jacobian * self._mode_stds, log_unevenness(log_tension_derivative)
@@ -326,8 +289,9 @@ class FilmCharges:
         charge = film.charges(contact)
         force_derivative = by_contact[:, :, 2]
         if coefficients.any():
-            force_derivative = _force_derivative(film, contact)
-        film_jacobian = self._parameter_jacobian(film, parameters, contact, charge, force_derivative) * self.prior.std
+            force_derivative = log_force_derivative(film, contact)
+        film_jacobian = self.maps.parameter_jacobian(film, parameters, contact, charge, force_derivative)
+        film_jacobian *= self.prior.std
         if not coefficients.size:
             return np.asarray(film_jacobian)
 
@@ -355,35 +319,6 @@ class FilmCharges:
         term_jacobian = own_charge[:, :, None, :] * terms(contact, self.domain)[:, None, :, None]
         term_jacobian = term_jacobian.reshape(*charge.shape, -1)
         return np.concatenate([film_jacobian, mode_jacobian, trace_jacobian, term_jacobian], axis=2)
-
-    def _parameter_jacobian(
-        self, film: ForwardMap, parameters: Array, contact: Array, charge: Array, force_derivative: Array
-    ) -> Array:
-        """Compute the derivatives of the charges without coefficients with respect to the parameters.
-
-        Args:
-            film: Forward map of the film.
-            parameters: Parameters of the film, shape (n_parameter,).
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            charge: Charges of these contacts, shape (n, n_electrode), pC.
-            force_derivative: Derivatives of the charges with respect to ln F, shape (n, n_electrode), pC.
-
-        Returns:
-            Shape (n, n_electrode, n_parameter), pC per unit of the parameter.
-        """
-        columns = {name: self._difference(name, parameters, contact, charge) for name in STEPPED}
-        # Chain rule for Q = E q(F / (E h a), T / E, h / a), with respect to ln E and ln h
-        columns["young"] = charge - force_derivative - self._pretension(parameters) * columns["pretension"]
-        columns["thickness"] = columns["thickness"] - force_derivative
-        piezo = film.sensor.piezo
-        columns["d32"] = np.zeros_like(charge)
-        if piezo.d32 != 0.0:
-            d32_alone = replace(film, sensor=replace(film.sensor, piezo=replace(piezo, d31=0.0)))
-            columns["d32"] = d32_alone.charges(contact)
-        columns["d31"] = charge - columns["d32"]
-        shared = np.stack([columns[name] for name in SHARED], axis=2)
-        gain_jacobian = charge[:, :, None] * np.eye(charge.shape[1])
-        return np.concatenate([shared, gain_jacobian], axis=2)
 
     def _without_terms(self, unknowns: Array) -> Array:
         """Return parameters and coefficients of a film, with the terms of the discrepancy set to zero."""
@@ -464,48 +399,3 @@ class FilmCharges:
             derivative = (self.factor(stepped_film, contact) - factor) / step
             log_derivatives[name] = derivative / np.maximum(factor, MIN_FACTOR)
         return log_derivatives
-
-    def _difference(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
-        """Compute the derivative of the charges with respect to one parameter by a finite difference.
-
-        The derivative with respect to ln h is computed at a constant load F / (E h a), so that it contains only the
-        effect of bending.
-
-        Args:
-            name: Name of the parameter.
-            parameters: Parameters of the film, shape (n_parameter,).
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            charge: Charges of these contacts, shape (n, n_electrode), pC.
-
-        Returns:
-            Shape (n, n_electrode), pC per unit of the parameter.
-        """
-        index = self.prior.index(name)
-        _, upper_bounds = self.prior.bounds
-        step = STEP * self.prior.std[index]
-        if parameters[index] + step > upper_bounds[index]:
-            step = -step
-        stepped = parameters.copy()
-        stepped[index] += step
-        change = stepped[index] - parameters[index]
-        stepped_contact = contact
-        if name == "thickness":
-            stepped_contact = contact * [1.0, 1.0, np.exp(change)]  # keeps F / h constant
-        return np.asarray((self.forward_map(stepped).charges(stepped_contact) - charge) / change)
-
-
-def _force_derivative(film: ForwardMap, contact: Array) -> Array:
-    """Compute the derivatives of the charges of a forward map with respect to ln F.
-
-    Args:
-        film: Forward map of the film.
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-
-    Returns:
-        Shape (n, n_electrode), pC.
-    """
-    log_force_step = CONTACT_STEPS[2]
-    force_factor = np.array([1.0, 1.0, np.exp(log_force_step)])
-    charge_above = film.charges(contact * force_factor)
-    charge_below = film.charges(contact / force_factor)
-    return np.asarray((charge_above - charge_below) / (2.0 * log_force_step))

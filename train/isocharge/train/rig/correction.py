@@ -15,7 +15,7 @@ from isocharge.common.measured_presses import MeasuredPresses
 from isocharge.simulate import NoiseModel
 from isocharge.simulate.forward.charge_map import ChargeMap, Domain, differences
 from isocharge.train.calibration.discrepancy import term_count, terms
-from isocharge.train.calibration.film_charges import CONTACT_STEPS
+from isocharge.train.calibration.film_maps import CONTACT_STEPS
 from isocharge.train.calibration.hypotheses import Hypothesis, LinearModel, mix_hypotheses
 
 SIZES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)

@@ -1,0 +1,160 @@
+"""Charges of presses on the perfect films of a prior, and their derivatives with respect to the parameters.
+
+A perfect film has no imperfections, no traces that the sensor file does not describe, and no discrepancy. It is
+described by the parameters of `FilmPrior` alone.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.simulate import Circle, Film, ForwardMap
+from isocharge.simulate.forward.charge_map import Domain
+from isocharge.simulate.forward.film_family import FilmFamily
+from isocharge.simulate.sensor.film_prior import PARAMETERS, SHARED, FilmPrior
+
+STEP = 0.005
+"""Step of the finite differences with respect to a parameter, in standard deviations of its prior."""
+
+STEPPED = tuple(parameter.name for parameter in PARAMETERS if parameter.derivative == "difference")
+"""Parameters whose derivatives are differences."""
+
+CONTACT_STEPS = (5e-3, 5e-3, 1e-3)
+"""Steps of the finite differences in x and y (mm) and in ln F. They are small, because the domain is reduced by a
+step."""
+
+CACHED_MAPS = 8
+"""Number of forward maps that are cached."""
+
+EDGE = 1.0 - 1e-6
+"""Share of the radius and of the forces of the family within which presses are evaluated."""
+
+
+@dataclass(frozen=True)
+class FilmMaps:
+    """Forward maps of the perfect films of a prior.
+
+    Attributes:
+        prior: Distribution of the films, which declares the parameters.
+        family: Solved films, between which the forward maps are interpolated.
+    """
+
+    prior: FilmPrior
+    family: FilmFamily
+
+    @cached_property
+    def domain(self) -> Domain:
+        """Contacts for which every film of the prior has charges, with a margin for the finite differences."""
+        film = self.prior.sensor.film
+        young = self.prior.index("young")
+        thickness = self.prior.index("thickness")
+        stiffness = film.young * film.thickness * film.radius
+        min_stiffness, max_stiffness = (
+            stiffness * np.exp(bound[young] + bound[thickness]) for bound in self.prior.bounds
+        )
+
+        # The family is limited in the distance over the radius, and in the load F / (E h a).
+        _, max_distance = self.family.limits["distance"]
+        min_load, max_load = self.family.limits["load"]
+        radius = EDGE * max_distance * film.radius - CONTACT_STEPS[0]
+        min_force = float(min_load * max_stiffness) * (2.0 - EDGE) * 1.01
+        max_force = float(max_load * min_stiffness) * EDGE / 1.01
+        return Domain(radius, (min_force, max_force))
+
+    def forward_map(self, parameters: Array) -> ForwardMap:
+        """Return the forward map of one film.
+
+        Films that differ only in piezoelectric coefficients, gains and electrodes have the same stresses. The last few
+        stresses are cached.
+
+        Args:
+            parameters: Parameters of the film, shape (n_parameter,).
+        """
+        sensor, probe = self.prior.film(parameters)
+        key = (sensor.film, probe)
+        if key not in self._maps:
+            if len(self._maps) >= CACHED_MAPS:
+                del self._maps[next(iter(self._maps))]
+            self._maps[key] = self.family.forward_map(sensor, probe)
+        return replace(self._maps[key], sensor=sensor)
+
+    @cached_property
+    def _maps(self) -> dict[tuple[Film, Circle], ForwardMap]:
+        return {}
+
+    def parameter_jacobian(
+        self, film: ForwardMap, parameters: Array, contact: Array, charge: Array, force_derivative: Array
+    ) -> Array:
+        """Compute the derivatives of the charges of a film with respect to the parameters.
+
+        Args:
+            film: Forward map of the film.
+            parameters: Parameters of the film, shape (n_parameter,).
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges of these contacts, shape (n, n_electrode), pC.
+            force_derivative: Derivatives of the charges with respect to ln F, shape (n, n_electrode), pC.
+
+        Returns:
+            Shape (n, n_electrode, n_parameter), pC per unit of the parameter.
+        """
+        pretension = parameters[self.prior.index("pretension")]
+        columns = {name: self.difference(name, parameters, contact, charge) for name in STEPPED}
+        # Chain rule for Q = E q(F / (E h a), T / E, h / a), with respect to ln E and ln h
+        columns["young"] = charge - force_derivative - pretension * columns["pretension"]
+        columns["thickness"] = columns["thickness"] - force_derivative
+        piezo = film.sensor.piezo
+        columns["d32"] = np.zeros_like(charge)
+        if piezo.d32 != 0.0:
+            d32_alone = replace(film, sensor=replace(film.sensor, piezo=replace(piezo, d31=0.0)))
+            columns["d32"] = d32_alone.charges(contact)
+        columns["d31"] = charge - columns["d32"]
+        shared = np.stack([columns[name] for name in SHARED], axis=2)
+        gain_jacobian = charge[:, :, None] * np.eye(charge.shape[1])
+        return np.concatenate([shared, gain_jacobian], axis=2)
+
+    def difference(self, name: str, parameters: Array, contact: Array, charge: Array) -> Array:
+        """Compute the derivative of the charges with respect to one parameter by a finite difference.
+
+        The derivative with respect to ln h is computed at a constant load F / (E h a), so that it contains only the
+        effect of bending.
+
+        Args:
+            name: Name of the parameter.
+            parameters: Parameters of the film, shape (n_parameter,).
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            charge: Charges of these contacts, shape (n, n_electrode), pC.
+
+        Returns:
+            Shape (n, n_electrode), pC per unit of the parameter.
+        """
+        index = self.prior.index(name)
+        _, upper_bounds = self.prior.bounds
+        step = STEP * self.prior.std[index]
+        if parameters[index] + step > upper_bounds[index]:
+            step = -step
+        stepped = parameters.copy()
+        stepped[index] += step
+        change = stepped[index] - parameters[index]
+        stepped_contact = contact
+        if name == "thickness":
+            stepped_contact = contact * [1.0, 1.0, np.exp(change)]  # keeps F / h constant
+        return np.asarray((self.forward_map(stepped).charges(stepped_contact) - charge) / change)
+
+
+def log_force_derivative(film: ForwardMap, contact: Array) -> Array:
+    """Compute the derivatives of the charges of a forward map with respect to ln F.
+
+    Args:
+        film: Forward map of the film.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Shape (n, n_electrode), pC.
+    """
+    log_force_step = CONTACT_STEPS[2]
+    force_factor = np.array([1.0, 1.0, np.exp(log_force_step)])
+    charge_above = film.charges(contact * force_factor)
+    charge_below = film.charges(contact / force_factor)
+    return np.asarray((charge_above - charge_below) / (2.0 * log_force_step))
