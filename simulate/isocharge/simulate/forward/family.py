@@ -230,6 +230,23 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
     check_press(film, probe, (radius, 0.0), high)
 
 
+Reading = Callable[[Equilibrium, Surface], Array]
+"""Function that computes values of a solved press, such as the stresses at a surface in the thickness, any shape."""
+
+
+def probe_frame_stress(solved: Equilibrium, surface: Surface) -> Array:
+    """Compute the scaled touch stress at the nodes in a frame that rotates with the probe.
+
+    Args:
+        solved: The solved press.
+        surface: Surface in the thickness; see `touch_stress`.
+
+    Returns:
+        (S11, S22, S12) in units of E_young A^2, shape (n_element, n_local, 3).
+    """
+    return rotate_stress(nodal_stress(solved, surface), -solved.probe.angle)
+
+
 @dataclass(frozen=True)
 class Chain:
     """Presses on one film at one position with different forces. Each solve starts from the equilibrium before.
@@ -241,7 +258,7 @@ class Chain:
         forces: Forces in the order in which they are solved, shape (n_force,), N.
         surface: Surface in the thickness at which the stress is read.
         settings: Theory, mesh and width of the thin rings.
-        read: Function that computes stresses at the nodes, shape (..., 3), from an equilibrium.
+        read: Function that computes the values of each press.
     """
 
     film: Film
@@ -250,7 +267,7 @@ class Chain:
     forces: Array
     surface: Surface
     settings: SolveSettings
-    read: Callable[[Equilibrium, Surface], Array] = nodal_stress
+    read: Reading = probe_frame_stress
 
 
 def solve_chains(chains: Sequence[Chain], executor: Executor | None) -> Array:
@@ -261,7 +278,7 @@ def solve_chains(chains: Sequence[Chain], executor: Executor | None) -> Array:
         executor: Executor that runs the chains; None for this process.
 
     Returns:
-        Stresses that `Chain.read` computes, in a frame that rotates with the probe, shape (n_chain, n_force, n_value).
+        Values that `Chain.read` computes, shape (n_chain, n_force, n_value).
     """
     return np.stack(list(track(in_order(executor, _solve_chain, chains), "solving the film", len(chains))))
 
@@ -272,7 +289,7 @@ def solve_films(
     grid: FilmGrid,
     settings: SolveSettings,
     executor: Executor | None,
-    read: Callable[[Equilibrium, Surface], Array] = nodal_stress,
+    read: Reading = probe_frame_stress,
 ) -> Array:
     """Solve presses with circular probes on the films of a grid.
 
@@ -282,10 +299,10 @@ def solve_films(
         grid: Grid of distances, loads, pretensions, thicknesses and probe radii.
         settings: Theory, mesh and width of the thin rings.
         executor: Executor that runs the solves; None for this process.
-        read: Function that computes stresses at the nodes, shape (..., 3), from an equilibrium.
+        read: Function that computes the values of each press.
 
     Returns:
-        Stresses that `read` computes, shape (*grid.shape, n_value).
+        Values that `read` computes, shape (*grid.shape, n_value).
     """
     radius = film.radius
     chains = []
@@ -300,10 +317,10 @@ def solve_films(
 
 
 def _solve_chain(chain: Chain) -> Array:
-    """Solve one chain, and return the stresses that it reads, shape (n_force, n_value)."""
+    """Solve one chain, and return the values of its presses, shape (n_force, n_value)."""
     start: Equilibrium | None = None
     rows = []
     for force in chain.forces.tolist():
         start = press(chain.film, chain.probe, (chain.distance, 0.0), force, chain.settings, start=start)
-        rows.append(rotate_stress(chain.read(start, chain.surface), -chain.probe.angle).ravel())
+        rows.append(chain.read(start, chain.surface).ravel())
     return np.stack(rows)

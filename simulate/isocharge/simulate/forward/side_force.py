@@ -19,27 +19,19 @@ Example:
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError
-from isocharge.common.progress import track
-from isocharge.simulate.execution.workers import in_order
-from isocharge.simulate.forward.family import Family
+from isocharge.simulate.forward.derivative_fields import solve_derivatives
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import FINE, ReadoutPoints
 from isocharge.simulate.mechanics.scaling import amplitude_squared, side_force_unit
-from isocharge.simulate.sensor.film import Film, Surface
-from isocharge.simulate.sensor.probe import Probe
+from isocharge.simulate.sensor.film import Surface
+from isocharge.simulate.solver.equilibrium import Equilibrium
 from isocharge.simulate.solver.friction import check_friction, holding_force, limited
-from isocharge.simulate.solver.load_case import SolveSettings
-from isocharge.simulate.solver.press import press
 from isocharge.simulate.solver.sensitivity import SIDE_FORCE_IS_ODD, side_force_stress
-
-NODE_COUNTS = (6, 6)
-"""Number of distances and number of forces at which the fields are solved."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +52,7 @@ class SideForceMap:
 
     @classmethod
     def build(cls, film: ForwardMap, *, executor: Executor | None = None) -> "SideForceMap":
-        """Solve the fields at `NODE_COUNTS` presses in the domain of a forward map, which takes about ten seconds.
+        """Solve the fields at some presses in the domain of a forward map, which takes about ten seconds.
 
         Args:
             film: Forward map of the film, whose probe is a circle. Its mesh and its readout are used.
@@ -75,17 +67,9 @@ class SideForceMap:
                 f"side forces: expected a circular probe, got {film.probe.notation}; use `press(..., side_force=...)` "
                 "or `isocharge simulate point --side-force` for other probes"
             )
-        family = Family.spread(film.domain, film.sensor.film.radius, NODE_COUNTS, period=0.0)
-        theory = replace(film.theory, stretching=True)
-        settings = SolveSettings(theory=theory, resolution=film.resolution, layer=film.layer)
-        chains = [
-            _Chain(film.sensor.film, film.probe, distance, family.force, film.sensor.surface, settings)
-            for distance in family.distance.tolist()
-        ]
-        solved = list(track(in_order(executor, _solve_chain, chains), "solving side forces", len(chains)))
-        table = np.concatenate([chain.table for chain in solved])
-        holding = np.concatenate([chain.holding for chain in solved])
-        return cls(film, replace(film, family=family, theory=theory, table=table), holding)
+        solved = solve_derivatives(film, _read_side_force, executor)
+        table, holding = np.split(solved.table, [-1], axis=1)
+        return cls(film, replace(solved, table=table), holding.ravel())
 
     def jacobian(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to the side force (Fx, Fy) of the probe on the film.
@@ -158,47 +142,16 @@ class SideForceMap:
         return ReadoutPoints.of(self.film.sensor, FINE)
 
 
-@dataclass(frozen=True)
-class _Chain:
-    """Presses at one distance with different forces. Each solve starts from the equilibrium before.
+def _read_side_force(solved: Equilibrium, surface: Surface) -> Array:
+    """Compute the stress fields of a side force under one press, and the holding force.
 
-    Attributes:
-        film: The film.
-        probe: The probe.
-        distance: Distance from the centre of the film, mm.
-        forces: Forces in the order in which they are solved, shape (n_force,), N.
+    Args:
+        solved: The solved press, on the positive x axis.
         surface: Surface in the thickness at which the stress is read.
-        settings: Theory, mesh and width of the thin rings.
+
+    Returns:
+        The values of `side_force_stress`, followed by the holding force along the direction of the press over the
+        force, shape (n_value + 1,).
     """
-
-    film: Film
-    probe: Probe
-    distance: float
-    forces: Array
-    surface: Surface
-    settings: SolveSettings
-
-
-class _SolvedChain(NamedTuple):
-    """Results of a chain.
-
-    Attributes:
-        table: Scaled stress of the two fields at the nodes of every element, shape (n_force, n_value).
-        holding: Holding force along the direction of the press over the force, shape (n_force,).
-    """
-
-    table: Array
-    holding: Array
-
-
-def _solve_chain(chain: _Chain) -> _SolvedChain:
-    """Solve one chain, with all presses on the positive x axis."""
-    start = None
-    rows = []
-    holding = []
-    for force in chain.forces.tolist():
-        start = press(chain.film, chain.probe, (chain.distance, 0.0), force, chain.settings, start=start)
-        rows.append(side_force_stress(start, chain.surface).ravel())
-        outward_force, _ = holding_force(start)
-        holding.append(outward_force / force)
-    return _SolvedChain(np.stack(rows), np.array(holding))
+    outward_force, _ = holding_force(solved)
+    return np.append(side_force_stress(solved, surface), outward_force / solved.force)

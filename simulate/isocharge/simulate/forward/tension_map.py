@@ -16,21 +16,17 @@ Example:
 """
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError
-from isocharge.simulate.forward.family import Chain, Family, solve_chains
+from isocharge.simulate.forward.derivative_fields import solve_derivatives
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.film_temperature import tension_change
 from isocharge.simulate.mechanics.scaling import amplitude_squared
-from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.sensitivity import TENSION_IS_ODD, tension_stress
-
-NODE_COUNTS = (6, 6)
-"""Number of distances and number of forces at which the fields are solved."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +44,7 @@ class TensionMap:
 
     @classmethod
     def build(cls, film: ForwardMap, *, executor: Executor | None = None) -> "TensionMap":
-        """Solve the fields at `NODE_COUNTS` presses in the domain of a forward map, which takes about ten seconds.
+        """Solve the fields at some presses in the domain of a forward map, which takes about ten seconds.
 
         Args:
             film: Forward map of the film, whose probe is a circle. Its mesh and its readout are used.
@@ -60,17 +56,7 @@ class TensionMap:
         """
         if not film.probe.is_axisymmetric:
             raise SceneError(f"temperature of the film: expected a circular probe, got {film.probe.notation}")
-        family = Family.spread(film.domain, film.sensor.film.radius, NODE_COUNTS, period=0.0)
-        theory = replace(film.theory, stretching=True)
-        settings = SolveSettings(theory=theory, resolution=film.resolution, layer=film.layer)
-        sensor = film.sensor
-        chains = [
-            Chain(sensor.film, film.probe, distance, family.force, sensor.surface, settings, tension_stress)
-            for distance in family.distance.tolist()
-        ]
-        rows = solve_chains(chains, executor)
-        table = rows.reshape(-1, rows.shape[-1])
-        return cls(film, replace(film, family=family, theory=theory, table=table))
+        return cls(film, solve_derivatives(film, tension_stress, executor))
 
     def tension_jacobian(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to the pretension (T11, T22, T12) along x and y.
