@@ -152,6 +152,24 @@ def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Charge
             f"series: expected equal degrees in x and y and degrees from 1 to {MAX_DEGREE}, got {x_degree}, "
             f"{y_degree} and {force_degree} in the force"
         )
+    radius_mm, force_N = read_contact_range(arrays)
+    charges = ChargeSeries(Series(coefficients), radius_mm, force_N)
+    _check_charges(charges)
+    return charges
+
+
+def read_contact_range(arrays: Mapping[str, np.ndarray]) -> tuple[float, tuple[float, float]]:
+    """Return the range of contacts of a series from the arrays `radius_mm` and `force_N` of a file.
+
+    Args:
+        arrays: Arrays of the file by name.
+
+    Returns:
+        The largest distance of a contact from the centre, mm, and the smallest and the largest force, N.
+
+    Raises:
+        ValueError: If an array is missing or not valid.
+    """
     radius_mm = finite_number(arrays, "radius_mm")
     if not 0.0 < radius_mm <= MAX_RADIUS_mm:
         raise ValueError(f"radius_mm: expected a radius up to {MAX_RADIUS_mm:g} mm, got {radius_mm:g}")
@@ -161,9 +179,7 @@ def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Charge
             f"force_N: expected a smallest force above 0 and a largest force of at least {MIN_FORCE_RATIO:g} times the "
             f"smallest, got {min_force_N:g} and {max_force_N:g} N"
         )
-    charges = ChargeSeries(Series(coefficients), radius_mm, (min_force_N, max_force_N))
-    _check_charges(charges)
-    return charges
+    return radius_mm, (min_force_N, max_force_N)
 
 
 def _check_charges(charges: ChargeSeries) -> None:

@@ -26,8 +26,8 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.chebyshev_series import Series
 from isocharge.common.errors import ModelError, cut
-from isocharge.common.npz import DAMAGED_FILE_ERRORS, finite_array, finite_number, npz_arrays
-from isocharge.serve.model.charge_series import MIN_FORCE_RATIO, MAX_RADIUS_mm
+from isocharge.common.npz import DAMAGED_FILE_ERRORS, finite_array, npz_arrays
+from isocharge.serve.model.charge_series import read_contact_range
 from isocharge.serve.model.companion_files import read_companion_file
 
 FILE = "film_directions.npz"
@@ -156,13 +156,5 @@ def _film_directions(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Film
         raise ValueError(
             f"by_pretension: expected changes up to {MAX_CHANGE_WITH_PRETENSION:g} per MPa, got {largest:g}"
         )
-    radius_mm = finite_number(arrays, "radius_mm")
-    if not 0.0 < radius_mm <= MAX_RADIUS_mm:
-        raise ValueError(f"radius_mm: expected a radius up to {MAX_RADIUS_mm:g} mm, got {radius_mm:g}")
-    low_N, high_N = finite_array(arrays, "force_N", (2,)).tolist()
-    if not (low_N > 0.0 and high_N >= MIN_FORCE_RATIO * low_N):
-        raise ValueError(
-            f"force_N: expected a smallest force above 0 and a largest force of at least {MIN_FORCE_RATIO:g} times the "
-            f"smallest, got {low_N:g} and {high_N:g} N"
-        )
-    return FilmDirections(coefficients, radius_mm, (low_N, high_N), by_pretension)
+    radius_mm, force_N = read_contact_range(arrays)
+    return FilmDirections(coefficients, radius_mm, force_N, by_pretension)
