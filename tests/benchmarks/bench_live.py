@@ -27,16 +27,14 @@ import numpy as np
 from shared import arguments, percentiles, print_results
 from websockets.asyncio.client import connect
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from headless_chromium import start_chromium
 from isocharge.serve import Predictor, Recording, Script, wander
 from isocharge.serve.viewer.messages import HEADER, SampleFormat
 
 SHARES = (50, 95, 99)
 MODEL = "three-25um-biaxial"
-CHROMIUM = "/usr/bin/chromium"
-ARGUMENTS = [
-    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"),
-    *("--disable-component-update", "--disable-gpu", "--enable-unsafe-swiftshader"),
-]
 
 
 def presses(rate_Hz):
@@ -75,10 +73,7 @@ async def _watch(url, form, stalls, seconds):
 
 def browse(url, seconds):
     """Chromium's view: ages of its pictures (ms), and pictures a second."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+    with start_chromium() as browser:
         page = browser.new_page(viewport={"width": 1280, "height": 820})
         page.goto(url)
         page.wait_for_timeout(3000)
@@ -86,7 +81,6 @@ def browse(url, seconds):
         page.wait_for_timeout(1e3 * seconds)
         ages = page.evaluate("isocharge.page.ages")
         rate = page.evaluate("(({starts: s}) => 1000 * (s.length - 1) / (s.at(-1) - s[0]))(isocharge.page)")
-        browser.close()
     return ages, rate
 
 

@@ -3,7 +3,6 @@
 import contextlib
 import http.server
 import json
-import shutil
 import threading
 
 import numpy as np
@@ -11,18 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from headless_chromium import start_chromium
 from isocharge.common.errors import InputError, OriginError
 from isocharge.serve.network.address import Token
 from isocharge.serve.network.browser_check import BrowserCheck, host_name
 from isocharge.serve.network.protocol import Handler
 
-CHROMIUM = "/usr/bin/chromium"
-ARGUMENTS = [
-    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"),
-    *("--disable-component-update", "--disable-gpu", "--host-resolver-rules=MAP evil.example 127.0.0.1"),
+CHROMIUM_ARGUMENTS = (
+    "--host-resolver-rules=MAP evil.example 127.0.0.1",
     # The browser's own protection of local addresses must not hide what the server does.
     "--disable-features=LocalNetworkAccessChecks,BlockInsecurePrivateNetworkRequests,PrivateNetworkAccessSendPreflights",
-]
+)
 INFER = "/v2/models/linear/infer"
 UNLOAD = "/v2/repository/models/linear/unload"
 
@@ -174,15 +172,11 @@ def attacking_page():
 
 
 def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_http, attacking_page):
-    if shutil.which(CHROMIUM) is None:
-        pytest.skip(f"needs {CHROMIUM} (apt-get install chromium)")
-    playwright = pytest.importorskip("playwright.sync_api")
     handler = Handler(store)
     url = start_http(handler).url
     port = url.rpartition(":")[2]
     page_port, settings = attacking_page
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+    with start_chromium(*CHROMIUM_ARGUMENTS) as browser:
         page = browser.new_page()
 
         # A page of another origin: a form, and fetches that may not read the answers.
@@ -207,7 +201,6 @@ def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_
         tensor = {"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [1.0, 2.0, 3.0]}
         body = json.dumps(json.dumps({"inputs": [tensor]}))
         assert page.evaluate(statuses.replace("arguments", body)) == 200
-        browser.close()
 
     requests = handler.traffic.requests()
     refused = sum(count for (_, _, status), count in requests.items() if status == "403")

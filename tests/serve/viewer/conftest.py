@@ -10,12 +10,20 @@ import numpy as np
 import pytest
 from websockets.asyncio.client import connect
 
+from headless_chromium import start_chromium
 from isocharge.serve.network.address import Address
 from isocharge.serve.viewer.link import make_link
 from isocharge.serve.viewer.messages import HEADER, SampleFormat, describe_film
 from isocharge.serve.viewer.process import Page, run_page
 
 NAMES = ("A", "B", "C")
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """A headless browser."""
+    with start_chromium() as browser:
+        yield browser
 
 
 class RunningPage:

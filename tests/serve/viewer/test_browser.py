@@ -2,7 +2,6 @@
 
 import contextlib
 import re
-import shutil
 import socket
 import time
 
@@ -10,12 +9,6 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Script, VirtualSensor
-
-CHROMIUM = "/usr/bin/chromium"
-ARGUMENTS = [
-    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"),
-    *("--disable-component-update", "--disable-gpu", "--enable-unsafe-swiftshader"),
-]
 
 RATE_HZ, PRESS_S, PAUSE_S = 200.0, 1.5, 0.9
 PRESSES = [(0.0, 0.0, 1.0), (6.0, 2.0, 0.5), (-5.0, 3.0, 2.0), (2.0, -6.0, 0.2), (5.0, -3.5, 0.1)]
@@ -38,17 +31,6 @@ DRAWN = """() => {
     width: (right - left + 1) / css, height: (bottom - top + 1) / css, shown: [".x b", ".y b", ".force b"].map(
       (name) => Number(film.find(name).textContent.replace("\\u2212", "-"))) };
 }"""
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    if shutil.which(CHROMIUM) is None:
-        pytest.skip(f"needs {CHROMIUM} (apt-get install chromium)")
-    playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

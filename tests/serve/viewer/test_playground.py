@@ -1,7 +1,5 @@
 """The playground in headless Chromium: its answers, charges and flags against the golden vectors and the simulator."""
 
-import shutil
-
 import numpy as np
 import pytest
 
@@ -13,8 +11,6 @@ from isocharge.simulate import Circle, ForwardMap, load_sensor, press, touch_cha
 from isocharge.simulate.forward.stress_series import FORCE_RANGE_N, PROBE, SENSOR, MAX_DISTANCE_mm, stress_series
 from kept import ROOT
 
-CHROMIUM = "/usr/bin/chromium"
-ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
 MAX_SIZE_BYTES = 1_000_000
 MAX_ANSWER_MS = 2.0
 SERIES = ROOT / "serve/isocharge/serve/viewer/playground/film-25um.json"
@@ -48,17 +44,6 @@ MIRROR = """() => {
 
 
 @pytest.fixture(scope="module")
-def browser():
-    if shutil.which(CHROMIUM) is None:
-        pytest.skip(f"needs {CHROMIUM} (apt-get install chromium)")
-    playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
 def file(tmp_path_factory):
     path = tmp_path_factory.mktemp("playground") / "playground.html"
     path.write_text(playground_html(), "utf-8")
@@ -66,7 +51,7 @@ def file(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def open_page(browser, file):
+def open_page(chromium, file):
     """Open the playground, offline, in a window of a given size, with its errors and its requests as lists.
 
     Scripts of a test do not run under the security policy of the page, so it is bypassed unless it is tested.
@@ -74,7 +59,7 @@ def open_page(browser, file):
 
     def open_window(width, height, bypass_csp=True, **options):
         viewport = {"width": width, "height": height}
-        context = browser.new_context(viewport=viewport, offline=True, bypass_csp=bypass_csp, **options)
+        context = chromium.new_context(viewport=viewport, offline=True, bypass_csp=bypass_csp, **options)
         page = context.new_page()
         page.errors, page.requests = [], []
         page.on("pageerror", lambda error: page.errors.append(str(error)))
