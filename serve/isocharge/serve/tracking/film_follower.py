@@ -6,10 +6,10 @@ they are smallest is that of the film. `isocharge.serve.tracking.film_filter` es
 frame of each touch, together with the gains, a common offset, and the directions in which the calibration left the film
 uncertain (`FilmDirections`). Contacts are corrected for the estimated pretension and directions.
 
-Touches that no pretension explains hardly change the estimate. The film is lost, i.e. not followed any more, if the
-last touches are of that kind (two contacts, for instance), if they are explained far better by a wrong gain, or if
-their charges have a common offset (the warmth of a hand) that is larger than the settings allow. The model then answers
-for the film as it was before these touches.
+Touches that no pretension explains hardly change the estimate. The film counts as lost, which means that it is no
+longer followed, if the last touches are of that kind (two contacts, for instance), if a wrong gain explains them far
+better, or if their charges have a common offset (the warmth of a hand) that is larger than the settings allow. Contacts
+are then computed with the estimate before these touches.
 """
 
 import math
@@ -31,40 +31,41 @@ from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.tracking.film_filter import FilmFilter, TouchResiduals
 
 HARMLESS_FLAGS = frozenset({STRESS, GAP, REPEAT})
-"""Flags of a frame that do not keep a touch from being counted. The last two only mean that frames were lost."""
+"""Flags of frames that do not exclude a touch. GAP and REPEAT only mean that frames were lost."""
 
 HARMLESS_FLAGS_OUTSIDE = HARMLESS_FLAGS | {OUTSIDE, BEYOND, MISFIT}
-"""The same for a frame outside the model's forces or area, as are the first frames of every touch."""
+"""Flags that do not exclude a touch if a frame has the flag OUTSIDE, which the first frames of every touch have."""
 
 RECENT_TOUCHES = 40
-"""Number of touches by which the follower judges whether the film is lost."""
+"""Number of the latest touches from which the follower decides whether the film is lost."""
 
 FEWEST_TOUCHES = 12
-"""Number of touches before which the film is not followed yet."""
+"""Number of touches after which contacts are corrected for the first time."""
 
 LARGEST_SQUARE = 9.0
-"""Upper bound of the squared misfit of a touch, over the mean square of good touches, in this judgement."""
+"""Upper bound of the squared misfit of a touch in this decision, in units of the mean square of good touches."""
 
 EXPLAINED_SQUARE = 1.25
-"""Largest mean square of the misfits of very many touches that count as explained."""
+"""Largest mean of the squared misfits of very many touches for which the touches count as explained."""
 
 EXPLAINED_SCATTER = 5.0
-"""Margin of that limit for n touches, times the root of n."""
+"""Amount, times the square root of n, by which the sum for n touches may exceed n times `EXPLAINED_SQUARE`."""
 
 WRONG_GAINS = np.outer([-1.0, 1.0], [0.03, 0.04, 0.06, 0.09]).ravel()
 """Gain errors of a single electrode that are compared with a change of the pretension."""
 
 WRONG_GAIN_MARGIN = 9.0
-"""Amount by which a wrong gain must reduce the sum of squares below that of any pretension to count as the cause."""
+"""Amount by which the sum of the squared misfits with a wrong gain must be smaller than the sum for any pretension, so
+that the gain counts as the cause."""
 
 OFFSET_CORRECTION_ERROR = 0.5
-"""Standard deviation of the correction of the pretension for offsets, over the correction."""
+"""Standard deviation of the correction of the pretension for offsets, in units of the correction."""
 
 SENSITIVITY_STEP_MPa = 0.05
-"""Step of the pretension by which the dependence of contacts on it is computed."""
+"""Step of the finite differences with respect to the pretension."""
 
 SMALLEST_CHANGE_MPa = 0.01
-"""Change of the pretension from which on the weights of the model are computed again."""
+"""Smallest change of the pretension after which the weights of the model are computed again."""
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):
@@ -191,7 +192,7 @@ class FilmFollower:
         self._filter.reset()
         self.predictor = self._calibrated
         self.is_lost = False
-        self._answer = self._calibrated_estimate
+        self._applied_estimate = self._calibrated_estimate
         self._neighbour: Predictor | None = None
         self._neighbour_step_MPa = SENSITIVITY_STEP_MPa
         self._factors: tuple[Array, Array] | None = None
@@ -210,7 +211,7 @@ class FilmFollower:
     @property
     def film(self) -> FollowedFilm:
         """The film as it is now."""
-        return FollowedFilm(self._answer.pretension_MPa, self._answer.std_MPa, self._touches)
+        return FollowedFilm(self._applied_estimate.pretension_MPa, self._applied_estimate.std_MPa, self._touches)
 
     def observe_frame(
         self, charge_pC: Array | None, contact: Contact | None, flags: tuple[str, ...], clock_s: float
@@ -242,9 +243,9 @@ class FilmFollower:
         self.discard_touch()
 
     def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
-        """Correct a contact for what touches have shown of the film, and add the uncertainty of the pretension.
+        """Correct a contact for the present estimate of the film, and add the uncertainty of the pretension.
 
-        Before the film is followed, the contact is returned as it is.
+        Before the first estimate, the contact is returned unchanged.
 
         Args:
             contact: Answer of `predictor` to the charges.
@@ -252,34 +253,41 @@ class FilmFollower:
         """
         if self._neighbour is None:
             return FollowedContact(contact, charge_pC)
-        answer = self._answer
+        estimate = self._applied_estimate
         if self._directions.count == 0:
             neighbour = partial(self._neighbour.predict, charge_pC)
             return FollowedContact(
-                contact.widened(self._sensitivity.shift(contact, answer.std_MPa, neighbour)), charge_pC
+                contact.widened(self._sensitivity.shift(contact, estimate.std_MPa, neighbour)), charge_pC
             )
         factor, neighbour_factor = self._charge_factors(contact)
         corrected_pC = charge_pC / factor
         corrected = self.predictor.predict(corrected_pC)
         neighbour = partial(self._neighbour.predict, charge_pC / neighbour_factor)
-        shift = self._sensitivity.shift(corrected, answer.std_MPa, neighbour)
+        shift = self._sensitivity.shift(corrected, estimate.std_MPa, neighbour)
         return FollowedContact(corrected.widened(shift), corrected_pC)
 
     def _charge_factors(self, contact: Contact) -> tuple[Array, Array]:
-        """Return the charges over those for which the models of the followed and of the neighbouring pretension answer.
+        """Return the factors by which the charges are divided before they are passed to the models.
 
-        Each factor has the shape (n_electrode,). The factors are computed again only if the contact has moved.
+        The factors are computed again only if the contact has moved.
+
+        Args:
+            contact: Contact near which the factors are needed.
+
+        Returns:
+            Factors for the model of the estimated pretension and for the model of the neighbouring pretension, each of
+            shape (n_electrode,).
         """
         if self._factors is None or not is_close(contact, self._factors_contact):
             (log_changes,) = self._directions.log_changes(np.array([contact[:3]]))
-            factor = self._answer.charge_factor(log_changes)
-            neighbour_factor = self._answer.charge_factor(log_changes, self._neighbour_step_MPa)
+            factor = self._applied_estimate.charge_factor(log_changes)
+            neighbour_factor = self._applied_estimate.charge_factor(log_changes, self._neighbour_step_MPa)
             self._factors = factor, neighbour_factor
             self._factors_contact = contact
         return self._factors
 
     def observe_touch(self, touch: HardestFrame, clock_s: float) -> None:
-        """Estimate the film anew by a touch, and decide for which film the model answers.
+        """Update the estimate of the film with a touch, and decide whether the film is lost.
 
         Args:
             touch: The hardest frame of the touch.
@@ -296,10 +304,10 @@ class FilmFollower:
         self.is_lost = self._is_unexplained() or self._is_gain_wrong() or self._filter.is_offset_too_large
         if not self.is_lost:
             self._earlier.append(self._estimate())
-            self._answer_for(self._earlier[-1])
+            self._apply_estimate(self._earlier[-1])
         elif not was_lost:
             before_recent = len(self._earlier) == RECENT_TOUCHES
-            self._answer_for(self._earlier[0] if before_recent else self._calibrated_estimate)
+            self._apply_estimate(self._earlier[0] if before_recent else self._calibrated_estimate)
             self._earlier.clear()
 
     def _touch_squares(self, charge_pC: Array, log_changes: Array, residuals: TouchResiduals) -> TouchSquares:
@@ -338,7 +346,11 @@ class FilmFollower:
         return bool(sum_by_wrong_gain.min() < sum_by_pretension.min() - WRONG_GAIN_MARGIN)
 
     def _estimate(self) -> FilmStateEstimate:
-        """Return the pretension if films that have changed and films that have not are equally likely beforehand."""
+        """Return the estimate of the film.
+
+        The estimate is the mean over two hypotheses, which have the same prior probability: the pretension has changed
+        since the calibration, or it has not.
+        """
         pretensions = self._pretensions
         mean_MPa = self._filter.mean_MPa
         change = mean_MPa - pretensions.calibrated_MPa
@@ -355,12 +367,15 @@ class FilmFollower:
         neighbouring = self._filter.direction_means(pretension_MPa + SENSITIVITY_STEP_MPa)
         return FilmStateEstimate(pretension_MPa, std, directions, (neighbouring - directions) / SENSITIVITY_STEP_MPa)
 
-    def _answer_for(self, estimate: FilmStateEstimate) -> None:
-        """Let the models answer for another estimate; a very small change of the pretension needs no new weights."""
-        is_same_film = abs(estimate.pretension_MPa - self._answer.pretension_MPa) < SMALLEST_CHANGE_MPa
+    def _apply_estimate(self, estimate: FilmStateEstimate) -> None:
+        """Set the models with which contacts are computed to those of a new estimate of the film.
+
+        If the pretension has changed by less than `SMALLEST_CHANGE_MPa`, the present models are kept.
+        """
+        is_same_film = abs(estimate.pretension_MPa - self._applied_estimate.pretension_MPa) < SMALLEST_CHANGE_MPa
         if is_same_film:
-            estimate = estimate._replace(pretension_MPa=self._answer.pretension_MPa)
-        self._answer = estimate
+            estimate = estimate._replace(pretension_MPa=self._applied_estimate.pretension_MPa)
+        self._applied_estimate = estimate
         self._factors = None
         if is_same_film and self._neighbour is not None:
             return
