@@ -164,29 +164,37 @@ def _candidates(
 def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Array]:
     """Tabulate the charges at every position as a function of the force.
 
-    Q / F^EXPONENT is interpolated by a polynomial in ln F, because this ratio varies slowly with the force.
+    The ratio Q / F^EXPONENT is interpolated by a polynomial in ln F, because it varies slowly with the force.
 
     Args:
         charge_map: Charges as a function of the contact.
         position: Positions (x, y), shape (n, 2), mm.
 
     Returns:
-        Weights of the interpolation as a function of the force, and the values of Q / F^EXPONENT at the nodes, shape
-        (n, n_node, n_electrode).
+        The interpolation as a function of the force, and the ratios Q / F^EXPONENT at the nodes, shape (n, n_node,
+        n_electrode).
     """
     force_range = charge_map.domain.force_range
     min_log, max_log = np.log(force_range)
     log_nodes = chebyshev_nodes(FORCES, min_log, max_log) if max_log > min_log else np.array([min_log])
     force_nodes = np.clip(np.exp(log_nodes), *force_range)
-    nodal_values = []
+    nodal_ratios = []
     for force in force_nodes:
         contact = np.column_stack([position, np.full(len(position), force)])
-        nodal_values.append(charge_map.charges(contact) / force**EXPONENT)
+        nodal_ratios.append(charge_map.charges(contact) / force**EXPONENT)
     barycentric = barycentric_weights(log_nodes)
 
     def weights(log_force: Array) -> Array:
-        """Return the weights of the nodal values in the charge for each ln F, shape (n, n_node)."""
-        interpolation_weights = lagrange_values(log_nodes, barycentric, log_force)
-        return np.asarray(interpolation_weights * np.exp(EXPONENT * log_force)[:, None])
+        """Compute the weights of the ratios at the nodes, whose weighted sum is the charge.
 
-    return ForceProfile.of(weights, force_range), np.stack(nodal_values, axis=1)
+        Args:
+            log_force: Values of ln F, shape (n,).
+
+        Returns:
+            Weights for each force, shape (n, n_node), N^EXPONENT.
+        """
+        interpolation_weights = lagrange_values(log_nodes, barycentric, log_force)
+        force_power = np.exp(EXPONENT * log_force)
+        return np.asarray(interpolation_weights * force_power[:, None])
+
+    return ForceProfile.of(weights, force_range), np.stack(nodal_ratios, axis=1)
