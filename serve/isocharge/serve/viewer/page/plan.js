@@ -22,14 +22,20 @@ export class Plan {
   /** Draw what does not move again: another theme. */
   refresh() { this.isStale = true; }
 
-  /** @param view {{sample, kind, trail, now, word}} the latest sample, what it is, and contacts with their age */
-  draw(view) {
+  /** Draw what does not move, and return the context of the canvas with millimetres of the film as its unit. */
+  drawBackground() {
     if (fit(this.canvas) || this.isStale) this.drawBase();
     const g = this.canvas.getContext("2d");
     g.setTransform(1, 0, 0, 1, 0, 0);
     g.clearRect(0, 0, this.canvas.width, this.canvas.height);
     g.drawImage(this.base, 0, 0);
     this.toMillimetres(g);
+    return g;
+  }
+
+  /** @param view {{sample, kind, trail, now, word}} the latest sample, what it is, and contacts with their age */
+  draw(view) {
+    const g = this.drawBackground();
     this.drawTrail(g, view);
     if (view.sample?.contact && view.sample.x !== null) this.drawTouch(g, view);
     if (view.word) this.drawWord(g, view.word);

@@ -1,6 +1,6 @@
 // The film of the playground from above: the plan of the live page with isocharge curves, mirror region and press.
 
-import { DASHES, fit, theme } from "./theme.js";
+import { DASHES, theme } from "./theme.js";
 import { Plan } from "./plan.js";
 
 const VIEW_MM = 24, LENS_REACH_MM = 1, CURVE_PX = 1.8, HATCH_MM = 1.5;
@@ -13,12 +13,7 @@ class Stage extends Plan {
 
   /** @param view {{press, sample, kind, trail, curves, lensCurves, mirror}} what is drawn over the film */
   draw(view) {
-    if (fit(this.canvas) || this.isStale) this.drawBase();
-    const g = this.canvas.getContext("2d");
-    g.setTransform(1, 0, 0, 1, 0, 0);
-    g.clearRect(0, 0, this.canvas.width, this.canvas.height);
-    g.drawImage(this.base, 0, 0);
-    this.toMillimetres(g);
+    const g = this.drawBackground();
     if (view.mirror) {
       this.drawMirror(g, view.mirror);
       this.drawWhole(g, this.css);
