@@ -21,15 +21,23 @@ from isocharge.train.films.films_file import FILE, read_films
 from isocharge.train.films.films_model import AddedVariance, FilmsModel
 from isocharge.train.training.fitted import Fitted
 
-DRIFT = {"pretension": 0.4, "d31": 0.05, "d32": 0.05, "gain": 0.1}
-"""Standard deviation of the change of some parameters since an earlier calibration, relative to the prior.
+DRIFT = {
+    "pretension": 0.4,
+    "young": 0.03,
+    "thickness": 0.03,
+    "d31": 0.05,
+    "d32": 0.05,
+    "shift": 0.03,
+    "rotation": 0.03,
+    "probe_radius": 0.03,
+    "gain": 0.1,
+}
+"""Standard deviation of the change of each parameter since an earlier calibration, relative to the prior, by the field
+of `FilmSpread`.
 
 The values correspond to 0.35 MPa of the pretension (creep and a degree of temperature), 1 % of the piezoelectric
-coefficients and 0.5 % of the gains. All other parameters change by `OTHER_DRIFT`. Presses with a known force can also
-reveal larger changes. Touches with an unknown force can only show a change of the pretension."""
-
-OTHER_DRIFT = 0.03
-"""Standard deviation of the change of each parameter that is not in `DRIFT`, relative to the prior."""
+coefficients and 0.5 % of the gains. Presses with a known force can also reveal larger changes. Touches with an unknown
+force can only show a change of the pretension."""
 
 COEFFICIENT_DRIFT_STD = 0.002
 """Standard deviation of the change of the coefficients of a discrepancy since an earlier calibration."""
@@ -39,13 +47,13 @@ CREEP = 0.1
 
 If both temperatures are known, the effect of the temperature is subtracted, and only creep remains."""
 
-LIKELY = Hypothesis(modes=0.5, discrepancy=0.01)
+PLANNED_IMPERFECTIONS = Hypothesis(modes=0.5, discrepancy=0.01)
 """Imperfections that are assumed when presses are planned: half of those of typical imperfect films.
 
 If smaller imperfections are assumed, the remaining errors on imperfect films are 1.5 times as large. On a film without
 imperfections, the assumption does not change the error after eight presses, and increases it by 7 % after five."""
 
-IDENTIFIED = 0.5
+MAX_IDENTIFIED_STD_RATIO = 0.5
 """Largest ratio of the standard deviations after and before the presses at which a quantity counts as identified."""
 
 
@@ -68,7 +76,7 @@ class Warming(NamedTuple):
     @property
     def identified(self) -> bool:
         """Whether presses have at least halved the standard deviation of the change."""
-        return self.std <= IDENTIFIED * PRETENSION_PER_KELVIN.std_with_temperatures
+        return self.std <= MAX_IDENTIFIED_STD_RATIO * PRETENSION_PER_KELVIN.std_with_temperatures
 
     def with_unknowns(self, count: int) -> "Warming":
         """Return the change with the covariances of another number of unknowns.
@@ -117,8 +125,7 @@ class FilmEstimate:
             prior: Distribution of the films.
             knows_temperature: Whether the temperature at the later time is known.
         """
-        kinds = [name.partition(" ")[0] for name in prior.names]  # "gain A" is of the kind "gain"
-        drift_std = np.array([DRIFT.get(kind, OTHER_DRIFT) for kind in kinds])
+        drift_std = np.array([DRIFT[parameter.spread] for parameter in prior.parameters])
         if knows_temperature and self.warming is not None:
             drift_std[prior.index("pretension")] = CREEP
         covariance = self.covariance + np.diag(drift_std**2)
@@ -302,12 +309,12 @@ class CalibrationProblem:
     def expected(self) -> FilmEstimate:
         """Estimate of the film with which presses are planned.
 
-        Without an earlier calibration, the estimate includes the imperfections of `LIKELY`.
+        Without an earlier calibration, the estimate includes the imperfections of `PLANNED_IMPERFECTIONS`.
         """
         if self.earlier:
             return self.before
         layout = self.charges.layout
-        joint = LIKELY.covariance(layout)[layout.film, layout.film]
+        joint = PLANNED_IMPERFECTIONS.covariance(layout)[layout.film, layout.film]
         joint[layout.parameters, layout.parameters] += self.before.covariance
         return replace(self.before, coefficients=np.zeros(layout.coefficient_count), joint=joint)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.sensor.film_prior import FilmPrior
-from isocharge.train.calibration.problem import IDENTIFIED, FilmEstimate
+from isocharge.train.calibration.problem import MAX_IDENTIFIED_STD_RATIO, FilmEstimate
 
 RELATIVE = " relative to the sensor file"
 """Words after the meaning of quantities that are relative to their described values."""
@@ -53,7 +53,7 @@ class Quantity:
     @property
     def identified(self) -> bool:
         """Whether the presses have at least halved the standard deviation."""
-        return self.std <= IDENTIFIED * self.before_std
+        return self.std <= MAX_IDENTIFIED_STD_RATIO * self.before_std
 
     @property
     def interval_95(self) -> tuple[float, float]:
