@@ -21,6 +21,7 @@ from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from isocharge.common.errors import OriginError, TokenError
 from isocharge.serve.network.address import Token
 from isocharge.serve.viewer import server
+from isocharge.serve.viewer.hub import MAX_MESSAGE_SAMPLES, MAX_SAMPLE_RATE_HZ
 from isocharge.serve.viewer.server import MAX_BURST_BYTES, MAX_VIEWERS, Access, RateLimit
 
 
@@ -56,6 +57,7 @@ def test_viewer_receives_samples_only_after_confirming_earlier_ones(page, record
 
     async def talk(client):
         first, _ = await client.samples(confirm=False)
+        start_s = time.time()
         put(page, record, 1)
         await client.samples(confirm=False)
         for _ in range(turns):
@@ -64,13 +66,15 @@ def test_viewer_receives_samples_only_after_confirming_earlier_ones(page, record
         with pytest.raises(asyncio.TimeoutError):
             await asyncio.wait_for(client.socket.recv(), 0.3)
         await client.confirm(first[3] + 1)
-        return await client.samples()
+        return *await client.samples(), time.time() - start_s
 
-    header, rows = viewer(page, talk)
+    header, rows, elapsed_s = viewer(page, talk)
     missed = header[5]
     assert missed + rows["records"].sum() == 100 * turns
     assert missed > 3000 if turns == 200 else missed == 0
-    assert len(rows) <= 600
+    # On a busy machine more time passes, so that the message may contain exactly the largest number of samples.
+    assert len(rows) <= MAX_SAMPLE_RATE_HZ * elapsed_s
+    assert len(rows) <= MAX_MESSAGE_SAMPLES
 
 
 def test_stalled_viewer_delays_neither_the_reader_nor_other_viewers(page, record, viewer):
