@@ -4,7 +4,9 @@ A computation reports its progress to a listener. The listener is stored in a co
 the way to the computation do not need an additional argument.
 """
 
+import threading
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError, Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeVar
@@ -46,6 +48,31 @@ def report(title: str, done: int, total: int, note: str = "") -> None:
     listener = _listener.get()
     if listener:
         listener(title, done, total, note)
+
+
+@contextmanager
+def second_thread() -> Iterator[Executor]:
+    """Run calls in a second thread, whose progress is reported to the listener of this thread.
+
+    The end of the block waits for all calls. If the block raises an exception, waiting calls are cancelled, and the
+    running call ends with a `CancelledError` at its next report.
+    """
+    listener = _listener.get()
+    is_stopped = threading.Event()
+
+    def report_until_stopped(title: str, done: int, total: int, note: str) -> None:
+        if is_stopped.is_set():
+            raise CancelledError
+        if listener:
+            listener(title, done, total, note)
+
+    with ThreadPoolExecutor(1, initializer=_listener.set, initargs=(report_until_stopped,)) as executor:
+        try:
+            yield executor
+        except BaseException:
+            is_stopped.set()
+            executor.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def track(items: Iterable[Item], title: str, total: int | None = None) -> Iterator[Item]:

@@ -33,5 +33,12 @@ def test_unnoticed_shares_are_those_of_the_places():
     assert f"{100.0 * expected:.0f} % of the presses outside the working area, from 10 to 40 mm" in unnoticed.summary
 
 
-def test_a_working_area_up_to_the_clamp_has_no_presses_outside():
-    assert OutsidePresses.of(load_sensor("four-25um-biaxial"), ("circle:1.0",), Domain(42.5, (0.05, 2.0))) is None
+def test_presses_beyond_a_working_area():
+    beyond = OUTSIDE.beyond(20.0)
+    distance = np.hypot(*beyond.draw(1000, seed=1).contact[:, :2].T)
+    assert (distance.min() >= 20.0, distance.max() <= 40.0) == (True, True)
+    assert OUTSIDE.beyond(39.5) is None  # the working area nearly reaches the clamp
+
+
+def test_a_probe_as_wide_as_the_film_leaves_no_presses_outside():
+    assert OutsidePresses.of(load_sensor("four-25um-biaxial"), ("circle:22",), (0.05, 2.0)) is None

@@ -15,7 +15,8 @@ BETAS = (0.9, 0.98)
 
 def run(optimiser, parameters, loss, steps):
     for _ in range(steps):
-        optimiser.zero_grad()
+        for parameter in parameters:
+            parameter.grad = None
         loss(*parameters).backward()
         optimiser.step()
 

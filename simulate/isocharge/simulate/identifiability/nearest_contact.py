@@ -12,7 +12,7 @@ from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import INNER_RADIUS
-from isocharge.simulate.numerics.disk_least_squares import MAX_STEPS, minimise
+from isocharge.simulate.numerics.disk_least_squares import MAX_STEPS, MIN_CHANGE, minimise
 
 STEPS = 8
 """Number of steps from a start near the solution. Most charges need five."""
@@ -47,7 +47,9 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
     return contact, np.linalg.norm(residual, axis=1)
 
 
-def explain(charge_map: ChargeMap, charge: Array, sigma: Array, start: Array) -> tuple[Array, Array]:
+def explain(
+    charge_map: ChargeMap, charge: Array, sigma: Array, start: Array, *, min_change: float = MIN_CHANGE
+) -> tuple[Array, Array]:
     """Find the contacts to which the least-squares descent from a start leads.
 
     Args:
@@ -55,6 +57,7 @@ def explain(charge_map: ChargeMap, charge: Array, sigma: Array, start: Array) ->
         charge: Charges to explain, shape (n, n_electrode), pC.
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
         start: Contacts (x, y, F) from which the search starts, shape (n, 3), mm and N.
+        min_change: Change of the squared distance below which the descent ends, relative to 1 + its value.
 
     Returns:
         Contacts within the domain of the map, shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
@@ -64,11 +67,16 @@ def explain(charge_map: ChargeMap, charge: Array, sigma: Array, start: Array) ->
         """Return the given standard deviations of these rows of the charges, pC."""
         return np.asarray(sigma[rows])
 
-    return _descend(charge_map, charge, given_sigma, start, MAX_STEPS)
+    return _descend(charge_map, charge, given_sigma, start, MAX_STEPS, min_change)
 
 
 def _descend(
-    charge_map: ChargeMap, charge: Array, sigma_of: Callable[[Integers, Array], Array], start: Array, max_steps: int
+    charge_map: ChargeMap,
+    charge: Array,
+    sigma_of: Callable[[Integers, Array], Array],
+    start: Array,
+    max_steps: int,
+    min_change: float = MIN_CHANGE,
 ) -> tuple[Array, Array]:
     """Run a least-squares descent from a start to the nearest local minimum.
 
@@ -80,6 +88,7 @@ def _descend(
         sigma_of: Function from rows of the charges and the predicted charges to standard deviations, pC.
         start: Contacts (x, y, F), shape (n, 3), mm and N.
         max_steps: Largest number of steps.
+        min_change: Change of the squared distance below which the descent ends, relative to 1 + its value.
 
     Returns:
         Contacts (x, y, F), shape (n, 3), and residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
@@ -106,12 +115,18 @@ def _descend(
 
     log_start = np.column_stack([start[:, :2], np.log(start[:, 2])])
     unit_start = (log_start - centre) / divisor
-    unit_solution, residual = minimise(residuals, unit_start, max_steps)
+    unit_solution, residual = minimise(residuals, unit_start, max_steps, min_change)
     return to_contact(unit_solution), residual
 
 
 def search(
-    charge_map: ChargeMap, charge: Array, sigma: Array, *, starts: int = 2, candidates: int = CANDIDATES
+    charge_map: ChargeMap,
+    charge: Array,
+    sigma: Array,
+    *,
+    starts: int = 2,
+    candidates: int = CANDIDATES,
+    min_change: float = MIN_CHANGE,
 ) -> tuple[Array, Array]:
     """Find the nearest contacts by a descent from each of the best few of many candidates.
 
@@ -121,6 +136,7 @@ def search(
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
         starts: Number of descents for each row of charges.
         candidates: Number of contacts among which the starts are chosen.
+        min_change: Change of the squared distance below which a descent ends, relative to 1 + its value.
 
     Returns:
         Contacts and residuals, as of `explain`.
@@ -133,7 +149,9 @@ def search(
         chunk = slice(first, first + CHUNK)
         start_rows.append(_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, starts))
     rows_of_starts = np.concatenate(start_rows).T  # shape (starts, n)
-    solutions = [explain(charge_map, charge, sigma, candidate_contacts[rows]) for rows in rows_of_starts]
+    solutions = [
+        explain(charge_map, charge, sigma, candidate_contacts[rows], min_change=min_change) for rows in rows_of_starts
+    ]
     contacts = np.stack([contact for contact, _ in solutions])
     residuals = np.stack([residual for _, residual in solutions])  # shape (starts, n, n_electrode)
     best_start = (residuals**2).sum(axis=2).argmin(axis=0)

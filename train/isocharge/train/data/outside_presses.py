@@ -6,14 +6,14 @@ depend on it.
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.serve.model.metadata import UnnoticedPresses
-from isocharge.simulate import Circle, Domain, Sensor, parse_probe
+from isocharge.simulate import Circle, Sensor, parse_probe
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.train.data.presses import LabelledPresses
@@ -48,26 +48,36 @@ class OutsidePresses:
     inner: float
 
     @classmethod
-    def of(cls, sensor: Sensor, probes: tuple[str, ...], domain: Domain) -> "OutsidePresses | None":
+    def of(cls, sensor: Sensor, probes: tuple[str, ...], force_range: tuple[float, float]) -> "OutsidePresses | None":
         """Solve the coarse map of the whole film for the widest probe.
 
         Args:
             sensor: The sensor.
             probes: Notations of the probes. A probe that is not round is replaced by a disk with the same reach.
-            domain: Working area and forces of the model.
+            force_range: Smallest and largest force of the model, N.
 
         Returns:
-            The presses; None if the working area reaches the clamp, or if the film cannot be solved there.
+            Presses on the whole film, to be restricted by `beyond`; None if the film cannot be solved.
         """
         reach = max(parse_probe(notation).reach for notation in probes)
         probe = Circle(reach)
-        if outermost_distance(sensor.film, probe) < domain.radius + MIN_WIDTH:
+        if outermost_distance(sensor.film, probe) < MIN_WIDTH:
             return None
         try:
-            return cls(whole_film_map(sensor, probe, domain.force_range), domain.radius)
+            return cls(whole_film_map(sensor, probe, force_range), inner=0.0)
         except (SceneError, SolveError) as error:
             _log.warning("presses outside the working area are not simulated: %s", error)
             return None
+
+    def beyond(self, radius: float) -> "OutsidePresses | None":
+        """Return the presses outside a working area; None if the working area nearly reaches the clamp.
+
+        Args:
+            radius: Radius of the working area, mm.
+        """
+        if self.outer < radius + MIN_WIDTH:
+            return None
+        return replace(self, inner=radius)
 
     @property
     def outer(self) -> float:

@@ -66,7 +66,7 @@ class TrainingConfig(Settings, frozen=True):
     """
 
     steps: Count = 2_000
-    misfit_steps: Count = 4_000
+    misfit_steps: Count = 3_000
     misfit_charges: Annotated[int, Meta(ge=1_000, le=10_000_000)] = 80_000
     batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 512
     learning_rate: Annotated[float, Meta(gt=0.0, lt=1.0, description="a number between 0 and 1")] = 2e-2

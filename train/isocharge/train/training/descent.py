@@ -8,9 +8,9 @@ import copy
 import io
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -36,7 +36,26 @@ SAVE_EVERY_S = 3.0
 """Time between two checkpoints, s."""
 
 
-def soap_optimiser(stage: "TrainingStage") -> list[torch.optim.Optimizer]:
+class Optimiser(Protocol):
+    """An optimiser: `Soap`, or one of PyTorch.
+
+    Attributes:
+        param_groups: Parameters and settings of each group. The key `lr` is the learning rate.
+    """
+
+    param_groups: list[dict[str, Any]]
+
+    def step(self) -> Any:
+        """Change the parameters."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that a checkpoint holds."""
+
+    def load_state_dict(self, state: dict[str, Any], /) -> None:
+        """Continue from a result of `state_dict`."""
+
+
+def soap_optimiser(stage: "TrainingStage") -> list[Optimiser]:
     """Return the optimiser SOAP for the parameters of a stage's network. Rounded weights are not trained."""
     slow_ids = {id(parameter) for parameter in stage.slow_parameters}
     trained = [parameter for parameter in stage.network.parameters() if parameter.requires_grad]
@@ -60,6 +79,7 @@ class TrainingStage:
         score: Function that returns the loss on validation data and a text for the progress report.
         steps: Number of steps.
         warm_up_steps: Number of first steps with another loss. Weights of these steps are never the best ones.
+        rate_factor: Largest learning rate relative to that of the training's settings.
         largest_gradient: Norm to which larger gradients are clipped after these steps.
         slow_parameters: Parameters of the network that have a smaller learning rate in SOAP.
         optimisers: Function from this stage to the optimisers of its network. The key `rate_factor` of each group of
@@ -72,9 +92,10 @@ class TrainingStage:
     score: Callable[[], tuple[float, str]]
     steps: int
     warm_up_steps: int = 0
+    rate_factor: float = 1.0
     largest_gradient: float = math.inf
     slow_parameters: tuple[Tensor, ...] = ()
-    optimisers: Callable[["TrainingStage"], list[torch.optim.Optimizer]] = soap_optimiser
+    optimisers: Callable[["TrainingStage"], Sequence[Optimiser]] = soap_optimiser
 
 
 class Descent:
@@ -139,7 +160,7 @@ class Descent:
     def take_step(self) -> Tensor:
         """Change the weights by one step of the optimisers and return the loss before it."""
         network = self.stage.network
-        rate = self.rate * _relative_rate(self.step / self.stage.steps)
+        rate = self.rate * self.stage.rate_factor * _relative_rate(self.step / self.stage.steps)
         for optimiser in self.optimisers:
             for group in optimiser.param_groups:
                 group["lr"] = rate * group["rate_factor"]

@@ -7,18 +7,20 @@ from the nearest contact of the domain is computed beforehand.
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import metadata
 
+import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ConfigError
+from isocharge.common.progress import second_thread
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve.model.charge_series import FILE as CHARGES_FILE
 from isocharge.serve.model.charge_series import ChargeSeries
@@ -26,7 +28,7 @@ from isocharge.simulate import ChargeMap, Dataset, Domain, NoiseModel
 from isocharge.simulate.forward.charge_map import within
 from isocharge.train.data.channel_noise import ChannelNoise, Noise
 from isocharge.train.data.charge_field import ChargeField, invertible_domain
-from isocharge.train.data.misfit_charges import draw_misfit_examples, misfit_noise
+from isocharge.train.data.misfit_charges import draw_misfit_examples, draw_outside_examples, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses, held_out, split_by_position
 from isocharge.train.training.config import FitConfig, TrainingConfig
@@ -62,8 +64,15 @@ ROUNDED_FRACTION = 0.25
 VALIDATION_FRACTION = 0.5
 """Number of validation positions relative to the number of test positions, dimensionless."""
 
+MISFIT_RATE_FACTOR = 1.5
+"""Learning rate of the misfit network, whose targets have no noise, relative to that of the contact network."""
+
 N_OUTSIDE_PRESSES = 6_000
 """Number of presses outside the working area from which charges for the misfit network are drawn."""
+
+OUTSIDE_SHARE = 0.15
+"""Share of the examples of the misfit network that are presses outside the working area, if those are simulated,
+dimensionless."""
 
 SIGNED_FEATURE_SCALE = 0.1
 """Charge above which features of charges of both signs are logarithmic, relative to the charge above which the noise is
@@ -184,12 +193,11 @@ class Split:
         validation_share = VALIDATION_FRACTION * training.hold_out
         train, validation = split_by_position(remaining, validation_share, training.seed + 1)
 
-        field: ChargeMap
-        inner_field = ChargeField.fit(domain, names, train, validation)
-        if is_folded and whole_field.error < inner_field.error:
-            field = within(whole_field, domain.radius)
-        else:
-            field = inner_field
+        field: ChargeMap = whole_field
+        if is_folded or presses.measured:  # the first field was fitted to presses beyond the fold, or to test presses
+            field = ChargeField.fit(domain, names, train, validation)
+            if is_folded and whole_field.error < field.error:
+                field = within(whole_field, domain.radius)
         folded_charges = whole_field.of_positive if is_folded else None
         return cls(domain, train, validation, test, field, cautions, folded_charges)
 
@@ -213,7 +221,7 @@ class TrainedNetwork:
 
 
 def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | None = None) -> TrainedNetwork:
-    """Train the contact perceptron and the misfit perceptron.
+    """Train the contact perceptron and, at the same time in a second thread, the misfit perceptron.
 
     Args:
         data: Presses, and possibly a teacher.
@@ -233,19 +241,30 @@ def train_network(data: TrainingData, config: FitConfig, *, run: ResumableRun | 
             f"network.electrodes: the configuration is for {expected} electrodes, the dataset of "
             f"{data.sensor.name!r} has {len(names)} ({', '.join(names)}); use another dataset or leave the key out"
         )
-    with threads_and_seed(training.threads, training.seed):
+    with threads_and_seed(training.threads, training.seed), second_thread() as executor:
+        whole_film = None
+        if not data.presses.measured:
+            whole_film = executor.submit(OutsidePresses.of, data.sensor, data.probes, data.domain.force_range)
         split = Split.of(data, training)
         for caution in split.cautions:
             _log.warning("%s", caution)
         features = split.features(misfit_noise(training.noise_model))
         network = InverseNetwork(split.domain, features, config.network)
+        examples = MisfitExamples(split, features, training, run)
+        inner_examples = examples.inner()
+
+        def train_misfit() -> OutsidePresses | None:
+            """Train the misfit perceptron, and return the film outside the working area if it is simulated."""
+            simulated = whole_film.result() if whole_film is not None else None
+            outside = simulated.beyond(split.domain.radius) if simulated is not None else None
+            all_examples = examples.with_outside(inner_examples, outside)
+            train_perceptron(misfit_stage(network, all_examples, training), network.misfit_vector, config, run)
+            return outside
+
+        misfit_training = executor.submit(train_misfit)
         contact = contact_stage(network, split.train, split.validation, training.noise_model, training, data.teacher)
         train_perceptron(contact, network.contact, config, run)
-        outside = None
-        if not data.presses.measured:
-            outside = OutsidePresses.of(data.sensor, data.probes, split.domain)
-        examples = _misfit_examples(split, outside, features, training, run)
-        train_perceptron(misfit_stage(network, examples, training), network.misfit_vector, config, run)
+        outside = misfit_training.result()
     return TrainedNetwork(network.eval(), split, outside)
 
 
@@ -356,37 +375,68 @@ def contact_stage(
     )
 
 
-def _misfit_examples(
-    split: Split,
-    outside: OutsidePresses | None,
-    features: WhitenedFeatures,
-    config: TrainingConfig,
-    run: ResumableRun | None,
-) -> Array:
-    """Draw the examples for the misfit network. The run saves them, because the search takes long.
+@dataclass(frozen=True)
+class MisfitExamples:
+    """Draws the examples for the misfit network. The run saves them, because the search takes long.
 
-    Args:
+    Attributes:
         split: Presses for training, and the charge field in which the nearest contacts are searched for.
-        outside: The film outside the working area; None if it is not simulated.
         features: Features of the network, which limit the charges.
         config: Noise, number of examples and seed.
         run: Run that saves the examples; None if they are not saved.
-
-    Returns:
-        Charges, pC, and residuals, shape (2, n, n_electrode); see `draw_misfit_examples`.
     """
-    noise: Noise = misfit_noise(config.noise_model)
-    draw = partial(draw_misfit_examples, split.train, split.field)
-    charge_features = features.charge_features
-    if charge_features.mean is not None:
-        noise = ChannelNoise.alike(misfit_noise(config.noise_model), charge_features.n_electrode)
-        draw = partial(draw, limits=(charge_features.low_pC, charge_features.high_pC))
-    if outside is not None:
-        draw = partial(draw, outside=outside.draw(N_OUTSIDE_PRESSES, config.seed).charge)
-    draw = partial(draw, noise, config.misfit_charges, config.seed)
-    if run is None:
-        return draw()
-    return run.storing_executor("misfit-charges").submit(draw).result()
+
+    split: Split
+    features: WhitenedFeatures
+    config: TrainingConfig
+    run: ResumableRun | None
+
+    def inner(self) -> Array:
+        """Return charges, pC, and residuals of examples made from presses in the working area.
+
+        The shape is (2, n, n_electrode); see `draw_misfit_examples`.
+        """
+        draw = partial(draw_misfit_examples, self.split.train, self.split.field, self._noise())
+        return self._kept("misfit-charges", partial(draw, self.config.misfit_charges, self.config.seed))
+
+    def with_outside(self, inner_examples: Array, outside: OutsidePresses | None) -> Array:
+        """Replace a share of the examples by presses outside the working area.
+
+        Args:
+            inner_examples: Result of `inner`.
+            outside: The film outside the working area; None if it is not simulated.
+
+        Returns:
+            Charges, pC, and residuals, same shape, in random order.
+        """
+        if outside is None:
+            return inner_examples
+        seed = self.config.seed
+        n_outside = round(OUTSIDE_SHARE * self.config.misfit_charges)
+        charge = outside.draw(N_OUTSIDE_PRESSES, seed).charge
+        draw = partial(draw_outside_examples, charge, self.split.field, self._noise(), n_outside, seed)
+        outside_examples = self._kept("misfit-outside", draw)
+        examples = np.concatenate([inner_examples[:, n_outside:], outside_examples], axis=1)
+        return np.random.default_rng(seed).permutation(examples, axis=1)
+
+    def _noise(self) -> Noise:
+        """Return the noise of good presses; for charges of any sign, the noise of each channel."""
+        noise = misfit_noise(self.config.noise_model)
+        charge_features = self.features.charge_features
+        if charge_features.mean is None:
+            return noise
+        return ChannelNoise.alike(noise, charge_features.n_electrode)
+
+    def _kept(self, name: str, draw: Callable[..., Array]) -> Array:
+        """Return the examples that a function draws, or that the run has saved under a name."""
+        charge_features = self.features.charge_features
+        limited_draw = draw
+        if charge_features.mean is not None:
+            limited_draw = partial(draw, limits=(charge_features.low_pC, charge_features.high_pC))
+        if self.run is None:
+            return limited_draw()
+        saved: Array = self.run.storing_executor(name).submit(limited_draw).result()
+        return saved
 
 
 def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:
@@ -418,4 +468,6 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
         validation_loss = squared_distance(slice(n_train, None)).item()
         return validation_loss, f"{validation_loss:.4f} on watched charges"
 
-    return TrainingStage("misfit", network.misfit_vector, loss, score, config.misfit_steps)
+    return TrainingStage(
+        "misfit", network.misfit_vector, loss, score, config.misfit_steps, rate_factor=MISFIT_RATE_FACTOR
+    )

@@ -6,6 +6,7 @@ close to a second-order method (Vyas et al. 2024, arXiv 2409.11321, algorithm 3)
 updated every few steps by one orthogonal iteration.
 """
 
+import copy
 from collections.abc import Iterable
 from typing import Any
 
@@ -19,14 +20,20 @@ EPSILON = 1e-10
 """Smallest root mean square of an entry of the gradient by which a step is divided."""
 
 
-class Soap(torch.optim.Optimizer):
+class Soap:
     """The optimiser SOAP. Parameters with one dimension, such as biases, are trained by Adam.
+
+    The class has the methods of PyTorch's optimisers that a training needs. It is not derived from
+    `torch.optim.Optimizer`, because the first optimiser of that class imports PyTorch's compiler, which takes 2 s.
 
     Args:
         params: Parameters, or groups of parameters as of all optimisers of PyTorch. A parameter with more than two
             dimensions is an array of matrices.
         lr: Learning rate: the change of each entry in one step, approximately.
         betas: Decay rates of the moving averages of the gradient and of its second moments.
+
+    Attributes:
+        param_groups: Parameters and settings of each group, which may be changed between two steps.
     """
 
     def __init__(
@@ -36,46 +43,69 @@ class Soap(torch.optim.Optimizer):
         betas: tuple[float, float] = (0.95, 0.95),
     ) -> None:
         """Prepare the optimiser. See the class for the arguments."""
-        super().__init__(params, {"lr": lr, "betas": betas})
+        defaults: dict[str, Any] = {"lr": lr, "betas": betas}
+        self.param_groups: list[dict[str, Any]] = []
+        single_parameters: list[Tensor] = []
+        for item in params:
+            if isinstance(item, Tensor):
+                single_parameters.append(item)
+            else:
+                self.param_groups.append(defaults | item)
+        if single_parameters:
+            self.param_groups.append(defaults | {"params": single_parameters})
+        self._states: list[dict[str, Any]] = [{} for group in self.param_groups for _ in group["params"]]
 
     @torch.no_grad()
-    def step(self) -> None:  # type: ignore[override]
+    def step(self) -> None:
         """Change all parameters that have a gradient."""
+        states = iter(self._states)
         for group in self.param_groups:
             for parameter in group["params"]:
+                state = next(states)
                 if parameter.grad is not None:
-                    self._update(parameter, parameter.grad, group["lr"], group["betas"])
+                    _update(parameter, parameter.grad, state, group["lr"], group["betas"])
 
-    def _update(self, parameter: Tensor, gradient: Tensor, rate: float, betas: tuple[float, float]) -> None:
-        """Change one parameter.
+    def state_dict(self) -> dict[str, Any]:
+        """Return the moving averages and the eigenvectors of all parameters, for a checkpoint."""
+        return {"states": self._states}
 
-        Args:
-            parameter: The parameter.
-            gradient: Its gradient, of the same shape.
-            rate: Learning rate.
-            betas: Decay rates of the moving averages.
-        """
-        state = self.state[parameter]
-        if not state:
-            state.update(_initial_state(gradient))
-        state["step"] += 1
-        mean_decay, square_decay = betas
-        if gradient.ndim > 1:
-            state["row_moment"].lerp_(gradient @ gradient.mT, 1.0 - square_decay)
-            state["column_moment"].lerp_(gradient.mT @ gradient, 1.0 - square_decay)
-            if state["step"] % BASIS_PERIOD == 1:
-                _update_basis(state)
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a result of `state_dict`."""
+        self._states = copy.deepcopy(state["states"])
 
-        mean = state["mean"].lerp_(gradient, 1.0 - mean_decay)
-        rotated_gradient = _rotate(gradient, state)
-        square = state["square"].mul_(square_decay)
-        square.addcmul_(rotated_gradient, rotated_gradient, value=1.0 - square_decay)
 
-        mean_weight = 1.0 - mean_decay ** state["step"]
-        square_weight = 1.0 - square_decay ** state["step"]
-        size = (square / square_weight).sqrt_().add_(EPSILON)
-        step = _rotate_back(_rotate(mean, state) / size, state)
-        parameter.add_(step, alpha=-rate / mean_weight)
+def _update(
+    parameter: Tensor, gradient: Tensor, state: dict[str, Any], rate: float, betas: tuple[float, float]
+) -> None:
+    """Change one parameter and its state.
+
+    Args:
+        parameter: The parameter.
+        gradient: Its gradient, of the same shape.
+        state: Moving averages and eigenvectors of the parameter; empty before its first step.
+        rate: Learning rate.
+        betas: Decay rates of the moving averages.
+    """
+    if not state:
+        state.update(_initial_state(gradient))
+    state["step"] += 1
+    mean_decay, square_decay = betas
+    if gradient.ndim > 1:
+        state["row_moment"].lerp_(gradient @ gradient.mT, 1.0 - square_decay)
+        state["column_moment"].lerp_(gradient.mT @ gradient, 1.0 - square_decay)
+        if state["step"] % BASIS_PERIOD == 1:
+            _update_basis(state)
+
+    mean = state["mean"].lerp_(gradient, 1.0 - mean_decay)
+    rotated_gradient = _rotate(gradient, state)
+    square = state["square"].mul_(square_decay)
+    square.addcmul_(rotated_gradient, rotated_gradient, value=1.0 - square_decay)
+
+    mean_weight = 1.0 - mean_decay ** state["step"]
+    square_weight = 1.0 - square_decay ** state["step"]
+    size = (square / square_weight).sqrt_().add_(EPSILON)
+    step = _rotate_back(_rotate(mean, state) / size, state)
+    parameter.add_(step, alpha=-rate / mean_weight)
 
 
 def _initial_state(gradient: Tensor) -> dict[str, Any]:
