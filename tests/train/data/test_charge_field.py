@@ -71,6 +71,19 @@ def folded_at(fold):
     return charges
 
 
+def test_field_of_a_taut_film_follows_the_change_of_the_exponent_of_the_force():
+    """The charges grow with F below 0.3 N and with F^(2/3) above it; two powers of ln F leave an error of 1 %."""
+
+    def charges(x, y, force):
+        growth = force / np.cbrt(1.0 + force / 0.3)
+        return 500.0 * growth[:, None] * np.exp(0.05 * np.stack([x + y, x - y, -x], axis=1))
+
+    field, presses = field_of(charges)
+    error = field.charges(presses.contact) / presses.charge - 1.0
+    assert np.sqrt(np.mean(error**2)) < 1e-3
+    assert field.error < 1e-3
+
+
 @pytest.mark.parametrize("fold", [2.0, 5.0])
 def test_a_fold_at_a_known_place_ends_the_domain(fold):
     field, presses = field_of(folded_at(fold))

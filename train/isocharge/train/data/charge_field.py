@@ -31,6 +31,14 @@ from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 CANDIDATES = ((6, 1), (10, 1), (16, 2), (24, 2), (30, 2), (36, 2))
 """Degrees in position and in force that are tried one after the other."""
 
+TAUT_CANDIDATES = ((6, 4), (10, 4), (16, 4), (24, 4))
+"""The same for positive charges on taut films. The charges grow with the force at small forces, and with its power 2/3
+at large ones, so that the logarithm of a charge is not a polynomial of low degree in the logarithm of the force."""
+
+TAUT_RATIO = 0.8
+"""Ratio of the errors with the first of `TAUT_CANDIDATES` and the first of `CANDIDATES` below which the film counts as
+taut. On a slack film the force degree hardly changes the error, and the ratio is nearly one."""
+
 SIGNED_CANDIDATES = ((6, 1), (6, 4), (8, 8), (12, 8), (16, 8), (20, 8), (24, 6), (24, 8))
 """The same for charges of both signs: on taut films, the exponent of the force changes with the force."""
 
@@ -93,27 +101,41 @@ class ChargeField:
         Raises:
             TrainingError: If there are too few presses for the smallest degree.
         """
-        best: ChargeField | None = None
         unit = domain.to_unit(presses.contact)
         signed = presses.signed
         log_size = _log_size(unit[:, 2], presses.charge) if signed else None
         target = np.log(presses.charge) if log_size is None else presses.charge / _size(log_size, unit[:, 2])[0]
-        for degree, force_degree in SIGNED_CANDIDATES if signed else CANDIDATES:
+
+        def fit_degrees(degree: int, force_degree: int) -> ChargeField | None:
+            """Fit a series of these degrees; return None if there are too few presses for it."""
             count = (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
             if FEWEST_PER_TERM * count > len(unit):
-                break
+                return None
             rows = slice(0, ROWS_PER_TERM * count)
             series = fit_series(unit[rows], target[rows], degree, force_degree)
             field = cls(domain, electrodes, series, np.inf, log_size)
             error = rms((field.charges(held.contact) - held.charge) / np.hypot(held.charge, NOISY if signed else 0.0))
-            if best is None or error < best.error:
-                best = replace(field, error=error)
-            if error < GOOD_ENOUGH:
-                break
+            return replace(field, error=error)
+
+        first_degrees, *further_degrees = SIGNED_CANDIDATES if signed else CANDIDATES
+        best = fit_degrees(*first_degrees)
         if best is None:
             raise TrainingError(
                 f"expected at least {FEWEST_PER_TERM * 56} presses to fit the charges by, got {len(unit)}"
             )
+        if not signed and best.error > GOOD_ENOUGH:
+            taut = fit_degrees(*TAUT_CANDIDATES[0])
+            if taut is not None and taut.error < TAUT_RATIO * best.error:
+                best = taut
+                further_degrees = list(TAUT_CANDIDATES[1:])
+        for degree, force_degree in further_degrees:
+            if best.error < GOOD_ENOUGH:
+                break
+            field = fit_degrees(degree, force_degree)
+            if field is None:
+                break
+            if field.error < best.error:
+                best = field
         return best
 
     def charges(self, contact: Array) -> Array:
