@@ -1,8 +1,9 @@
-"""A sensor whose physics has a closed-form inverse, and a real model file of it.
+"""Fixtures of the service: a linear film, whose contacts follow from its charges in closed form, and its model.
 
-On the linear film, an electrode in the direction u has the charge Q = 800 pC/N * F * (1 + u.p / 20 mm). The sum of the
-charges then gives the force and their weighted mean the position, exactly, and an ONNX graph of seven nodes is its
-perfect model: what the serving path answers can be compared with what was pressed.
+On the linear film, a contact with the force F at the position p gives an electrode in the direction u the charge
+Q = 800 pC/N * F * (1 + u.p / 20 mm). The sum of the charges gives the force exactly, and their weighted mean gives the
+position exactly. A small ONNX graph computes both. The contacts that the service computes can therefore be compared
+with the contacts that were pressed.
 """
 
 import errno
@@ -25,32 +26,50 @@ from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 
 NAMES = ("A", "B", "C", "D")
-PC_PER_N, LEVER_MM, RADIUS_MM = 800.0, 20.0, 8.0
+"""Names of the electrodes."""
+
+PC_PER_N = 800.0
+"""Charge of an electrode for a force of 1 N at the centre, pC/N."""
+
+LEVER_MM = 20.0
+"""Distance from the centre at which the charge of an electrode vanishes or doubles, mm."""
+
+RADIUS_MM = 8.0
+"""Radius of the working area, mm."""
 
 
 @dataclass(frozen=True)
 class LinearFilm:
-    """The sensor, its forward map and its model."""
+    """A linear film, its forward map and its model.
+
+    Attributes:
+        directions: Direction of each electrode from the centre, unit vectors, shape (n_electrode, 2).
+    """
 
     directions: np.ndarray
 
     @classmethod
     def with_electrodes(cls, n: int) -> "LinearFilm":
+        """Return the film with n electrodes, which are evenly distributed on a circle."""
         angle = 2 * np.pi * np.arange(n) / n - np.pi / 2
         return cls(np.column_stack([np.cos(angle), np.sin(angle)]))
 
     @property
     def electrodes(self) -> tuple[str, ...]:
+        """Names of the electrodes."""
         return NAMES[: len(self.directions)]
 
     def charge_pC(self, x_mm: np.ndarray, y_mm: np.ndarray, force_N: np.ndarray) -> np.ndarray:
-        lever = np.column_stack([x_mm, y_mm]) @ self.directions.T / LEVER_MM
-        return PC_PER_N * np.asarray(force_N)[:, None] * (1.0 + lever)
+        """Compute the charges of n contacts, shape (n, n_electrode), pC, from arrays of shape (n,)."""
+        relative_change = np.column_stack([x_mm, y_mm]) @ self.directions.T / LEVER_MM
+        return PC_PER_N * np.asarray(force_N)[:, None] * (1.0 + relative_change)
 
     def charges(self, contact: np.ndarray) -> np.ndarray:
+        """Compute the charges of contacts (x, y, F), shape (n, 3)."""
         return self.charge_pC(*contact.T)
 
     def metadata(self, **changes: object) -> ModelMetadata:
+        """Return the metadata of the model with some changed values."""
         angle = 2 * np.pi * np.arange(64) / 64
         values = {
             "name": "linear",
@@ -68,7 +87,13 @@ class LinearFilm:
         return ModelMetadata(**(values | changes))
 
     def onnx(self, props: dict[str, str], *, renamed: dict[str, str] | None = None, batch: int | str = "n") -> bytes:
-        """The model; `renamed` and `batch` spoil its interface."""
+        """Return the ONNX graph of the model.
+
+        Args:
+            props: Metadata that are stored in the graph.
+            renamed: Wrong names of inputs and outputs by their right names, for tests of wrong interfaces.
+            batch: Size of the batch. A number makes the interface wrong.
+        """
         n = len(self.directions)
         constants = {
             "lever": 2.0 * LEVER_MM * self.directions,
@@ -76,8 +101,9 @@ class LinearFilm:
             "std_scale": [[50.0, 50.0, 0.0]],
             "std_floor": [[0.0, 0.0, 7e-4]],
         }
-        node, names = helper.make_node, {name: name for name in ("charge_pC", "contact", "contact_std", "misfit")}
+        names = {name: name for name in ("charge_pC", "contact", "contact_std", "misfit")}
         names |= renamed or {}
+        node = helper.make_node
         nodes = [
             node("ReduceSum", [names["charge_pC"], "axes"], ["sum"], keepdims=1),
             node("MatMul", [names["charge_pC"], "lever"], ["moment"]),
@@ -90,34 +116,33 @@ class LinearFilm:
             node("Relu", ["negated"], ["negative"]),
             node("ReduceSum", ["negative", "axes"], [names["misfit"]], keepdims=1),
         ]
-        value = helper.make_tensor_value_info
-        graph = helper.make_graph(
-            nodes,
-            "linear film",
-            [value(names["charge_pC"], TensorProto.FLOAT, [batch, n])],
-            [
-                value(names[k], TensorProto.FLOAT, [batch, w])
-                for k, w in (("contact", 3), ("contact_std", 3), ("misfit", 1))
-            ],
-            [
-                numpy_helper.from_array(np.array([1], dtype=np.int64), "axes"),
-                *(numpy_helper.from_array(np.array(c, dtype=np.float32), name) for name, c in constants.items()),
-            ],
-        )
+        tensor_info = helper.make_tensor_value_info
+        output_widths = {"contact": 3, "contact_std": 3, "misfit": 1}
+        inputs = [tensor_info(names["charge_pC"], TensorProto.FLOAT, [batch, n])]
+        outputs = [tensor_info(names[name], TensorProto.FLOAT, [batch, width]) for name, width in output_widths.items()]
+        initializers = [numpy_helper.from_array(np.array([1], dtype=np.int64), "axes")]
+        for name, values in constants.items():
+            initializers.append(numpy_helper.from_array(np.array(values, dtype=np.float32), name))
+        graph = helper.make_graph(nodes, "linear film", inputs, outputs, initializers)
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
         helper.set_model_props(model, props)
         return model.SerializeToString()
 
     def golden_pC(self) -> np.ndarray:
+        """Return the charges of the golden vectors, shape (8, n_electrode), pC."""
         rng = np.random.default_rng(0)
         return self.charge_pC(rng.uniform(-5, 5, 8), rng.uniform(-5, 5, 8), rng.uniform(0.1, 2, 8)).astype(np.float32)
 
     def write(self, models: Path, **changes: object) -> Path:
-        """Write the model into a repository; the version folder."""
+        """Write the model into a repository, and return the version folder.
+
+        Args:
+            models: Folder of the repository.
+            changes: Changed values of the metadata.
+        """
         metadata = self.metadata(**changes)
-        return write_model(
-            models / metadata.name, self.onnx(metadata.to_props()), metadata, self.golden_pC(), "# The linear film\n"
-        )
+        graph = self.onnx(metadata.to_props())
+        return write_model(models / metadata.name, graph, metadata, self.golden_pC(), "# The linear film\n")
 
 
 @pytest.fixture(scope="session")
@@ -128,13 +153,13 @@ def film() -> LinearFilm:
 
 @pytest.fixture(scope="session")
 def make_film() -> Callable[[int], LinearFilm]:
-    """Linear films with another number of electrodes."""
+    """Return a function that creates a linear film with a given number of electrodes."""
     return LinearFilm.with_electrodes
 
 
 @pytest.fixture(scope="session")
 def models(film: LinearFilm, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A model repository that holds `linear/1`; not to be written to."""
+    """A model repository that contains `linear/1`. Tests must not write to it."""
     root = tmp_path_factory.mktemp("models")
     film.write(root)
     return root
@@ -148,7 +173,7 @@ def predictor(models: Path) -> Predictor:
 
 @pytest.fixture
 def store(film, tmp_path):
-    """The linear model in two versions, in a folder of the test's own."""
+    """A store with two versions of the linear model, in a folder that only this test uses."""
     film.write(tmp_path / "models")
     film.write(tmp_path / "models", version=2)
     return open_model_store(tmp_path / "models")
@@ -156,13 +181,13 @@ def store(film, tmp_path):
 
 @pytest.fixture
 def handler(store):
-    """A handler for these models."""
+    """A handler for the models of `store`."""
     return Handler(store)
 
 
 @pytest.fixture(scope="session")
 def stopping():
-    """Servers that were stopped, with their threads; at the end of the session all threads must have ended."""
+    """A list of stopped servers with their threads. At the end of the session, all threads must have ended."""
     stopped = []
     yield stopped
     for server, thread in stopped:
@@ -173,7 +198,10 @@ def stopping():
 
 @pytest.fixture
 def start_http(stopping):
-    """Start servers on loopback, in threads, each on a free port; they are stopped when the test ends."""
+    """Return a function that starts a server in a thread, on a free port of the loopback address.
+
+    The servers are stopped when the test ends.
+    """
     started = []
 
     def start(handler, *, tls=None, uds=None):
@@ -191,24 +219,26 @@ def start_http(stopping):
 
 @pytest.fixture
 def board(film):
-    """A board that is pressed at (3, -2) mm with 1 N for 0.1 s, each 0.25 s."""
+    """A board whose film is pressed at (3, -2) mm with 1 N for 0.1 s, every 0.25 s."""
     with TcpBoard(taps(film)) as board:
         yield board
 
 
 @pytest.fixture
 def fill_disk(monkeypatch):
-    """Let files take so many bytes until the disk is full."""
+    """Return a function after which files accept only a given number of further bytes, as on a full disk."""
 
-    def fill(room):
-        write, remaining = os.write, [room]
+    def fill(free_bytes):
+        original_write = os.write
+        remaining_bytes = free_bytes
 
         def write_until_full(descriptor, data):
-            if not remaining[0]:
+            nonlocal remaining_bytes
+            if remaining_bytes == 0:
                 raise OSError(errno.ENOSPC, "No space left on device")
-            taken = write(descriptor, bytes(data)[: remaining[0]])
-            remaining[0] -= taken
-            return taken
+            written_bytes = original_write(descriptor, bytes(data)[:remaining_bytes])
+            remaining_bytes -= written_bytes
+            return written_bytes
 
         monkeypatch.setattr("os.write", write_until_full)
 
@@ -217,30 +247,35 @@ def fill_disk(monkeypatch):
 
 @pytest.fixture
 def contract():
-    """The fields of a prediction record, in their order."""
+    """Names of the fields of a prediction record, in their order."""
     return [
-        *(
-            "timestamp",
-            "t_device_us",
-            "seq",
-            "x_mm",
-            "y_mm",
-            "force_N",
-            "x_std_mm",
-            "y_std_mm",
-            "force_std_N",
-            "misfit",
-            "xy_correlation",
-            "xF_correlation",
-            "yF_correlation",
-        ),
-        *("contact", "charge_pC", "charge_raw_pC", "tare_pC", "flags", "latency_us", "model", "frame_id"),
+        "timestamp",
+        "t_device_us",
+        "seq",
+        "x_mm",
+        "y_mm",
+        "force_N",
+        "x_std_mm",
+        "y_std_mm",
+        "force_std_N",
+        "misfit",
+        "xy_correlation",
+        "xF_correlation",
+        "yF_correlation",
+        "contact",
+        "charge_pC",
+        "charge_raw_pC",
+        "tare_pC",
+        "flags",
+        "latency_us",
+        "model",
+        "frame_id",
     ]
 
 
 @pytest.fixture
 def record(contract):
-    """Make a prediction record; fields that are not given are as in an ordinary press, or None."""
+    """Return a function that makes a prediction record of a press with some changed fields."""
 
     def make(**changes):
         values = dict.fromkeys(contract) | {

@@ -1,10 +1,10 @@
-"""From charges to contacts: models, the predictor, and the live path from a port to prediction records.
+"""Computation of contacts from charges: models, the predictor, and the path from a port to prediction records.
 
     >>> from isocharge.serve import Predictor
     >>> touch = Predictor("three-25um-biaxial")
     >>> contact = touch.predict([850.0, 840.0, 846.0])  # pC on A, B, C
 
-The packages follow the way of a frame; `serve/README.md` shows them.
+The packages are arranged in the order in which they process a frame. `serve/README.md` lists them.
 """
 
 from typing import TYPE_CHECKING
@@ -99,6 +99,6 @@ def __dir__() -> list[str]:
     return list(__all__)
 
 
-if not TYPE_CHECKING:  # a type checker would take every misspelt name for a text
+if not TYPE_CHECKING:  # with __getattr__, a type checker would accept every misspelt name
     __getattr__ = version_attribute(__name__)
     del TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""The words in the field `flags` of a record, and the meaning of each word."""
+"""The flags in the field `flags` of a record, and the meaning of each flag."""
 
 TARE = "tare"
 OUTSIDE = "outside"
@@ -33,4 +33,4 @@ MEANINGS = {
     STRESS: "the press stresses the film beyond 45 MPa, where PVDF yields: a dent stays",
     FILM: "no pretension explains the last touches (a wrong gain, warm fingers): the film is not followed now",
 }
-"""Every word, and what it says."""
+"""Meaning of each flag."""

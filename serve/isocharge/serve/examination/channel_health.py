@@ -24,10 +24,11 @@ class ChannelHealth:
 
     Attributes:
         name: Name that the device uses, or the number of the channel from 1.
-        offset_pC: Mean.
-        noise_pC: Standard deviation without drift and hum.
-        drift_pC_per_s: Slope.
-        hum_pC: Amplitudes at 50 and at 60 Hz; None if the rate is too low, or the time too short, to estimate them.
+        offset_pC: Mean charge.
+        noise_pC: Standard deviation of the charge without drift and hum.
+        drift_pC_per_s: Slope of the charge.
+        hum_pC: Amplitudes of the hum at 50 and at 60 Hz. An amplitude is None if the frame rate is too low or the time
+            is too short to estimate it.
         span_pC: Difference between the largest and the smallest value.
         unusable: Number of values that are not finite, or larger than the charges of any film.
     """
@@ -70,10 +71,12 @@ def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz:
     coefficients = np.linalg.lstsq(design_matrix, usable_pC, rcond=None)[0]
     residual_pC = usable_pC - design_matrix @ coefficients
 
-    _, slope_pC_per_s, *hum_coefficients = coefficients.tolist()
+    _constant, slope_pC_per_s, *hum_coefficients = coefficients.tolist()
     cosines_pC = hum_coefficients[0::2]
     sines_pC = hum_coefficients[1::2]
-    amplitudes_pC = dict(zip(fitted_Hz, map(math.hypot, cosines_pC, sines_pC), strict=True))
+    amplitudes_pC = {}
+    for hum_Hz, cosine_pC, sine_pC in zip(fitted_Hz, cosines_pC, sines_pC, strict=True):
+        amplitudes_pC[hum_Hz] = math.hypot(cosine_pC, sine_pC)
     return ChannelHealth(
         name,
         offset_pC=float(usable_pC.mean()),

@@ -26,11 +26,13 @@ REST_BLOCKS = 5
 """Number of quiet blocks before a press, from which the rest is measured: half a second."""
 
 RELEASED_SHARE = 0.3
-"""Share of the largest change below which a press has ended, dimensionless. A leaking amplifier does not return to rest
-at once."""
+"""Share of the largest change below which a press has ended, dimensionless.
+
+The share is not small, because a leaking amplifier returns to rest slowly.
+"""
 
 REST_UPDATE = 0.2
-"""Weight of a new block in the rest while nothing presses, dimensionless. The rest follows a slow drift."""
+"""Weight of a new block in the rest level while nothing presses, dimensionless. The rest level follows a slow drift."""
 
 NORMALISATION_STEPS = 20
 """Number of times that the changes are divided by the means of their rows and columns."""
@@ -116,8 +118,8 @@ def check_electrodes(
         timeout_s: Time to wait for each press, s.
 
     Raises:
-        PressCheckError: If a press does not come in time, or the presses do not tell the channels apart.
-        PortLost: If the port goes away.
+        PressCheckError: If a press does not come in time, or the presses do not distinguish the channels.
+        PortLost: If the connection to the board is lost.
     """
     electrodes = list(channels)
     channel_names = list(channels.values())
@@ -196,9 +198,9 @@ def _reassigned_settings(section: Any, source_electrode: Mapping[str, str]) -> A
     """Return a section of a device file in which the settings of the electrodes are exchanged.
 
     Args:
-        section: The section. A section that is no table, and settings that are not given for each electrode, are
-            returned unchanged.
-        source_electrode: Electrode whose settings each electrode gets, by the name of the electrode.
+        section: The section. It is returned unchanged if it is not a table. Settings that do not have a value for each
+            electrode are also returned unchanged.
+        source_electrode: For each electrode, the electrode whose settings it receives.
     """
     if not isinstance(section, Mapping):
         return section
@@ -216,6 +218,13 @@ class _Blocks:
     """Reader of a port that averages the values of some channels over blocks of `BLOCK_S`."""
 
     def __init__(self, port: Port, device: Device, channels: list[str]) -> None:
+        """Begin without data.
+
+        Args:
+            port: The open port.
+            device: Format of the frames.
+            channels: Names of the channels.
+        """
         self._port = port
         self._parser = device.parser()
         self._channels = channels
@@ -285,7 +294,9 @@ def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
             largest_change = change
         if change_size < RELEASED_SHARE * np.abs(largest_change).sum():
             return largest_change
-    raise _timeout_error(electrode, timeout_s, is_pressed=is_pressed)
+    if is_pressed:
+        raise _restless_error(electrode, timeout_s)
+    raise _missing_press_error(electrode, timeout_s)
 
 
 def _wait_for_rest(blocks: _Blocks, electrode: str, deadline_s: float, timeout_s: float) -> tuple[Array, Array]:
@@ -311,14 +322,19 @@ def _wait_for_rest(blocks: _Blocks, electrode: str, deadline_s: float, timeout_s
         is_quiet = bool(np.all(np.ptp(levels, axis=0) <= 0.5 * CHANGE_SIGMAS * noise))
         if len(recent_blocks) == REST_BLOCKS and is_quiet:
             return levels.mean(axis=0), noise
-    raise _timeout_error(electrode, timeout_s, is_pressed=bool(recent_blocks))
+    if recent_blocks:
+        raise _restless_error(electrode, timeout_s)
+    raise _missing_press_error(electrode, timeout_s)
 
 
-def _timeout_error(electrode: str, timeout_s: float, *, is_pressed: bool) -> PressCheckError:
-    """Return the error of a press that has not ended, or has not begun, within `timeout_s`."""
-    if is_pressed:
-        return PressCheckError(
-            f"electrode {electrode}: the charges did not come to rest within {timeout_s:g} s; take the finger away "
-            "after each press, and try again"
-        )
+def _restless_error(electrode: str, timeout_s: float) -> PressCheckError:
+    """Return the error for charges that do not come to rest within `timeout_s`."""
+    return PressCheckError(
+        f"electrode {electrode}: the charges did not come to rest within {timeout_s:g} s; take the finger away after "
+        "each press, and try again"
+    )
+
+
+def _missing_press_error(electrode: str, timeout_s: float) -> PressCheckError:
+    """Return the error for a press that does not begin within `timeout_s`."""
     return PressCheckError(f"electrode {electrode}: no press came within {timeout_s:g} s; try again")

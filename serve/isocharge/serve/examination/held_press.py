@@ -1,8 +1,8 @@
-"""Description of a press that is held during the port check: its charge is constant, leaks, creeps or drifts.
+"""Description of a press that is held during the port check. Its charge is constant, leaks, creeps or drifts.
 
-The gain of the board may be unknown, so a press is not defined by a charge in pC. The press is the first large change
-of the channels within 0.2 s. The size of the press is the component of the channels along this change, minus the rest
-before the press, which is extrapolated along a straight line if it drifts.
+The gain of the board may be unknown, so a press is not defined by a charge in pC. The press begins with the first large
+change of the channels within 0.2 s. The size of the press is the component of the channels along this change, minus the
+rest level before the press. If the rest level drifts, it is extrapolated along a straight line.
 """
 
 from dataclasses import dataclass
@@ -31,13 +31,13 @@ RELEASE_SHARE = 0.3
 """Share of the step by which the charge must fall at once when the press ends, dimensionless."""
 
 STEADY_SHARE = 0.02
-"""Share of its charge that a press may lose or gain and still count as steady, dimensionless."""
+"""Largest relative change of the charge of a steady press, dimensionless."""
 
 DRIFT_SIGMAS = 4.0
 """Slope of the rest above which it drifts, in standard errors of the slope."""
 
 LEARNING_TAU_s = 1e5
-"""Time constant for `[leak]` that undoes no leak, s. The stage still learns the drift at rest and removes it."""
+"""Time constant for `[leak]` that corrects no leak, s. The stage still estimates the drift at rest and removes it."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     if levels is None or len(levels) * BLOCK_S < MIN_REST_S + SETTLE_S + MIN_HELD_S:
         return None
 
-    # The step of the press is the first change within two blocks that is half as large as the largest one.
+    # The step of the press is the first change within two blocks that is at least half as large as the largest change.
     steps = levels[2:] - levels[:-2]  # shape (blocks - 2, channels)
     step_sizes = np.linalg.norm(steps, axis=1)
     rest_blocks = int(np.argmax(step_sizes > 0.5 * step_sizes.max()))  # number of blocks before the press
@@ -99,9 +99,9 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
 def _extrapolate_rest(
     component: Reals, block_times_s: Reals, rest_blocks: int, step_size: float
 ) -> tuple[Reals, float]:
-    """Extrapolate the rest before a press to the time of the press.
+    """Extrapolate the rest level before a press to the time of the press.
 
-    The rest is taken as constant, unless its slope is significant and large enough to disturb the description.
+    The rest level is constant, unless its slope is significant and large enough to affect the description.
 
     Args:
         component: Mean of each block along the change of the press, shape (blocks,), any unit.
@@ -159,7 +159,7 @@ def _end_of_press(component: Array, settled: int, step_size: float) -> int:
 def _with_drift(
     description: str, sections: dict[str, dict[str, float]], percent_per_s: float
 ) -> tuple[str, dict[str, dict[str, float]]]:
-    """Return the description and the sections of a press with those that describe a drift of the rest added.
+    """Add a drift of the rest level to the description and to the sections of a press.
 
     Args:
         description: Description of the press.

@@ -1,4 +1,4 @@
-"""Reception of bytes from a port, at the baud rate at which the bytes are frames, and parsing of these frames."""
+"""Reception of bytes from a port, search for its baud rate, and parsing of the frames."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ ECHO_S = 0.3
 """Time of listening for an echo of the requests, s."""
 
 ECHO_SHARE = 0.7
-"""Share of returned requests above which a line has an echo, dimensionless."""
+"""Smallest share of returned requests on a line with an echo, dimensionless."""
 
 MIN_SPAN_S = 1e-3
 """Smallest time span of received bytes, s. It keeps rates finite."""
@@ -37,7 +37,7 @@ class ReceivedData:
 
     Attributes:
         url: The port.
-        baud: Its speed, bit/s.
+        baud: Baud rate of the port, bit/s.
         request: Request that was sent to the board; None if the board sends frames by itself.
         chunks: The bytes with the times of their arrival.
         seconds: Time of listening, s.
@@ -91,14 +91,14 @@ def listen(
 
     Args:
         url: The port.
-        bauds: Baud rates to try, each for a second, bit/s.
+        bauds: Baud rates to try, bit/s, each for `TRY_S`.
         seconds: Time of listening at the right baud rate, s.
-        request: Request that the board needs. Whether the line returns it is measured.
+        request: Request that the board needs. The function measures whether the line returns it as an echo.
         has_frames: Function that returns whether most of the bytes are frames.
         wait: Time to wait until the port can be opened, s.
 
     Returns:
-        The bytes at the baud rate that was chosen; at the first baud rate if there are no frames at any.
+        The bytes at the chosen baud rate. This is the first baud rate of `bauds` if there are no frames at any of them.
 
     Raises:
         PortError: If the port cannot be opened.

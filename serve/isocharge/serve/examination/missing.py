@@ -1,4 +1,4 @@
-"""Sentences for the user that state what prevents a board from providing contacts."""
+"""Messages to the user about settings and properties that a board needs before it can provide contacts."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from isocharge.serve.live.device import Device
 from isocharge.serve.signal_chain.tare import TareRule
 
 CLEAN_SHARE = 0.99
-"""Share of bytes in good frames below which the cable or the baud rate may be wrong, dimensionless."""
+"""Smallest share of bytes in good frames with a good cable and the right baud rate, dimensionless."""
 
 HUM_LIMIT_PC = 0.5
 """Largest harmless amplitude of hum, pC. It is below the noise of the film."""
@@ -25,7 +25,7 @@ GAIN_REQUESTS = {
     "V": "the amplifier's feedback capacitance, if these are volts: --v-per-unit 1 --feedback-pf NUMBER; or the charge "
     "of one unit, pC: --pc-per-unit NUMBER (1 if these are pC)",
 }
-"""What the user has to state about the gain, by the unit of the channels."""
+"""Request to the user for the gain, by the unit of the channels."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class BoardFindings:
         electrodes: Electrodes of the model; empty for any model.
         unit: Unit of the channels: "pC", "counts" or "V".
         held: Press that was held during the check; None if there was none.
-        touch: Sentence about a touch that disturbed the rest; empty if there was none.
+        touch: Sentence about a touch of the film, which should be at rest; empty if there was none.
     """
 
     capture: Capture

@@ -23,10 +23,10 @@ from isocharge.serve.port.serial_line import Request
 from isocharge.serve.recognition.recognise import recognise
 
 RIGHT_BAUD_SHARE = 0.5
-"""Share of bytes in good frames from which a baud rate is assumed to be right, dimensionless."""
+"""Smallest share of bytes in good frames at the right baud rate, dimensionless."""
 
 PRESS_MARGIN_S = 0.2
-"""Time before the beginning of a held press that does not count as rest, s: the force is rising."""
+"""Time before the beginning of a held press that does not count as rest, s, because the force is already rising."""
 
 
 @dataclass(frozen=True)
@@ -36,22 +36,24 @@ class Examination:
     Attributes:
         url: The port.
         baud: Bits per second at which most bytes were frames.
-        format: Description of the format, for people.
+        format: Description of the format of the frames, for the user.
         bytes_seen: Number of bytes that were received.
         seconds: Time of listening, s.
         rate_Hz: Frames per second, Hz.
-        good, bad: Number of intact frames, and of damaged ones.
-        lost, repeated: Number of frames, by the frame numbers; None if frames have no numbers.
-        device_clock: Whether the device sends a clock.
+        good: Number of intact frames.
+        bad: Number of damaged frames.
+        lost: Number of lost frames according to the frame numbers; None if frames have no numbers.
+        repeated: Number of repeated frames according to the frame numbers; None if frames have no numbers.
+        device_clock: Whether the frames contain the time of a clock of the device.
         unit: Unit of the channels: "pC", or "counts" or "V" if the charge of one unit is not known.
         channels: Health of each channel that is used; empty without frames.
         unused: Channels that no electrode uses.
         held: Description of a press that was held during the check, a sentence; empty if there was none.
         touch: Description of a touch while the film should be at rest, a sentence; empty if there was none.
-        missing: One sentence for each thing that is missing to get a contact.
+        missing: One sentence for each setting or property that is missing before contacts can be computed.
         works: Whether a film at rest is tared with this device file. False after a touch.
-        device: Content of the device file: the one that was given, or else one that fits. It is empty without frames,
-            and has no offsets after a touch.
+        device: Content of the given device file, or of a proposed device file. It is empty without frames, and has no
+            offsets after a touch.
     """
 
     url: str
@@ -144,17 +146,18 @@ def examine_received(
 
     capture = read_frames(received, device)
     unit = "pC" if device.gain is not None else unit_of(capture)
-    used = electrode_positions(capture, device)
-    unused = tuple(name for position, name in enumerate(capture.names) if position not in used)
+    electrode_at = electrode_positions(capture, device)
+    unused = tuple(name for position, name in enumerate(capture.names) if position not in electrode_at)
     held = find_held_press(*capture.values()) if capture.frames else None
     rest_end_s = math.inf if held is None else held.begin_s
-    channels = tuple(_channels(capture, device, used, rest_end_s))
-    touch = _touch_sentence(capture, device, used, held, unit)
+    channels = tuple(_channels(capture, device, electrode_at, rest_end_s))
+    touch = _touch_sentence(capture, device, electrode_at, held, unit)
 
     table = _completed_table(proposal.table, held, without_offsets=is_proposed and bool(touch))
     board = BoardFindings(capture, channels, unused, device, proposal.electrodes, unit, held, touch)
-    is_untouched = bool(used) and not touch
-    works = is_untouched and _can_be_tared(received, table, proposal.electrodes or tuple(used.values()))
+    electrode_names = proposal.electrodes or tuple(electrode_at.values())
+    is_at_rest = bool(electrode_at) and not touch
+    works = is_at_rest and _can_be_tared(received, table, electrode_names)
     first_frame = capture.frames[0] if capture.frames else Frame(None, None, ())
     is_numbered = first_frame.seq is not None
     counts = capture.parser.counts
@@ -182,7 +185,7 @@ def examine_received(
 
 
 def _completed_table(table: Mapping[str, Any], held: HeldPress | None, *, without_offsets: bool) -> dict[str, Any]:
-    """Return a device file with the sections that follow from a held press.
+    """Return the content of a device file, completed with the sections that follow from a held press.
 
     Args:
         table: Content of the device file. Its sections take precedence.
@@ -202,25 +205,26 @@ def _completed_table(table: Mapping[str, Any], held: HeldPress | None, *, withou
 
 
 def _touch_sentence(
-    capture: Capture, device: Device, used: Mapping[int, str], held: HeldPress | None, unit: str
+    capture: Capture, device: Device, electrode_at: Mapping[int, str], held: HeldPress | None, unit: str
 ) -> str:
-    """Return a sentence if the charges change as under a touch before any held press; otherwise an empty text.
+    """Return a sentence if the film was touched before any held press; otherwise an empty text.
 
     Args:
         capture: The frames.
         device: Settings of the board, with its gain.
-        used: Name of the electrode by the position of its channel in the frame.
+        electrode_at: Name of the electrode by the position of its channel in the frame.
         held: The held press; None if there was none.
         unit: Unit of the channels: "pC", "counts" or "V".
     """
-    if not capture.frames or not used:
+    if not capture.frames or not electrode_at:
         return ""
     rest_end_s = math.inf if held is None else held.begin_s - PRESS_MARGIN_S
-    values, times_s = _rest_charges(capture, device, used, rest_end_s)
-    touch = find_touch(values, times_s, unit_is_pC=unit == "pC")
+    charges, times_s = _rest_charges(capture, device, electrode_at, rest_end_s)
+    touch = find_touch(charges, times_s, unit_is_pC=unit == "pC")
     if touch is None:
         return ""
-    position_in_frame = list(used)[touch.position]
+    positions_in_frame = list(electrode_at)
+    position_in_frame = positions_in_frame[touch.position]
     name = printable(capture.names[position_in_frame])
     return (
         f"an untouched film: channel {name} changes by {touch.change:.4g} {unit} about {touch.time_s:.1f} s after the "
@@ -231,8 +235,8 @@ def _touch_sentence(
 def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: tuple[str, ...]) -> bool:
     """Return whether a tare of the film succeeds with the settings of a device file.
 
-    The result is also true if the device file has no tare, or if there are too few frames for two tares, so that a
-    missing tare proves nothing. It is false if there are no frames, or if reading the frames raises an error.
+    The result is also true if the device file has no tare, or if there are too few frames for two tares. The result is
+    false if there are no frames, or if reading the frames raises an error.
 
     Args:
         received: Bytes that the board sent while the film was at rest.
@@ -254,9 +258,9 @@ def _can_be_tared(received: ReceivedData, table: Mapping[str, Any], electrodes: 
 
 
 def electrode_positions(capture: Capture, device: Device) -> dict[int, str]:
-    """Return the electrodes by the positions of their channels in the frame.
+    """Return the name of each electrode by the position of its channel in the frame.
 
-    If the device names no channels, every channel is an electrode of its own name.
+    If the device file has no section `[channels]`, every channel is an electrode with the name of the channel.
     """
     if not device.channels or not capture.frames:
         return dict(enumerate(capture.names))
@@ -264,39 +268,45 @@ def electrode_positions(capture: Capture, device: Device) -> dict[int, str]:
     return {position: electrode for position, electrode in positions.items() if position is not None}
 
 
-def _channels(capture: Capture, device: Device, used: Mapping[int, str], until_s: float) -> Iterator[ChannelHealth]:
-    """Yield the health of each channel that an electrode uses.
+def _channels(
+    capture: Capture, device: Device, electrode_at: Mapping[int, str], until_s: float
+) -> Iterator[ChannelHealth]:
+    """Yield the health of each channel that belongs to an electrode.
 
     Args:
         capture: The frames.
         device: Settings of the board, with its gain.
-        used: Name of the electrode by the position of its channel in the frame.
+        electrode_at: Name of the electrode by the position of its channel in the frame.
         until_s: Time until which the film is at rest, s from the first frame. Later frames are left out.
     """
     if not capture.frames:
         return
-    charges_pC, times_s = _rest_charges(capture, device, used, until_s)
-    for position, charge_pC in zip(used, charges_pC.T, strict=True):
+    charges_pC, times_s = _rest_charges(capture, device, electrode_at, until_s)
+    for position, charge_pC in zip(electrode_at, charges_pC.T, strict=True):
         yield measure_channel_health(capture.names[position], charge_pC, times_s, capture.rate_Hz)
 
 
-def _rest_charges(capture: Capture, device: Device, used: Mapping[int, str], until_s: float) -> tuple[Array, Array]:
+def _rest_charges(
+    capture: Capture, device: Device, electrode_at: Mapping[int, str], until_s: float
+) -> tuple[Array, Array]:
     """Return the charges of the frames in which the film is at rest, and the times of these frames.
 
     Args:
         capture: The frames.
         device: Settings of the board, with its gain.
-        used: Name of the electrode by the position of its channel in the frame.
+        electrode_at: Name of the electrode by the position of its channel in the frame.
         until_s: Time until which the film is at rest, s from the first frame.
 
     Returns:
-        Charges of the used channels, shape (n, used), in pC if the gain is known; and times, shape (n,), s.
+        Charges, shape (n, n_electrode), in the order of `electrode_at`, in pC if the gain is known, otherwise in the
+        unit of the board; and times, shape (n,), s.
     """
     values, times_s = capture.values()
     is_rest = times_s < until_s
-    charges = values[is_rest][:, list(used)]
+    positions_in_frame = list(electrode_at)
+    charges = values[is_rest][:, positions_in_frame]
     if device.gain is not None:
-        for column, electrode in enumerate(used.values()):
+        for column, electrode in enumerate(electrode_at.values()):
             with np.errstate(over="ignore"):
                 charges[:, column] = device.gain.charge_pC(electrode, charges[:, column])
     return charges, times_s[is_rest]

@@ -1,6 +1,6 @@
 """Proposal of the device file that fits a board: its frames, the channels of the electrodes, and their offsets.
 
-The charge of one count cannot be found from the bytes. The user has to state it, and it is never guessed.
+The charge of one count cannot be derived from the bytes. The user has to state it.
 """
 
 import math
@@ -19,20 +19,22 @@ from isocharge.serve.recognition.recognise import recognise
 from isocharge.serve.signal_chain.tare import TareRule
 
 QUIET_SHARE = 0.1
-"""Share of the usual noise below which a channel is not connected to an electrode, dimensionless."""
+"""Smallest noise of a channel that is connected to an electrode, relative to the median noise of the channels."""
 
 HALF_SCALE_SHARE = 0.05
-"""Largest distance of a rest from half of a converter's range, as a share of that half, dimensionless. A rest within
-this distance is replaced by half of the range."""
+"""Largest distance of a rest level from half of the range of a converter, relative to that half, dimensionless.
+
+A rest level within this distance is replaced by half of the range.
+"""
 
 CONVERTER_BITS = range(8, 32)
 """Possible resolutions of converters, bits."""
 
 REST_SIGMAS = 20.0
-"""Distance of a rest from zero above which it is an offset, in standard deviations of the noise."""
+"""Largest rest level of a channel without an offset, in standard deviations of the noise."""
 
 LARGEST_STILL_PC = 20.0
-"""Largest whole number that is taken for a charge in pC if no channel ever changes."""
+"""Largest value that is assumed to be a charge in pC if no channel ever changes."""
 
 LARGEST_V = 12.0
 """Largest value of a board that sends volts, V."""
@@ -45,7 +47,7 @@ ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
 def rest_of(values: Array) -> float:
-    """Compute the level at which a channel rests: the median of its finite values, or 0 if there is none."""
+    """Compute the rest level of a channel, which is the median of its finite values; 0 if there are none."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else 0.0
 
@@ -134,11 +136,14 @@ def _recognise_frames(received: ReceivedData) -> dict[str, Any] | None:
 
 
 def unit_of(capture: Capture) -> str:
-    """Return the unit of the values if nothing is known of the gain: "pC", "counts" or "V".
+    """Return the unit of the values of a board whose gain is unknown: "pC", "counts" or "V".
 
-    The unit is pC if the frames are the binary frames of isocharge, if all names of channels end in `_pC`, or if no
-    value ever changes and all are small. Otherwise whole numbers are counts, and numbers are volts if they are small
-    and have little noise, or if all names end in `V`. All other numbers are taken for pC.
+    The rules are applied in this order:
+
+    - Binary frames of isocharge, channels whose names end in `_pC`, and small values that never change are in pC.
+    - Whole numbers are counts.
+    - Channels whose names end in `V`, and small numbers with little noise, are in volts.
+    - All other numbers are assumed to be in pC.
     """
     names_state_pC = all(name.endswith("_pC") for name in capture.names)
     if not capture.frames or capture.parser.format == BINARY or names_state_pC:
@@ -163,8 +168,8 @@ def unit_of(capture: Capture) -> str:
 def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...]) -> dict[str, int]:
     """Choose the channel of each electrode.
 
-    Channels with the names of the electrodes are taken first. Otherwise as many varying channels as there are
-    electrodes are assigned in their order. Without a model, each varying channel is an electrode.
+    If there are channels with the names of the electrodes, these are chosen. Otherwise as many varying channels as
+    there are electrodes are assigned in their order. Without a model, each varying channel is an electrode.
 
     Args:
         capture: The frames.
@@ -193,9 +198,9 @@ def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...
 
 
 def _varying_channels(values: Array) -> list[int]:
-    """Return the positions of the channels that vary like the others; all positions if no channel varies.
+    """Return the positions of the channels that vary, except for channels with much less noise than the others.
 
-    A channel with a value that is not finite does not count as varying.
+    All positions are returned if no channel varies. A channel with a value that is not finite does not vary.
     """
     columns = [column if np.isfinite(column).all() else np.zeros(1) for column in values.T]
     varying = [position for position, column in enumerate(columns) if np.ptp(column) > 0.0]
@@ -209,7 +214,8 @@ def _varying_channels(values: Array) -> list[int]:
 def _most_alike(values: Array, candidates: list[int], count: int) -> list[int]:
     """Choose the adjacent channels whose noise is most similar, and return their positions.
 
-    The range of the noise is compared in whole decades. The first of several equal choices is taken.
+    The ratio of the largest to the smallest noise is compared in whole decades. The first of several equal choices is
+    used.
 
     Args:
         values: Values of all channels, shape (n, channels).
@@ -224,9 +230,10 @@ def _most_alike(values: Array, candidates: list[int], count: int) -> list[int]:
 
 
 def _offsets(columns: Mapping[str, Array], gain: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the key `offset` of the section `[gain]`: one value if all electrodes agree; empty if they rest at 0.
+    """Return the key `offset` of the section `[gain]`.
 
-    Half of a converter's range is preferred to the measured rest, unless the difference would disturb a tare.
+    The result has one value if all electrodes have the same offset, and is empty if all electrodes rest at 0. Half of
+    the range of a converter is preferred to the measured rest level, unless the difference would prevent a tare.
 
     Args:
         columns: Values of the channel of each electrode at rest, each of shape (n,), in the unit of the board.
@@ -265,7 +272,10 @@ def _largest_pC(gain: Mapping[str, Any]) -> float:
 
 
 def _offset(column: Array) -> float | int:
-    """Return the value of a channel without charge: half of a converter's range if the rest is near, else the rest."""
+    """Return the value of a channel without charge.
+
+    This is half of the range of a converter if the rest level is near it, and otherwise the rest level.
+    """
     rest = rest_of(column)
     has_whole_numbers = bool((column == np.round(column)).all())
     if has_whole_numbers:
@@ -277,7 +287,7 @@ def _offset(column: Array) -> float | int:
 
 
 def _rounded(rest: float) -> float | int:
-    """Round a rest to six digits, or to a whole number if it is large."""
+    """Round a rest level to six digits, or to a whole number if it is 1000 or more."""
     value = float(f"{rest:.6g}")
     if abs(rest) >= 1000.0 or value.is_integer():
         return round(rest)

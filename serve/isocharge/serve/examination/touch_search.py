@@ -1,8 +1,10 @@
 """Search for touches in charges that should come from a film at rest.
 
-The gain and the rest level of a board are not known yet, so a touch is recognised by its changes: a press begins, ends
-or wavers within half a second, while warming, creep and the slow noise of amplifiers take longer. Hum averages out
-within a block of 0.1 s, and a single damaged value does not change the median of a block.
+The gain and the rest level of a board are not known yet. A touch is therefore recognised by changes of the charges
+within half a second. Warming, creep and the slow noise of amplifiers cause slower changes.
+
+The median of each block of 0.1 s is computed, in which hum averages out. A single damaged value does not change the
+median of a block.
 
 A press that is held with constant force for the whole time does not change the charges. It cannot be distinguished from
 an amplifier that rests at another level.
@@ -17,22 +19,22 @@ from isocharge.common.arrays import Array
 from isocharge.serve.examination.proposal import noise_of
 
 BLOCK_S = 0.1
-"""Time over which values are averaged, s: whole periods of 50 and 60 Hz."""
+"""Time over which values are averaged, s. It contains whole periods of 50 and of 60 Hz."""
 
 MIN_BLOCKS = 6
-"""Number of blocks below which no touch is searched for."""
+"""Smallest number of blocks in which a touch is searched for."""
 
 STEEP_BLOCKS = 5
-"""Number of blocks within which the changes of a touch are searched for: half a second."""
+"""Number of blocks within which a touch changes the charges, which is half a second."""
 
 CHANGE_SIGMAS = 20.0
-"""Change within half a second from which the film was touched, in standard deviations of the noise of one frame."""
+"""Smallest change within half a second that counts as a touch, in standard deviations of the noise of one frame."""
 
 MIN_CHANGE_PC = 20.0
 """Smallest change within half a second that counts as a touch, pC. A press of 0.01 N on a film of 25 um causes 40."""
 
 MAX_SLOW_CHANGE_PC = 100.0
-"""Change during the whole time from which the film was touched, pC. It is the largest rest that a tare accepts."""
+"""Largest change during the whole time without a touch, pC. It is the largest offset that a tare accepts."""
 
 
 class TouchFound(NamedTuple):
@@ -59,7 +61,7 @@ def find_touch(values: Array, times_s: Array, unit_is_pC: bool) -> TouchFound | 
             noise only.
 
     Returns:
-        The channel with the largest change, of those that change as under a touch; None if there is none.
+        The largest change of a channel that is a touch; None if there is none.
     """
     blocks = block_medians(values, times_s)
     if len(blocks) < MIN_BLOCKS:

@@ -2,8 +2,8 @@
 
 | topic | message | written for |
 |---|---|---|
-| `/isocharge/record` | the record, JSON with its schema, or a `std_msgs/msg/String` of that JSON | every record |
-| `/isocharge/wrench` | `geometry_msgs/msg/WrenchStamped` | every record with a force, 0 N out of contact included |
+| `/isocharge/record` | the record, as JSON with its schema or as a `std_msgs/msg/String` of that JSON | every record |
+| `/isocharge/wrench` | `geometry_msgs/msg/WrenchStamped` | every record with a force, including 0 N out of contact |
 | `/isocharge/pose` | `geometry_msgs/msg/PoseWithCovarianceStamped` | every record with a position |
 
 Log time and publish time are the `timestamp` of the record. The file is written in complete chunks at least once per
@@ -48,7 +48,7 @@ FLUSH_INTERVAL_S = 1.0
 """Longest time for which records wait in memory, s. These records are lost if the process is killed."""
 
 MAX_SEQUENCE_NUMBER = 0xFFFFFFFF
-"""Largest sequence number of a message, after which it begins again at 0."""
+"""Largest sequence number of a message. The next number is 0."""
 
 
 class McapFile:
@@ -118,7 +118,7 @@ class McapFile:
         """Write a record.
 
         Raises:
-            InputError: If ROS 2 has no time stamp for the time of the record.
+            InputError: If a time stamp of ROS 2 cannot express the time of the record.
             OSError: If the disk is full or was removed.
         """
         values = record.json_values
@@ -150,13 +150,20 @@ class McapFile:
             self._flushed = self._now()
 
     def _record_channel(self) -> int:
+        """Register the channel of the records, and return its identifier."""
         if self._encoding is RecordEncoding.ros2:
             return self._ros_channel(RECORD_TOPIC, STRING, STRING_DEFINITION)
-        schema = json.dumps(record_schema(self._electrodes)).encode()
-        return self._writer.register_channel(
-            RECORD_TOPIC, "json", self._writer.register_schema(SCHEMA_NAME, "jsonschema", schema)
-        )
+        schema_text = json.dumps(record_schema(self._electrodes)).encode()
+        schema_id = self._writer.register_schema(SCHEMA_NAME, "jsonschema", schema_text)
+        return self._writer.register_channel(RECORD_TOPIC, "json", schema_id)
 
     def _ros_channel(self, topic: str, kind: str, definition: str) -> int:
-        schema = self._writer.register_schema(kind, "ros2msg", definition.encode())
-        return self._writer.register_channel(topic, "cdr", schema)
+        """Register a channel of ROS 2 messages, and return its identifier.
+
+        Args:
+            topic: Topic of the messages.
+            kind: Name of the message type.
+            definition: Definition of the message type.
+        """
+        schema_id = self._writer.register_schema(kind, "ros2msg", definition.encode())
+        return self._writer.register_channel(topic, "cdr", schema_id)

@@ -1,16 +1,16 @@
 """Conversion of prediction records to ROS 2 messages in CDR: the wrench of the press, its pose, and the record as text.
 
-The coordinate frame of the messages is named `frame_id`, after the sensor. README.md, Coordinates, defines its origin
-and its axes x and y. ROS requires
-right-handed frames, so z points towards the probe, against the push. The wrench is the load of the probe on the film: a
-press of F at (x, y) has the force (0, 0, -F) and the torque (-y F, x F, 0) about the origin. The pose is the point of
-contact in the plane of the unloaded film, without rotation, with the model's standard deviations.
+The name of the coordinate frame of the messages is the `frame_id` of the record, which is the name of the sensor. The
+section Coordinates of README.md defines its origin and its axes x and y. ROS requires right-handed frames, so z points
+towards the probe, against the direction of the push.
 
-If contacts are tracked, the wrench and the pose describe the tracked contact, as on the live page. The record also has
-the contact that the frame alone gives.
+The wrench is the load of the probe on the film. A press of F at (x, y) has the force (0, 0, -F) and the torque (-y F, x
+F, 0) about the origin. The pose is the point of contact in the plane of the unloaded film, without rotation, with the
+standard deviations of the model. If contacts are tracked, the wrench and the pose describe the tracked contact, as on
+the live page. The record also contains the contact of the single frame.
 
 A ROS message consists of a header and numbers of double precision. The messages are encoded here, because
-`mcap-ros2-support` offers its encoder only as a part of its own writer, which writes no JSON and takes 15 times as
+`mcap-ros2-support` provides its encoder only as a part of its own writer, which cannot write JSON and takes 15 times as
 long. The tests decode the messages with `mcap-ros2-support` and with rosbags.
 """
 
@@ -26,10 +26,10 @@ DEFLECTION_STD_m = 5e-3
 """Standard deviation of z, m. The model does not estimate the deflection of the film, which is a few millimetres."""
 
 ROTATION_VARIANCE_rad2 = math.pi**2 / 3.0
-"""Variance of every rotation, rad^2: the variance of an angle that is uniformly distributed over a full turn."""
+"""Variance of every rotation, rad^2. It is the variance of an angle that is uniformly distributed over a full turn."""
 
 MAX_TIMESTAMP_S = 1 << 31
-"""Upper limit of the times that a ROS 2 time stamp can hold, unix seconds: the year 2038."""
+"""Upper limit of the time in a ROS 2 time stamp, unix seconds. It is in the year 2038."""
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
 """First bytes of a CDR message: little endian, no options."""
@@ -83,7 +83,7 @@ def time_of(record: Mapping[str, Any]) -> int:
     """Return the `timestamp` of a record in nanoseconds, rounded to a microsecond.
 
     Raises:
-        InputError: If ROS 2 has no time stamp for this time.
+        InputError: If a time stamp of ROS 2 cannot express this time.
     """
     seconds: float | None = record["timestamp"]
     if seconds is None or not 0.0 <= seconds < MAX_TIMESTAMP_S:
@@ -95,7 +95,7 @@ def time_of(record: Mapping[str, Any]) -> int:
 
 
 def contact_of(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the values of a record, in which the tracked contact replaces the contact of the frame if there is one."""
+    """Return the values of a record. If there is a tracked contact, it replaces the contact of the frame."""
     tracked = record.get("tracked")
     if tracked is None or record["force_N"] is None:
         return record
@@ -103,11 +103,14 @@ def contact_of(record: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
-    """Return a record as a WrenchStamped, N and N m: zeros out of contact, and None if the force is unknown.
+    """Return the load of a record as a WrenchStamped, in N and N m.
 
     Args:
         record: Values of the record by name.
         time_ns: Time of the record, ns.
+
+    Returns:
+        The message, with zeros out of contact; None if the force is unknown.
     """
     contact = contact_of(record)
     force_N = contact["force_N"]
@@ -122,14 +125,18 @@ def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
 
 
 def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
-    """Return a record as a PoseWithCovarianceStamped, m, m^2 and rad^2; None if nothing touches.
+    """Return the position of a record as a PoseWithCovarianceStamped, in m, m^2 and rad^2.
 
     Args:
         record: Values of the record by name.
         time_ns: Time of the record, ns.
+
+    Returns:
+        The message; None if nothing touches.
     """
     contact = contact_of(record)
-    x_mm, y_mm = contact["x_mm"], contact["y_mm"]
+    x_mm = contact["x_mm"]
+    y_mm = contact["y_mm"]
     x_std_mm = contact["x_std_mm"]
     y_std_mm = contact["y_std_mm"]
     if None in (x_mm, y_mm, x_std_mm, y_std_mm):
@@ -157,7 +164,15 @@ def string_message(text: str) -> bytes:
 
 
 def _stamped(frame_id: str, time_ns: int, values: tuple[float, ...]) -> bytes:
-    """Return a message of a header and numbers, which begin at a multiple of 8 bytes after the encapsulation."""
+    """Return a message that consists of a header and numbers.
+
+    The numbers begin at a multiple of 8 bytes after the encapsulation.
+
+    Args:
+        frame_id: Name of the coordinate frame.
+        time_ns: Time of the message, ns.
+        values: The numbers.
+    """
     seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
     header = struct.pack("<iI", seconds, nanoseconds) + _string(frame_id)
     padding = bytes(-len(header) % 8)
@@ -165,7 +180,7 @@ def _stamped(frame_id: str, time_ns: int, values: tuple[float, ...]) -> bytes:
 
 
 def _string(text: str) -> bytes:
-    """Return a text as CDR encodes it: its length, its bytes in UTF-8, and a zero."""
+    """Encode a text in CDR: its length, its bytes in UTF-8, and a zero."""
     data = text.encode() + b"\0"
     return struct.pack("<I", len(data)) + data
 

@@ -1,8 +1,9 @@
-"""The binary frame of isocharge: (version u8, seq u16, t_us u32, n u8, flags u8, n x f32 pC, CRC u16), encoded by COBS.
+"""The binary frame of isocharge, encoded by COBS.
 
-All numbers are little-endian. The CRC is CRC-16/CCITT-FALSE over everything before it. A zero byte ends each frame and
-occurs nowhere else. After damaged bytes, the parser therefore continues with the frame that follows the next zero, and
-a damaged frame does not affect its neighbours.
+The fields are (version u8, seq u16, t_us u32, n u8, flags u8, n x f32 pC, CRC u16). All numbers are little-endian. The
+CRC is CRC-16/CCITT-FALSE over all bytes before it. A zero byte ends each frame and occurs nowhere else. After damaged
+bytes, the parser therefore continues with the frame that follows the next zero, and a damaged frame does not affect its
+neighbours.
 """
 
 import binascii
@@ -12,10 +13,10 @@ from isocharge.serve.frames.frame import ChecksumError, Frame, StuffedParser
 from isocharge.serve.frames.stuffing import MAX_BLOCK, cobs_decode, cobs_encode
 
 FORMAT = "binary frames of isocharge"
-"""Description of the format, for people."""
+"""Description of the format, for the user."""
 
 FRAME_VERSION = 1
-"""Version of the frame's layout; it is the first byte of a frame."""
+"""Version of the layout, which is the first byte of a frame."""
 
 DELIMITER = b"\0"
 """The byte that ends a frame."""
@@ -24,9 +25,10 @@ HEADER = struct.Struct("<BHIBB")
 """Version, frame counter, clock in us, number of charges, flags."""
 
 CRC = struct.Struct("<H")
+"""The checksum."""
 
 MAX_CHARGES = 255
-"""Largest number of charges in a frame; its byte can count no more."""
+"""Largest number of charges in a frame, because one byte contains the number."""
 
 MAX_FRAME_LENGTH = HEADER.size + MAX_CHARGES * 4 + CRC.size
 """Length of the longest frame before byte stuffing, bytes."""
@@ -36,7 +38,7 @@ MAX_STUFFED_LENGTH = MAX_FRAME_LENGTH + 1 + MAX_FRAME_LENGTH // MAX_BLOCK
 
 
 def encode_frame(frame: Frame) -> bytes:
-    """Return the bytes of a frame with its delimiter. A missing counter or clock is sent as zero.
+    """Return the bytes of a frame with its delimiter. A missing counter or clock is encoded as zero.
 
     Raises:
         struct.error: If a number does not fit its field.
@@ -55,7 +57,7 @@ def decode_frame(piece: bytes) -> Frame:
 
     Raises:
         ChecksumError: If the CRC is wrong.
-        ValueError: If the bytes are no frame.
+        ValueError: If the bytes are not a frame.
     """
     data = cobs_decode(piece)
     if len(data) < HEADER.size + CRC.size:

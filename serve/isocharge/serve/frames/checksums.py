@@ -1,8 +1,8 @@
-"""Checksums of frames, by the names that catalogues and manuals use.
+"""Checksums of frames, with the names that catalogues and manuals use.
 
 A cyclic redundancy check (CRC) has the parameters of Williams's model ("A painless guide to CRC error detection
 algorithms", 1993). Names and values are those of Cook's catalogue of parametrised CRC algorithms, where
-CRC-16/CCITT-FALSE is called CRC-16/IBM-3740. A check without a name is described by its parameters.
+CRC-16/CCITT-FALSE is called CRC-16/IBM-3740. A device file describes a check without a name by its parameters.
 """
 
 from collections.abc import Callable
@@ -17,10 +17,10 @@ class Crc:
 
     Attributes:
         width: Number of bits: 8, 16, 24 or 32.
-        polynomial: Polynomial without its highest power; the highest bit is the highest power.
-        start: Initial value of the register; the highest bit is the highest power.
+        polynomial: Polynomial without its highest power. The highest bit is the coefficient of the highest power.
+        start: Initial value of the register, in the bit order of the polynomial.
         reflected: Whether bytes and register are processed from the lowest bit.
-        final: Value that is combined with the register by exclusive or at the end.
+        final: Value that is combined with the register by an exclusive or at the end.
     """
 
     width: int
@@ -31,16 +31,16 @@ class Crc:
 
     @cached_property
     def table(self) -> tuple[int, ...]:
-        """Change of the register by each byte."""
+        """Register after each of the 256 bytes, starting from a register of zero."""
         return tuple(map(self._table_entry, range(256)))
 
     @cached_property
     def initial_register(self) -> int:
-        """Initial value of the register, in the bit order in which the register is held."""
+        """Initial value of the register, in the bit order of the register."""
         return self._in_register_order(self.start)
 
     def _in_register_order(self, number: int) -> int:
-        """Return a number in the bit order of the register: reversed if the check is reflected."""
+        """Convert a number to the bit order of the register, which is reversed if the check is reflected."""
         if not self.reflected:
             return number
         bits = f"{number:0{self.width}b}"

@@ -19,10 +19,11 @@ class AutoParser(Parser):
 
     Args:
         columns: Names for the columns of a CSV; see `TextParser`.
-        meanings: Names that the board has for its counter and its clock; see `TextParser`.
+        meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the board uses; see `TextParser`.
     """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
+        """Begin with the parsers of all formats; the arguments are described in the class."""
         super().__init__("nothing recognised yet")
         self._candidates: tuple[Parser, ...] = (BinaryParser(), TextParser(columns, meanings))
 
@@ -53,7 +54,7 @@ class AutoParser(Parser):
     def _feed_recognised(self, parser: Parser, data: bytes) -> list[Frame]:
         """Return the frames that the parser of the recognised format finds, and copy its format and its moduli.
 
-        The format and the moduli are copied each time, because the parser may learn them only after many frames.
+        The format and the moduli are copied in each call, because the parser may learn them only after many frames.
         """
         frames = parser.feed(data)
         self.format = parser.format
@@ -67,8 +68,10 @@ class TextFrames(FrameSection, tag="text", frozen=True):
 
     Attributes:
         columns: Names of the columns of a CSV.
-        seq: Name that the board has for its frame counter.
-        t_us, t_ms, t_s: Name that the board has for its clock in us, ms or s.
+        seq: Name that the board uses for its frame counter.
+        t_us: Name that the board uses for a clock in us.
+        t_ms: Name that the board uses for a clock in ms.
+        t_s: Name that the board uses for a clock in s.
     """
 
     columns: tuple[str, ...] = ()
@@ -79,7 +82,7 @@ class TextFrames(FrameSection, tag="text", frozen=True):
 
     @property
     def meanings(self) -> Mapping[str, str]:
-        """Map the board's own names to `seq`, `t_us`, `t_ms` and `t_s`."""
+        """`seq`, `t_us`, `t_ms` or `t_s` by the name that the board uses."""
         meanings = {self.seq: "seq", self.t_us: "t_us", self.t_ms: "t_ms", self.t_s: "t_s"}
         return {name: meaning for name, meaning in meanings.items() if name}
 
@@ -89,7 +92,7 @@ class TextFrames(FrameSection, tag="text", frozen=True):
 
 
 class AutoFrames(TextFrames, tag="auto", frozen=True):
-    """The binary frames of isocharge or lines of text, whichever the board sends."""
+    """The binary frames of isocharge, or lines of text. The parser recognises which of them the board sends."""
 
     def parser(self) -> Parser:
         """Create a parser."""
@@ -97,7 +100,7 @@ class AutoFrames(TextFrames, tag="auto", frozen=True):
 
 
 class BinaryFrames(FrameSection, tag="binary", frozen=True):
-    """Our binary frames."""
+    """The binary frames of isocharge."""
 
     def parser(self) -> Parser:
         """Create a parser."""
@@ -105,3 +108,4 @@ class BinaryFrames(FrameSection, tag="binary", frozen=True):
 
 
 Frames = AutoFrames | TextFrames | BinaryFrames | FrameLayout
+"""The section `[frames]` of a device file."""

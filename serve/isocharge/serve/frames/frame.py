@@ -1,7 +1,7 @@
-"""What all frame formats share: the frame, the base classes of parsers, counters, and the columns of a row of numbers.
+"""Common parts of all frame formats: the frame, base classes of parsers, counters, and columns of a row of numbers.
 
-A parser does not know where its bytes come from: it takes bytes and returns frames. The frames and counters do not
-depend on how the bytes are cut into chunks, and memory is bounded for any input.
+A parser converts bytes to frames, and is independent of the source of the bytes. The frames and counters do not depend
+on how the bytes are cut into chunks, and the memory is bounded for any input.
 """
 
 from abc import ABC, abstractmethod
@@ -21,16 +21,16 @@ SATURATED_BIT = 0x01
 """Bit in the flags of a frame that reports an amplifier at its limit. The other bits are reserved and sent as zero."""
 
 SEQ = "seq"
-"""Name under which a device sends its frame counter."""
+"""Name of the field with the frame counter."""
 
 FLAGS = "flags"
-"""Name under which a device sends the flags of a frame."""
+"""Name of the field with the flags of a frame."""
 
 TIMES_US = {"t_us": 1.0, "t_ms": 1e3, "t_s": 1e6}
-"""Names under which a device sends its clock, with the unit of each name, us."""
+"""Names of the field with the clock of a device, and the unit of each, us."""
 
 Raw = TypeVar("Raw")
-"""What a frame is decoded from: its bytes, or the numbers of a row."""
+"""Type of the data from which a frame is decoded: bytes, or the numbers of a row."""
 
 
 class SequenceGaps:
@@ -44,6 +44,7 @@ class SequenceGaps:
     """
 
     def __init__(self) -> None:
+        """Begin without a frame."""
         self.lost = 0
         self.repeated = 0
         self.restarts = 0
@@ -88,13 +89,13 @@ class SequenceGaps:
 class CounterWrap:
     """Learns the value at which a counter in text wraps to 0, because text does not show the width of a counter.
 
-    When the counter falls, it either wrapped or started again. It is taken to have wrapped if there is a usual modulus
-    that is larger than every value so far and modulo which the step is not much larger than the steps before.
+    If the counter decreases, it has either wrapped or restarted. A wrap is assumed if there is a usual modulus that is
+    larger than all previous values, and if the step modulo this modulus is not much larger than the previous steps.
 
     Args:
         usual_moduli: Moduli that boards use, in ascending order.
         initial_modulus: Modulus to assume until the counter wraps.
-        max_steps: Largest step across a wrap, as a multiple of the step before it.
+        max_steps: Largest step across a wrap, as a multiple of the previous step.
     """
 
     def __init__(self, usual_moduli: Iterable[int], initial_modulus: int, max_steps: int) -> None:
@@ -107,31 +108,38 @@ class CounterWrap:
         self._largest_value = 0
 
     def update(self, value: int | None) -> int:
-        """Learn from the next value of the counter, and return the modulus as far as it is known.
+        """Process the next value of the counter, and return the modulus.
 
         Args:
             value: The value; None if a connection has ended.
+
+        Returns:
+            The modulus that was learned, or the initial modulus before the first wrap.
         """
         last_value = self._last_value
         self._last_value = value
         if value is None or last_value is None:
             return self._modulus
         if value < last_value:
-            self._modulus = self._modulus_after_fall(value - last_value)
+            self._modulus = self._modulus_after_decrease(value - last_value)
         elif value > last_value:
             self._last_step = value - last_value
         self._largest_value = max(self._largest_value, value)
         return self._modulus
 
-    def _modulus_after_fall(self, step: int) -> int:
+    def _modulus_after_decrease(self, step: int) -> int:
         """Return the smallest usual modulus that explains a negative step, or the present modulus if none does.
 
-        A modulus explains the step if it is larger than all values, and the step modulo the modulus is about as small
-        as the steps before.
+        A modulus explains the step if it is larger than all values, and if the step modulo the modulus is at most
+        `max_steps` times the previous step.
+
+        Args:
+            step: Present value minus previous value, negative.
         """
         max_step = self._max_steps * self._last_step
         for modulus in self._usual_moduli:
-            has_plausible_step = step % modulus <= min(max_step, modulus // 2)
+            step_across_wrap = step % modulus
+            has_plausible_step = step_across_wrap <= min(max_step, modulus // 2)
             if self._largest_value < modulus and has_plausible_step:
                 return modulus
         return self._modulus
@@ -142,9 +150,9 @@ class Frame:
     """One reading of a sensor.
 
     Attributes:
-        seq: Frame counter, modulo the parser's `seq_modulus`; None if the format has no counter.
-        t_us: Clock of the device, us, modulo the parser's `t_us_modulus`; None if the format has no clock.
-        values: One value for each channel, in the unit of the device. In our binary frame the unit is pC.
+        seq: Frame counter, modulo the `seq_modulus` of the parser; None if the format has no counter.
+        t_us: Clock of the device, us, modulo the `t_us_modulus` of the parser; None if the format has no clock.
+        values: One value for each channel, in the unit of the device. In the binary frame of isocharge, the unit is pC.
         flags: Bits; see `SATURATED_BIT`.
         names: Names of the channels; empty if the format has no names.
     """
@@ -158,12 +166,12 @@ class Frame:
 
 @dataclass(slots=True)
 class FrameCounts:
-    """Counters of a parser. A piece is what should have been a frame: the bytes between two delimiters, or a line.
+    """Counters of a parser. A piece is a sequence of bytes that should be a frame, such as a line of text.
 
     Attributes:
         frames: Number of intact frames.
         crc_errors: Number of pieces with a wrong checksum.
-        malformed: Number of pieces that were rejected for another reason: stuffing, length, version, not a number.
+        malformed: Number of pieces that were rejected for another reason, such as a wrong length.
         bytes_dropped: Number of bytes in the rejected pieces, including their delimiters.
         resyncs: Number of intact frames that followed dropped bytes.
         is_out_of_sync: Whether bytes were dropped since the last intact frame.
@@ -188,7 +196,7 @@ class FrameCounts:
 
         Args:
             size: Length of the piece with its delimiter, bytes.
-            wrong_checksum: Whether it was rejected because of its checksum.
+            wrong_checksum: Whether the piece was rejected because of its checksum.
         """
         if wrong_checksum:
             self.crc_errors += 1
@@ -259,7 +267,7 @@ class Parser(ABC):
     """Base class of all parsers: takes bytes and returns frames.
 
     Args:
-        format: Description of the format, for people.
+        format: Description of the format, for the user.
         seq_modulus: Value at which the `seq` of a frame wraps to 0.
         t_us_modulus: Time at which the `t_us` of a frame wraps to 0, us.
 
@@ -268,6 +276,7 @@ class Parser(ABC):
     """
 
     def __init__(self, format: str, seq_modulus: int = SEQ_MODULUS, t_us_modulus: int = T_US_MODULUS) -> None:
+        """Begin without bytes; the arguments are described in the class."""
         self.format = format
         self.seq_modulus = seq_modulus
         self.t_us_modulus = t_us_modulus
@@ -276,7 +285,7 @@ class Parser(ABC):
 
     @abstractmethod
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that end within `data`. Bytes of an unfinished frame are kept for the next call."""
+        """Return the frames that end within `data`. Bytes of an unfinished frame are stored for the next call."""
 
     def reset(self) -> None:
         """Drop the bytes of an unfinished frame, because the next bytes come from another connection."""
@@ -287,12 +296,12 @@ class Parser(ABC):
         """Decode one frame and count it.
 
         Args:
-            decode: Function that decodes a frame, and raises ValueError or OverflowError if `raw` is no frame.
+            decode: Function that decodes a frame, and raises ValueError or OverflowError if `raw` is not a frame.
             raw: Argument of `decode`: bytes or numbers.
-            size: Number of bytes that are dropped if `raw` is no frame.
+            size: Number of bytes that are dropped if `raw` is not a frame.
 
         Returns:
-            A list with the frame; an empty list if `raw` is no frame.
+            A list with the frame; an empty list if `raw` is not a frame.
         """
         try:
             frame = decode(raw)
@@ -304,7 +313,7 @@ class Parser(ABC):
 
 
 class DelimitedParser(Parser):
-    """Base class of parsers for pieces between one-byte delimiters. It drops pieces that are longer than any frame.
+    """Base class of parsers for pieces between delimiters of one byte. Pieces longer than any frame are dropped.
 
     Args:
         delimiter: The byte after each piece.
@@ -313,6 +322,7 @@ class DelimitedParser(Parser):
     """
 
     def __init__(self, delimiter: bytes, max_length: int, *parser_arguments: Any) -> None:
+        """Begin without bytes; the arguments are described in the class."""
         super().__init__(*parser_arguments)
         self._delimiter = delimiter
         self._max_length = max_length
@@ -321,8 +331,8 @@ class DelimitedParser(Parser):
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
-        Bytes after the last delimiter are stored for the next call. If they are longer than any frame, they are
-        dropped, and so is everything up to the next delimiter.
+        Bytes after the last delimiter are stored for the next call. If there are more of them than any frame has, they
+        are dropped together with all bytes up to the next delimiter.
         """
         *pieces, tail = (self._tail + data).split(self._delimiter)
         frames = []
@@ -349,18 +359,19 @@ class DelimitedParser(Parser):
 
 
 class StuffedParser(DelimitedParser):
-    """Parser of frames with byte stuffing: every piece is a frame, and an empty piece is an idle line.
+    """Parser of frames with byte stuffing. Every piece is a frame. Empty pieces are ignored.
 
     Args:
         delimiter: The byte after each frame.
         max_length: Length of the longest stuffed frame, bytes.
-        decode: Function from the bytes of a piece to its frame; it raises ValueError if the piece is no frame.
+        decode: Function from the bytes of a piece to its frame. It raises ValueError if the piece is not a frame.
         parser_arguments: Arguments of `Parser`.
     """
 
     def __init__(
         self, delimiter: bytes, max_length: int, decode: Callable[[bytes], Frame], *parser_arguments: Any
     ) -> None:
+        """Begin without bytes; the arguments are described in the class."""
         super().__init__(delimiter, max_length, *parser_arguments)
         self._decode = decode
 

@@ -17,12 +17,12 @@
 
 The types are u8, u16, u24, u32, i8, i16, i24, i32, f32, f64 and `pad`. Padding is either `count` bytes without a
 meaning, or a `value` in hexadecimal that every frame must have, such as its length. A field named `seq` is the frame
-counter, `t_us`, `t_ms` or `t_s` is the clock, and `flags` holds the bits of `isocharge.serve.frames.frame`. All other
-fields are channels.
+counter, `t_us`, `t_ms` or `t_s` is the clock, and `flags` contains the bits of `isocharge.serve.frames.frame`. All
+other fields are channels.
 
-If the checksum of a frame with a sync pattern is wrong, the parser searches for the pattern again from the next byte
-on, so that a pattern that occurs by chance inside the data does not cost an intact frame. Stuffed frames end at their
-delimiter, and a datagram holds whole frames only; a wrong piece of either is dropped as a whole.
+If the checksum of a frame with a sync pattern is wrong, the parser searches for the pattern again from the next byte.
+The pattern may have occurred by chance inside the data, and an intact frame may begin there. Stuffed frames end at
+their delimiter, and a datagram contains only whole frames. Damaged pieces and datagrams are dropped as a whole.
 """
 
 import struct
@@ -59,13 +59,13 @@ STRUCT_FORMATS = {
     "f32": "f",
     "f64": "d",
 }
-"""Format character of the module `struct` for each type of a field. Three bytes have none and are read as bytes."""
+"""Format of the module `struct` for each type of a field. Numbers of three bytes are read as bytes."""
 
 PADDING = "pad"
 """Type of bytes that are not read."""
 
 MAX_PADDING = 4096
-"""Largest padding, bytes. It is more than any real frame has, so that a typing error cannot ask for a gigabyte."""
+"""Largest padding, bytes. The limit prevents that a typing error requests a gigabyte."""
 
 MAX_REQUEST_RATE_Hz = 100_000.0
 """Highest rate of requests, Hz."""
@@ -74,7 +74,7 @@ SYNC = "sync"
 """Framing in which a frame begins with its sync pattern."""
 
 DATAGRAM = "datagram"
-"""Framing in which a datagram holds one or more whole frames."""
+"""Framing in which a datagram contains one or more whole frames."""
 
 Framing = Literal["sync", "cobs", "slip", "hdlc", "datagram"]
 ByteOrder = Literal["little", "big"]
@@ -203,7 +203,7 @@ class FrameSection(Settings, frozen=True, tag_field="format"):
 
 
 class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only=True):
-    """A described frame. The attributes are keys of the section `[frames]`.
+    """The layout of a frame. The attributes are keys of the section `[frames]`.
 
     Attributes:
         length: Length of the whole frame without stuffing, bytes.
@@ -226,7 +226,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     checksum_order: ByteOrder | None = None
 
     def __post_init__(self) -> None:
-        """Check that the fields make a frame, and that length and checksum fit the fields."""
+        """Check that the fields form a frame, and that the length and the checksum fit the fields."""
         names = [field.name for field in self.fields]
         if isinstance(self.checksum, str) and self.checksum not in CHECKSUMS:
             raise WrongKey("checksum", f"one of {', '.join(CHECKSUMS)}, or the parameters of a CRC", self.checksum)
@@ -265,7 +265,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     @cached_property
     def check(self) -> Checksum:
-        """The checksum that the key `checksum` names or describes."""
+        """The checksum given by the key `checksum`, which is a name or the parameters of a CRC."""
         if isinstance(self.checksum, str):
             return CHECKSUMS[self.checksum]
         return self.checksum.checksum
@@ -339,13 +339,14 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         return self.columns.frame(numbers)
 
     def _convert_three_byte_fields(self, numbers: tuple[Any, ...]) -> list[Any]:
+        """Convert the fields of three bytes to integers. The other numbers stay the same."""
         converted = list(numbers)
         for position, is_signed in self.three_byte_fields:
             converted[position] = int.from_bytes(numbers[position], self.byte_order, signed=is_signed)
         return converted
 
     def encode(self, frame: Frame) -> bytes:
-        """Return the bytes of a frame without stuffing. The values go into the channels in their order.
+        """Return the bytes of a frame without stuffing. The values are assigned to the channels in their order.
 
         Raises:
             struct.error: If a number does not fit its field.
@@ -373,14 +374,14 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         stuffing = STUFFINGS[self.framing]
         max_length = 2 * self.length + 2  # at worst, stuffing doubles the length
 
-        def decode(piece: bytes) -> Frame:
+        def decode_stuffed(piece: bytes) -> Frame:
             return self.decode(stuffing.decode(piece))
 
-        return StuffedParser(stuffing.delimiter, max_length, decode, *_parser_arguments(self))
+        return StuffedParser(stuffing.delimiter, max_length, decode_stuffed, *_parser_arguments(self))
 
 
 def _parser_arguments(layout: FrameLayout) -> tuple[str, int, int]:
-    """Return the arguments of `Parser` for a layout."""
+    """Return the arguments of `Parser` for a layout: the description of the format, and the two moduli."""
     names = ", ".join(field.name for field in layout.fields)
     return f"described frames of {layout.length} bytes: {names}", layout.seq_modulus, layout.t_us_modulus
 
@@ -389,14 +390,15 @@ class SyncParser(Parser):
     """Parser for a layout whose frames begin with a sync pattern."""
 
     def __init__(self, layout: FrameLayout) -> None:
+        """Begin without bytes."""
         super().__init__(*_parser_arguments(layout))
         self.layout = layout
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
-        A frame may begin wherever the sync pattern occurs. If the bytes there are no frame, the search continues one
-        byte later. Bytes of an unfinished frame are stored for the next call.
+        A frame may begin wherever the sync pattern occurs. If the bytes after the pattern are not a frame, the search
+        continues one byte later. Bytes of an unfinished frame are stored for the next call.
         """
         sync = self.layout.sync
         length = self.layout.length
@@ -421,9 +423,10 @@ class SyncParser(Parser):
 
 
 class DatagramParser(Parser):
-    """Parser for datagrams, each of which holds one or more whole frames."""
+    """Parser for datagrams, each of which contains one or more whole frames."""
 
     def __init__(self, layout: FrameLayout) -> None:
+        """Begin without bytes."""
         super().__init__(*_parser_arguments(layout))
         self.layout = layout
 

@@ -1,10 +1,10 @@
 """Byte stuffing: encodings in which the byte that separates frames never occurs inside a frame.
 
 - COBS, Consistent Overhead Byte Stuffing (Cheshire and Baker 1999), ends a frame with a zero. Each zero in the data is
-  replaced by the distance to the next zero, and the first byte is the distance to the first one. A distance of 255
-  stands for 254 bytes that no zero follows.
-- SLIP (RFC 1055) and the asynchronous framing of HDLC (RFC 1662) separate frames by a byte of their own. Where this
-  byte occurs in the data, they send two other bytes instead.
+  replaced by the distance to the next zero. The first byte is the distance to the first zero. A distance of 255 stands
+  for 254 bytes without a zero after them.
+- SLIP (RFC 1055) and the asynchronous framing of HDLC (RFC 1662) separate frames by a special byte. If this byte occurs
+  in the data, two other bytes are sent instead.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,10 @@ class Stuffing(NamedTuple):
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """Encode bytes so that the result holds no zero. It is at most 1 + len(data) // 254 bytes longer than `data`."""
+    """Encode bytes so that the result contains no zero.
+
+    The result is at most 1 + len(data) // 254 bytes longer than `data`.
+    """
     *blocks, last = data.split(b"\0")
     encoded = [_encode_block(block, ends_in_zero=True) for block in blocks]
     return b"".join([*encoded, _encode_block(last, ends_in_zero=False)])
@@ -37,8 +40,8 @@ def cobs_encode(data: bytes) -> bytes:
 def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
     """Encode bytes without zeros, and the zero that follows them if there is one.
 
-    Each piece of at most `MAX_BLOCK` bytes follows a byte with the distance to the next such byte. A distance of
-    `MAX_BLOCK` + 1 means that no zero follows the piece.
+    The bytes are cut into pieces of at most `MAX_BLOCK` bytes. A distance byte is put before each piece: the length of
+    the piece plus 1. A distance of `MAX_BLOCK` + 1 means that no zero follows the piece.
 
     Args:
         block: The bytes.
@@ -55,7 +58,7 @@ def _encode_block(block: bytes, *, ends_in_zero: bool) -> bytes:
 
 
 def cobs_decode(data: bytes) -> bytes:
-    """Return the bytes from which `cobs_encode` made `data`.
+    """Decode bytes that `cobs_encode` has encoded.
 
     Raises:
         ValueError: If a distance points beyond the end, or `data` contains a zero.
@@ -63,7 +66,7 @@ def cobs_decode(data: bytes) -> bytes:
     decoded = bytearray()
     position = 0
     while position < len(data):
-        distance = data[position]  # distance to the next such byte, which stands for a zero
+        distance = data[position]  # distance to the next distance byte
         block = data[position + 1 : position + distance]
         if len(block) != distance - 1 or 0 in block:
             raise ValueError(f"byte {position} is {distance}, but {len(data) - position - 1} bytes or a zero follow")
@@ -76,6 +79,7 @@ def cobs_decode(data: bytes) -> bytes:
 
 
 def _slip_decode(piece: bytes) -> bytes:
+    """Decode bytes with the byte stuffing of SLIP; raise ValueError if no encoder produces them."""
     decoded = piece.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
     if piece.count(b"\xdb") != piece.count(b"\xdb\xdc") + piece.count(b"\xdb\xdd"):
         raise ValueError("expected DC or DD after the byte DB")
@@ -83,10 +87,18 @@ def _slip_decode(piece: bytes) -> bytes:
 
 
 def _hdlc_decode(piece: bytes) -> bytes:
-    first, *escaped = piece.split(b"\x7d")
-    if not all(escaped):
-        raise ValueError("expected a byte after 7D")
-    return first + b"".join(bytes([part[0] ^ 0x20]) + part[1:] for part in escaped)
+    """Decode bytes with the byte stuffing of HDLC; raise ValueError if no encoder produces them.
+
+    The byte 7D is dropped, and the sixth bit of the byte after it is inverted.
+    """
+    first_part, *other_parts = piece.split(b"\x7d")
+    decoded = bytearray(first_part)
+    for part in other_parts:
+        if not part:
+            raise ValueError("expected a byte after 7D")
+        decoded.append(part[0] ^ 0x20)
+        decoded += part[1:]
+    return bytes(decoded)
 
 
 STUFFINGS = {

@@ -1,17 +1,19 @@
 """Frames from lines of text, whose layout is recognised from the first good lines.
 
-A layout is recognised when it has occurred three times in a row: either three rows of the same width or with the same
-names, or three times the same cycle of lines with one name each. Reading may start in the middle of a cycle, so a cycle
-is taken to begin with the name that sorts first; frame counter and clock sort before the channels. Reading may also
-start in the middle of a line, so a first line of bare numbers is dropped. After recognition, lines of another layout
-are dropped and counted.
+A board sends one row of numbers for each frame, or a cycle of several lines with one name each. The layout is
+recognised when the same row or the same cycle has occurred three times in succession. After recognition, lines of
+another layout are dropped and counted.
 
-Text has no checksum, except for sentences in the style of NMEA 0183, so a damaged digit in an otherwise intact line
-goes unnoticed. A line that is no reading but occurs again and again, such as the echo of a request, is dropped and does
-not prevent recognition.
+Reading may start in the middle of a cycle. The first line of a cycle is therefore the line whose name sorts first,
+where the frame counter and the clock sort before the channels. Reading may also start in the middle of a line, so a
+first line of numbers without names is dropped.
 
-The name `seq` means the frame counter, and `t_us`, `t_ms` or `t_s` the clock of the device. All other names are
-channels. The values at which counter and clock wrap are learned when they wrap for the first time.
+Text has no checksum, except for sentences in the style of NMEA 0183. A damaged digit in an otherwise intact line is
+therefore not detected. A line without a reading that occurs repeatedly, such as the echo of a request, is dropped and
+does not prevent recognition.
+
+The name `seq` means the frame counter, and `t_us`, `t_ms` or `t_s` means the clock of the device. All other names are
+channels. The values at which the counter and the clock wrap are learned when they wrap for the first time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,10 +47,10 @@ SEQ_MODULI = (100, 256, 1000, 10_000, SEQ_MODULUS, 1 << 32)
 """Values at which frame counters usually wrap."""
 
 MAX_SEQ_STEPS = 2
-"""Largest step of the frame counter across a wrap, as a multiple of the step before."""
+"""Largest step of the frame counter across a wrap, as a multiple of the previous step."""
 
 MAX_TIME_STEPS = 16
-"""Largest step of the clock across a wrap, as a multiple of the step before."""
+"""Largest step of the clock across a wrap, as a multiple of the previous step."""
 
 
 class Layout:
@@ -65,6 +67,7 @@ class Layout:
     """
 
     def __init__(self, notation: Notation, names: tuple[str, ...], width: int, lines: int = 1) -> None:
+        """Store the layout; the arguments are described in the class."""
         self.notation = notation
         self.names = names
         self.width = width
@@ -77,7 +80,7 @@ class TextParser(DelimitedParser):
 
     Args:
         columns: Names for the columns of a CSV.
-        meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the device has for it.
+        meanings: `seq`, `t_us`, `t_ms` or `t_s` by the name that the device uses.
 
     Attributes:
         layout: The layout; None until it is recognised.
@@ -137,9 +140,14 @@ class TextParser(DelimitedParser):
         return []
 
     def _reject_unreadable(self, piece: bytes, size: int) -> list[Frame]:
-        """Count a line that is no reading.
+        """Count a line that cannot be parsed.
 
-        A line that occurs again is the echo of a request. The lines around it are kept for recognition.
+        If the line is the same as the previous such line, it is the echo of a request. The other lines are then kept
+        for recognition.
+
+        Args:
+            piece: The line.
+            size: Number of bytes of the line.
         """
         if piece != self._last_unreadable_line:
             self._reject_unrecognised()
@@ -153,9 +161,10 @@ class TextParser(DelimitedParser):
         self._unrecognised = []
 
     def _name_columns(self, header: Line, size: int) -> list[Frame]:
-        """Use the names in a header as the names of the columns, unless they have names. Return no frames.
+        """Use the names in a header as the names of the columns, unless the columns already have names.
 
-        If a header arrives after the layout is known, the board was reset, or the line only looks like a header.
+        The header is counted as rejected if the columns cannot have its names. Then the board was reset, or the line
+        only looks like a header. The result is always empty.
 
         Args:
             header: The header.
@@ -172,6 +181,7 @@ class TextParser(DelimitedParser):
         return self._reject(size)
 
     def _set_layout(self, layout: Layout) -> None:
+        """Use a layout for all further lines."""
         self.layout = layout
         self._clock_wrap = clock_wrap(layout.columns.time_unit_us)
         names = ", ".join(layout.names) or f"{layout.width} columns without names"
@@ -206,15 +216,19 @@ class TextParser(DelimitedParser):
         return frames
 
     def _layout_of(self, lines: list[Line]) -> Layout:
-        """Return the layout of the lines of one cycle, which is a single line for most boards."""
+        """Return the layout of the lines of one cycle, which is a single line for most boards.
+
+        If a single line has no names, its values get the names of the columns, provided that their number is the same.
+        """
         first_line = lines[0]
         if len(lines) > 1:
             names = sorted({name for line in lines for name in line.names}, key=_sort_key)
             return Layout(first_line.notation, tuple(names), len(names), len(lines))
         width = len(first_line.values)
-        if first_line.names or len(self._columns) != width:
-            return Layout(first_line.notation, first_line.names, width)
-        return Layout(first_line.notation, self._columns, width)
+        names_of_row = first_line.names
+        if not names_of_row and len(self._columns) == width:
+            names_of_row = self._columns
+        return Layout(first_line.notation, names_of_row, width)
 
     def _read(self, layout: Layout, line: Line, size: int) -> list[Frame]:
         """Return the frame that a line completes, in a list; empty if the line completes no frame or is rejected.
@@ -267,11 +281,12 @@ class TextParser(DelimitedParser):
         self._clear_cycle()
 
     def _clear_cycle(self) -> None:
+        """Begin a new cycle of lines."""
         self._cycle_values = {}
         self._cycle_bytes = 0
 
     def _frame(self, layout: Layout, values: Sequence[float], size: int) -> list[Frame]:
-        """Return the frame with some values, in a list, and learn where its counter and its clock wrap.
+        """Return the frame with some values in a list, and update the moduli of the counter and the clock.
 
         Args:
             layout: The layout of the lines.
@@ -307,7 +322,7 @@ def _sort_key(name: str) -> tuple[bool, str]:
 
 
 def _period(lines: list[Line]) -> int:
-    """Return the number of lines in the cycle that has just occurred three times in a row, or 0 if there is none.
+    """Return the number of lines in the cycle that has just occurred three times in succession; 0 if there is none.
 
     Only lines with names form cycles of several lines.
 

@@ -1,14 +1,14 @@
-"""Lines of text from boards: their notation, names and numbers. Also writes frames as such lines.
+"""Parsing of lines of text from boards in several notations, and writing of frames as such lines.
 
 | notation | example |
 |---|---|
-| CSV, also with semicolons, tabs or blanks; header or not | `12, 801.2, 799.5, 803.3` |
-| name:value, several in a line or one | `A:801.2,B:799.5,C:803.3` |
+| CSV, also with semicolons, tabs or blanks; with or without a header | `12, 801.2, 799.5, 803.3` |
+| one or several pairs name:value in a line | `A:801.2,B:799.5,C:803.3` |
 | Teleplot (github.com/nesnes/teleplot) | `>A:1627551892437:801.2§pC` (time in ms and unit are optional) |
 | JSON object or list | `{"seq": 12, "A": 801.2}` |
-| sentence in the manner of NMEA 0183, checksum or not | `$PZT,801.2,799.5,803.3*5D` |
+| sentence in the style of NMEA 0183, with or without a checksum | `$PZT,801.2,799.5,803.3*5D` |
 
-Blank lines and lines that begin with # hold no values. Numbers are read by `isocharge.common.number_text`.
+Blank lines and lines that begin with # have no values. `isocharge.common.number_text` parses the numbers.
 """
 
 import json
@@ -23,10 +23,10 @@ from isocharge.common.number_text import parse_number
 from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame
 
 TELEPLOT_TIME = "t_ms"
-"""Name under which the time of a Teleplot line is reported; Teleplot itself gives it no name."""
+"""Name of the time of a Teleplot line, which has no name in Teleplot."""
 
 MAX_JSON_LEVEL = 3
-"""Depth of a JSON object down to which numbers are looked for."""
+"""Largest depth in a JSON object at which numbers are read."""
 
 _SEPARATOR = re.compile(r"\s*[,;\t]\s*|\s+")
 
@@ -66,7 +66,7 @@ NO_READING = Line(Notation.nothing)
 
 
 def parse_line(data: bytes) -> Line:
-    """Parse a line of text in any of the notations, which the first characters distinguish.
+    """Parse a line of text in any of the notations. The first characters determine the notation.
 
     Args:
         data: The line without the characters that end it.
@@ -102,16 +102,16 @@ def _csv(text: str) -> Line:
 
 
 def _sentence(text: str) -> Line:
-    """Parse the numbers of a sentence such as `$FILM,1.5,2.5*3A`, which follow a word that names the sentence.
+    """Parse the numbers of a sentence such as `$FILM,1.5,2.5*3A`, whose first word is a name.
 
-    The sentence may end in `*` and a checksum, the exclusive or of all bytes between `$` and `*`.
+    The sentence may end in `*` and a checksum, which is the exclusive or of all bytes between `$` and `*`.
     """
     content, star, checksum = text[1:].partition("*")
     if star:
         expected_checksum = reduce(xor, content.encode(), 0)
         if len(checksum) != 2 or int(checksum, 16) != expected_checksum:
             raise ValueError(f"expected the checksum of the sentence, got {text[-100:]!r}")
-    _, *cells = _SEPARATOR.split(content.rstrip(",; \t"))
+    _name, *cells = _SEPARATOR.split(content.rstrip(",; \t"))
     if not cells:
         raise ValueError(f"expected numbers after the first word, got {text[:100]!r}")
     return Line(Notation.sentence, (), tuple(map(parse_number, cells)))
@@ -135,7 +135,7 @@ def _teleplot(text: str) -> Line:
     """Parse the latest value of a Teleplot line, `>name:time:value;time:value§unit|flags`.
 
     The time, the unit and the flags may be missing. Lines with texts (flag `t`) or with points of x-y plots (flag `xy`)
-    are no readings.
+    have no values.
     """
     content, _, flags = text[1:].partition("|")
     name, _, values = content.partition(":")
@@ -199,7 +199,10 @@ def _numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, float]]
 
 
 def _fields(frame: Frame) -> list[tuple[str, str]]:
-    """Return names and texts of frame counter, clock and channels. Channels without names are called A, B, C, ..."""
+    """Return the names and the values of the frame counter, the clock and the channels, as text.
+
+    Channels without names are called A, B, C, and so on.
+    """
     fields = []
     if frame.seq is not None:
         fields.append((SEQ, str(frame.seq)))
@@ -235,8 +238,7 @@ TEXT_FORMATS: dict[str, Callable[[Frame], str]] = {
     "teleplot": _write_teleplot,
     "json": _write_json,
 }
-"""Function that writes a frame, for each notation. CSV has only the channels and no header, like the simplest boards.
-"""
+"""Function that writes a frame, by the name of the notation. CSV has only the channels and no header."""
 
 
 def encode_text(frame: Frame, notation: str) -> bytes:

@@ -2,11 +2,11 @@
 
 The stages are, in this order:
 
-1. prediction: the contact that the model predicts, with the flags of its validity;
-2. film: the pretension of the film, followed from touch to touch (section `[follow]` of the device file);
-3. tracking: the contact followed from frame to frame (section `[track]`);
-4. charge scale: larger standard deviations where the charges have a common uncertainty (section `[memory]`);
-5. touch offset: larger standard deviations where touches may have a common offset (section `[touch_offset]`).
+1. prediction: predicts the contact with the model, and adds the flags of the model;
+2. film: follows the pretension of the film from touch to touch (section `[follow]` of the device file);
+3. tracking: follows the contact from frame to frame (section `[track]`);
+4. charge scale: increases the standard deviations if the scale of all charges is uncertain (section `[memory]`);
+5. touch offset: increases the standard deviations if touches may have a common offset (section `[touch_offset]`).
 """
 
 from abc import ABC, abstractmethod
@@ -26,21 +26,24 @@ from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule
 from isocharge.serve.tracking.tracker import Tracker
 
 CHARGE_SCALE_STEP = 0.01
-"""Relative step of all touch charges by which the dependence of contacts on an error of their scale is computed."""
+"""Relative change of all touch charges for the finite difference with respect to their common scale."""
 
 TOUCH_OFFSET_STEP_pC = 1.0
-"""Common offset by which the dependence of contacts on an offset is computed."""
+"""Step of the finite difference with respect to a common offset of the charges, pC."""
 
 LARGEST_FORCE_EXPONENT = 1.5
-"""Largest exponent of the force as a power of all charges together: that of a film without pretension."""
+"""Largest exponent p with which the force is proportional to the p-th power of a common scale of all charges.
+
+A film without pretension has this exponent.
+"""
 
 
 @dataclass(slots=True)
 class CurrentModel:
-    """The model that currently answers, which the stages share.
+    """The current model, which all stages share.
 
     Attributes:
-        predictor: The model that was loaded or, if the film is followed, the model of the film as it is now.
+        predictor: The loaded model. If the film is followed, the model of the film at its estimated pretension.
     """
 
     predictor: Predictor
@@ -48,16 +51,16 @@ class CurrentModel:
 
 @dataclass(slots=True)
 class ContactFrame:
-    """A frame on its way through the stages, which change it in place.
+    """A frame of the stages. The stages change it in place.
 
     Attributes:
         reading: Charges of the frame after the signal chain.
         clock_s: Time of the frame on a clock that does not jump, s.
-        flags: Words of `isocharge.serve.flags`.
+        flags: Flags of `isocharge.serve.flags`.
         contact: The contact; None if nothing touches, or the frame is invalid.
-        film: The followed film; None if the film is not followed.
+        film: State of the followed film; None if the film is not followed.
         tracking: The tracked contact; None if contacts are not tracked.
-        is_mixture_contact: Whether the contact is that of a `ContactMixture` and not that of the model.
+        is_mixture_contact: Whether the contact comes from a `ContactMixture` and not from the model.
         model_charge_pC: Charges for which the current model gives the contact, shape (n_electrode,), pC; None out of
             contact. On a followed film they differ from those of the reading.
     """
@@ -80,7 +83,7 @@ class ContactStage(ABC):
         """Process the next frame in place."""
 
     def reset(self) -> None:  # noqa: B027  # some stages have no state
-        """Discard the contact that is under way, as after an outage or a new tare."""
+        """Discard the present contact, as after an outage or a new tare."""
 
 
 class PredictionStage(ContactStage):
@@ -90,7 +93,7 @@ class PredictionStage(ContactStage):
         """Set the model.
 
         Args:
-            model: The current model. The flags are those of the model at this moment.
+            model: The current model. Its predictor may change later, but the limits of the flags do not.
         """
         self._model = model
         self._validity = model.predictor.validity
@@ -118,7 +121,8 @@ class FilmStage(ContactStage):
         Args:
             model: The current model.
             rule: Settings.
-            warming_ratio: Charge of each electrode over the mean of all when the film warms, shape (n_electrode,).
+            warming_ratio: Charge that warming adds to each electrode, relative to the mean over all electrodes, shape
+                (n_electrode,).
 
         Raises:
             ModelError: If the film of the model cannot be followed.
@@ -127,7 +131,7 @@ class FilmStage(ContactStage):
         self.follower = FilmFollower(model.predictor, rule, warming_ratio)
 
     def step(self, frame: ContactFrame) -> None:
-        """Correct the contact for what is known of the film, and use the frame to follow the film."""
+        """Correct the contact for the estimated film, and update the estimate of the film with the frame."""
         charge_pC = frame.reading.charge_pC
         if frame.contact is not None and charge_pC is not None:
             frame.contact, frame.model_charge_pC = self.follower.follow_contact(frame.contact, charge_pC)
@@ -138,7 +142,7 @@ class FilmStage(ContactStage):
             frame.flags = (*frame.flags, FILM)
 
     def reset(self) -> None:
-        """Discard the touch that is under way; the pretension is kept."""
+        """Discard the present touch. The estimated pretension is kept."""
         self.follower.discard_touch()
 
     def reset_film(self) -> None:
@@ -151,16 +155,16 @@ class TrackingStage(ContactStage):
     """Tracks the contact from frame to frame."""
 
     def __init__(self, tracker: Tracker, predictor: Predictor, *, is_film_followed: bool) -> None:
-        """Set the model of a tracker, which keeps the contact that is under way.
+        """Set the model of a tracker. The tracker keeps its present contact.
 
         Args:
             tracker: The tracker with its state.
-            predictor: The model that was loaded.
-            is_film_followed: Whether the film is followed. The file of charges describes the calibrated film. It is
-                not used in this case, because it would contradict the current model.
+            predictor: The loaded model.
+            is_film_followed: Whether the film is followed. If so, the file of charges is not used, because it describes
+                the calibrated film and not the current film.
 
         Raises:
-            ModelError: If the model's file of charges is damaged.
+            ModelError: If the file of charges of the model is damaged.
         """
         mixture = None
         self._mixture_validity = predictor.validity
@@ -172,7 +176,7 @@ class TrackingStage(ContactStage):
         self._tracker.mixture = mixture
 
     def step(self, frame: ContactFrame) -> None:
-        """Track the contact; where the map folds, the contact of the mixture replaces that of the model."""
+        """Track the contact. If there is a mixture, its contact replaces the contact of the model."""
         tracker = self._tracker
         reading = frame.reading
         tracked, event = tracker.update(frame.contact, frame.clock_s, frame.flags, reading.charge_pC)
@@ -204,13 +208,17 @@ def _add_error(frame: ContactFrame, contact: Contact, shift: tuple[float, float,
 
 
 class ChargeScaleStage(ContactStage):
-    """Increases the standard deviations of a contact where all charges have an uncertain common scale.
+    """Increases the standard deviations of a contact if the common scale of all charges is uncertain.
 
     The scale is uncertain if the memory of the film is not known exactly.
     """
 
     def __init__(self, model: CurrentModel) -> None:
-        """Set the current model, with which the sensitivity of the contact is computed."""
+        """Begin without a sensitivity.
+
+        Args:
+            model: The current model, with which the sensitivity of the contact is computed.
+        """
         self._model = model
         self.reset()
 
@@ -229,9 +237,16 @@ class ChargeScaleStage(ContactStage):
         self._sensitivity_predictor = self._model.predictor
 
     def _shift(self, frame: ContactFrame, contact: Contact) -> tuple[float, float, float] | None:
-        """Return how far one standard deviation of the scale moves x and y, mm, and the force, N; None if not at all.
+        """Return the changes of x and y, mm, and of the force, N, that one standard deviation of the scale causes.
 
         For a contact of the mixture, only the force is assumed to depend on the scale, with the largest exponent.
+
+        Args:
+            frame: The frame.
+            contact: The contact of the frame.
+
+        Returns:
+            The changes; None if the scale is known exactly.
         """
         charge_scale_std = frame.reading.charge_scale_std
         charge_pC = frame.model_charge_pC
@@ -260,8 +275,8 @@ class TouchOffsetRule(Rule, frozen=True, kw_only=True):
 class TouchOffsetStage(ContactStage):
     """Increases the standard deviations of a contact because its touch may have a common offset.
 
-    An offset shifts light presses more than strong ones. A contact of the mixture keeps its standard deviations, since
-    no single model describes it.
+    An offset shifts light presses more than strong presses. A contact of the mixture keeps its standard deviations,
+    because the sensitivity is computed with the model, which does not predict this contact.
     """
 
     def __init__(self, model: CurrentModel, rule: TouchOffsetRule, warming_ratio: Array | float) -> None:
@@ -270,7 +285,8 @@ class TouchOffsetStage(ContactStage):
         Args:
             model: The current model, with which the sensitivity of the contact is computed.
             rule: Settings.
-            warming_ratio: Charge of each electrode over the common offset, shape (n_electrode,), or one number for all.
+            warming_ratio: Charge that the offset adds to each electrode, relative to the common offset, shape
+                (n_electrode,), or one number for all electrodes.
         """
         self._model = model
         self._rule = rule

@@ -58,7 +58,7 @@ MIN_ELECTRODES_FOR_WARMING = 4
 
 
 class Gain(Rule, frozen=True, kw_only=True):
-    """Conversion of the unit of a board to charge. Each setting is a number, or a number for each electrode.
+    """Conversion of the unit of a board to charge. Each setting is one number, or one number for each electrode.
 
     Attributes:
         pC_per_unit: Charge of one unit, pC.

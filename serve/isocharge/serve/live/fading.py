@@ -1,7 +1,6 @@
-"""Why the charges of a held press decrease: the amplifier leaks, or the film creeps.
+"""Cause of a decrease of the charges of a held press: a leak of the amplifier, or creep of the film.
 
-A leak removes equal shares of the charge in equal times. Creep removes equal shares when the time grows by equal
-factors:
+A leak removes the same share of the charge in every second. Creep removes the same share in every decade of time:
 
     leak:   ln Q = a - t / tau
     creep:  ln Q = a + b ln t
@@ -24,8 +23,10 @@ from isocharge.common.arrays import Array
 from isocharge.serve.signal_chain.memory import MAX_CREEP, MemoryRule
 
 MIN_RESIDUAL_RATIO = 9.0
-"""Ratio of the squared residuals of two laws from which the better law is reported. The variations of the force of a
-hand would decide at a smaller ratio."""
+"""Smallest ratio of the squared residuals of two laws with which the better law is reported.
+
+With a smaller ratio, the variations of the force of a hand could determine the result.
+"""
 
 MIN_WINDOWS = 5
 """Smallest number of charges of a press that are compared."""
@@ -38,7 +39,9 @@ UNDECIDED = (
 
 
 class Fading(NamedTuple):
-    """The law by which the charges of a press decrease. All values are at their defaults if no law fits clearly better.
+    """The law by which the charges of a press decrease.
+
+    All values have their defaults if no law fits clearly better than the others.
 
     Attributes:
         tau_s: Time constant of a leak, s.
@@ -62,7 +65,7 @@ class Fading(NamedTuple):
 
     @property
     def remedy(self) -> str:
-        """What the user can do about creep; a part of a sentence."""
+        """Advice to the user on how to deal with creep, as a part of a sentence."""
         if self.memory is None:
             return "wait longer before each reading"
         settings = ", ".join(f"{key} = {value:g}" for key, value in self.memory.items())
@@ -84,8 +87,8 @@ class LineFit(NamedTuple):
 def law_of_fading(sizes: Sequence[tuple[float, float]]) -> Fading:
     """Determine the law by which the charges of a press with a constant force decrease.
 
-    Three laws are fitted and compared by their residuals: a leak, with which ln Q falls linearly with the time; creep,
-    with which ln Q falls linearly with the logarithm of the time; and creep with a thermoelastic step.
+    Three laws are fitted and compared by their residuals. With a leak, ln Q falls linearly with time. With creep, ln Q
+    falls linearly with the logarithm of time. The third law is creep with a thermoelastic step.
 
     Args:
         sizes: Times since the touch, s, and mean magnitudes of the charges at these times, positive, pC.

@@ -30,10 +30,9 @@ BYTES_TO_RECOGNISE = 8192
 class ChannelPicker:
     """Selects the value of each electrode from frames.
 
-    The section `[channels]` of the device file assigns a channel to each electrode, by a name or number of
-    `channel_names`. Without this section, channels are assigned by the names of the electrodes (`A`, `A_pC` or
-    `charge.A`). If the channels have no such names, they are assigned by their order, provided that there are as many
-    channels as electrodes. The assignment is only computed again when the names in a frame change.
+    The section `[channels]` of the device file assigns a channel to each electrode, by its name or its number. Without
+    this section, channels are assigned by the names of the electrodes (`A`, `A_pC` or `charge.A`). If the channels have
+    no such names, they are assigned by their order, provided that there are as many channels as electrodes.
     """
 
     def __init__(
@@ -74,7 +73,7 @@ class ChannelPicker:
     def _look_up(self, frame: Frame) -> tuple[int, ...]:
         """Return the position of each electrode's channel among the values of a frame.
 
-        The channels are assigned by the device file, otherwise by their names, otherwise by their order.
+        The class describes how the channels are assigned.
 
         Raises:
             ChargeError: If the device file assigns no channels, the names differ, and the number of values is wrong.
@@ -151,7 +150,7 @@ class TimedReading(NamedTuple):
 
 
 class ReadingStream:
-    """The path from chunks to readings, with its state; belongs to one thread.
+    """The path from chunks to readings, with its state. An object belongs to one thread.
 
     Attributes:
         parser: Parser of the frames, with its counters.
@@ -197,7 +196,7 @@ class ReadingStream:
 
     @property
     def warming_ratio(self) -> Array | float:
-        """Charge of each electrode over the mean magnitude of all when the film warms, shape (n_electrode,)."""
+        """Charge that warming adds to each electrode, relative to the mean magnitude of all, shape (n_electrode,)."""
         return self._settings.pyro
 
     def _new_chain(self) -> SignalChain:
@@ -209,7 +208,7 @@ class ReadingStream:
         self._chain.reset_tare()
 
     def restart(self) -> None:
-        """Begin as a new stream does: discard the format, the frame numbers, the clock, the tare and all counters."""
+        """Return to the initial state: discard the format, the frame numbers, the clock, the tare and all counters."""
         self.parser = self._device.parser()
         self.gaps = SequenceGaps()
         self.clock = DeviceClock()
@@ -230,7 +229,7 @@ class ReadingStream:
         self.arrived(frames, chunk)
 
     def frames(self, chunk: Chunk) -> list[Frame]:
-        """Return the frames that end in a chunk. After an outage, start over before."""
+        """Return the frames that end in a chunk. If the chunk follows an outage, discard the earlier state first."""
         if chunk.outage_s > 0.0:
             self._reconnect()
         return self.parser.feed(chunk.data)
@@ -244,7 +243,7 @@ class ReadingStream:
 
         Raises:
             ChargeError: If the frame has no value for an electrode.
-            TareError: If the film is not left alone for long enough to tare.
+            TareError: If the film is touched during the whole search for a tare.
         """
         time_of_reading = self.clock.read(frame.t_us, self.parser.t_us_modulus, chunk.timestamp)
         flags = self._pending_flags + self.gaps.update(frame.seq, self.parser.seq_modulus)
@@ -291,7 +290,7 @@ class ReadingStream:
         _check_recognised(self.parser, max_bytes=-1)
 
     def _reconnect(self) -> None:
-        """Start over after an outage, because frames are missing and the film may have been touched meanwhile."""
+        """Discard the state after an outage. Frames are missing, and the film may have been touched meanwhile."""
         self.parser.reset()
         self.gaps.reset()
         self.clock.reset()

@@ -25,9 +25,10 @@ log = logging.getLogger(__name__)
 
 
 class RecordedStream:
-    """A touch stream that writes its chunks and records to a recording; belongs to one thread.
+    """A touch stream that writes its chunks and records to a recording.
 
-    The methods `request_...` may be called from any thread. The requests are executed before the next chunk.
+    An object belongs to one thread. Only the methods `request_...` may be called from any thread. The requests are
+    executed before the next chunk.
 
     Attributes:
         recorder: The recording that is being written; None if there is none.
@@ -63,10 +64,10 @@ class RecordedStream:
         self._requests.append(self._reset_film)
 
     def request_recording(self, recorder: Recorder | None) -> None:
-        """Request to end the present recording and to begin another one.
+        """Request to end the present recording and to begin another recording.
 
-        The request replaces an earlier request that has not been executed yet. The stream is restarted, including its
-        tare, when a recording begins, because a replay only has the bytes of the recording.
+        The request replaces an earlier request that has not been executed yet. When a recording begins, the stream is
+        restarted and the tare is measured again, because a replay only has the bytes of the recording.
 
         Args:
             recorder: The next recording, which the stream opens and closes; None for no recording.
@@ -79,10 +80,10 @@ class RecordedStream:
         self._requests.append(partial(self._mark, marker))
 
     def request_model(self, load: Load) -> None:
-        """Request another model, which is loaded in the background and used from the next chunk after that.
+        """Request another model, which is loaded in the background.
 
-        If the model cannot be loaded, or has other electrodes, an error is logged and the present model is kept. The
-        method may also be called from a signal handler.
+        The model is used from the next chunk after it is loaded. If it cannot be loaded, or has other electrodes, an
+        error is logged and the present model is kept. The method may also be called from a signal handler.
 
         Args:
             load: Function that loads the model.
@@ -93,18 +94,21 @@ class RecordedStream:
         """Yield the records until the chunks end.
 
         Requests are executed before each chunk. A chunk is recorded after its last record has been yielded. Close the
-        generator before the recorder. The present chunk is then recorded, too, even if the program is interrupted.
+        generator before the recorder, so that the present chunk is also recorded, even if the program is interrupted.
 
         Args:
             chunks: Chunks of a port or of a file.
 
         Raises:
-            As `isocharge.serve.live.stream.stream`.
+            ChargeError: If a frame has another number of charges than the model.
+            TareError: If the film is touched during the whole search for a tare.
+            PortError: If the bytes contain no frames.
+            PortLost: If the port disappears.
         """
         try:
             for chunk in chunks:
                 if self._load_requested or self._loading:
-                    self._take_model()
+                    self._continue_loading()
                 while self._requests:
                     execute_request = self._requests.popleft()
                     execute_request()
@@ -158,8 +162,8 @@ class RecordedStream:
         if self.recorder is not None:
             self.recorder.mark(marker)
 
-    def _take_model(self) -> None:
-        """Use a model that has been loaded, and begin to load the next one that was requested."""
+    def _continue_loading(self) -> None:
+        """Use the requested model if it has been loaded, and begin to load the next requested model."""
         if self._loading is not None and self._loading.done():
             self._use(self._loading)
             self._loading = None
@@ -171,7 +175,7 @@ class RecordedStream:
             loader.shutdown(wait=False)
 
     def _use(self, loaded: "Future[Predictor]") -> None:
-        """Continue with a loaded model. If that fails, log an error and continue with the present model.
+        """Use a loaded model from now on. If that fails, log an error and continue with the present model.
 
         Args:
             loaded: Result of the thread that has loaded the model.
@@ -191,13 +195,13 @@ class RecordedStream:
         log.warning("%s serves from now on, after %s", new_label, present_label)
 
     def _tare(self) -> None:
-        """Measure the tare again, and record that."""
+        """Measure the tare again, and record the request."""
         self._stream.tare()
         if self.recorder is not None:
             self.recorder.tare()
 
     def _reset_film(self) -> None:
-        """Reset the followed film to its calibration, and record the reset."""
+        """Reset the followed film to its calibration, and record the request."""
         self._stream.reset_film()
         if self.recorder is not None:
             self.recorder.back()
@@ -214,15 +218,15 @@ def replay(
 ) -> Iterator[PredictionRecord]:
     """Compute the records of a recording again, and yield them.
 
-    Of each chunk, as many records are yielded as were used when the recording was made.
+    For each chunk, as many records are yielded as were used when the recording was made.
 
     Args:
         recording: The recording.
         stream: A new stream with the same model, device and policy, whose `now_ns` is `clock`.
         clock: The clock of the replay.
         real_time: Whether to wait between two chunks for the time that had passed in the recording.
-        load: Function that loads a model by its label, for recordings in which the model changes. None keeps the first
-            model.
+        load: Function that loads a model by its label, for recordings in which the model changes. If None, the first
+            model computes all records.
         on_marker: Function that is called with each marker, between the records before and after it.
 
     Raises:

@@ -35,11 +35,13 @@ MIN_REST_FRAMES = 3
 """Smallest number of frames at rest before a touch."""
 
 MAX_SCATTER_RATIO = 2.0
-"""Scatter of a window, relative to the calmest window of the press, above which the probe is leaving the film."""
+"""Largest scatter of a window, relative to the calmest window of the press. A larger scatter shows a jerk."""
 
 MAX_SLOPE_DIFFERENCE = 0.3
-"""Largest deviation of a charge's relative slope from the mean slope, relative to the mean slope, for which all charges
-are said to change equally."""
+"""Largest deviation of the relative slope of a charge from the mean slope, relative to the mean slope.
+
+If no deviation is larger, all charges change in proportion.
+"""
 
 MIN_CHARGE_pC = 1e-9
 """Smallest charge by which a drift is divided, pC."""
@@ -117,7 +119,7 @@ class WatchResult(NamedTuple):
         charge_pC: Touch charges of this reading minus the rest before, shape (n_electrode,), pC; None without a tare.
         held_s: Time since the touch, s; 0 if nothing touches.
         reason: Why a press is refused, or is not yet steady; a part of a sentence.
-        press: The press that is taken.
+        press: The press, if it was accepted with this reading; otherwise None.
     """
 
     phase: Phase
@@ -142,7 +144,7 @@ class WindowFrame(NamedTuple):
 
 
 class PressWatch:
-    """Finds one steady press in each touch; belongs to one thread."""
+    """Finds one steady press in each touch. An object belongs to one thread."""
 
     def __init__(self, electrodes: tuple[str, ...], rule: SteadyRule | None = None) -> None:
         """Begin to wait for a tare.
@@ -166,7 +168,7 @@ class PressWatch:
         self._sizes: list[tuple[float, float]] = []
 
     def arm(self) -> None:
-        """Ignore the press that is under way, and take only the next one."""
+        """Ignore the present press, and accept only the next press."""
         if self._phase is Phase.settling:
             self._phase = Phase.lift
 
@@ -315,7 +317,7 @@ class PressWatch:
         charge_pC = np.array(charges)  # shape (frames, n_electrode)
         window_s = float(end_s - begin_s)
 
-        # Least squares: with centred times, the slope is independent of the mean.
+        # Least squares with centred times, so that the slope is independent of the mean.
         centred_s = times_s - times_s.mean()
         slope_pC_per_s = centred_s @ charge_pC / max(float(centred_s @ centred_s), 1e-30)
         mean_pC = charge_pC.mean(axis=0)

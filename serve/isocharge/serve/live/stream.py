@@ -56,7 +56,10 @@ class StreamCounts:
 
 
 class StreamTotals(NamedTuple):
-    """All counts of a stream since it began, also before a restart; see `FrameCounts` and `SequenceGaps`."""
+    """All counts of a stream since it began, including the counts before a restart.
+
+    The counts have the same meanings as in `FrameCounts` and `SequenceGaps`.
+    """
 
     frames: int = 0
     lost: int = 0
@@ -101,15 +104,15 @@ def stream(
 
 
 class TouchStream:
-    """The path from chunks to records, with its state; belongs to one thread.
+    """The path from chunks to records, with its state. An object belongs to one thread.
 
     Attributes:
         parser: Parser of the frames, with its counters.
         gaps: Counter of missing frame numbers.
         clock: Clock of the device.
         counts: Records, skipped frames and outages.
-        predictor: The model as it was loaded. If the film is followed, `answering_predictor` is the model of the film
-            as it is now.
+        predictor: The loaded model. If the film is followed, `answering_predictor` is the model of the film at its
+            estimated pretension.
         frame_id: Name of the film in the records.
     """
 
@@ -134,7 +137,7 @@ class TouchStream:
             parser: Parser of the frames; by default that of the device.
             gaps: Counter of missing frame numbers; by default a new one.
             policy: Which frames have a record.
-            now_ns: The clock of `Chunk.clock_ns`, for latencies.
+            now_ns: Function that returns the time of the clock of `Chunk.clock_ns`, ns, for latencies.
             frame_id: Name of this film in its records; by default that of the model's sensor.
 
         Raises:
@@ -235,7 +238,7 @@ class TouchStream:
             self._film_stage.reset_film()
 
     def _discard_contact(self) -> None:
-        """Discard the contact that is under way."""
+        """Discard the present contact."""
         for stage in self._stages:
             stage.reset()
 
@@ -265,13 +268,16 @@ class TouchStream:
             bytes_dropped=counts.bytes_dropped,
             resyncs=counts.resyncs,
         )
-        return StreamTotals(*map(sum, zip(self._before_restart, since_restart, strict=True)))
+        pairs = zip(self._before_restart, since_restart, strict=True)
+        return StreamTotals(*(before + since for before, since in pairs))
 
     def feed(self, chunk: Chunk) -> Iterator[PredictionRecord]:
         """Yield the records of the frames that end in this chunk.
 
         Raises:
-            As `stream`.
+            ChargeError: If a frame has another number of charges than the model.
+            TareError: If the film is touched during the whole search for a tare.
+            PortError: If the bytes contain no frames.
         """
         if chunk.outage_s > 0.0:
             self.counts.outages += 1
@@ -300,7 +306,7 @@ class TouchStream:
         self._readings.finish()
 
     def _record(self, chunk: Chunk, frame: Frame, timed: TimedReading) -> PredictionRecord:
-        """Return the record of a frame. Its latency is measured after everything else has been computed.
+        """Return the record of a frame. The latency is measured last, after the contact has been computed.
 
         Args:
             chunk: The chunk in which the frame ends.
@@ -356,6 +362,11 @@ def _contact_fields(frame: ContactFrame) -> Mapping[str, Any]:
 
 
 def _with_lasting_flags(reading: Reading, skipped_flags: set[str]) -> Reading:
-    """Return a reading with those flags of skipped frames that describe events before it, such as lost frames."""
-    earlier = tuple(flag for flag in LASTING_FLAGS if flag in skipped_flags and flag not in reading.flags)
-    return reading._replace(flags=earlier + reading.flags)
+    """Add those flags of skipped frames to a reading that describe earlier events, such as lost frames.
+
+    Args:
+        reading: The reading.
+        skipped_flags: All flags of the skipped frames.
+    """
+    added_flags = tuple(flag for flag in LASTING_FLAGS if flag in skipped_flags and flag not in reading.flags)
+    return reading._replace(flags=added_flags + reading.flags)

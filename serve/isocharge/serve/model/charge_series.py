@@ -1,12 +1,12 @@
 """Charges of a film as a Chebyshev series in position and force, and the file `charges.npz` that stores the series.
 
-A network maps charges to a contact. Where several contacts give the same charges (a fold of the forward map), that
-mapping is not unique, and the tracker compares the measured charges with this series instead:
+A network maps charges to a contact. If several contacts give the same charges (a fold of the forward map), a network
+cannot distinguish them. The tracker then compares the measured charges with this series:
 
     ln Q_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
 
 where T_i are Chebyshev polynomials, r is the largest distance of a contact from the centre, and l is the logarithm of
-the force, scaled to [-1, 1]. The file lies beside `model.onnx` and holds three arrays:
+the force, scaled to [-1, 1]. The file is in the same folder as `model.onnx` and contains three arrays:
 
     series      c, shape (degree + 1, degree + 1, force_degree + 1, n_electrode)
     radius_mm   r
@@ -97,10 +97,9 @@ class ChargeSeries:
 
         unit_force = unit_contact[:, 2:]
         distance_from_range = unit_force - np.clip(unit_force, -1.0, 1.0)  # 0 within the range of forces
-        charge = np.exp(log_charge + distance_from_range * log_force_slope)
-        # d Q = Q d(ln Q)
-        slopes = charge[:, :, None] * log_slopes.swapaxes(1, 2) / scale
-        return charge, slopes
+        charge_pC = np.exp(log_charge + distance_from_range * log_force_slope)
+        jacobian = charge_pC[:, :, None] * log_slopes.swapaxes(1, 2) / scale  # because dQ = Q d(ln Q)
+        return charge_pC, jacobian
 
     def to_bytes(self) -> bytes:
         """Return the content of the file `charges.npz`."""
@@ -132,7 +131,7 @@ def read_charges(version_folder: Path, n_electrode: int) -> ChargeSeries | None:
 
 
 def _charge_series(arrays: Mapping[str, np.ndarray], n_electrode: int) -> ChargeSeries:
-    """Return the series of the charges that the arrays of a file contain.
+    """Create the series of the charges from the arrays of a file, and check it.
 
     Args:
         arrays: Arrays of the file by name.

@@ -1,8 +1,8 @@
 """Files that belong to one `model.onnx` and lie beside it, such as `charges.npz`.
 
-`golden.json` holds the checksum of each companion file. A companion file of another model has the right format, but
-would give wrong contacts. Therefore a file with another checksum, or without a checksum, is refused. Models that were
-written before companion files had checksums are still read, with a warning in the log.
+`golden.json` contains the checksum of each companion file. A companion file of another model has the right format, but
+would give wrong contacts. A file whose checksum differs or is missing is therefore refused. Models that were written
+before companion files had checksums are still read, with a warning in the log.
 """
 
 import logging
@@ -41,7 +41,6 @@ def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
     if actual_sha256 != expected_sha256:
         raise ModelError(
             f"{path}: expected sha256 {expected_sha256:.12} (golden.json), got {actual_sha256:.12}; the file is "
-            "damaged or belongs "
-            f"to another model: copy the whole folder of the model again, or {advice}"
+            f"damaged or belongs to another model: copy the whole folder of the model again, or {advice}"
         )
     return data

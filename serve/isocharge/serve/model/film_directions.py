@@ -1,17 +1,17 @@
-"""The file `film_directions.npz` beside a calibrated model: unknowns of the film besides its pretension.
+"""The file `film_directions.npz` of a calibrated model: unknowns of the film other than its pretension.
 
-A calibration leaves a joint uncertainty of the parameters of the film, its imperfections, its discrepancy and its
-gains. The misfits of touches can only identify a few combinations of them, the directions. Along each direction the
-charges of a contact change by a relative amount that depends on the contact:
+After a calibration, the parameters of the film, its imperfections, its discrepancy and its gains have a joint
+uncertainty. The misfits of touches identify only a few linear combinations of these unknowns, the directions. A change
+along a direction changes the charges of a contact by a relative amount that depends on the contact:
 
     ln Q_e = ln Q_e(calibrated film) + sum over k of z_k s_ke(x, y, F),
 
 where the z_k are independent and have the standard deviation 1 at a given pretension. The s_ke are Chebyshev series, as
-in `charge_series`. The file holds these arrays:
+in `charge_series`. The file contains these arrays:
 
     series             coefficients of s, shape (degree + 1, degree + 1, force_degree + 1, n_direction, n_electrode)
-    radius_mm          largest distance of a contact from the centre
-    force_N            smallest and largest force
+    radius_mm          largest distance of a contact from the centre, mm
+    force_N            smallest and largest force, N
     by_pretension      change of the mean of each z_k with the pretension, shape (n_direction,), 1/MPa
 """
 
@@ -34,7 +34,7 @@ FILE = "film_directions.npz"
 """Name of the file in a version folder."""
 
 ADVICE = "copy the model's folder again, or calibrate again"
-"""What the user can do about a damaged file, for error messages."""
+"""Advice to the user if a file is damaged, for error messages."""
 
 MAX_DIRECTIONS = 40
 """Largest number of directions in a file; `isocharge train calibrate` writes about ten."""
@@ -43,7 +43,7 @@ MAX_DEGREE = 30
 """Largest degree of the series in a file."""
 
 MAX_LOG_CHANGE = 10.0
-"""Largest change of ln Q by one unit of a direction; calibrated films have changes below 0.5."""
+"""Largest change of ln Q by one unit of a direction. The changes of calibrated films are below 0.5."""
 
 MAX_CHANGE_WITH_PRETENSION = 1e3
 """Largest change of the mean of a direction with the pretension, 1/MPa."""
@@ -69,7 +69,8 @@ class FilmDirections:
     @classmethod
     def none(cls, n_electrode: int) -> "FilmDirections":
         """Return an empty set of directions, for a model that was calibrated by an earlier version."""
-        return cls(np.zeros((1, 1, 1, 0, n_electrode)), 1.0, (1.0, 2.0), np.zeros(0))
+        no_coefficients = np.zeros((1, 1, 1, 0, n_electrode))
+        return cls(no_coefficients, radius_mm=1.0, force_N=(1.0, 2.0), by_pretension=np.zeros(0))
 
     @property
     def count(self) -> int:
@@ -78,30 +79,34 @@ class FilmDirections:
 
     @cached_property
     def _series(self) -> Series:
+        """Series of all directions and electrodes, which are combined in one axis."""
         return Series(self.coefficients.reshape(*self.coefficients.shape[:3], -1))
 
     def log_changes(self, contact: Array) -> Array:
         """Compute the changes of ln Q by one unit of each direction.
 
-        A contact outside the radius or the range of forces has the values of the nearest contact inside.
+        A contact outside the radius or the range of forces is replaced by the nearest contact inside.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Shape (n, n_direction, n_electrode), dimensionless.
+            Changes, shape (n, n_direction, n_electrode), dimensionless.
         """
         *_, n_direction, n_electrode = self.coefficients.shape
         if n_direction == 0:
             return np.zeros((len(contact), 0, n_electrode))
-        log_low, log_high = np.log(self.force_N)
+
+        # The series is a function of coordinates between -1 and 1.
+        min_log_force, max_log_force = np.log(self.force_N)
         log_force = np.log(np.clip(contact[:, 2], *self.force_N))
-        unit_force = (2.0 * log_force - log_low - log_high) / (log_high - log_low)
+        unit_force = (2.0 * log_force - min_log_force - max_log_force) / (max_log_force - min_log_force)
         distance_mm = np.hypot(contact[:, 0], contact[:, 1])
-        place = contact[:, :2] / np.maximum(distance_mm, self.radius_mm)[:, None]
-        unit = np.column_stack([place, unit_force])
-        values = self._series.values(unit)[:, 0]
-        return np.asarray(values.reshape(len(contact), n_direction, n_electrode))
+        unit_position = contact[:, :2] / np.maximum(distance_mm, self.radius_mm)[:, None]
+        unit_contact = np.column_stack([unit_position, unit_force])
+
+        log_changes = self._series.values(unit_contact)[:, 0]  # without the derivatives, which follow in this axis
+        return np.asarray(log_changes.reshape(len(contact), n_direction, n_electrode))
 
     def to_bytes(self) -> bytes:
         """Return the content of the file."""
@@ -139,7 +144,15 @@ def read_film_directions(version_folder: Path, n_electrode: int) -> FilmDirectio
 
 
 def _film_directions(arrays: Mapping[str, np.ndarray], n_electrode: int) -> FilmDirections:
-    """Return what the arrays of a file describe; raise ValueError if they do not fit together."""
+    """Create the directions from the arrays of a file, and check them.
+
+    Args:
+        arrays: Arrays of the file by name.
+        n_electrode: Number of electrodes of the model.
+
+    Raises:
+        ValueError: If an array is missing or not valid, or the arrays do not fit together.
+    """
     coefficients = finite_array(arrays, "series", (None, None, None, None, n_electrode))
     n_x, n_y, n_force, n_direction, _ = coefficients.shape
     if n_x != n_y or max(n_x, n_force) > MAX_DEGREE + 1 or n_direction > MAX_DIRECTIONS:
@@ -147,14 +160,15 @@ def _film_directions(arrays: Mapping[str, np.ndarray], n_electrode: int) -> Film
             f"series: expected equal degrees in x and y, degrees up to {MAX_DEGREE} and up to {MAX_DIRECTIONS} "
             f"directions, got the shape {coefficients.shape}"
         )
-    largest = float(np.abs(coefficients).sum(axis=(0, 1, 2)).max(initial=0.0))
-    if largest > MAX_LOG_CHANGE:
-        raise ValueError(f"series: expected changes of ln Q up to {MAX_LOG_CHANGE:g}, got up to {largest:g}")
+    # A Chebyshev polynomial is at most 1, so the sum of the coefficients is the largest possible value of a series.
+    largest_log_change = float(np.abs(coefficients).sum(axis=(0, 1, 2)).max(initial=0.0))
+    if largest_log_change > MAX_LOG_CHANGE:
+        raise ValueError(f"series: expected changes of ln Q up to {MAX_LOG_CHANGE:g}, got up to {largest_log_change:g}")
     by_pretension = finite_array(arrays, "by_pretension", (n_direction,))
-    largest = float(np.abs(by_pretension).max(initial=0.0))
-    if largest > MAX_CHANGE_WITH_PRETENSION:
+    largest_change = float(np.abs(by_pretension).max(initial=0.0))
+    if largest_change > MAX_CHANGE_WITH_PRETENSION:
         raise ValueError(
-            f"by_pretension: expected changes up to {MAX_CHANGE_WITH_PRETENSION:g} per MPa, got {largest:g}"
+            f"by_pretension: expected changes up to {MAX_CHANGE_WITH_PRETENSION:g} per MPa, got {largest_change:g}"
         )
     radius_mm, force_N = read_contact_range(arrays)
     return FilmDirections(coefficients, radius_mm, force_N, by_pretension)

@@ -1,7 +1,8 @@
 """Golden vectors of a model: input charges and the outputs that the model computed at the time of export.
 
 The checksum shows whether `model.onnx` is still the released file. The outputs show whether another machine or another
-version of onnxruntime computes the same results: |a - b| <= 1e-5 max(|b|, floor).
+version of onnxruntime computes the same results. A computed output a and a stored output b are the same if
+|a - b| <= 1e-5 max(|b|, floor).
 """
 
 import json
@@ -28,25 +29,25 @@ RELATIVE_TOLERANCE = 1e-5
 FLOORS = {
     "contact": (1.0, 1.0, 0.1),  # mm, mm, N
     "contact_std": (1.0, 1.0, 0.1),
-    # A correlation is the cosine of a sum whose terms nearly cancel: runtimes differ by 1e-4.
+    # A correlation is computed from terms that nearly cancel. Versions of onnxruntime differ by 1e-4.
     CORRELATION: (10.0, 10.0, 10.0),
-    # The misfit is the sinh of a norm whose terms cancel near zero: runtimes differ by 1e-4 in float32.
+    # Near zero, the misfit is computed from terms that nearly cancel. Versions of onnxruntime differ by 1e-4.
     "misfit": (20.0,),
 }
 """Floor for each column of an output, in the unit of the column. Below it, differences are compared absolutely."""
 
 REFERENCE_RADIUS_MM = 20.0
-"""Radius of the working area up to which the floors of x and y hold, mm. For a larger area they grow in proportion."""
+"""Radius of the working area up to which the floors of x and y are constant, mm. Above it, they grow in proportion."""
 
 REFERENCE_FORCE_N = 2.0
-"""Largest force up to which the floor of the force holds, N. For larger forces it grows in proportion."""
+"""Largest force up to which the floor of the force is constant, N. Above it, the floor grows in proportion."""
 
 
 def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
     """Return the floors of x and y, mm, and of the force, N, for the outputs `contact` and `contact_std` of a model.
 
     The tolerance of an output is relative to the larger of its absolute value and its floor. The floors of the position
-    grow with the working area and with the position error of the model, the floor of the force grows with the largest
+    grow with the working area and with the position error of the model. The floor of the force grows with the largest
     force.
     """
     x_floor_mm, y_floor_mm, force_floor_N = FLOORS["contact"]

@@ -31,14 +31,14 @@ NoiseLevel = Annotated[
 
 
 class ModelNoise(Struct, frozen=True, kw_only=True):
-    """The noise of the charges that a model was trained for.
+    """The noise that was added to the charges in the training of a model.
 
-    The standard deviation of a charge q is the root of `white_pC`^2 + (`gain` * q)^2.
+    The variance of a charge q is `white_pC`^2 + (`gain` * q)^2.
 
     Attributes:
         name: Name of the noise model.
-        white_pC: Standard deviation that does not depend on the charge, pC.
-        gain: Standard deviation in proportion to the charge, dimensionless.
+        white_pC: Standard deviation of the part that does not depend on the charge, pC.
+        gain: Standard deviation of the part that is proportional to the charge, relative to the charge.
     """
 
     name: Text
@@ -61,7 +61,7 @@ Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class UnnoticedPresses(Struct, frozen=True, kw_only=True):
-    """Presses outside the working area that a model answers wrongly without a flag, by place.
+    """Shares of presses outside the working area whose contact is wrong although the model reports no flag.
 
     The film between two circles about the origin is divided into rings of equal width, and each ring into equal
     sectors. The first sector begins at the x axis, and the others follow anticlockwise.
@@ -134,8 +134,8 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         format_version: Version of the format of the metadata.
         yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if that force is above
             the range of forces, or unknown.
-        unnoticed: Presses outside the working area that the model answers wrongly without a flag. None if they were not
-            measured.
+        unnoticed: Shares of presses outside the working area whose contact is wrong without a flag. None if they were
+            not measured.
     """
 
     name: ModelName

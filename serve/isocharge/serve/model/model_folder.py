@@ -47,9 +47,9 @@ def find_model(model: str | Path, models: Path | None = None) -> Path:
 
     Args:
         model: A name (`three-25um-biaxial` for the highest version, or `three-25um-biaxial/1`), or the path of a model
-            folder, of a version folder, or of a `model.onnx`. A Path object, and a text that begins with `.` or `/` or
-            ends in `.onnx`, is always taken as a path. Any other text is taken as a path only if no model has this
-            name.
+            folder, of a version folder, or of a `model.onnx`. A Path object is always a path. A text that begins with
+            `.` or `/` or ends in `.onnx` is also always a path. Any other text is used as a path only if no model has
+            this name.
         models: Repository in which names are looked up first.
 
     Raises:
@@ -71,8 +71,8 @@ def find_model(model: str | Path, models: Path | None = None) -> Path:
 def find_labelled_model(label: str, models: Path | None = None) -> Path:
     """Find the version folder of a model by a label, `NAME/VERSION`, that was read from a file.
 
-    Unlike `find_model`, this function searches only the repositories and never takes the label as a path, because the
-    file may come from an untrusted source.
+    Unlike `find_model`, this function searches only the repositories. The label is never used as a path, because the
+    file that contains it may come from an untrusted source.
 
     Args:
         label: The label, for example the one in a recording.
@@ -96,7 +96,7 @@ def repositories(models: Path | None = None) -> list[Path]:
     """Return the folders in which the names of models are looked up, in the order of the search.
 
     Args:
-        models: Repository that is searched first. The other folders need not exist.
+        models: Repository that is searched first. It must exist; the other folders need not exist.
 
     Raises:
         ModelError: If `models` is given and is not a folder.
@@ -125,7 +125,14 @@ def _released_models() -> Path:
 
 
 def _version_folder(path: Path) -> Path | None:
-    """Return the version folder that a path stands for: its highest version if the path is a model folder."""
+    """Return the version folder for a path, which is the folder of the highest version if the path is a model folder.
+
+    Args:
+        path: Path of a model folder, of a version folder, or of a `model.onnx`.
+
+    Returns:
+        The version folder; None if the path is none of these.
+    """
     if path.name == "model.onnx" and path.is_file():
         return path.parent
     if (path / "model.onnx").is_file():
@@ -143,6 +150,7 @@ def version_folders(folder: Path) -> dict[int, Path]:
 
 
 def _versions(folder: Path) -> list[int]:
+    """Return the versions in a model folder, in any order."""
     return [int(entry.name) for entry in _subfolders(folder) if VERSION.fullmatch(entry.name)]
 
 
@@ -264,9 +272,12 @@ def check_golden(model: Model) -> None:
 def load_checked_model(folder: Path) -> Model:
     """Read a model, and check that this machine computes its golden vectors.
 
+    Args:
+        folder: The version folder, as `find_model` returns it.
+
     Raises:
-        ModelError: If `load_model` or `check_golden` raises it, or the folder is named after another version than the
-            metadata.
+        ModelError: If a file is missing or damaged, if an output differs from the golden vectors, or if the version in
+            the name of the folder differs from the version in the metadata.
     """
     model = load_model(folder)
     if folder.name.isdecimal() and folder.name != str(model.metadata.version):
@@ -291,7 +302,7 @@ def write_model(
     Args:
         folder: The model's folder. It has the model's name and may already contain other versions.
         onnx_model: Content of `model.onnx`, with `metadata.to_props()` in its metadata_props.
-        metadata: The same metadata.
+        metadata: The metadata of the model.
         golden_charge_pC: Input charges of the golden vectors, shape (n, electrodes), pC.
         card: Text of the model card.
         companion_files: Contents of companion files for the version folder, by file name. Their checksums are stored in
@@ -333,18 +344,20 @@ def _write_triton_config(path: Path, metadata: ModelMetadata, *, has_correlation
     Args:
         path: The file, which may exist already.
         metadata: Metadata of the new version.
-        has_correlation: Whether the new version computes correlations. They are left out if an existing file does not
-            list them, because an older version then does not compute them.
+        has_correlation: Whether the new version computes correlations. The output of the correlations is not listed if
+            an existing file does not list it, because an older version then does not compute correlations.
     """
     n_electrode = len(metadata.electrodes)
     config_without_correlation = triton_config(metadata.name, n_electrode, correlation=False)
-    older_has_correlation = not path.exists() or path.read_text(encoding="utf-8") != config_without_correlation
-    correlation = has_correlation and older_has_correlation
+    older_lacks_correlation = path.exists() and path.read_text(encoding="utf-8") == config_without_correlation
+    correlation = has_correlation and not older_lacks_correlation
     write_whole(path, triton_config(metadata.name, n_electrode, correlation=correlation).encode())
 
 
 def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Path:
-    """Check that a model version can be written, and return its folder. Training does this before it starts.
+    """Check that a version of a model can be written, and return its folder.
+
+    A training calls this function before it starts, so that it does not fail at its end.
 
     Args:
         folder: The model's folder, which has the name of the model.
@@ -395,7 +408,7 @@ def _check_triton_config(path: Path, name: str, electrodes: tuple[str, ...]) -> 
 
 
 def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
-    """Load a new version like a user, check it, and compare its metadata with the expected metadata.
+    """Check a new version in the same way as a reader, and compare its metadata with the expected metadata.
 
     Args:
         draft: Folder with the files of the new version.

@@ -1,12 +1,12 @@
-"""The file `pretensions.npz` beside a calibrated model: the network's weights at several pretensions of the film.
+"""The file `pretensions.npz` of a calibrated model: the weights of its network at several pretensions of the film.
 
     about                JSON: the numbers of `Pretensions`, and the names of the weights in the order of the layers
-    node_MPa             pretensions at which the weights are given, that of the calibration among them
+    node_MPa             pretensions at which the weights are given, including the pretension of the calibration
     typical_pC           charges by which the charges are divided before the logarithm
-    <constant>           values of the graph's constant of this name at each of these pretensions
+    <constant>           values of the constant of the graph with this name, at each of these pretensions
 
-Between these pretensions the weights are interpolated by a polynomial. The graph `model.onnx` stays the same for every
-pretension: onnxruntime gets other constants, so a prediction takes as long as before.
+Between these pretensions, the weights are interpolated by a polynomial. All pretensions use the same graph,
+`model.onnx`, with other constants. A prediction therefore takes the same time at every pretension.
 """
 
 import io
@@ -32,7 +32,7 @@ FILE = "pretensions.npz"
 """Name of the file in a version folder."""
 
 FORMAT = 1
-"""Version of the file's format."""
+"""Version of the format of the file."""
 
 MAX_CONSTANTS = 100
 """Largest number of weight arrays."""
@@ -44,7 +44,7 @@ MAX_PRETENSION_MPa = 50.0
 """Largest pretension, MPa; PVDF yields at about 45 MPa."""
 
 MAX_WEIGHT = 1e6
-"""Largest absolute value of a weight; those of trained networks are below 100."""
+"""Largest absolute value of a weight. The weights of trained networks are below 100."""
 
 CALIBRATION_ADVICE = (
     "a film is followed from a model that `isocharge train calibrate` made of presses on it, with four electrodes "
@@ -56,10 +56,10 @@ CHECKED_PRETENSIONS = 50
 """Number of pretensions at which the misfits of a file are checked to be finite."""
 
 MIN_NODE_DISTANCE_MPa = 1e-3
-"""Smallest distance of two pretensions, MPa, between which the interpolation is well conditioned."""
+"""Smallest distance of two pretensions for which the interpolation is well conditioned, MPa."""
 
 MIN_LENGTH = 1e-12
-"""Length below which a misfit vector counts as having this length, so that no division by zero occurs."""
+"""Smallest length of a misfit vector. It prevents a division by zero."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,19 +67,19 @@ class Pretensions:
     """The network of one film at every pretension of a range.
 
     Attributes:
-        node_MPa: Pretensions at which the weights are given, shape (k,), rising.
-        calibrated_MPa: Pretension that the calibration found; one of `node_MPa`.
-        std_MPa: Standard deviation of the pretension when a stream begins: the uncertainty of the calibration and of
-            the drift since then.
-        floor_MPa: Standard deviation of the pretension that many touches estimate, caused by errors of the film's other
-            parameters.
+        node_MPa: Pretensions at which the weights are given, shape (k,), MPa, in ascending order.
+        calibrated_MPa: Pretension that the calibration estimated, MPa; one of `node_MPa`.
+        std_MPa: Standard deviation of the pretension when a stream begins, MPa. It includes the uncertainty of the
+            calibration and of the drift since then.
+        floor_MPa: Smallest standard deviation that an estimate from many touches reaches, MPa. Errors of the other
+            parameters of the film cause it.
         misfit_rms: Root mean square of the misfits of good touches, in standard deviations of the noise.
         misfit_unit: Scale of the misfit: misfit = misfit_unit * sinh(|misfit vector|).
-        limits_pC: Smallest and largest charge, to which charges are clipped, pC.
+        limits_pC: Smallest and largest charge, pC. Charges outside this range are clipped.
         typical_pC: Charge by which each charge is divided before the logarithm, shape (n_electrode,), pC.
-        weights: Arrays of each layer by the name of the graph's constant, float32. First the hidden layers, weight of
-            shape (k, n_input, n_output) and bias of shape (k, n_output) each; then the skip layer, shape
-            (k, n_electrode, n_answer), the bias and the weight of the output layer.
+        weights: Arrays of the layers by the names of the constants in the graph, float32, in this order: weight, shape
+            (k, n_input, n_output), and bias, shape (k, n_output), of each hidden layer; weight of the skip layer,
+            shape (k, n_electrode, n_answer); bias and weight of the output layer.
         activation: Name of the activation of the hidden layers.
     """
 
@@ -143,13 +143,17 @@ class Pretensions:
         return np.asarray(np.prod(factors, axis=2, where=is_other_node))
 
     def at(self, node_MPa: Array) -> "Pretensions":
-        """Return the same network with its weights given at other pretensions of the range, shape (k,)."""
+        """Return the same network with its weights given at other pretensions.
+
+        Args:
+            node_MPa: Pretensions within `range_MPa`, shape (k,), MPa, in ascending order.
+        """
         factors = self.interpolation_weights(node_MPa)
         weights = {name: np.tensordot(factors, rows, axes=1).astype(np.float32) for name, rows in self.weights.items()}
         return replace(self, node_MPa=node_MPa, weights=weights)
 
     def constants(self, pretension_MPa: float) -> dict[str, Singles]:
-        """Return the graph's constants by name for one pretension of the range."""
+        """Return the constants of the graph at one pretension within `range_MPa`, by their names."""
         single = self.at(np.array([pretension_MPa]))
         return {name: rows[0] for name, rows in single.weights.items()}
 
@@ -157,11 +161,11 @@ class Pretensions:
         """Compute the misfit of one press at several pretensions.
 
         Args:
-            charge_pC: Shape (n_electrode,), pC.
-            pretension_MPa: Shape (n,).
+            charge_pC: Charges of the press, shape (n_electrode,), pC.
+            pretension_MPa: Pretensions, shape (n,), MPa.
 
         Returns:
-            Shape (n,), in standard deviations of the noise.
+            Misfits, shape (n,), in standard deviations of the noise.
         """
         (vectors,) = self.vectors(charge_pC[None], pretension_MPa)
         return np.asarray(np.linalg.norm(vectors, axis=1))
@@ -169,8 +173,8 @@ class Pretensions:
     def vectors(self, charge_pC: Array, pretension_MPa: Array) -> Array:
         """Compute the vectors whose lengths are the misfits of presses at several pretensions.
 
-        The vectors are interpolated linearly between the pretensions of `node_MPa`, which must therefore lie close to
-        each other; `at` provides that.
+        The vectors are interpolated linearly between the pretensions of `node_MPa`. These must therefore be close to
+        each other. Use `at` to obtain a network with close pretensions.
 
         Args:
             charge_pC: Charges of m presses, shape (m, n_electrode), pC.
@@ -232,7 +236,7 @@ def read_pretensions(version_folder: Path) -> Pretensions:
 
 
 def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
-    """Return the network that the arrays of a file contain, and check it.
+    """Create the network from the arrays of a file, and check it.
 
     Args:
         arrays: Arrays of the file by name.
@@ -265,7 +269,7 @@ def _pretensions(arrays: Mapping[str, np.ndarray]) -> Pretensions:
 
 
 def _check_misfits(pretensions: Pretensions) -> None:
-    """Raise ValueError if the network computes misfits that are not finite, for pretensions between the given ones."""
+    """Raise ValueError if the network computes misfits that are not finite at pretensions within its range."""
     checked_MPa = np.linspace(*pretensions.range_MPa, CHECKED_PRETENSIONS)
     with np.errstate(over="ignore", invalid="ignore"):
         charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)

@@ -1,8 +1,9 @@
 """ONNX sessions: opening them, checking their interface, running them, and converting charges for them.
 
-A network of this size takes microseconds. A session therefore uses one thread, because a second thread costs more time
-than it saves, and does not spin between runs, because onnxruntime's default would keep most of a core busy at 100 Hz.
-`BoundPress` is the fastest way to compute one press: its input and output memory is bound to the session once.
+A network of this size takes microseconds. A session therefore uses one thread, because a second thread would cost more
+time than it saves. A session also does not spin between runs. With the default of onnxruntime, a stream of 100 frames
+per second would keep most of a core busy. `BoundPress` is the fastest way to compute one press, because its input and
+output memory is bound to the session once.
 
 Charges must be finite numbers in the order of the electrodes. The fast checks are `write_finite` for plain numbers and
 `as_float32` for arrays. If a fast check fails, the numbers are checked one by one, so that the error names the
@@ -50,7 +51,7 @@ def output_widths(session: ort.InferenceSession) -> dict[str, int]:
 def open_session(
     onnx_model: bytes, where: str, constants: Mapping[str, Singles] = MappingProxyType({})
 ) -> ort.InferenceSession:
-    """Open a session with one thread. Its inputs and outputs are not checked; `check_interface` does that.
+    """Open a session with one thread. The inputs and outputs are not checked; use `check_interface` to check them.
 
     Args:
         onnx_model: Content of `model.onnx`.
@@ -156,6 +157,17 @@ def check_interface(session: ort.InferenceSession, electrodes: int, where: str) 
 
 
 def _check_tensors(kind: str, tensors: list[ort.NodeArg], widths: dict[str, int], where: str) -> None:
+    """Check the names, number types and widths of tensors.
+
+    Args:
+        kind: "input" or "outputs", for error messages.
+        tensors: The tensors of the graph.
+        widths: Expected width of each tensor by its name.
+        where: Name or file of the model, for error messages.
+
+    Raises:
+        ModelError: If a tensor is missing, unknown or different.
+    """
     expected = {name: ("tensor(float)", width) for name, width in widths.items()}
     actual = {tensor.name: (tensor.type, _row_width(tensor.shape)) for tensor in tensors}
     if actual != expected:
@@ -166,17 +178,21 @@ def _check_tensors(kind: str, tensors: list[ort.NodeArg], widths: dict[str, int]
 
 
 def _row_width(shape: list[int | str | None]) -> object:
-    """Return the width of a tensor of shape [variable, width]; return the whole shape of any other tensor."""
+    """Return the width of a tensor of shape [variable, width].
+
+    The whole shape is returned if the tensor does not have such a shape. It then differs from every expected width.
+    """
     is_batch = len(shape) == 2 and not isinstance(shape[0], int)
     return shape[1] if is_batch else shape
 
 
 def _describe(tensors: Mapping[str, tuple[str, object]]) -> str:
+    """Return number types and widths of tensors as text for an error message."""
     return ", ".join(f"{name} {kind} [n, {width}]" for name, (kind, width) in tensors.items())
 
 
 N_WITHOUT_CORRELATION = 7
-"""Number of the values of a `Contact` without its correlations, which are the last values."""
+"""Number of values of a `Contact` before its correlations, which come last."""
 
 
 class BoundPress:
@@ -187,7 +203,7 @@ class BoundPress:
         run: Function that computes the outputs from the stored charges.
         read: Function that returns the computed values in the order of a `Contact`.
         size: Number of values that `read` returns: ten, or seven if the model computes no correlations.
-        columns: Positions of each output among these values.
+        columns: Slice of each output in these values, by the name of the output.
     """
 
     def __init__(self, session: ort.InferenceSession, electrodes: int) -> None:
@@ -199,7 +215,7 @@ class BoundPress:
         """
         charges = np.zeros((1, electrodes), dtype=np.float32)
         self.columns = _columns(output_widths(session))
-        self.size = max(part.stop for part in self.columns.values())
+        self.size = max(columns.stop for columns in self.columns.values())
         outputs = np.zeros(self.size, dtype=np.float32)
         # The session holds only the addresses of the arrays. The views in `write` and `read` keep the arrays alive.
         binding = _bind(session, charges, outputs, self.columns)
@@ -276,14 +292,14 @@ MAX_FAST_SQUARE_SUM_pC2 = 1e38
 
 
 def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
-    """Write the charges of one press as float32 numbers if they are finite and within the range of float32.
+    """Write the charges of one press as float32 numbers, and check that they are finite.
 
     Args:
         write: Function that takes the numbers as separate arguments and raises the exceptions of `struct.pack_into`.
         values: The numbers, as many as `write` takes.
 
     Returns:
-        Whether the numbers were written and are finite. If not, the written memory must not be used.
+        Whether all numbers were written and are finite. If not, the memory contains no valid charges.
     """
     try:
         numbers = tuple(values)
@@ -362,7 +378,7 @@ def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...], *, is_single_
     """
     if charges.dtype.kind == "f":
         flat = charges.ravel()
-        # A scalar product is faster than a check of each number, and is not finite if one of the charges is not.
+        # The sum of the squares is not finite if a charge is not finite. It is faster than a check of each charge.
         square_sum_pC2 = np.vdot(flat, flat)
         if square_sum_pC2 <= MAX_FAST_SQUARE_SUM_pC2:
             return np.ascontiguousarray(charges, dtype=np.float32)

@@ -1,6 +1,6 @@
-"""Settings that the HTTP and the gRPC server share: address, TLS certificate, token, and limits.
+"""Settings of the HTTP and the gRPC server: address, TLS certificate, token, and limits.
 
-By default a server listens on the loopback address, so that only programs on the same machine can connect.
+By default, a server listens on the loopback address, so that only programs on the same machine can connect.
 """
 
 import contextlib
@@ -189,7 +189,10 @@ class Tls:
 
 
 class Token:
-    """A secret that clients must send. The time of the comparison does not depend on the number of right characters."""
+    """A secret that clients must send.
+
+    The duration of the comparison does not depend on the number of correct characters.
+    """
 
     def __init__(self, token: str) -> None:
         """Check and store the token.

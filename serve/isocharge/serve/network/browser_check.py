@@ -1,12 +1,13 @@
-"""Protection against requests that a web page of another site makes a browser send.
+"""Protection against requests from web pages of other sites.
 
-A browser lets every page send requests to every address that the browser can reach, the loopback address included. A
-form or a `fetch` with `mode: "no-cors"` cannot read the answer, but the request is carried out. With DNS rebinding, the
-owner of a name lets it point to this machine after the page was loaded; the page then counts as a page of this server
-and can read the answers too. Three headers that pages cannot change reveal such requests:
+Every page in a browser can send requests to every address that the browser can reach, including the loopback address. A
+form or a `fetch` with `mode: "no-cors"` cannot read the response, but the server executes the request. With DNS
+rebinding, an attacker changes the address of a name to this machine after the page was loaded. The browser then treats
+the page as a page of this server, and the page can also read the responses. Pages cannot change the following headers,
+by which such requests are recognised:
 
-- `Host` is the name that the browser asked for. A rebound name is neither an IP address nor a name of this server.
-- `Origin` names the site of the page that sent the request.
+- `Host` is the name that the browser has requested. A rebound name is neither an IP address nor a name of this server.
+- `Origin` is the site of the page that sent the request.
 - `Sec-Fetch-Site` states whether the page belongs to the same site. Browsers also send it with
   requests without `Origin`.
 
@@ -21,7 +22,7 @@ from isocharge.common.errors import InputError, OriginError
 from isocharge.serve.network.address import ip_address
 
 CACHED_REQUESTS = 256
-"""Number of combinations of the headers whose result is cached. Clients send the same headers again and again."""
+"""Number of combinations of headers whose result is cached. Clients repeatedly send the same headers."""
 
 LOCALHOST = "localhost"
 
@@ -36,7 +37,7 @@ class BrowserCheck:
         host: Name or address on which the server listens.
         allowed_hosts: Further names by which the server is reached, for example through a reverse proxy. Pages of these
             names may send requests, too.
-        any_host: Whether to accept every `Host`. Rebinding does no harm if requests need a token, which a page of
+        any_host: Whether to accept every `Host`. DNS rebinding is harmless if requests need a token, which a page of
             another site does not have, or if the server listens on a Unix socket.
     """
 
@@ -77,15 +78,15 @@ class BrowserCheck:
         fetch_mode: bytes | None,
         fetch_dest: bytes | None,
     ) -> str | None:
-        """Return the reason for which a request is refused; None if the request is accepted.
+        """Return the reason why a request is refused; None if the request is accepted.
 
         Args:
             method: Method in capitals.
             host: Value of the header `Host`; empty if the request has none.
-            origin: Value of `Origin`; None if the request has none, as for the following headers.
-            fetch_site: Value of `Sec-Fetch-Site`.
-            fetch_mode: Value of `Sec-Fetch-Mode`.
-            fetch_dest: Value of `Sec-Fetch-Dest`.
+            origin: Value of `Origin`; None if the request has none.
+            fetch_site: Value of `Sec-Fetch-Site`; None if the request has none.
+            fetch_mode: Value of `Sec-Fetch-Mode`; None if the request has none.
+            fetch_dest: Value of `Sec-Fetch-Dest`; None if the request has none.
         """
         if not (self._any_host or self._is_served(host)):
             return (
@@ -111,8 +112,8 @@ class BrowserCheck:
         )
 
     def _is_served(self, host: bytes) -> bool:
-        """Return whether a `Host` is an address, or a name by which this server is reached."""
-        if not host:  # HTTP/1.0 does not require the header, and every browser sends it.
+        """Return whether a `Host` is an IP address or a name of this server. A missing `Host` is accepted."""
+        if not host:  # HTTP/1.0 does not require the header. Browsers always send it.
             return True
         name = _name_in(f"//{host.decode('latin-1')}")
         return ip_address(name) is not None or name in self._host_names
@@ -120,8 +121,9 @@ class BrowserCheck:
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
         """Return whether a request was sent by a page of this server.
 
-        The page belongs to this server if its origin is the requested host, or an allowed name whose proxy has replaced
-        the `Host`. A page on another port of the requested host belongs to another server.
+        The page belongs to this server if its origin is the requested host. It also belongs to this server if its
+        origin is an allowed name and a proxy has replaced the `Host`. A page on another port of the requested host
+        belongs to another server.
 
         Args:
             origin: Value of the header `Origin`, for example b"http://localhost:8000".
@@ -138,7 +140,7 @@ class BrowserCheck:
         return page_name in self._allowed_names and page_name != requested_name
 
     def _served_names(self) -> str:
-        """Return the names by which this server is reached, separated by commas."""
+        """Return the names of this server, separated by commas."""
         return ", ".join(sorted(self._host_names))
 
 

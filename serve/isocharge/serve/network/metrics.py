@@ -1,7 +1,7 @@
 """Counters of models and traffic in the text format of Prometheus, for the path `/metrics`.
 
-A request only increments plain integers, which takes a fraction of a microsecond; a histogram of the client library
-would take several. The metric families are built from the integers when Prometheus asks for them.
+A request only increments plain integers, which takes a fraction of a microsecond. A histogram of the client library
+would take several microseconds. The metric families are computed from the integers when Prometheus requests them.
 """
 
 from collections.abc import Iterable

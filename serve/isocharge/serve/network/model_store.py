@@ -3,9 +3,9 @@
 Each version is checked when it is loaded: checksum, metadata, shapes, and the golden vectors, which are computed again.
 A version that fails a check is refused with the reason, and all other versions stay available.
 
-When a model is loaded again, its files are read into new sessions, and one assignment then replaces the old sessions. A
-request that has begun finishes with its session. If the new files of a version are refused, the old version stays
-available.
+When a model is loaded again, its files are read into new sessions, and one assignment then replaces the old sessions.
+Requests that have begun are finished with the old sessions. If the new files of a version are refused, the old version
+stays available.
 """
 
 import logging
@@ -63,7 +63,7 @@ class LoadedVersion:
         return tuple(output_widths(self.model.session))
 
     def press(self) -> BoundPress:
-        """Return the bound memory for one press. Each thread has its own."""
+        """Return the bound memory for one press. Each thread has its own memory."""
         bound: BoundPress | None = getattr(self._thread_local, "press", None)
         if bound is None:
             bound = BoundPress(self.model.session, len(self.metadata.electrodes))
@@ -81,7 +81,8 @@ class ModelStore:
         """Load all versions of all models.
 
         Args:
-            folders: Function that returns the folder of each model by its name. It is called for each load and index.
+            folders: Function that returns the folder of each model by its name. Each call of `load` and `index` calls
+                this function.
 
         Raises:
             ModelError: If there is no model, or no version passes its checks.
@@ -89,7 +90,7 @@ class ModelStore:
         self._folders = folders
         self._change_lock = threading.Lock()
         self._statistics: dict[tuple[str, int], Statistics] = {}
-        # Versions by name and version. The key with an empty version holds the highest version.
+        # Versions by name and version. An empty version in the key means the highest version.
         self._loaded: dict[tuple[str, str], LoadedVersion] = {}
         self._refused: dict[tuple[str, int], str] = {}
         for name, folder in folders().items():
@@ -203,10 +204,10 @@ class ModelStore:
         return {(name, str(version)): statistics.snapshot() for (name, version), statistics in counters}
 
     def load(self, name: str) -> None:
-        """Read a model's files again and replace its versions.
+        """Read the files of a model again, and replace its versions.
 
-        A loaded version is removed only if its folder has disappeared and every version that was found is valid. A
-        model therefore stays available while its folders are being copied or moved.
+        A loaded version is removed only if its folder has disappeared and all other versions are valid. A model
+        therefore stays available while its folders are copied or moved.
 
         Raises:
             ModelNotFound: If the folders contain no such model.
@@ -306,17 +307,18 @@ def open_model_store(models: Path | None = None) -> ModelStore:
             repositories(models)  # raises an error if the folder itself is missing
             raise ModelError(f"{models}: expected models, <name>/<version>/model.onnx, found none; correct --models")
 
-    def folders() -> Mapping[str, Path]:
-        by_name: dict[str, Path] = {}
-        for root in reversed(roots):
-            by_name |= {name: root / name for name in model_names(root)}
-        return MappingProxyType(by_name)
+    def find_folders() -> Mapping[str, Path]:
+        folder_of_model: dict[str, Path] = {}
+        for root in roots:
+            for name in model_names(root):
+                folder_of_model.setdefault(name, root / name)  # the first repository takes precedence
+        return MappingProxyType(folder_of_model)
 
-    return ModelStore(folders)
+    return ModelStore(find_folders)
 
 
 def _refusal_reason(folder: Path, error: Exception) -> str:
-    """Return why a version is refused. An error that is no ModelError is also written to the log."""
+    """Return the reason why a version is refused. An error that is not a ModelError is also written to the log."""
     if isinstance(error, ModelError):
         return str(error)
     log.error("%s: the model cannot be checked", folder, exc_info=error)

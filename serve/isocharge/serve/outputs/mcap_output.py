@@ -17,7 +17,8 @@ ROS2_SUFFIX = ".ros2.mcap"
 class McapOutput:
     """Writes records into a new MCAP file.
 
-    On the live path the file has its name from the beginning. In a replay it gets its name when it is complete.
+    If the records come from a sensor, the file has its name from the beginning. In a replay, the file gets its name
+    when it is complete.
     """
 
     def __init__(self, path: Path, electrodes: tuple[str, ...], encoding: RecordEncoding, *, is_live: bool) -> None:
@@ -26,7 +27,7 @@ class McapOutput:
         Args:
             path: The file; it must not exist.
             electrodes: Names of the electrodes.
-            encoding: How the records are written.
+            encoding: Encoding of the records.
             is_live: Whether the records come from a sensor.
 
         Raises:
@@ -45,19 +46,19 @@ class McapOutput:
         """Write a record.
 
         Raises:
-            InputError: If ROS 2 has no time stamp for the time of the record.
+            InputError: If the time of the record cannot be expressed as a time stamp of ROS 2.
             OutputError: If the disk is full.
         """
         with as_output_errors(self._path):
             self._file.write(record)
 
     def close(self) -> None:
-        """Write the index and close the file; in a replay it gets its name now."""
+        """Write the index and close the file. In a replay, the file gets its name now."""
         with as_output_errors(self._path):
             self._stack.close()
 
     def discard(self) -> None:
-        """Close the file without an index; in a replay it is removed."""
+        """Close the file without an index. In a replay, the file is removed."""
         self._file.is_abandoned = True
         # The contexts are left with an error, so that they remove an incomplete file. The error itself is suppressed.
         incomplete = OutputError(f"{self._path}: incomplete")

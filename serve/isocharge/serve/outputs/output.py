@@ -24,10 +24,10 @@ class Output(Protocol):
     """
 
     def write(self, record: PredictionRecord, /) -> None:
-        """Write a record. An exception ends this output, and the stream goes on."""
+        """Write a record. After an exception, the output receives no more records, but the stream continues."""
 
     def close(self) -> None:
-        """Write what is still in memory, and release files and sockets."""
+        """Write all records that are still in memory, and release files and sockets."""
 
 
 def discard(output: Output) -> None:
@@ -61,10 +61,10 @@ class OutputKind:
     """A kind of output, which is chosen by the form of its target.
 
     Attributes:
-        form: Form of the targets for people: `FILE.csv`.
+        form: Form of the targets, for help and messages, such as `FILE.csv`.
         accepts: Function that returns whether a target has this form.
         open: Function that opens a target. It raises an `IsochargeError` if this is impossible.
-        may_block: Whether `write` may wait. Such an output gets a thread and a queue of its own on the live path.
+        may_block: Whether `write` may wait. In a live stream, such an output has its own thread and queue.
         is_standard_output: Whether the output writes to standard output. At most one target may do that, and the stream
             ends when standard output is closed.
     """

@@ -1,4 +1,4 @@
-"""An output with a queue and a thread of its own, so that the live path never waits for a slow consumer."""
+"""An output with its own queue and thread, so that a live stream never waits for a slow consumer."""
 
 import logging
 from collections.abc import Callable
@@ -14,7 +14,7 @@ class QueuedOutput:
     """Writes records to another output in a thread.
 
     Attributes:
-        has_failed: Whether the other output raised an error. It gets no more records then.
+        has_failed: Whether the other output has raised an error. It receives no more records afterwards.
     """
 
     def __init__(
@@ -26,8 +26,8 @@ class QueuedOutput:
             output: The other output.
             target: Its target, for messages.
             is_ready: Function that waits a short time and returns whether the consumer would accept a record.
-            ends_stream: Whether an error of the other output is raised by the next call of `write`, and so ends the
-                stream. Otherwise it is written to the log.
+            ends_stream: Whether an error of the other output ends the stream. The next call of `write` then raises the
+                error. Otherwise the error is written to the log.
         """
         self.has_failed = False
         self._output = output
@@ -41,7 +41,7 @@ class QueuedOutput:
         return self._queue.lost
 
     def write(self, record: PredictionRecord) -> None:
-        """Append a record to the queue; raise the error of the other output if it ends the stream."""
+        """Append a record to the queue. If an error of the other output ends the stream, raise this error."""
         self._queue.put(record)
 
     def close(self) -> None:

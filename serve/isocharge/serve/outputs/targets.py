@@ -34,9 +34,9 @@ def target_forms() -> str:
 
 
 def kind_of(target: str) -> OutputKind:
-    """Return the kind of output that a target names.
+    """Return the kind of output for a target.
 
-    The built-in kinds are asked first, and then the kinds that installed packages add by entry points.
+    The built-in kinds are tried first, and then the kinds that installed packages add by entry points.
 
     Args:
         target: Target of an output, such as `json` or `touch.csv`.
@@ -90,7 +90,7 @@ class Outputs:
     """The outputs of a command; a context manager that closes them.
 
     Attributes:
-        not_written: For each target that did not get all records, the number of records that are missing, or None if an
+        not_written: For each target that did not receive all records, the number of missing records, or None if an
             error ended the output.
     """
 
@@ -112,7 +112,7 @@ class Outputs:
             )
         if len(set(targets)) < len(targets):
             raise InputError(f"outputs {shown(list(targets))}: expected targets that differ; remove one of them")
-        # Standard output is written last, so that the other outputs have the record if its reader has gone away.
+        # Standard output is written last. If its reader has closed it, the other outputs have received the record.
         self._kinds = sorted(kinds, key=lambda target_and_kind: target_and_kind[1].is_standard_output)
         self._context = context
         self._outputs: dict[str, Output] = {}
@@ -149,14 +149,14 @@ class Outputs:
 
     @property
     def has_incomplete_file(self) -> bool:
-        """Whether an output other than standard output did not get all records; known when the outputs are closed."""
+        """Whether an output other than standard output lacks records. The outputs must be closed before."""
         return any(not kind_of(target).is_standard_output for target in self.not_written)
 
     def write(self, record: PredictionRecord) -> None:
         """Write a record to every output.
 
         Raises:
-            Exception: In a replay, the error of any output; on the live path, only an error of standard output.
+            Exception: In a replay, the error of any output. In a live stream, only an error of standard output.
         """
         for target, output in self._outputs.items():
             try:
@@ -167,13 +167,13 @@ class Outputs:
                 raise _failure(target, error) from error
 
     def close(self) -> None:
-        """Close the outputs, once, and count the records that are missing in each output.
+        """Close all open outputs, and count the records that are missing in each output.
 
         Raises:
             OSError, IsochargeError: The first error of an output. The other outputs are closed as well.
         """
         errors: list[BaseException] = []
-        for target, output in self._taken():
+        for target, output in self._remove_all():
             try:
                 output.close()
             except (OSError, IsochargeError) as error:
@@ -186,11 +186,12 @@ class Outputs:
             raise errors[0]
 
     def _discard(self) -> None:
-        for target, output in self._taken():
+        """Discard all open outputs, because their records are incomplete."""
+        for target, output in self._remove_all():
             discard(output)
             self.not_written[target] = None
 
-    def _taken(self) -> Iterator[tuple[str, Output]]:
-        """Yield the open outputs, each once."""
+    def _remove_all(self) -> Iterator[tuple[str, Output]]:
+        """Remove the open outputs one by one, and yield each of them with its target."""
         while self._outputs:
             yield self._outputs.popitem()

@@ -1,9 +1,9 @@
-"""The clock of a device: its wraps are removed, and it is fitted to the clock of the host.
+"""Conversion of the clock of a device to the time of the host, after its wraps are removed.
 
 Arrival times jitter with the delays of the kernel, the cable and the reading program. The clock of the device does not
-jitter, but its rate differs from the rate of the host's clock. A delay-locked loop of second order (Adriaensen, "Using
-a DLL to filter time", 2005) follows the arrivals with a small bandwidth and gives each reading a smooth host time. The
-bandwidth is larger in the first seconds, so that the loop locks soon.
+jitter, but its rate differs from the rate of the clock of the host. A delay-locked loop of second order (Adriaensen,
+"Using a DLL to filter time", 2005) follows the arrivals with a small bandwidth, and computes a smooth host time for
+each reading. The bandwidth is larger in the first seconds, so that the loop locks soon.
 """
 
 import math
@@ -13,13 +13,15 @@ BANDWIDTH_Hz = 0.05
 """Bandwidth of the loop, Hz. A jitter of 1 ms is reduced to 0.2 ms."""
 
 FIRST_BANDWIDTH_Hz = 1.0
-"""Bandwidth at the start, Hz; it falls as the inverse of the time."""
+"""Bandwidth at the start, Hz. The bandwidth falls in inverse proportion to the time."""
 
 MAX_LOOP_GAIN = 0.5
-"""Largest phase of the loop per update, dimensionless, so that it stays stable when readings are rare."""
+"""Largest gain of the loop in an update, dimensionless. It keeps the loop stable if readings are rare."""
 
 MAX_DEVIATION_s = 1.0
-"""Difference between arrival and prediction beyond which the fit starts again, s: a clock was set or the device reset.
+"""Largest difference between an arrival and its prediction, s.
+
+After a larger difference, the fit starts again, because a clock was set or the device was reset.
 """
 
 
@@ -27,10 +29,10 @@ class ReadingTime(NamedTuple):
     """Time at which a reading was taken.
 
     Attributes:
-        host_s: Unix seconds: the clock of the device fitted to the arrivals, or the arrival if the device sends no
-            clock. It decreases only where a new fit begins, because a clock was set.
-        device_us: Clock of the device without its wraps, us; None if the device sends none.
-        step_s: Time since the reading before, s; 0 for the first reading after a start.
+        host_s: Time of the host, unix seconds. It is computed from the clock of the device, or is the arrival time if
+            the device sends no clock. It decreases only if a new fit begins because a clock was set.
+        device_us: Clock of the device without its wraps, us; None if the device sends no clock.
+        step_s: Time since the previous reading, s; 0 for the first reading after a start.
     """
 
     host_s: float
@@ -47,7 +49,7 @@ class ReadingTime(NamedTuple):
 
 
 class DeviceClock:
-    """Clock of one device. It must be given every reading, in order.
+    """Clock of one device. Its method `read` must be called for every reading in order.
 
     Attributes:
         rate: Seconds of the host per second of the device.
@@ -55,6 +57,7 @@ class DeviceClock:
     """
 
     def __init__(self) -> None:
+        """Begin without a reading."""
         self.rate = 1.0
         self.restarts = 0
         self.reset()
@@ -65,7 +68,7 @@ class DeviceClock:
         self._device_us = 0
         self._last_arrival_s: float | None = None
         self._chunk_arrival_s: float | None = None
-        # The fit: the device's clock at `_fitted_us` is the host time `_fitted_host_s`.
+        # In the fit, the time `_fitted_us` of the device is the host time `_fitted_host_s`.
         self._fitted_us: int | None = None
         self._fitted_host_s = 0.0
         self._fit_age_s = 0.0
@@ -76,9 +79,9 @@ class DeviceClock:
         """Return the time of the next reading.
 
         Args:
-            t_us: Clock of the device as it was sent, us; None if the device sends none.
+            t_us: Clock as the device sent it, us; None if the device sends no clock.
             modulus: Time at which the clock wraps to 0, us.
-            arrived_s: Arrival of the chunk that held the reading, unix seconds.
+            arrived_s: Arrival of the chunk that contains the reading, unix seconds.
         """
         if t_us is None:
             step_s = 0.0
@@ -100,9 +103,12 @@ class DeviceClock:
         return ReadingTime(self._latest_host_s, self._device_us, step_us * 1e-6)
 
     def _is_ahead_of(self, arrived_s: float) -> bool:
-        """Return whether the fitted clock is so far ahead of an arrival, unix seconds, that the clock was set.
+        """Return whether the fitted clock is so far ahead of an arrival that the clock must have been set.
 
         The chunks of a file all arrive at the same time. Such an arrival contains no information about the clock.
+
+        Args:
+            arrived_s: Arrival of the chunk, unix seconds.
         """
         is_new_arrival = self._chunk_arrival_s not in (None, arrived_s)
         if self._fitted_us is None or not is_new_arrival:
@@ -146,14 +152,14 @@ class DeviceClock:
         self._fitted_us = self._device_us
 
     def _predict(self, device_us: int) -> float:
-        """Return the host time of a time of the device, s."""
+        """Return the host time, unix seconds, at a time of the device, us."""
         return self._fitted_host_s + self.rate * (device_us - (self._fitted_us or 0)) * 1e-6
 
     def _unwrap(self, t_us: int, modulus: int) -> int:
         """Return the time since the previous reading, us, and add it to the clock without wraps.
 
         The result is 0 for the first reading. If the clock jumped back, or ahead by more than half of its range, the
-        device has restarted; then the clock starts again, and the result is 0, too.
+        device has restarted. The fit then starts again, and the result is also 0.
 
         Args:
             t_us: Clock of the device as it was sent, us.

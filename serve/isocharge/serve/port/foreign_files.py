@@ -8,7 +8,7 @@ import shlex
 from isocharge.common.errors import InputError
 
 HEAD_BYTES = 4096
-"""Number of bytes at the start of a file by which its kind is recognised."""
+"""Number of bytes at the start of a file from which its kind is recognised."""
 
 RECORDING_START = b'{"isocharge_recording"'
 RECORD_KEYS = (b'"frame_id"', b'"charge_pC"', b'"tare_pC"')
@@ -39,7 +39,7 @@ def refuse_foreign_file(name: str, head: bytes) -> None:
 
 
 def _kind_and_command(name: str, head: bytes) -> tuple[str, str] | None:
-    """Return the kind of a file that does not come from a board, and advice what to do with this file.
+    """Return the kind of a file that does not come from a board, and advice on what to do with the file.
 
     Args:
         name: Name of the file.
@@ -76,7 +76,10 @@ def _kind_and_command(name: str, head: bytes) -> tuple[str, str] | None:
 
 
 def _is_table_of_presses(name: str, first_line: bytes) -> bool:
-    """Return whether a file is a CSV with the columns of presses or records, or a .csv file with only electrodes.
+    """Return whether a file is a CSV table of presses or records.
+
+    A table has columns that only presses or records have. A file whose name ends in `.csv` is also a table if its
+    header has only names, and none of them is a column of boards.
 
     Args:
         name: Name of the file.

@@ -1,16 +1,18 @@
-"""Recordings: files of the chunks of a port and of the records that were computed from them, one line of JSON each.
+"""Recordings: files of the chunks of a port and of the records that were computed from them.
+
+Each line of the file is a JSON object:
 
     {"isocharge_recording": 1, "model": "three/1", "policy": "every", "device": {...}, "name": "left"}
     {"chunk": [timestamp, clock_ns, outage_s, "base64 of the bytes"]}
-    {"timestamp": ..., ...}                       the records of that chunk, as they went out
+    {"timestamp": ..., ...}                       a record of that chunk
     {"tare": true}                                a request for a new tare
-    {"back": true}                                a request to go back to the film as it was calibrated
-    {"use": "three/2"}                            the model of all that follows
-    {"marker": [timestamp, "text"]}               a moment that somebody noted
+    {"back": true}                                a request to reset the followed film to its calibration
+    {"use": "three/2"}                            the model of all records after this line
+    {"marker": [timestamp, "text"]}               a moment that the user has marked
 
-Everything in a replay is recomputed except `latency_us`, which is copied from the recording because it belongs to the
-original run. The same model therefore gives the same records, bit for bit. Whole lines are written at once; a line that
-a full disk or a power cut left unfinished is ignored.
+A replay computes all fields of the records again, except `latency_us`, which is copied from the recording. With the
+same model, the records are the same, bit for bit. Whole lines are written at once. If a full disk or a power failure
+leaves an incomplete last line, this line is ignored.
 """
 
 import base64
@@ -32,13 +34,13 @@ from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.port.source import Chunk
 
 VERSION = 1
-"""Version of the file's format."""
+"""Version of the format of the file."""
 
 KIND = "isocharge_recording"
-"""Key of the version in the first line: what makes a file a recording."""
+"""Key of the version in the first line, by which a recording is recognised."""
 
 LONGEST_ENTRY = 1 << 20
-"""Longest line, characters: a chunk of 64 KiB in base64 is a tenth of it."""
+"""Length of the longest line, characters. A chunk of 64 KiB in base64 has a tenth of this length."""
 
 Latency = Annotated[float, Meta(ge=-1e12, le=1e12, description="a latency of some days at most, us")]
 Moment = Annotated[float, Meta(ge=-1e11, le=1e11, description="a time before the year 5138, unix seconds")]
@@ -47,15 +49,15 @@ Nanoseconds = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 log = logging.getLogger(__name__)
 
 Line = TypeVar("Line")
-"""What a line is read as."""
+"""Type of the struct as which a line is parsed."""
 
 
 class Marker(NamedTuple):
-    """A moment that somebody noted.
+    """A moment that the user has marked.
 
     Attributes:
-        timestamp: Unix seconds.
-        text: May be empty.
+        timestamp: Time of the marker, unix seconds.
+        text: Note of the user; may be empty.
     """
 
     timestamp: float
@@ -67,19 +69,19 @@ class Recorder:
 
     Attributes:
         path: The file.
-        model_label: `name/version` of the model at its begin.
-        failed: Whether writing has stopped because the disk is full. What was written before is whole.
+        model_label: Label of the model at the beginning of the recording, `name/version`.
+        failed: Whether writing has stopped because the disk is full. All lines before are complete.
     """
 
     def __init__(self, path: Path, model: str, policy: str, device: Mapping[str, Any], name: str | None = None) -> None:
-        """Describe a recording; the file is created on entering the context.
+        """Store the description of a recording. The file is created when the context is entered.
 
         Args:
             path: The file; it must not exist.
-            model: The model's label, `name/version`.
-            policy: Which frames get a record.
+            model: Label of the model, `name/version`.
+            policy: Which frames have a record; a `Policy`.
             device: Content of the device file.
-            name: The film's own name in the records; None for that of the model's sensor.
+            name: Name of the film in the records; None for the name of the sensor of the model.
         """
         self.path = path
         self.model_label = model
@@ -94,8 +96,8 @@ class Recorder:
         """Create the file.
 
         Raises:
-            OutputExists: If it is already there.
-            OutputError: If it cannot be created.
+            OutputExists: If the file exists already.
+            OutputError: If the file cannot be created.
         """
         self._file = AtomicWriter(self.path)
         self._write(json.dumps(self._header))
@@ -112,7 +114,7 @@ class Recorder:
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
         """Write a chunk and the lines of its records.
 
-        After an interruption the same chunk may be passed again. It is written once.
+        After an interruption, the same chunk may be passed again. It is written only once.
 
         Args:
             chunk: The chunk.
@@ -144,7 +146,10 @@ class Recorder:
         self._write(json.dumps({"marker": list(marker)}))
 
     def _write(self, lines: str) -> None:
-        """Write whole lines or none; a partial write of an interruption is overwritten."""
+        """Write complete lines. Lines that an interruption left incomplete are overwritten.
+
+        If the disk is full, log an error and write nothing from then on.
+        """
         if self.failed:
             return
         try:
@@ -181,9 +186,9 @@ class Recording:
 
     Attributes:
         model: Label of the model, `name/version`, at the beginning of the recording.
-        policy: Which frames got a record.
+        policy: Which frames have a record; a `Policy`.
         device: Content of the device file.
-        name: Name of the film in the records; empty if it is the name of the model's sensor.
+        name: Name of the film in the records; empty for the name of the sensor of the model.
     """
 
     def __init__(self, path: Path) -> None:
@@ -329,14 +334,15 @@ class _Entry(Struct):
 
 
 class RecordedClock:
-    """The clock of a replay. For each record it shows the time at which the original record was built."""
+    """The clock of a replay. For each record, it returns the time at which the original record was created."""
 
     def __init__(self) -> None:
+        """Begin at the time 0."""
         self._base_ns = 0
         self._latencies_us: deque[float] = deque()
 
     def set(self, event: Event) -> None:
-        """Set the clock to a chunk, whose records are built next."""
+        """Set the clock to a chunk, whose records are created next."""
         self._base_ns = event.chunk.clock_ns if event.chunk else 0
         self._latencies_us = deque(event.latencies_us)
 

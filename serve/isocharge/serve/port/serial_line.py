@@ -1,12 +1,14 @@
-"""Lines to a board that are open, and the requests that some boards need before they send a frame.
+"""Connections to a board, and the requests that some boards need before they send a frame.
 
-A line is a serial port, opened by pyserial, or a UDP socket. Where the system has file descriptors for ports, a serial
-port is read with two system calls. Each datagram of a socket is one chunk. A board may send one line of text in each
-datagram without an end of line; one is then added, because parsers of lines wait for it. Nothing is added any more once
-a datagram of the board has ended with an end of line.
+A line is a serial port, opened by pyserial, or a UDP socket. If the system has file descriptors for ports, a serial
+port is read with two system calls. Each datagram of a socket is one chunk.
 
-On a line with two wires, both ends receive everything that is sent: the request returns before the answer and has to be
-removed from it. The next request waits until the answer has arrived and the line is quiet.
+Some boards send one line of text in each datagram, without a line feed at its end. A line feed is then added, because
+parsers of text need it. If a datagram of the board has ended with a line feed, nothing is added to later datagrams.
+
+On a line with two wires, both ends receive everything that is sent. The request therefore returns before the answer,
+and has to be removed from the received bytes. The next request waits until the answer has arrived and the line is
+quiet.
 """
 
 import importlib
@@ -23,7 +25,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 QUIET_TIME_s = 0.002
-"""Silence after which an answer counts as complete, s. Two bytes take this long at 9600 baud."""
+"""Silence after which an answer is complete, s. Two bytes take this time at 9600 baud."""
 
 REPEAT_TIME_s = 0.2
 """Time after which a request without an answer is repeated, s."""
@@ -53,6 +55,7 @@ class Requester:
     """
 
     def __init__(self, request: Request, now_s: Callable[[], float] = time.monotonic) -> None:
+        """Begin with a request that is due; the arguments are described in the class."""
         self._request = request
         self._now_s = now_s
         self._requests = 0
@@ -65,7 +68,7 @@ class Requester:
         return self._echoes / max(1, self._requests)
 
     def reset(self) -> None:
-        """Make a request due at once, because the line was opened again."""
+        """Make a request due now, because the line was opened again."""
         self._requested_s = -float("inf")
         self._received_s = -float("inf")
         self._expected_echo = b""
@@ -73,7 +76,7 @@ class Requester:
     def wait_s(self) -> float:
         """Return the time until the next request is due, s; 0 if it is due now.
 
-        An unanswered request is repeated later than an answered one, and no request is sent while the line is busy.
+        The time after a request without an answer is longer. No request is due while bytes are arriving.
         """
         now_s = self._now_s()
         due_s = self._requested_s + 1.0 / self._request.rate_Hz
@@ -84,7 +87,7 @@ class Requester:
         return max(0.0, due_s - now_s, quiet_s - now_s)
 
     def next_request(self) -> bytes:
-        """Return the bytes to send now, and note that they are sent."""
+        """Return the bytes of the next request, and store the time of the request."""
         self._requested_s = self._now_s()
         self._requests += 1
         self._expected_echo = self._request.data
@@ -93,8 +96,8 @@ class Requester:
     def remove_echo(self, received: bytes) -> bytes:
         """Return the received bytes without the echo of the request.
 
-        The echo may arrive in several parts. Complete echoes are counted also if the request states that the line has
-        none; then the bytes are returned unchanged.
+        The echo may arrive in several parts. If the line has no echo according to the request, complete echoes are
+        counted, but the bytes are returned unchanged.
         """
         if not received:
             return b""
@@ -126,7 +129,7 @@ def _terminal_errors() -> tuple[type[Exception], ...]:
 
 
 HAS_POSIX_PORTS = bool(_terminal_errors())
-"""Whether ports have file descriptors for which `select` can wait. Where they have none, pyserial reads them."""
+"""Whether ports have file descriptors for which `select` can wait. Otherwise pyserial reads the ports."""
 
 READ_ERRORS: tuple[type[Exception], ...] = (OSError, *_terminal_errors())
 """Exceptions that reading a line can raise."""
@@ -191,16 +194,20 @@ class SerialLine:
         readable, _, _ = select.select([self._descriptor], [], [], timeout_s)
         if not readable:
             return b""
-        # pyserial would need five system calls, and one for each byte of a socket.
+        # This needs one system call. pyserial would need five, or one for each byte of a socket.
         data = os.read(self._descriptor, MAX_READ_BYTES)
         if not data:
             raise OSError("it is readable and has no data: it was unplugged, or the other end has closed")
         return data
 
     def _receive_by_pyserial(self, timeout_s: float) -> bytes:
-        """Wait up to `timeout_s` for a byte, and return all bytes that have arrived.
+        """Receive bytes from a line without a file descriptor.
 
-        The line has no file descriptor.
+        Args:
+            timeout_s: Longest time to wait for the first byte, s.
+
+        Returns:
+            All bytes that have arrived; empty if none arrive in time.
         """
         if timeout_s != self._serial.timeout:  # Setting the timeout costs a system call.
             self._serial.timeout = timeout_s
@@ -251,7 +258,14 @@ class UdpSocket:
             self._socket.recv(MAX_READ_BYTES)
 
     def receive(self, timeout_s: float) -> bytes:
-        """Return the next datagram that is not empty; empty if none arrives in time, s."""
+        """Return the next datagram that is not empty.
+
+        Args:
+            timeout_s: Longest time to wait, s.
+
+        Returns:
+            The datagram; empty bytes if no datagram arrives in time.
+        """
         deadline_s = time.monotonic() + timeout_s
         while self._is_ready(max(0.0, deadline_s - time.monotonic())):
             data, self._peer = self._socket.recvfrom(MAX_READ_BYTES)
@@ -269,11 +283,12 @@ class UdpSocket:
         self._socket.close()
 
     def _is_ready(self, timeout_s: float) -> bool:
+        """Return whether a datagram has arrived or arrives within `timeout_s`, s."""
         readable, _, _ = select.select([self._socket], [], [], timeout_s)
         return bool(readable)
 
     def _end_line(self, data: bytes) -> bytes:
-        """Return a datagram with an end of line if it is text, unless the board sends ends of lines itself."""
+        """Add a line feed to a datagram of text, unless the board ends its datagrams with line feeds."""
         if data.endswith(b"\n"):
             self._board_ends_lines = True
         has_control_characters = _CONTROL_CHARACTER.search(data) is not None

@@ -1,9 +1,10 @@
 """Sources of bytes: ports, files and the standard input. Each source is a context manager and an iterator of chunks.
 
 A port is any URL that pyserial accepts: `/dev/ttyACM0`, a pseudo-terminal, `socket://host:port`, `rfc2217://host:port`
-or `loop://`. In addition, `tcp://host:port` means the same as `socket://`, and `udp://host:port` receives datagrams. On
-request, a port that disappears or falls silent is opened again until it is back, and the first chunk afterwards states
-the length of the outage. Boards that send frames only on request are sent the request.
+or `loop://`. In addition, `tcp://host:port` means the same as `socket://`, and `udp://host:port` receives datagrams.
+
+If `reconnect` is true, a port that disappears or falls silent is opened repeatedly until it is back. The first chunk
+afterwards contains the length of the outage. If a board sends frames only on request, the port sends the requests.
 """
 
 import contextlib
@@ -30,7 +31,7 @@ from isocharge.serve.port.serial_line import (
 )
 
 FIRST_RETRY_PAUSE_s = 0.1
-"""First pause before a lost port is opened again, s. Each pause is twice as long as the one before."""
+"""First pause before a lost port is opened again, s. Each pause is twice as long as the previous pause."""
 
 MAX_RETRY_PAUSE_s = 2.0
 """Longest pause before a lost port is opened again, s."""
@@ -62,8 +63,8 @@ class Port:
     Args:
         url: Device path or URL.
         baud: Bits per second; USB ports and pseudo-terminals ignore it.
-        silence_s: Time without a byte after which the port counts as lost, s.
-        reconnect: Whether to open a lost port again until it is back, instead of raising an error.
+        silence_s: Time without a byte after which the port is considered lost, s.
+        reconnect: Whether to open a lost port repeatedly until it is back, instead of raising an error.
         request: Request that the board needs for each frame; None for a board that sends frames by itself.
         wait: Time to wait until the port can be opened, s.
 
@@ -89,7 +90,7 @@ class Port:
         request: Request | None = None,
         wait: float = 0.0,
     ) -> None:
-        """Store the settings. The port is opened when the context is entered; see the class for the arguments."""
+        """Store the settings, which the class describes. The port is opened when the context is entered."""
         self.url = url
         self.outages = 0
         self._baud = baud
@@ -100,10 +101,10 @@ class Port:
         self._line: SerialLine | UdpSocket | None = None
 
     def __enter__(self) -> Self:
-        """Open the port and drop the bytes that it has buffered.
+        """Open the port, and drop the bytes that it has buffered.
 
         Raises:
-            PortError: If the port cannot be opened, or not in time.
+            PortError: If the port cannot be opened within `wait`.
             InputError: If the port is a file.
         """
         deadline_s = time.monotonic() + self._wait
@@ -118,7 +119,7 @@ class Port:
                 time.sleep(FIRST_RETRY_PAUSE_s)
 
     def _open(self) -> None:
-        """Open the line, drop the bytes that it has buffered, and make a request due.
+        """Open the line, drop the bytes that it has buffered, and request a frame if the board needs requests.
 
         Raises:
             PortError: If the line cannot be opened.
@@ -155,6 +156,7 @@ class Port:
         self._close()
 
     def _close(self) -> None:
+        """Close the line if it is open."""
         if self._line is not None:
             self._line.close()
         self._line = None
@@ -304,6 +306,7 @@ class FileSource:
     is_live = False
 
     def __init__(self, descriptor: int, name: str) -> None:
+        """Store the file descriptor and the name."""
         self._descriptor = descriptor
         self._name = name
 
@@ -370,6 +373,7 @@ def _refuse_file(path: Path) -> None:
 
 
 def _is_file_or_pipe(path: Path) -> bool:
+    """Return whether a path is a file or a named pipe, and not a device."""
     with contextlib.suppress(OSError):
         mode = path.stat().st_mode
         return stat.S_ISREG(mode) or stat.S_ISFIFO(mode)

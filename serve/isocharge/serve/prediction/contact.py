@@ -1,7 +1,7 @@
 """Contacts that a model computes from charges, and the domain in which the model is valid.
 
-A contact is ten numbers in an order on which other programs rely. `Validity` compares contacts with the domain for
-which a model was trained and returns the flags `outside`, `beyond`, `misfit` and `stress`.
+A contact has ten numbers in a fixed order, on which other programs rely. `Validity` compares contacts with the domain
+for which a model was trained, and returns the flags `outside`, `beyond`, `misfit` and `stress`.
 """
 
 import math
@@ -18,7 +18,7 @@ from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 
 MAX_DECIMALS = 6
-"""Largest number of decimals in the text of a contact, which is 1 nm or 1 uN."""
+"""Largest number of decimals in the text of a contact. The last decimal is 1 nm or 1 uN."""
 
 
 class Contact(NamedTuple):
@@ -34,8 +34,8 @@ class Contact(NamedTuple):
         misfit: Distance of the charges from the charges of the nearest single contact, in standard deviations of the
             noise.
         xy_correlation: Correlation of the errors of x and y, -1 to 1; NaN if the model computes no correlations.
-        xF_correlation: Correlation of the errors of x and the force, -1 to 1; NaN as above.
-        yF_correlation: Correlation of the errors of y and the force, -1 to 1; NaN as above.
+        xF_correlation: Correlation of the errors of x and the force, -1 to 1; NaN without correlations.
+        yF_correlation: Correlation of the errors of y and the force, -1 to 1; NaN without correlations.
     """
 
     x_mm: float
@@ -52,7 +52,7 @@ class Contact(NamedTuple):
     def widened(self, shift: tuple[float, float, float]) -> "Contact":
         """Return the contact with larger standard deviations, which include an additional, independent error.
 
-        The error moves x, y and the force together, so its covariances are added, too.
+        The error changes x, y and the force together. Its covariances are therefore added, too.
 
         Args:
             shift: Changes of x and y, mm, and of the force, N, that one standard deviation of the error causes.
@@ -111,16 +111,18 @@ REUSE_FORCE_RATIO = 0.05
 
 
 class Sensitivity:
-    """Change of a contact with an uncertain parameter, computed from a second prediction with another parameter value.
+    """Change of a contact with an uncertain parameter.
 
-    The second prediction is reused while the contact hardly moves, so that most frames of a held press take one
-    prediction instead of two.
-
-    Args:
-        unit: Difference of the parameter between the two predictions.
+    The change is computed from a second prediction with another value of the parameter. The change is reused while the
+    contact hardly moves, so that most frames of a held press need one prediction instead of two.
     """
 
     def __init__(self, unit: float) -> None:
+        """Begin without a contact.
+
+        Args:
+            unit: Difference of the parameter between the two predictions.
+        """
         self._unit = unit
         self._reference: Contact | None = None
         self._unit_shift = (0.0, 0.0, 0.0)
@@ -150,7 +152,12 @@ class Sensitivity:
 
 
 def is_close(contact: Contact, reference: Contact | None) -> bool:
-    """Return whether a contact is so close to another contact that its sensitivities are the same."""
+    """Return whether a contact is so close to a reference that both have the same sensitivity to a parameter.
+
+    Args:
+        contact: The contact.
+        reference: The contact to compare it with. The result is False for None.
+    """
     return (
         reference is not None
         and abs(contact.x_mm - reference.x_mm) <= REUSE_DISTANCE_mm
@@ -160,7 +167,7 @@ def is_close(contact: Contact, reference: Contact | None) -> bool:
 
 
 class Contacts(NamedTuple):
-    """Contacts of n presses: the fields of `Contact`, each as a float32 array of shape (n,).
+    """Contacts of n presses. The fields are those of `Contact`, each as a float32 array of shape (n,).
 
     `np.asarray` converts them to one array of shape (n, 10) with one press in each row.
     """
@@ -182,19 +189,22 @@ class Contacts(NamedTuple):
 
 
 MISFIT_LIMIT = 5.0
-"""Smallest limit of the misfit, in standard deviations. A model may state a larger limit, which 0.1 % of good presses
-exceed."""
+"""Smallest limit of the misfit, in standard deviations of the noise.
+
+The metadata of a model may contain a larger limit, which 0.1 % of good presses exceed.
+"""
 
 TOUCH_LIMIT = 5.0
 """Charge, in standard deviations of the white noise, above which an electrode indicates a touch."""
 
 IMPLAUSIBLE_FACTOR = 3.0
-"""Multiple of the largest force, and of the radius of the circle around the working area, beyond which an output of the
-model cannot be a measurement."""
+"""Factor for the limits beyond which an output of the model cannot be a measurement, dimensionless.
+
+The limits are this multiple of the largest force, and of the radius of the circle around the working area.
+"""
 
 MAX_CENTRE_OFFSET = 0.05
-"""Largest distance of the centre of a working area from the origin for which the area counts as centred, relative to
-the radius of the area, dimensionless."""
+"""Largest distance of the centre of a centred working area from the origin, relative to the radius of the area."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +216,7 @@ class Validity:
         force_range_N: Smallest and largest force, N.
         misfit_limit: Largest misfit of a single contact, in standard deviations.
         yield_force_N: Force above which the film yields, N.
-        white_pC: Standard deviation of the white noise of each charge, or one for each electrode, pC.
+        white_pC: Standard deviation of the white noise, pC: one number for all electrodes, or one for each electrode.
     """
 
     corners_mm: Array
@@ -217,7 +227,7 @@ class Validity:
 
     @classmethod
     def of(cls, metadata: ModelMetadata) -> "Validity":
-        """Return the limits that a model's metadata state."""
+        """Return the domain that the metadata of a model describe."""
         measured_limit = metadata.errors.get("misfit_p999", MISFIT_LIMIT)
         return cls(
             corners_mm=np.array(metadata.working_area_mm),
@@ -254,7 +264,7 @@ class Validity:
             charge_pC: Charges, shape (n, electrodes), pC.
 
         Returns:
-            Shape (n,).
+            Whether each row of charges is a touch, shape (n,).
         """
         limit_pC = TOUCH_LIMIT * np.asarray(self.white_pC)
         return np.asarray((np.abs(charge_pC) > limit_pC).any(axis=1))
@@ -303,8 +313,8 @@ class Validity:
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the flags of one contact.
 
-        Contacts inside the largest circle around the origin, or outside the radius of the working area, take about a
-        microsecond. Other contacts have to be compared with the polygon, which takes about 30 us.
+        Most contacts take about a microsecond. Contacts near the edge of the working area are compared with its
+        polygon, which takes about 30 us.
         """
         return _flag_words(
             is_outside=self._is_outside(contact),
@@ -343,7 +353,7 @@ class Validity:
         is_outside = is_outside_area | is_outside_forces
         has_misfit = contacts.misfit > self.misfit_limit
         yields = contacts.force_N > self.yield_force_N
-        # An implausible contact is outside, too, so that `is_beyond` need not be tested here.
+        # Every contact that is beyond the limits is also outside, so that `is_beyond` need not be tested here.
         if not (is_outside | has_misfit | yields).any():
             return [()] * len(is_outside)
 
@@ -388,7 +398,7 @@ def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
         corners: Corners in order, shape (m, 2). The last corner may repeat the first one.
 
     Returns:
-        Shape (n,). The result for points on an edge is undefined.
+        Whether each point is inside, shape (n,). The result for points on an edge is undefined.
     """
     edge_ends = np.roll(corners, -1, axis=0)
     # Coordinates of shape (m, 1), so that the arrays below have the shape (m edges, n points).

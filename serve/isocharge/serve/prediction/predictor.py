@@ -1,10 +1,10 @@
 """Prediction of contacts from charges in the same process.
 
-A single press uses memory that is bound to the session once, so that a prediction allocates no arrays and is faster
-than `session.run`. Batches use `session.run`.
+A single press uses memory that is bound to the session once. Its prediction allocates no arrays and is faster than
+`session.run`. Batches use `session.run`.
 
-`predict` checks the charges and returns a named tuple. `predict_into` is for the loop of a host program: it copies one
-array into another without checks of the values.
+`predict` checks the charges and returns a named tuple. `predict_into` is for fast loops: it writes the contact into an
+existing array and does not check the charges.
 """
 
 import logging
@@ -79,13 +79,15 @@ class Predictor:
         _check_bound_memory(self._press, loaded)
 
     def with_constants(self, constants: Mapping[str, Singles]) -> "Predictor":
-        """Return a predictor of the same graph with other values of some constants. This takes about a millisecond.
+        """Return a predictor with the same graph, but other values of some of its constants.
+
+        The call takes about a millisecond.
 
         Args:
             constants: New values by the names of the graph's constants.
 
         Raises:
-            ModelError: If the graph has no constant of a name, or the shapes differ.
+            ModelError: If the graph has no constant with one of the names, or a shape differs.
         """
         other = copy(self)
         other._constants = constants  # keeps the arrays alive, because onnxruntime uses their memory
@@ -94,9 +96,9 @@ class Predictor:
         return other
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
-        """Compute the contact of one press. `flags` returns whether the contact is valid.
+        """Compute the contact of one press. Call `flags` to learn whether the contact is valid.
 
-        The first contact that cannot be a measurement is logged as a warning.
+        The first contact that is too far away or too hard to be a measurement is logged as a warning.
 
         Args:
             charge_pC: Touch charges, shape (electrodes,), pC, in the order of `metadata.electrodes`.

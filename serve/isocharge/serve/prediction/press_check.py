@@ -1,8 +1,8 @@
 """Comparison of a model with measured presses: its errors, the part that noise and rig explain, and a verdict.
 
-If the errors are larger than the noise of the charges and the uncertainty of the rig explain, the model does not
-describe the film: the film has aged, its pretension has crept, or it was never calibrated. Such a drift first appears
-as a common scale of the forces and as a common shift of the positions.
+If the noise of the charges and the uncertainty of the rig do not explain the errors, the model does not describe the
+film. Either the film was never calibrated, or it has aged or crept since then. Such a drift first appears as a common
+scale of the forces and as a common shift of the positions.
 """
 
 import math
@@ -164,9 +164,10 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
 
 
 def _bad_presses(errors: PressErrors) -> Booleans:
-    """Return which presses are bad, shape (n,): presses whose exclusion makes all others agree with the model.
+    """Return which presses are bad, shape (n,).
 
-    No press is bad if all presses agree with the model, or if too many presses would have to be excluded.
+    The bad presses are those whose exclusion makes all other presses agree with the model. No press is bad if all
+    presses agree with the model, or if too many presses would have to be excluded.
     """
     is_compared = errors.is_compared
     no_bad_press = np.zeros_like(is_compared)
@@ -312,7 +313,7 @@ def _remedies(metadata: ModelMetadata, position: ErrorSummary | None, force: Err
 
 
 def _explaining_rig_std(errors: ErrorSummary) -> float:
-    """Return the standard deviation of the rig with which the errors would be explained, in the unit of the errors."""
+    """Return the standard deviation of the rig that would explain the errors, in the unit of the errors."""
     return math.sqrt(max(errors.rms**2 - errors.noise**2, 0.0))
 
 
@@ -332,7 +333,10 @@ def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[s
 
 
 def _explain_exclusion(reason: str, metadata: ModelMetadata) -> str:
-    """Return the reason for an exclusion as a part of a sentence, with the limits of the model if it exceeds them."""
+    """Return the reason for an exclusion as a part of a sentence.
+
+    If a press is outside the domain of the model, the text contains the limits of the domain.
+    """
     if reason != NOT_TRAINED:
         return reason
     min_force_N, max_force_N = metadata.force_range_N

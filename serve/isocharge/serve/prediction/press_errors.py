@@ -51,8 +51,8 @@ class PressErrors:
             the measured value is unknown.
         noise_std: Standard deviations that the model reports for the noise, in the units of `error`, shape (n, 3).
         rig_std: Standard deviations of the measured values, in the units of `error`, shape (n, 3).
-        flags: Flags of each press: `outside` as `Validity` defines it, and `misfit` above the misfit that 1 % of good
-            presses exceed.
+        flags: Flags of each press. `outside` is the flag of `Validity`. `misfit` means that the misfit is above
+            `misfit_limit`, which 1 % of good presses exceed.
         exclusion_reasons: Reason why each press is excluded from the comparison; empty if it is compared.
     """
 
@@ -140,12 +140,20 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
 
 
 def misfit_limit(metadata: ModelMetadata) -> float:
-    """Return the misfit that 1 % of good presses exceed, which the metadata of a model state."""
+    """Return the misfit that 1 % of good presses exceed, from the metadata of a model."""
     return float(metadata.errors.get("misfit_p99", MISFIT_LIMIT))
 
 
 def _predicted_contacts(predictor: Predictor, charge_pC: Array) -> Array:
-    """Predict presses from charges of shape (n, electrodes), pC; the rows with an unknown charge are NaN."""
+    """Predict the contacts of presses.
+
+    Args:
+        predictor: The model.
+        charge_pC: Charges, shape (n, electrodes), pC; NaN where unknown.
+
+    Returns:
+        Values of a `Contact`, shape (n, 10). A row with an unknown charge is NaN.
+    """
     predicted = np.full((len(charge_pC), len(Contacts._fields)), np.nan)
     is_complete = ~np.isnan(charge_pC).any(axis=1)
     predicted[is_complete] = np.column_stack(predictor.predict_batch(charge_pC[is_complete]))
@@ -197,14 +205,16 @@ def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tup
 
 
 SIGNIFICANCE = 0.01
-"""Probability with which a model that fits is refused: half each by the sum of squares and by the mean error."""
+"""Probability with which a model that fits is refused. Each of the two tests has half of this probability."""
 
 MAX_ACCEPTED_CHI_SQUARED = 1.1
 """Chi-squared per degree of freedom that is always accepted, because standard deviations are known to 5 % at best."""
 
 COMMON_RATIO = 0.2
-"""Fraction of a rig's standard deviation that may be equal in all presses, dimensionless. For example, a stage has a
-constant offset, and a load cell has an error of scale."""
+"""Fraction of the standard deviation of a rig that may be equal in all presses, dimensionless.
+
+For example, the position of a stage has a constant offset, and the force of a load cell has an error of scale.
+"""
 
 
 @dataclass(frozen=True)
@@ -363,6 +373,7 @@ class Agreement:
 
 
 def _p_value(chi_squared: float, degrees: int) -> float:
+    """Return the probability that a chi-squared variable exceeds a value; NaN without degrees of freedom."""
     return chi_squared_survival(chi_squared, degrees) if degrees else math.nan
 
 

@@ -1,7 +1,8 @@
 """Reading of charges from a file, and writing of contacts as CSV or as prediction records.
 
-The header of the file contains the names of the electrodes in any order, and may have further columns. The rows are
-touch charges in pC, from which no tare is subtracted. In a row whose charges do not exceed the noise, nothing touches.
+The header of the file contains the names of the electrodes in any order, and may have further columns. Each row
+contains touch charges in pC. No tare is subtracted. If the charges of a row do not exceed the noise, the row has no
+contact.
 """
 
 import csv
@@ -23,7 +24,7 @@ from isocharge.serve.prediction.predictor import Predictor
 from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
 
 BLOCK_ROWS = 4096
-"""Number of rows that are converted at a time, which limits the memory."""
+"""Number of rows that are converted at a time. It limits the memory."""
 
 MAX_CHARGE_ROWS = 10_000_000
 """Largest number of rows of a file of charges."""
@@ -38,35 +39,36 @@ def read_charges(
     """Read a CSV text of charges.
 
     Args:
-        lines: Lines of the text; CRLF, blank lines and lines that begin with # do not matter.
-        electrodes: The columns that are read; a file of measured presses may have more.
-        where: The file, for messages.
-        warn: Called with a sentence if columns are ignored.
+        lines: Lines of the text. Lines may end in CRLF. Blank lines and lines that begin with # are ignored.
+        electrodes: Names of the columns that are read. The text may have more columns.
+        where: Name of the file, for messages.
+        warn: Function that is called with a sentence if columns are ignored.
 
     Returns:
         Charges in the order of `electrodes`, shape (n, electrodes), pC.
 
     Raises:
-        ChargeError: If a column is missing or there twice, or a cell is not a finite number, or there are more rows
-            than `MAX_CHARGE_ROWS`.
+        ChargeError: If a column is missing or occurs twice, a cell is not a finite number, or there are more rows than
+            `MAX_CHARGE_ROWS`.
     """
     table = CsvTable(lines, electrodes, where, ChargeError, _expected_header(electrodes))
     return _charges(table, electrodes, warn)
 
 
 def read_charge_file(path: Path, electrodes: tuple[str, ...], warn: Callable[[str], None] = lambda _: None) -> Array:
-    """Read a file of charges, which is Parquet if its name ends in `.parquet`, else CSV.
+    """Read a file of charges.
 
     Args:
-        path: The file.
-        electrodes: As `read_charges` takes them.
-        warn: As `read_charges` takes it.
+        path: The file. It is read as Parquet if its name ends in `.parquet`, and as CSV otherwise.
+        electrodes: Names of the columns that are read. The file may have more columns.
+        warn: Function that is called with a sentence if columns are ignored.
 
     Returns:
         Charges in the order of `electrodes`, shape (n, electrodes), pC.
 
     Raises:
-        ChargeError: As `read_charges`, and if the file cannot be read.
+        ChargeError: If the file cannot be read, a column is missing or occurs twice, a cell is not a finite number, or
+            there are more rows than `MAX_CHARGE_ROWS`.
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     with open_table(path, electrodes, ChargeError, _expected_header(electrodes)) as table:
@@ -74,6 +76,7 @@ def read_charge_file(path: Path, electrodes: tuple[str, ...], warn: Callable[[st
 
 
 def _expected_header(electrodes: tuple[str, ...]) -> str:
+    """Return a description of the expected header, for error messages."""
     return f"a header with one column for each of the electrodes {electrodes} and charges in pC"
 
 
@@ -104,13 +107,13 @@ def write_contacts(
     Args:
         contacts: The contacts of n presses.
         out: Text file to which the rows are written.
-        validity: Limits of the model's validity. If given, a column `flags` is added: words separated by blanks.
+        validity: Domain of the model. If given, a column `flags` is added, with the flags separated by blanks.
         charge_pC: The charges of the presses, shape (n, electrodes), pC. If given together with `validity`, a row
-            whose charges do not exceed the noise gets a force of 0 and otherwise empty cells.
+            whose charges do not exceed the noise has a force of 0, and its other cells are empty.
     """
-    touches = np.ones(len(contacts.x_mm), dtype=bool)
+    is_touch = np.ones(len(contacts.x_mm), dtype=bool)
     if validity is not None and charge_pC is not None:
-        touches = validity.is_touch(charge_pC)
+        is_touch = validity.is_touch(charge_pC)
     names = Contacts._fields[:N_WITHOUT_CORRELATION]
     no_contact = tuple("0.000000" if name == "force_N" else "" for name in names)
 
@@ -119,25 +122,29 @@ def write_contacts(
     rows = np.column_stack(contacts)
     for start in range(0, len(rows), BLOCK_ROWS):
         block = rows[start : start + BLOCK_ROWS]
-        is_touch = touches[start : start + BLOCK_ROWS]
+        block_is_touch = is_touch[start : start + BLOCK_ROWS].tolist()
         values = block[:, :N_WITHOUT_CORRELATION].tolist()
         flags = [()] * len(block) if validity is None else validity.batch_flags(Contacts(*block.T))
-        for numbers, has_contact, words in zip(values, is_touch.tolist(), flags, strict=True):
-            cells = tuple(map("{:.6f}".format, numbers)) if has_contact else no_contact
-            flag_text = " ".join(words) if has_contact else ""
+        for numbers, row_is_touch, row_flags in zip(values, block_is_touch, flags, strict=True):
+            cells = tuple(f"{number:.6f}" for number in numbers) if row_is_touch else no_contact
+            flag_text = " ".join(row_flags) if row_is_touch else ""
             writer.writerow(cells if validity is None else (*cells, flag_text))
 
 
 def blocks(rows: Array) -> Iterator[Array]:
-    """Yield the rows in blocks, because Python numbers need five times as much memory as an array."""
+    """Yield blocks of `BLOCK_ROWS` rows.
+
+    The rows are converted to Python numbers, which need five times as much memory as an array.
+    """
     for start in range(0, len(rows), BLOCK_ROWS):
         yield rows[start : start + BLOCK_ROWS]
 
 
 def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
-    """Yield a record for each row of charges. Times, counters and raw charges, which a table does not have, are None.
+    """Yield a record for each row of charges.
 
-    A row whose charges do not exceed the noise of the model is out of contact: its force is 0, and it has no position.
+    A table has no times, counters and raw charges, so these fields are None. A row whose charges do not exceed the
+    noise of the model is out of contact. Its force is 0, and it has no position.
 
     Args:
         charge_pC: Charges, shape (n, electrodes), pC.
@@ -150,9 +157,9 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
     for block in blocks(charge_pC):
         contacts = predictor.predict_batch(block)
         flags = predictor.validity.batch_flags(contacts)
-        touches = predictor.validity.is_touch(block)
+        block_is_touch = predictor.validity.is_touch(block)
         for row, charges in enumerate(block.tolist()):
-            is_touch = bool(touches[row])
+            is_touch = bool(block_is_touch[row])
             contact = Contact(*(float(column[row]) for column in contacts))
             yield PredictionRecord(
                 timestamp=None,

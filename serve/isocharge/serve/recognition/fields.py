@@ -1,8 +1,8 @@
 """Recognition of the fields of a frame: sync bytes, frame counter, clock and channels.
 
-Every division of the bytes into fields has a score, in bits: the number of bits that the values of a frame need if the
-frame before is known, plus the `Weights` of the fields. The division with the lowest score is chosen. Of two divisions
-that explain the bytes equally well, this is the simpler one, such as adjacent channels of one type.
+Every division of the bytes into fields has a score in bits. The score is the number of bits that the values of a frame
+need if the previous frame is known, plus the `Weights` of the fields. The division with the lowest score is chosen. Due
+to the weights, simple divisions are preferred, such as adjacent channels of one type.
 `tests/benchmarks/fit_recognition.py` fits the weights on random boards.
 """
 
@@ -30,7 +30,7 @@ CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
 """Name of the field, and value of one tick in the unit of that name, by the tick rate of a clock, Hz."""
 
 CLOCK_RATE_TOLERANCE = 0.06
-"""Largest relative deviation of a tick rate from a common one. It is not small, because frames arrive in bursts."""
+"""Largest relative deviation of a tick rate from a common tick rate. It is large, because frames arrive in bursts."""
 
 PLAUSIBLE_MAGNITUDES = (1e-7, 1e8)
 """Smallest and largest typical magnitude of a floating-point channel."""
@@ -40,9 +40,9 @@ TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "f32", "f64")
 
 
 def steady_step(step: Array) -> float:
-    """Return the mean of the regular steps of a counter or clock; 0 if the steps are not regular.
+    """Return the mean of the regular steps of a counter or clock; 0 if too few steps are regular.
 
-    A step is regular if it is close to the median. Lost frames cause other steps.
+    A step is regular if it is close to the median step. Lost frames cause other steps.
 
     Args:
         step: Differences of the values of consecutive frames, shape (n,).
@@ -122,8 +122,8 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
     The first possible part at each byte is a single byte without a meaning.
 
     Args:
-        rows: Bytes of the frames, each followed by the next frame, shape (n, 2 * length). Where a frame begins need not
-            be known.
+        rows: Bytes of the frames, each followed by the next frame, shape (n, 2 * length). The frames may begin at any
+            position.
         order: Byte order of the numbers.
         rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
         weights: Contributions to the score.
@@ -149,26 +149,26 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
 
 
 def _numbers(
-    cut: Bytes, constant: Booleans, is_zero: Booleans, kind: str, rate_Hz: float, weights: Weights
+    number_bytes: Bytes, is_constant: Booleans, is_zero: Booleans, kind: str, rate_Hz: float, weights: Weights
 ) -> Iterator[Part]:
-    """Yield the possible meanings of bytes as a number of a type: frame counter or clock, and channel.
+    """Yield the possible meanings of bytes as a number of one type: frame counter or clock, and channel.
 
     Args:
-        cut: The bytes, the lowest first, shape (n, size).
-        constant: Whether each byte is constant, shape (size,).
+        number_bytes: Bytes of the number, the lowest first, shape (n, size).
+        is_constant: Whether each byte is constant, shape (size,).
         is_zero: Whether each byte is always 0, shape (size,).
         kind: Type of the number.
         rate_Hz: Number of frames per second, Hz.
         weights: Contributions to the score.
     """
-    size = len(constant)
-    if constant.all():
+    size = len(is_constant)
+    if is_constant.all():
         yield Part("channel", kind, size, weights.constant, is_constant=True, row=kind)
         return
     is_float = kind[0] == "f"
     is_unsigned = kind[0] == "u"
     is_signed = kind[0] == "i"
-    values = _values(cut, kind)
+    values = _values(number_bytes, kind)
     step = np.diff(values)
     counter_step = step
     magnitude = float(np.median(np.abs(values)))
@@ -254,18 +254,18 @@ def split_frame(
     return lowest_score, best_sync_length, best_parts
 
 
-def _values(cut: Bytes, kind: str) -> Array:
+def _values(number_bytes: Bytes, kind: str) -> Array:
     """Return the values of a number in all frames, shape (n,).
 
     Args:
-        cut: Bytes of the number, the lowest first, shape (n, size).
+        number_bytes: Bytes of the number, the lowest first, shape (n, size).
         kind: Type of the number: "f" for floating-point, "u" for unsigned or "i" for signed, and the size in bits.
     """
-    size = cut.shape[1]
+    size = number_bytes.shape[1]
     if kind[0] == "f":
-        return np.ascontiguousarray(cut).view(f"<f{size}")[:, 0].astype(float)
+        return np.ascontiguousarray(number_bytes).view(f"<f{size}")[:, 0].astype(float)
     byte_weights = 256.0 ** np.arange(size)
-    unsigned: Array = cut @ byte_weights
+    unsigned: Array = number_bytes @ byte_weights
     if kind[0] == "u":
         return unsigned
     value_count = 256.0**size

@@ -1,12 +1,12 @@
-"""Recognition of the framing: where frames begin, how long they are, and with which checksum they end.
+"""Recognition of the framing: the beginning and the length of frames, and their checksum.
 
-A stream with byte stuffing is split at its delimiter. In other streams some bytes are the same in every frame, so they
-occur again after the length of a frame. Of all pairs of bytes, the pair is chosen whose most frequent distance to its
-next occurrence covers the largest part of the stream. At which position of the frame this pair lies is not known yet.
+A stream with byte stuffing is split at its delimiter. In other streams, some bytes are the same in every frame, and
+therefore repeat after the length of a frame. The repetitions of each pair of bytes cover a part of the stream. The pair
+that covers the largest part is chosen. The position of this pair in the frame is not known yet.
 
-Named checksums are tried from every first byte. For cyclic redundancy checks without a name, only the polynomials have
-to be tried: in frames of one length, the initial value, the final value and all constant bytes together contribute a
-constant.
+Named checksums are tried with every possible first byte. For cyclic redundancy checks without a name, only the
+polynomials have to be tried, because the initial value, the final value and all constant bytes contribute the same
+constant in all frames of one length.
 """
 
 from collections import Counter
@@ -44,7 +44,10 @@ COVERED_SHARE = 0.4
 """Smallest share of a stream that frames of one length must cover, dimensionless."""
 
 SINGLE_BYTE_PENALTY = 0.05
-"""Share of a stream by which a single byte must cover more than a pair of bytes, which rarely repeats by chance."""
+"""Share of a stream by which a single byte must cover more than a pair of bytes.
+
+A pair of bytes rarely repeats by chance, but a single byte often does.
+"""
 
 MAX_FRAME_LENGTHS = 3
 """Number of frame lengths that are tried."""
@@ -102,6 +105,7 @@ def framings(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Window
 
 
 def _side_by_side(framing: str, data: bytes, length: int) -> Windows:
+    """Return the windows of a stream that contains only whole frames of one length."""
     return Windows(framing, np.frombuffer(data, np.uint8), np.arange(0, len(data), length), length)
 
 
@@ -124,7 +128,7 @@ def _stuffed(name: str, stuffing: Stuffing, data: bytes) -> Iterator[Windows]:
     if count < STUFFED_SHARE * len(pieces) or not has_frame_length:
         return
 
-    # If decoding makes the lengths no more regular, every frame only happens to begin with the delimiter.
+    # If the lengths are as regular without decoding, there is no stuffing, and frames begin with this byte by chance.
     _, count_without_decoding = _most_common_length(pieces)
     if name == "cobs" or count > count_without_decoding:
         frames = [piece for piece in decoded_pieces if len(piece) == length]
@@ -141,8 +145,9 @@ def _most_common_length(pieces: Sequence[bytes]) -> tuple[int, int]:
 def _synchronised(stream: Bytes) -> Iterator[Windows]:
     """Yield the divisions of a stream at bytes that repeat after the length of a frame.
 
-    For each length, the pair of bytes or the single byte that is repeated in the largest share of the stream is
-    chosen. The lengths with the largest shares are yielded; of about equal shares, the shorter length comes first.
+    For each length, the pair of bytes or the single byte is chosen whose repetitions cover the largest share of the
+    stream. The lengths with the largest shares are yielded. If the shares are about equal, the shorter length comes
+    first.
 
     Args:
         stream: Bytes of the stream, shape (n,).
@@ -171,7 +176,7 @@ def _repeats(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]
     """Yield the frequent distances from a code to its next occurrence, and the positions of the code.
 
     Args:
-        codes: Bytes, or pairs of bytes as numbers, at each position of the stream, shape (n,).
+        codes: Code at each position of the stream, shape (n,). A code is a byte, or a pair of bytes as a number.
     """
     # A stable sort puts equal codes side by side, in the order of their positions.
     sorted_positions = np.argsort(codes, kind="stable")

@@ -1,7 +1,7 @@
 """Recognition of the format of a board: the binary frames of isocharge, lines of text, or frames of fixed length."""
 
 from collections.abc import Iterator, Sequence
-from itertools import count, groupby
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -24,13 +24,13 @@ from isocharge.serve.recognition.framing import (
 )
 
 MAX_EXAMINED_FRAMES = 300
-"""Number of frames that are examined."""
+"""Largest number of frames that are examined."""
 
 MAX_FRAME_STARTS = 24
 """Number of constant bytes that are tried as the first byte of a frame."""
 
 MAX_SYNC_BYTES = 6
-"""Longest sync, bytes. The bytes after it may be constant only by chance."""
+"""Longest sync pattern, bytes. Further constant bytes may be constant by chance."""
 
 WEIGHTS = Weights()
 """Weights that were fitted on random boards."""
@@ -153,7 +153,7 @@ def _fields(parts: Sequence[Part]) -> list[dict[str, Any]]:
 
 
 CLEAR_SHARE = 0.4
-"""Share of bytes in intact frames from which no other format is tried. Echoes may lie between the frames."""
+"""Smallest share of bytes in intact frames with which no other format is tried. Echoes may lie between the frames."""
 
 
 def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False) -> dict[str, Any] | None:
@@ -184,14 +184,20 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
 def _read(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], float]:
     """Return the frames that a parser finds, and the share of the bytes that lie in these frames."""
     frames = [frame for chunk in chunks for frame in parser.feed(chunk)]
-    return frames, 1.0 - parser.counts.bytes_dropped / max(1, sum(map(len, chunks)))
+    byte_count = sum(len(chunk) for chunk in chunks)
+    return frames, 1.0 - parser.counts.bytes_dropped / max(1, byte_count)
 
 
 def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[str, Any]:
     """Return the keys of a device file for lines of text.
 
-    Columns without names get names if one of them has a meaning. The header of a CSV stream becomes part of the device
-    file, because a program that starts later does not receive it.
+    If the columns have no names and one of them is a counter or a clock, all columns get names. The header of a CSV
+    stream is copied to the device file, because a program that starts later does not receive the header.
+
+    Args:
+        layout: Layout of the lines.
+        frames: Frames of these lines.
+        rate_Hz: Number of frames per second, Hz.
     """
     last_frame = frames[-1]
     meanings = _meanings(frames, rate_Hz)
@@ -203,8 +209,15 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], rate_Hz: float) -> dict[
         return {"columns": columns}
     if last_frame.names or not meanings:
         return {meaning: last_frame.names[position] for position, meaning in meanings.items()}
-    channel_names = map("ch{}".format, count(1))
-    return {"columns": [meanings.get(position) or next(channel_names) for position in range(len(last_frame.values))]}
+    column_names = []
+    channel_count = 0
+    for position in range(len(last_frame.values)):
+        if position in meanings:
+            column_names.append(meanings[position])
+        else:
+            channel_count += 1
+            column_names.append(f"ch{channel_count}")
+    return {"columns": column_names}
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -13,13 +13,13 @@ KINDS: dict[Any, Kind] = {float: "number", int: "integer", bool: "boolean", str:
 
 
 class Meaning(NamedTuple):
-    """Annotation of a field: what its value means.
+    """Annotation of a field with the meaning of its value.
 
     Attributes:
-        text: A sentence for people.
+        text: Description of the value, a sentence.
         unit: Unit of the value; empty if it has none.
         is_shown_live: Whether the samples of the live page contain the value.
-        is_flattened: Whether the fields of a nested struct stand in the record itself instead of in an object.
+        is_flattened: Whether the fields of a nested struct are fields of the record instead of fields of an object.
     """
 
     text: str
@@ -29,12 +29,12 @@ class Meaning(NamedTuple):
 
 
 class Field(NamedTuple):
-    """One field of a record, as JSON shows it.
+    """One field of a record in JSON.
 
     Attributes:
         name: Key in JSON.
         kind: Kind of the value.
-        meaning: What the value means.
+        meaning: Meaning of the value.
         may_be_null: Whether the value may be unknown.
         parts: Fields of the value, if its kind is `object`.
         group: Name of the nested struct that the field belongs to. A record without that struct has no such field.

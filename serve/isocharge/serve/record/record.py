@@ -1,8 +1,8 @@
 """The prediction record: one reading of a sensor and the answer of a model.
 
-The fields are declared here and nowhere else. JSON, CSV, the JSON Schema, the samples of the live page and the table in
-the documentation are derived from the declaration. An unknown value is None, which is `null` in JSON: a CSV file of
-charges has no time of the device, and a film that nobody touches has no position.
+The fields are declared only here. JSON, CSV, the JSON Schema, the samples of the live page and the table in the
+documentation are derived from the declaration. An unknown value is None, which is `null` in JSON. For example, a CSV
+file of charges has no time of the device, and a film without a contact has no position.
 """
 
 import json
@@ -15,14 +15,14 @@ from msgspec import Struct, structs
 from isocharge.serve.record.fields import Field, Meaning, fields_of
 
 DECIMALS = 6
-"""Number of decimals in JSON and CSV: 1 nm, 1 uN, 1 aC and 1 us, which no sensor resolves."""
+"""Number of decimals in JSON and CSV. The last decimal is 1 nm, 1 uN, 1 aC or 1 us, which no sensor resolves."""
 
 Charges = dict[str, float | None]
 """Charges by the name of the electrode, pC; None if the device sent no number."""
 
 
 class TrackedContact(Struct, frozen=True):
-    """A contact as estimated from all frames up to now. The correlations are those of the latest frame."""
+    """A contact that is estimated from all frames so far. The correlations are those of the latest frame."""
 
     x_mm: Annotated[float, Meaning("Position x.", "mm")]
     y_mm: Annotated[float, Meaning("Position y.", "mm")]
@@ -35,7 +35,7 @@ class TrackedContact(Struct, frozen=True):
     moving: Annotated[float, Meaning("Probability that the contact moves, 0 to 1.")]
 
     def widened(self, shift: tuple[float, float, float]) -> "TrackedContact":
-        """Return the contact with the standard deviations increased by an error that all frames have in common.
+        """Return the contact with larger standard deviations, which include an error that all frames have in common.
 
         Args:
             shift: Changes of x and y, mm, and of the force, N, by one standard deviation of the error.
@@ -59,7 +59,7 @@ class OtherContact(Struct, frozen=True):
 
 
 class FollowedFilm(Struct, frozen=True):
-    """The film as estimated from the touches up to now."""
+    """The film as estimated from all touches so far."""
 
     pretension_MPa: Annotated[float, Meaning("Pretension for which the model answered.", "MPa")]
     pretension_std_MPa: Annotated[float, Meaning("Standard deviation of the pretension.", "MPa")]
@@ -163,7 +163,7 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
 
     @property
     def field_names(self) -> tuple[str, ...]:
-        """Names of the fields that this record is written with, in their order."""
+        """Names of the fields with which this record is written, in their order."""
         return field_names(with_tracking=self.tracking is not None, with_film=self.film is not None)
 
     @property
@@ -207,10 +207,10 @@ CONTACT_FIELDS = (
 """Names of the fields that a model computes, in the order of its outputs."""
 
 UNKNOWN_CONTACT: dict[str, Any] = dict.fromkeys(CONTACT_FIELDS)
-"""Values of these fields if nothing was computed."""
+"""Values of the `CONTACT_FIELDS` if nothing was computed."""
 
 NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
-"""Values of these fields if nothing touches."""
+"""Values of the `CONTACT_FIELDS` if nothing touches."""
 
 
 def selected_fields(*, with_tracking: bool, with_film: bool) -> tuple[Field, ...]:
@@ -238,23 +238,28 @@ _NAMES = {
 
 
 def field_names(*, with_tracking: bool = False, with_film: bool = False) -> tuple[str, ...]:
-    """Return the names of the fields of records with or without tracking and the following of the film."""
+    """Return the names of the fields of a record.
+
+    Args:
+        with_tracking: Whether the record has the fields of the tracking.
+        with_film: Whether the record has the fields of the film follower.
+    """
     return _NAMES[with_tracking, with_film]
 
 
 _UNCHANGED = frozenset({str, int, bool, tuple, type(None)})
-"""Classes of values that JSON shows without a change."""
+"""Classes of values that are written to JSON without a change."""
 
 _ENCODE = json.JSONEncoder(allow_nan=False).encode
 
 
 def _json_value(value: Any) -> Any:
-    """Return the value of a field in the form in which it is written as JSON: numbers are rounded to six decimals.
+    """Return the value of a field for JSON. Numbers are rounded to six decimals, and a struct becomes a dictionary.
 
     The class is compared by identity, because the function is called 20 times for each record.
 
     Args:
-        value: A number, a value that JSON has too, the charges by electrode, or a struct.
+        value: A number, text, boolean, tuple of texts or None; the charges by electrode; or a struct.
     """
     value_class = value.__class__
     if value_class is float:

@@ -1,6 +1,6 @@
-"""The table of the record's fields for the documentation, in Markdown.
+"""Table of the fields of a record for the documentation, in Markdown.
 
-python -m isocharge.serve.record.reference
+The command `python -m isocharge.serve.record.reference` prints the table.
 """
 
 from collections.abc import Iterable, Iterator
@@ -20,7 +20,7 @@ TYPES = {
 """Words for the kinds of values."""
 
 GROUPS = {"tracking": "with `[track]`", "film": "with `[follow]`"}
-"""When a record has the fields of a group."""
+"""Condition under which a record has the fields of a group."""
 
 
 def record_table() -> str:

@@ -2,19 +2,20 @@
 
 `Chain` has the settings of all stages. `SignalChain` has the stages that these settings request, in this order:
 
-1. gain: the device's unit to pC, with offset, sign and gain of each channel;
-2. limit: a charge at the limit of the converter;
-3. hum: mains hum, estimated and subtracted (`isocharge.serve.signal_chain.hum`);
-4. tare: mean and noise of quiet frames, subtracted from all later frames (`isocharge.serve.signal_chain.tare`);
-5. leak: the decay of the amplifiers undone, and their offset current learned (`isocharge.serve.signal_chain.leak`); or
-   memory: the same together with creep, the thermoelastic step and the warmth of the film
+1. gain: converts the unit of the device to pC, with the offset, the sign and the gain of each channel;
+2. limit: marks frames with a charge at the limit of the converter;
+3. hum: estimates and subtracts mains hum (`isocharge.serve.signal_chain.hum`);
+4. tare: measures the mean and the noise of quiet frames, and subtracts the mean from all later frames
+   (`isocharge.serve.signal_chain.tare`);
+5. leak: corrects the leak of the amplifiers, and estimates their inflow (`isocharge.serve.signal_chain.leak`); or
+   memory: also corrects creep, the thermoelastic step and the warmth of the film
    (`isocharge.serve.signal_chain.memory`);
-6. touch: contact with hysteresis (`isocharge.serve.signal_chain.contact`);
-7. press flags: saturation until the press is over, and charges below zero;
-8. warming: the common charge of a warming film, estimated with the model and subtracted
+6. touch: detects touches with hysteresis (`isocharge.serve.signal_chain.contact`);
+7. press flags: flags saturated presses, and charges below zero;
+8. warming: estimates the common charge of a warming film with the model, and subtracts it
    (`isocharge.serve.signal_chain.thermal`).
 
-A frame with a value that cannot be a charge passes no stage. Its time counts as part of the next frame's.
+A frame with a value that cannot be a charge passes no stage. Its time is added to the time of the next frame.
 """
 
 import math
@@ -45,26 +46,26 @@ from isocharge.serve.signal_chain.tare import Tare, TareRule
 from isocharge.serve.signal_chain.thermal import Misfit, ThermalRule
 
 LARGEST_PC = 1e9
-"""Largest charge of a valid reading, pC: sums of such charges are exact to 1e-7 pC in double precision."""
+"""Largest charge of a valid reading, pC. Sums of such charges are exact to 1e-7 pC in double precision."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """The settings of all stages, in their order; None switches a stage off.
+    """The settings of all stages, in the order of the stages. None switches a stage off.
 
     Attributes:
         gain_pC: Charge per unit of the device, with sign, shape (electrodes,), pC.
-        zero: Values that the device shows without charge, shape (electrodes,), in its unit.
-        limit_pC: Largest charge that the converter can show, pC.
+        zero: Values of the device without charge, shape (electrodes,), in the unit of the device.
+        limit_pC: Largest charge that the converter can represent, pC.
         hum: Settings of the estimate of mains hum.
-        tare: Which frames are quiet enough for a tare.
+        tare: Conditions of a tare.
         tau_s: Time constant of each amplifier, shape (electrodes,), s; None if charges do not leak.
-        leak: Settings of the estimate of the amplifiers' offset current.
-        memory: Memory of the film: how a held press changes its charges.
-        touch: Thresholds of a touch; without them, every frame with a tare is in contact.
+        leak: Settings of the estimate of the inflow of the amplifiers.
+        memory: Memory of the film, which changes the charges of a held press.
+        touch: Thresholds of a touch. If None, every frame with a tare is in contact.
         thermal: Settings of the estimate of warming.
-        pyro: Charge of each electrode over the mean magnitude of all when the film warms, shape (electrodes,),
-            dimensionless; 1.0 if all electrodes are alike.
+        pyro: Charge that warming adds to each electrode, relative to the mean magnitude over all electrodes, shape
+            (electrodes,), dimensionless; 1.0 if all electrodes are equal.
         largest: Largest value of a valid reading, in the unit of the device.
     """
 
@@ -94,7 +95,7 @@ class Reading(NamedTuple):
         charge_pC: Touch charges, shape (electrodes,), pC; None while there is no tare, and for an invalid frame.
         tare: The tare that was subtracted.
         contact: Whether something touches.
-        flags: Words of `isocharge.serve.flags`: those that the frame had before the chain, then those of the chain.
+        flags: Flags that the frame had before the signal chain, followed by the flags of the signal chain.
         charge_scale_std: Relative standard deviation that all touch charges have in common, because the memory of the
             film is not known exactly.
     """
@@ -108,10 +109,12 @@ class Reading(NamedTuple):
 
 
 class SignalChain:
-    """The stages of one sensor with their state; belongs to one thread. The same frames give the same readings.
+    """The stages of one sensor with their state.
+
+    An object belongs to one thread. The same frames give the same readings.
 
     Attributes:
-        stages: The stages that the settings ask for, in their order.
+        stages: The stages that the settings request, in their order.
     """
 
     def __init__(self, settings: Chain, n_electrode: int, misfit: Misfit | None = None) -> None:
@@ -120,7 +123,7 @@ class SignalChain:
         Args:
             settings: Settings of all stages.
             n_electrode: Number of electrodes.
-            misfit: Misfit of the model that currently answers. The warming stage needs it, the others do not.
+            misfit: Misfit of the current model. Only the warming stage needs it.
 
         Raises:
             ValueError: If there is a warming stage and no misfit is given.
@@ -155,17 +158,17 @@ class SignalChain:
     def advance(
         self, values: Array, t_s: float, dt_s: float, *, limited: bool = False, flags: tuple[str, ...] = ()
     ) -> Reading:
-        """Process the next frame by all stages, and return the charges of the touch with the flags.
+        """Process the next frame with all stages, and return the touch charges with the flags.
 
         Args:
             values: Values as the device sent them, in the unit of the device, shape (electrodes,).
             t_s: Time on the clock of the device, s.
             dt_s: Time since the previous frame, s.
             limited: Whether the device reports that an amplifier is at its limit.
-            flags: Flags that the frame has already, to which the chain adds further flags.
+            flags: Flags that the frame already has. The stages add further flags.
 
         Raises:
-            TareError: If the film is not left alone for long enough to tare.
+            TareError: If the film is touched during the whole search for a tare.
         """
         is_valid = math.hypot(*values.tolist()) <= self._settings.largest  # false for NaN
         if not is_valid:
@@ -191,6 +194,6 @@ class SignalChain:
         )
 
     def reset_tare(self) -> None:
-        """Measure the tare again from the next quiet frames, however long that takes. The estimate of the hum stays."""
+        """Measure the tare again from the next quiet frames. The estimate of the hum is kept."""
         for stage in self.stages:
             stage.reset()

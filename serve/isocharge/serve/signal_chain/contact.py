@@ -21,8 +21,9 @@ class TouchRule(Rule, frozen=True, kw_only=True):
 
     Attributes:
         sigmas: First part of the touch threshold, in standard deviations of the total charge at rest.
-        floor_pC: Second part of the touch threshold, pC, which is added to the first.
-        release_share: Release threshold as a share of the peak of the press. It is at least half the touch threshold.
+        floor_pC: Second part of the touch threshold, pC. The touch threshold is the sum of both parts.
+        release_share: Release threshold, relative to the peak of the press. The release threshold is at least half of
+            the touch threshold.
     """
 
     sigmas: Setting = 6.0
@@ -35,10 +36,11 @@ class Touch(NamedTuple):
 
     Attributes:
         contact: Whether something touches.
-        peak_pC: Largest total charge in this press that two consecutive frames reached, pC. A spike is not a peak.
+        peak_pC: Largest total charge in this press that two consecutive frames reached, pC. The spike of a single frame
+            is not a peak.
         last_pC: Total charge of the latest frame, pC.
-        base_pC: Smallest total charge since the last release, pC. A touch is a rise above it, so a slow drift is not
-            taken for a touch.
+        base_pC: Smallest total charge since the last release, pC. A touch is a rise above the base, so a slow drift
+            does not begin a touch.
         is_negative: Whether the total charge lies below zero by more than the touch threshold.
     """
 
@@ -66,9 +68,9 @@ def update_contact(
         touch: State after the previous frame.
         total_pC: Total touch charge of this frame, pC. A press makes it positive.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
-        decay: Factor of the base from frame to frame; below 1 if the charge itself decays to zero.
-        scale_std: Relative standard deviation that all charges have in common, because the film's memory is not known
-            exactly.
+        decay: Factor by which the base decays since the previous frame. It is below 1 if the charge at rest decays.
+        scale_std: Relative standard deviation that all charges have in common, because the memory of the film is not
+            known exactly.
     """
     touch_threshold_pC = rule.floor_pC + rule.sigmas * math.sqrt(float(np.dot(noise_pC, noise_pC)))
     if touch.contact:

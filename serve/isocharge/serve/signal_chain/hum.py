@@ -1,10 +1,12 @@
 """Removal of mains hum by an adaptive notch filter.
 
-A fixed notch filter rings after every touch: a step of 850 pC through a notch of 1 Hz takes a second to settle.
-Therefore the hum itself is estimated and subtracted (Widrow et al., "Adaptive noise cancelling", 1975; normalised least
-mean squares). In each channel it is a sine of known frequency whose amplitude and phase change slowly. The estimate is
-updated with the *differences* of consecutive frames, because hum changes them all the time, whereas a touch changes
-them only briefly. Each difference is clipped. The filter does not delay the signal.
+A fixed notch filter rings after every touch. For example, a step of 850 pC through a notch of 1 Hz takes a second to
+settle. Therefore the hum itself is estimated and subtracted (Widrow et al., "Adaptive noise cancelling", 1975;
+normalised least mean squares). In each channel, the hum is a sine of known frequency whose amplitude and phase change
+slowly.
+
+The estimate is updated with the differences of consecutive frames, because a touch changes these differences only
+briefly. Each difference is clipped. The filter does not delay the signal.
 """
 
 import cmath
@@ -17,7 +19,7 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.serve.signal_chain.rule import Rule, Setting, TimeConstant
 
 MIN_SQUARED_STEP = 0.02
-"""Smallest squared change of the unit phasor between two frames, dimensionless, with which the hum is updated."""
+"""Smallest squared change of the unit phasor between two frames for an update of the hum, dimensionless."""
 
 
 class HumRule(Rule, frozen=True, kw_only=True):

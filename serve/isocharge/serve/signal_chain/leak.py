@@ -6,13 +6,14 @@ frame by frame,
     q[n] = q[n-1] + i[n] - b dt,        i[n] = v[n] - a v[n-1],        a = exp(-dt / tau),
 
 where i is the innovation and b is the inflow (pC/s), the current that flows in because of offset, bias and slow
-warming. The inflow is estimated from the innovation and only out of contact, where the innovation consists of b dt and
-noise. An estimate from the output v would diverge. The first frames of a touch must not change the inflow. Therefore
-each innovation is clipped, a touch begins with the inflow of `look_back_s` before, and after a release the estimate
-pauses for `hold_off_s`.
+warming. The inflow is estimated from the innovation, because an estimate from the output v would diverge. The inflow is
+estimated only out of contact, where the innovation consists of b dt and noise.
 
-Out of contact the charge decays to zero, because any charge that remains then is an error, or comes from a slow warming
-of the film, which gives every electrode the same charge.
+Three rules keep the frames of a touch from changing the inflow. Each innovation is clipped. A touch uses the inflow
+that was estimated `look_back_s` before. After a release, the estimate pauses for `hold_off_s`.
+
+Out of contact, the charge decays to zero. A charge that remains out of contact is an error, or comes from a slow
+warming of the film.
 """
 
 import math
@@ -54,10 +55,10 @@ class Leak(NamedTuple):
         output_pC: Output v above the tare, shape (electrodes,), pC.
         inflow_pC_per_s: Inflow b, shape (electrodes,), pC/s.
         trusted_pC_per_s: Inflow as it was estimated at least `look_back_s` ago, before a touch could affect it.
-        candidate_pC_per_s: Inflow that becomes the trusted one when it is `look_back_s` old.
+        candidate_pC_per_s: Inflow that becomes the trusted inflow when its age is `look_back_s`.
         candidate_age_s: Age of the candidate, s.
         learned_s: Time over which the inflow was averaged, s. It starts at 1 s, with an inflow of 0 as the prior.
-        hold_s: Time for which the estimate still pauses, s.
+        hold_s: Remaining time of the pause after a release, s.
     """
 
     charge_pC: Array
@@ -79,7 +80,7 @@ class Leak(NamedTuple):
 def undo_leak(
     rule: LeakRule, tau_s: Array, leak: Leak, output_pC: Array, noise_pC: Array, dt_s: float, *, contact: bool
 ) -> Leak:
-    """Return the state after the next frame.
+    """Compute the touch charge of the next frame, and return the state after this frame.
 
     Args:
         rule: Settings of the estimate of the inflow.
@@ -117,8 +118,17 @@ def in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) 
         output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
         hold_off_s: Pause of the estimate after the release, s.
     """
-    trusted = leak.trusted_pC_per_s
-    return Leak(charge_pC, output_pC, trusted, trusted, trusted, 0.0, leak.learned_s, hold_off_s)
+    trusted_pC_per_s = leak.trusted_pC_per_s
+    return Leak(
+        charge_pC,
+        output_pC,
+        inflow_pC_per_s=trusted_pC_per_s,
+        trusted_pC_per_s=trusted_pC_per_s,
+        candidate_pC_per_s=trusted_pC_per_s,
+        candidate_age_s=0.0,
+        learned_s=leak.learned_s,
+        hold_s=hold_off_s,
+    )
 
 
 def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array, dt_s: float) -> Leak:
@@ -129,7 +139,7 @@ def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array,
     Args:
         rule: Settings of the estimate of the inflow.
         leak: State of this frame with the inflow of the previous frame.
-        surplus_pC: Innovation that the inflow does not explain, shape (electrodes,), pC. It is clipped.
+        surplus_pC: Innovation minus the contribution of the inflow, shape (electrodes,), pC.
         noise_pC: Standard deviation of each electrode at rest, shape (electrodes,), pC.
         dt_s: Time since the previous frame, s.
 

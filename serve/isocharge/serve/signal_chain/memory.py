@@ -1,27 +1,29 @@
-"""Compensation of the film's memory together with the leak of the amplifiers: creep, thermoelastic step and warmth.
+"""Correction of the memory of the film (creep, thermoelastic step and warmth) and of the leak of the amplifiers.
 
 A step of the touch charge q changes the charge of the film by this step times
 
     h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / warmth_s).
 
-The film creeps with the logarithm of time, so a charge has its nominal value after one second. A film that is stretched
-cools, and the pyroelectric charge of this cooling vanishes when the film has its temperature again. The logarithm is
-approximated by a sum of exponentials with one time constant in each decade (a Prony series, whose ripple is 2 % of
-`creep`). The charge of the film is then
+The film creeps with the logarithm of time. A charge has its nominal value one second after the step. Stretching cools
+the film, and the pyroelectric charge of this cooling vanishes when the film has reached its temperature again. The
+logarithm is approximated by a sum of exponentials with one time constant in each decade (a Prony series, whose ripple
+is 2 % of `creep`). The charge of the film is then
 
     y[n] = h(0) q[n] - sum_j w_j r_j[n] + d[n],     r_j[n] = e r_j[n-1] + (1 - e) q[n-1],     e = exp(-dt / tau_j)
 
-and is solved for q frame by frame. Here y is the output of the amplifier after the leak is compensated
-(`isocharge.serve.signal_chain.leak`), r_j is the touch charge smoothed with the time constant tau_j, and d is the
-pyroelectric charge of each electrode. The film follows the air within warmth_s, so the slope of d decays with this time
-constant. The state (r_j, d, slope of d, q) is advanced by one product with a matrix.
+where y is the output of the amplifier after the correction of the leak (`isocharge.serve.signal_chain.leak`), r_j is
+the touch charge smoothed with the time constant tau_j, and d is the warmth, the pyroelectric charge of each electrode.
+The equation is solved for q in each frame. The slope of d decays with the time constant warmth_s, because the film
+follows the temperature of the air with this time constant. One product with a matrix advances the state (r_j, d, slope
+of d, q).
 
-Out of contact q is 0, and d is observed. A fading-memory filter (g = 1 - f^2, h = (1 - f)^2; Brookner 1998, chapter 1)
-estimates d and its slope. During a touch both are predicted from their values of `look_back_s` before the touch.
+Out of contact, q is 0, so that y gives d. A fading-memory filter (g = 1 - f^2, h = (1 - f)^2; Brookner 1998, chapter 1)
+estimates d and its slope. During a touch, d and its slope are predicted from their values `look_back_s` before the
+touch.
 
-The charge that remains after a release shows how well creep and thermoelastic step are known. A Kalman filter estimates
-the two scale factors from this charge. The noise of this measurement includes the change that warmth may have caused
-since the touch began.
+After a release, the remaining charge shows the errors of `creep` and `thermoelastic`. A Kalman filter estimates a scale
+factor for each of these two settings from the remaining charge. The noise of this measurement includes the change that
+warmth may have caused since the touch began.
 """
 
 import math
@@ -43,14 +45,17 @@ SLOPE_ROW = -2
 CHARGE_ROW = -1
 """Rows of the warmth d, of its slope and of the touch charge q in the state.
 
-They follow the rows of the creep terms and of the thermoelastic term.
+The first rows of the state are the creep terms and the thermoelastic term.
 """
 
 WARMTH_ROWS = slice(WARMTH_ROW, CHARGE_ROW)
 """Rows of the warmth and of its slope."""
 
 INITIAL_PROPAGATION = np.diag([*np.ones(len(DECADES_S) + 3), 0.0])
-"""Propagation of the state over no time, shape (rows, rows). The touch charge of the next frame is not known yet."""
+"""Propagation of the state over a time of 0, shape (rows, rows).
+
+The row of the touch charge is 0, because the touch charge of the next frame is not known yet.
+"""
 
 SCALE_RESPONSE = np.array(
     [
@@ -58,16 +63,19 @@ SCALE_RESPONSE = np.array(
         [*np.zeros(len(DECADES_S)), -1.0, 0.0, 0.0, 1.0],
     ]
 )
-"""Contribution of each row to the charge of the film, for a creep of 1 and for a step of 1, shape (2, rows)."""
+"""Contribution of each row of the state to the charge of the film, shape (2, rows).
+
+The first line is for `creep = 1`, and the second line for `thermoelastic = 1`.
+"""
 
 LEARN_S = 5.0
 """Time after a release in which the scale factors of the film are updated, s."""
 
 MAX_CREEP = 0.2
-"""Upper bound of the creep in a decade. With more, nothing would remain of a charge after some days."""
+"""Upper bound of the creep in a decade. With a larger creep, a charge would vanish within some days."""
 
 RELEASE_S = 0.1
-"""Time after a release in which a finger still leaves the film, s. Its last charges are not warmth."""
+"""Time after a release in which the finger still leaves the film, s. The charges of this time are not warmth."""
 
 WARMTH_CHANGE_PC = 1.0
 """Standard deviation of the change of the warmth of an electrode in one second, pC."""
@@ -76,7 +84,10 @@ CREEP_LAW_DEVIATION = 0.05
 """Relative deviation of real creep from the logarithmic law."""
 
 OUTLIER_SIGMAS = 4.0
-"""Number of standard deviations from which the charge after a release is not creep, but a hand that warms the film."""
+"""Largest charge after a release that is explained by creep, in standard deviations.
+
+A larger charge is caused by a hand that warms the film.
+"""
 
 CALM_PC_PER_S = 2.0
 """Slope of the warmth above which the inflow of the amplifiers is not updated, because warmth is temporary, pC/s."""
@@ -93,9 +104,11 @@ class MemoryRule(Rule, frozen=True, kw_only=True):
 
     Attributes:
         creep: Share of a charge that is lost in each decade of time.
-        thermoelastic: Share by which a touch is larger at first, until the film has its temperature again.
+        thermoelastic: Share by which the charges of a touch are larger at first, before the film has reached its
+            temperature again.
         warmth_s: Time constant with which the film follows the temperature of the air, s.
-        known: Relative standard deviation of `creep` and `thermoelastic`, which enters the deviations of contacts.
+        known: Relative standard deviation of `creep` and `thermoelastic`. It increases the standard deviations of
+            contacts.
         settle_s: Time constant with which warmth is estimated out of contact, s.
     """
 
@@ -115,8 +128,8 @@ def _relaxation(warmth_s: float) -> tuple[Array, Array]:
 
     Returns:
         Time constant of each row of the state, shape (rows, 1), s; and the propagation over a very long time, shape
-        (rows, rows). Then the creep terms and the thermoelastic term equal the touch charge, and the slope of the
-        warmth has changed the warmth by `warmth_s` times the slope.
+        (rows, rows). After such a time, the creep terms and the thermoelastic term equal the touch charge, and the
+        slope of the warmth has changed the warmth by `warmth_s` times the slope.
     """
     steady_state = np.zeros_like(INITIAL_PROPAGATION)
     steady_state[:WARMTH_ROW, CHARGE_ROW] = 1.0
@@ -147,10 +160,10 @@ class Film(NamedTuple):
     """Properties of a film.
 
     Attributes:
-        creep: Share of a charge that is lost in each decade of time, as it was learned.
-        thermoelastic: Share by which a touch is larger at first, as it was learned.
-        response: Contribution of each row of the state to the film's charge, shape (rows,), dimensionless.
-        step_response: Charge of the film directly after a step of 1: h(0).
+        creep: Estimated share of a charge that is lost in each decade of time.
+        thermoelastic: Estimated share by which the charges of a touch are larger at first.
+        response: Contribution of each row of the state to the charge of the film, shape (rows,), dimensionless.
+        step_response: Charge of the film directly after a step of the touch charge by 1, which is h(0).
         variances: Variances of the scale factors of creep and step.
     """
 
@@ -179,12 +192,13 @@ class Memory(NamedTuple):
         rows_pC: The state, shape (rows, electrodes): r_j, pC; d, pC; the slope of d, pC/s; and q, pC, which is 0 out of
             contact.
         trusted_pC: d and its slope at least `look_back_s` ago, before a touch could affect them, shape (2, electrodes).
-        candidate_pC: d and its slope that become trusted when they are `look_back_s` old.
-        expected_pC: d and its slope as they were predicted for the time after the release.
+        candidate_pC: d and its slope that become the trusted values when their age is `look_back_s`.
+        expected_pC: d and its slope after the release, as predicted from their values before the touch.
         trusted_s: Age of the trusted values, s.
         candidate_s: Age of the candidate, s.
-        unseen_s: Time in which d was not observed, s.
-        learn_s: Time for which the film is still learned, s. While it is above LEARN_S, a finger still leaves.
+        unseen_s: Time for which d could not be observed, s.
+        learn_s: Remaining time in which the scale factors are updated, s. While it is above `LEARN_S`, something
+            touches or a finger is leaving the film.
     """
 
     film: Film
@@ -240,12 +254,15 @@ def undo_memory(
     *,
     contact: bool,
 ) -> Memory:
-    """Return the state after the next frame. The touch charge is `leak.charge_pC`.
+    """Compute the touch charge of the next frame, and return the state after this frame.
+
+    The touch charge is `leak.charge_pC` of the state. During a touch, the remaining state is predicted. Out of contact,
+    the warmth and its slope, the inflow of the amplifiers, and the scale factors of the film are updated.
 
     Args:
         rule: Memory of the film.
-        leak_rule: Settings of the estimate of the inflow: also the age of the values with which a touch begins, and
-            the pause of the estimates after a release.
+        leak_rule: Settings of the estimate of the inflow. `look_back_s` and `hold_off_s` also apply to the estimate of
+            the warmth.
         tau_s: Time constant of each amplifier, shape (electrodes,), s; None if charges do not leak.
         memory: State after the previous frame.
         output_pC: Output of the amplifiers above the tare, shape (electrodes,), pC.
@@ -262,6 +279,7 @@ def undo_memory(
         surplus_pC = output_pC - np.exp(-dt_s / tau_s) * leak.output_pC - leak.inflow_pC_per_s * dt_s
         film_pC = memory.film_pC + surplus_pC
 
+    # Solve the equation of the film for the touch charge.
     propagation = _propagation(rule.warmth_s, dt_s)
     rows_pC = propagation.dot(memory.rows_pC)
     residual_pC = film_pC - film.response.dot(rows_pC)
@@ -282,6 +300,7 @@ def undo_memory(
             learn_s=LEARN_S + RELEASE_S if contact else memory.learn_s - dt_s,
         )
 
+    # Out of contact, the whole charge is warmth. The fading-memory filter updates the warmth and its slope.
     fading = math.exp(-dt_s / rule.settle_s)
     rows_pC[WARMTH_ROW] += (1.0 - fading * fading) * residual_pC
     leak = leak._replace(charge_pC=charge_pC, output_pC=output_pC)
@@ -292,10 +311,12 @@ def undo_memory(
         steepest_pC_per_s = max(map(abs, rows_pC[SLOPE_ROW].tolist()))
         is_calm = leak.learned_s < leak_rule.settle_s or steepest_pC_per_s < CALM_PC_PER_S
         if tau_s is not None and leak_rule.learn and is_calm:
+            # The part of the surplus that creep and the thermoelastic step explain is not inflow.
             change_pC = rows_pC - memory.rows_pC
             recovery_pC = film.response.dot(change_pC) - change_pC[WARMTH_ROW]
             leak = learn_inflow(leak_rule, leak, surplus_pC - recovery_pC, noise_pC, dt_s)
 
+    # For some time after a release, the scale factors of the film are updated.
     learn_s = memory.learn_s
     expected_pC = memory.expected_pC
     is_learning = learn_s > 0.0
@@ -330,17 +351,17 @@ def undo_memory(
 def _learn_film(memory: Memory, dt_s: float) -> Memory:
     """Update the scale factors of creep and thermoelastic step with the charge that remains after a release.
 
-    This is a Kalman update of two scale factors with one measurement: the remaining charge, projected onto the
-    predicted charges of creep and step. All frames after one release together count as one measurement, so its
-    variance is increased by the number of frames in `LEARN_S`.
+    This is a Kalman update of two scale factors with one measurement. The measurement is the remaining charge,
+    projected onto the sum of the predicted charges of creep and step. All frames after a release count as one
+    measurement together. The variance of each frame is therefore multiplied by the number of frames in `LEARN_S`.
 
     Args:
         memory: State of this frame.
         dt_s: Time since the previous frame, s.
 
     Returns:
-        The state with the updated film. If the remaining charge cannot be creep, the film is not updated after this
-        release.
+        The state with the updated film. If creep cannot explain the remaining charge, the film is not updated until
+        the next release.
     """
     film = memory.film
     rows_pC = memory.rows_pC.copy()
@@ -409,14 +430,14 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
 def add_warmth(
     memory: Memory, change_pC: Array | float, rate_pC_per_s: Array | float, *, is_learned: bool = True
 ) -> Memory:
-    """Return the state in which a part of the touch charge counts as warmth.
+    """Return the state in which a part of the touch charge is assigned to the warmth.
 
     Args:
         memory: The state.
         change_pC: Part of the touch charge, shape (electrodes,), pC.
         rate_pC_per_s: Change of the slope of the warmth, shape (electrodes,), pC/s.
-        is_learned: Whether the scale factors of the film are updated after this touch. They should not be if the
-            warmth is not known well.
+        is_learned: Whether the scale factors of the film may be updated after this touch. Set it to False if the warmth
+            is uncertain.
     """
     step_response = memory.film.step_response
     charge_pC = memory.leak.charge_pC - change_pC
@@ -434,7 +455,7 @@ def add_warmth(
 def charge_scale_std(memory: Memory) -> float:
     """Return the relative standard deviation that all touch charges have in common, dimensionless.
 
-    It follows from the variances of the scale factors of creep and step. Without a touch it is 0.
+    The value follows from the variances of the scale factors of creep and step. Without a touch, it is 0.
     """
     film = memory.film
     total_rows_pC = memory.rows_pC.sum(axis=1)  # summed over the electrodes, shape (rows,)

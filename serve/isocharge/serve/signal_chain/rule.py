@@ -1,4 +1,4 @@
-"""What all rules of the signal chain share: they are sections of a device file, with bounds on each setting."""
+"""Base class of the settings of the stages, which are sections of a device file, and types with bounds for them."""
 
 from typing import Annotated
 
@@ -13,7 +13,7 @@ Setting = Annotated[float, Meta(ge=0, le=LARGEST)]
 Share = Annotated[float, Meta(ge=0, lt=1)]
 Count = Annotated[int, Meta(ge=0, le=LARGEST)]
 TimeConstant = Annotated[float, Meta(ge=1e-3, le=LARGEST)]
-"""What the chain divides by, s."""
+"""Time constant, s. It is never 0, because the signal chain divides by it."""
 
 
 class Rule(Settings, frozen=True):

@@ -12,19 +12,19 @@ from isocharge.serve.signal_chain.tare import Tare
 
 @dataclass(slots=True)
 class ChainFrame:
-    """A frame on its way through the stages, which change it in place.
+    """A frame of the signal chain. The stages change it in place.
 
     Attributes:
-        values: Values as they came, in the unit of the device, shape (electrodes,).
+        values: Values as the device sent them, in the unit of the device, shape (electrodes,).
         t_s: Time on the clock of the device, s.
         dt_s: Time since the previous frame, s.
         is_at_limit: Whether an amplifier is at its limit.
         was_contact: Whether something touched in the previous frame.
-        flags: Words of `isocharge.serve.flags`, in their order.
+        flags: Flags of `isocharge.serve.flags`, in the order in which the stages add them.
         raw_pC: Charges as the device sent them, shape (electrodes,), pC.
         charge_pC: The same charges after the stages so far, shape (electrodes,), pC.
         tare: The tare that was subtracted; None while there is none.
-        is_finished: Whether the later stages are left out, because there is no tare yet.
+        is_finished: Whether the later stages do not process the frame, because there is no tare yet.
         charge_scale_std: Relative standard deviation that all charges have in common, because the film's memory is not
             known exactly.
         touch: Whether something touches, after the touch stage.
@@ -55,7 +55,7 @@ class ChainFrame:
 
     @property
     def noise_pC(self) -> Array:
-        """Standard deviation of each electrode at rest, shape (electrodes,), pC; known once there is a tare."""
+        """Standard deviation of each electrode at rest, shape (electrodes,), pC. It requires a tare."""
         assert self.tare is not None
         return self.tare.noise_pC
 
@@ -71,15 +71,15 @@ class Stage(ABC):
         """Discard the state that depends on the tare, because the film is tared again."""
 
     def begin_touch(self, frame: ChainFrame) -> None:  # noqa: B027  # most stages do nothing
-        """Adapt to a touch that begins with this frame; the touch stage calls it on the stages before it."""
+        """Adapt to a touch that begins with this frame. The touch stage calls this method of all earlier stages."""
 
 
 class OffsetStage(Stage):
-    """A stage that holds the charge at rest, from which the touch charge is measured."""
+    """A stage that stores the charge at rest, from which the touch charge is measured."""
 
     @abstractmethod
     def add_warming(self, change: "WarmingChange") -> None:
-        """Count a part of the touch charge as warming of the film."""
+        """Assign a part of the touch charge to the warming of the film."""
 
 
 class WarmingChange(NamedTuple):

@@ -1,7 +1,8 @@
 """The stages of the signal chain, each with its settings and its state.
 
-The computations are pure functions in a module for each stage (`hum`, `tare`, `leak`, `memory`, `contact`, `thermal`).
-The classes here hold the state between frames and pass on what other stages need.
+The computations are pure functions in one module for each stage (`hum`, `tare`, `leak`, `memory`, `contact`,
+`thermal`). The classes here store the state between frames, and write the results that other stages need into the
+frame.
 """
 
 import math
@@ -34,13 +35,13 @@ class Gain(Stage):
 
         Args:
             gain_pC: Charge per unit of the device, with sign, shape (electrodes,), pC; None if the unit is pC.
-            zero: Values that the device shows without charge, shape (electrodes,), in its unit; None for zeros.
+            zero: Values of the device without charge, shape (electrodes,), in the unit of the device; None for zeros.
         """
         self._gain_pC = gain_pC
         self._zero = zero
 
     def convert(self, values: Array) -> Array:
-        """Return values of the device, shape (electrodes,), as charges, pC."""
+        """Convert values of the device, shape (electrodes,), to charges, pC."""
         charges = values if self._zero is None else values - self._zero
         return charges if self._gain_pC is None else charges * self._gain_pC
 
@@ -81,7 +82,7 @@ class HumStage(Stage):
 
 
 class TareStage(OffsetStage):
-    """Measures the charge at rest on quiet frames, and subtracts it from all later frames."""
+    """Measures the charge at rest in quiet frames, and subtracts it from all later frames."""
 
     def __init__(self, rule: TareRule | None, n_electrode: int) -> None:
         """Begin without a tare.
@@ -102,10 +103,10 @@ class TareStage(OffsetStage):
         return self._tare
 
     def step(self, frame: ChainFrame) -> None:
-        """Subtract the tare, or use the frame to find one.
+        """Subtract the tare. While there is no tare, search for one.
 
         Raises:
-            TareError: If the film is not left alone for long enough.
+            TareError: If the film is touched during the whole search for a tare.
         """
         if self._tare is not None:
             frame.tare = self._tare
@@ -118,7 +119,7 @@ class TareStage(OffsetStage):
             frame.flags.append(SATURATED)
 
     def reset(self) -> None:
-        """Measure the tare again from the next quiet frames, however long that takes."""
+        """Measure the tare again from the next quiet frames. This search does not end with an error."""
         self._tare = None
         self._waiting_pC = self._waiting_pC[:0]
         self._searched_frames = 0
@@ -130,9 +131,9 @@ class TareStage(OffsetStage):
         self._tare = self._tare._replace(charge_pC=self._tare.charge_pC + change.charge_pC)
 
     def _search(self, charge_pC: Array) -> None:
-        """Measure the tare on the latest frames if there are enough of them and they are quiet.
+        """Measure the tare if there are enough frames and they are quiet.
 
-        The tare is subtracted from the next frame on.
+        The tare is subtracted from the frames after this frame.
 
         Args:
             charge_pC: Charges of this frame, shape (electrodes,), pC.
@@ -151,7 +152,7 @@ class TareStage(OffsetStage):
 
 
 class LeakStage(OffsetStage):
-    """Undoes the decay of the charge amplifiers, and learns their offset current."""
+    """Corrects the leak of the charge amplifiers, and estimates their inflow."""
 
     def __init__(self, rule: LeakRule, tau_s: Array) -> None:
         """Set the time constant of each amplifier, shape (electrodes,), s."""
@@ -188,7 +189,7 @@ class LeakStage(OffsetStage):
 
 
 class MemoryStage(OffsetStage):
-    """Undoes creep, the thermoelastic step and the decay of the amplifiers together."""
+    """Corrects creep, the thermoelastic step and the leak of the amplifiers together."""
 
     def __init__(self, rule: MemoryRule, leak_rule: LeakRule, tau_s: Array | None) -> None:
         """Set the properties of the film and of the amplifiers.
@@ -266,7 +267,7 @@ class TouchStage(Stage):
         return self._touch.contact
 
     def step(self, frame: ChainFrame) -> None:
-        """Decide whether something touches in this frame, and notify the earlier stages if a touch begins."""
+        """Determine whether something touches in this frame, and notify the earlier stages if a touch begins."""
         previous_touch = self._touch
         self._touch = self._next_touch(previous_touch, frame)
         frame.touch = self._touch
@@ -276,7 +277,7 @@ class TouchStage(Stage):
                 stage.begin_touch(frame)
 
     def reset(self) -> None:
-        """Forget the touch."""
+        """Discard the touch."""
         self._touch = NO_TOUCH
 
     def _next_touch(self, previous_touch: Touch, frame: ChainFrame) -> Touch:
@@ -288,7 +289,7 @@ class TouchStage(Stage):
         """
         if self._rule is None:
             return Touch(contact=True)
-        # While a finger leaves the film, a positive charge at rest must not decay, because it still belongs to the
+        # While a finger leaves the film, a positive base must not decay, because this charge still belongs to the
         # finger.
         base_relax_s = frame.base_relax_s
         if frame.is_base_held and previous_touch.base_pC > 0.0:
@@ -316,7 +317,7 @@ class PressFlags(Stage):
             frame.flags.append(NEGATIVE)
 
     def reset(self) -> None:
-        """Forget the press."""
+        """Discard the press."""
         self._is_saturated = False
 
 
@@ -336,9 +337,10 @@ class Warming(Stage):
 
         Args:
             rule: Settings of the estimate of warming.
-            misfit: Misfit of the model that currently answers.
-            offset_stage: Stage that holds the charge at rest, to which the warming is added.
-            ratios: Charge of each electrode over the mean magnitude of all, shape (electrodes,), dimensionless.
+            misfit: Misfit of the current model.
+            offset_stage: Stage that stores the charge at rest, to which the warming is added.
+            ratios: Charge that warming adds to each electrode, relative to the mean magnitude over all electrodes,
+                shape (electrodes,), dimensionless.
             warmth_s: Time constant with which the film follows the air, s; None if it is not known.
         """
         self._rule = rule
@@ -353,7 +355,7 @@ class Warming(Stage):
         if not frame.touch.contact:
             self._drift = NO_DRIFT
             return
-        if frame.is_saturated:  # a clipped charge fits no contact, whatever the temperature
+        if frame.is_saturated:  # clipped charges have a misfit at every temperature
             return
         previous_pC = self._drift.charge_pC
         drift = track_thermal_drift(
@@ -372,5 +374,5 @@ class Warming(Stage):
             frame.flags.append(BLIND)
 
     def reset(self) -> None:
-        """Forget the warming."""
+        """Discard the warming."""
         self._drift = NO_DRIFT

@@ -16,8 +16,8 @@ class TareRule(Rule, frozen=True, kw_only=True):
         frames: Number of frames in a tare; 100 are 0.5 s at 200 Hz.
         noise_limit_pC: Largest standard deviation of an electrode at rest, pC. The reference noise is 1 pC.
         offset_limit_pC: Largest mean of an electrode at rest, pC. A press of 0.05 N or more on a film of 25 um gives a
-            larger mean over three electrodes, even if it is held still during the tare.
-        patience: Number of frames after which the search for quiet frames is given up; 0 for never.
+            larger mean over three electrodes. The tare therefore fails even if the press is held still.
+        patience: Number of frames after which the search for quiet frames ends with an error; 0 for no limit.
     """
 
     frames: Count = 100
@@ -32,7 +32,7 @@ class Tare(NamedTuple):
     Attributes:
         charge_pC: Mean charge, shape (electrodes,), pC.
         noise_pC: Standard deviation of the charge, shape (electrodes,), pC.
-        frames: Number of frames from which it was measured.
+        frames: Number of frames from which the tare was measured.
     """
 
     charge_pC: Array
@@ -41,7 +41,7 @@ class Tare(NamedTuple):
 
 
 def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None:
-    """Return the tare of the latest frames, or None if they are too few or not quiet.
+    """Return the tare of the latest frames; None if there are too few frames, or the frames are not quiet.
 
     Args:
         rule: Number of frames, and limits of their noise and offset.
@@ -49,7 +49,7 @@ def look_for_tare(rule: TareRule, waiting_pC: Array, frames: int) -> Tare | None
         frames: Number of frames since the search began.
 
     Raises:
-        TareError: If the search is given up.
+        TareError: If the frames are not quiet, and the search has lasted for `rule.patience` frames.
     """
     if len(waiting_pC) < rule.frames:
         return None

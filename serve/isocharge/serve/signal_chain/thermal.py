@@ -1,15 +1,17 @@
 """Estimation of the warming of the film during a press, with the misfit of the model.
 
-A change of temperature gives every electrode a charge (pyroelectricity): the same charge, or charges in known ratios.
-During a touch the charge at rest cannot be measured. A contact has three unknowns, so with four electrodes one charge
-is left over for a check. The common charge p is estimated as the value without which the charges fit a single contact
-best. The squared misfit is a parabola in p, and its curvature gives the variance of the estimate. A Kalman filter
-describes p as a random walk that begins at 0 with every touch. If the memory of the film predicts the warmth, the slope
-of p is the random walk.
+A change of temperature adds a charge to every electrode (pyroelectricity). The charges of all electrodes are equal, or
+have known ratios. During a touch, the charge at rest cannot be measured. A contact has three unknowns, so four
+electrodes have one charge more than the contact needs.
 
-Where a press raises all charges by the same amount, warming looks like force and the curvature vanishes. This is so
-everywhere with three electrodes, and near the centre of a biaxial film. There p is not changed, and the record is
-flagged `blind`.
+The common charge p is estimated as the charge that has to be subtracted so that the charges fit a single contact best.
+The squared misfit is a parabola in p, and its curvature gives the variance of the estimate. A Kalman filter describes p
+as a random walk that begins at 0 with every touch. If the memory of the film predicts the warmth, the slope of p is the
+random walk.
+
+At positions where a press increases all charges equally, warming cannot be distinguished from force, and the curvature
+vanishes. With three electrodes, this is the case at every position. With four electrodes, it is the case near the
+centre of a biaxial film. Then p is not changed, and the record has the flag `blind`.
 """
 
 import math
@@ -22,7 +24,7 @@ from isocharge.common.arrays import Array, Reals
 from isocharge.serve.signal_chain.rule import Rule, Setting
 
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
-"""Changes of the common charge at which the misfit is evaluated, pC; a parabola is fitted to its square."""
+"""Changes of the common charge at which the misfit is evaluated, pC. A parabola is fitted to the squared misfits."""
 
 _PARABOLA_FIT = np.linalg.pinv(np.column_stack([np.ones(5), TRIED_PC, TRIED_PC**2]))
 
@@ -38,8 +40,8 @@ class ThermalRule(Rule, frozen=True, kw_only=True):
         wander_pC: Standard deviation of the change of p in one second, pC. The default of 50 pC is a change of 0.19 K
             on 9 mm^2. A film of 25 um in air follows a step of half a kelvin within 2.7 s, about as fast.
         noise: Factor by which the errors of the model increase the standard deviation of an estimate.
-        blind_pC: Standard deviation of an estimate above which temperature counts as inseparable from force, pC.
-        tell_pC: Smallest |p| that is flagged `thermal`, pC.
+        blind_pC: Standard deviation of an estimate above which temperature cannot be distinguished from force, pC.
+        tell_pC: Smallest absolute value of p with which a record has the flag `thermal`, pC.
     """
 
     every_s: Setting = 0.05
@@ -56,7 +58,7 @@ class ThermalDrift(NamedTuple):
         charge_pC: Common charge p, pC.
         variance_pC2: Variance of p, pC^2.
         waited_s: Time since the last estimate, s.
-        blind: Whether temperature was inseparable from force at the last estimate.
+        blind: Whether temperature could not be distinguished from force at the last estimate.
         rate_pC_per_s: Change of the slope of p with this estimate, if the slope is predicted, pC/s.
         covariance: Covariance of p and its slope, pC^2/s.
         rate_variance: Variance of the slope, pC^2/s^2.
@@ -72,6 +74,7 @@ class ThermalDrift(NamedTuple):
 
 
 NO_DRIFT = ThermalDrift()
+"""State at the beginning of a touch."""
 
 
 def track_thermal_drift(
@@ -85,16 +88,16 @@ def track_thermal_drift(
 ) -> ThermalDrift:
     """Return the state after the next frame in contact.
 
-    Every `every_s`, the common charge p is estimated as the minimum of the squared misfit, to which a parabola is
-    fitted over several trial values of p. The estimate corrects the prediction by a Kalman filter.
+    Every `every_s`, the common charge p is estimated. A parabola is fitted to the squared misfits at several trial
+    values of p, and its minimum is the estimate. A Kalman filter combines the estimate with the prediction.
 
     Args:
         rule: Settings of the estimate of warming.
         state: State after the previous frame.
         charge_pC: Touch charges without the warming so far, shape (electrodes,), pC.
-        misfit: Misfit of the model that answers.
+        misfit: Misfit of the current model.
         dt_s: Time since the previous frame, s.
-        ratios: Charge of each electrode over p, shape (electrodes,), dimensionless.
+        ratios: Charge that warming adds to each electrode, relative to p, shape (electrodes,), dimensionless.
         warmth_s: Time constant with which the slope of p decays, s; None if the slope is not predicted.
     """
     waited_s = state.waited_s + dt_s
@@ -102,10 +105,10 @@ def track_thermal_drift(
         return state._replace(waited_s=waited_s, rate_pC_per_s=0.0)
     predicted_pC2, covariance, rate_variance = _predicted_variances(rule, state, waited_s, warmth_s)
 
-    # squared misfit = constant + slope * p + curvature * p^2, fitted to the charges without each trial value of p
+    # Fit: squared misfit = constant + slope * p + curvature * p^2, where p is the trial value that is subtracted.
     trial_charges_pC = charge_pC - TRIED_PC[:, np.newaxis] * ratios  # shape (trials, electrodes)
     squared_misfits = np.square(misfit(trial_charges_pC), dtype=float)
-    _, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
+    _constant, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
     estimate_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
     if estimate_pC2 > rule.blind_pC**2:
         return state._replace(waited_s=0.0, blind=True, rate_pC_per_s=0.0)

@@ -1,9 +1,10 @@
 """Filter that smooths the contacts predicted by a model from frame to frame.
 
-One `TwoModeFilter` estimates the position and another one the logarithm of the force. Some errors of a model are the
-same in every frame of a held contact, such as its approximation error and the errors of the gains. The filters only
-process the rest of the variance. The variance of the constant errors is added to the results, so that the reported
-standard deviations remain correct.
+One `TwoModeFilter` estimates the position, and another `TwoModeFilter` estimates the logarithm of the force.
+
+Some errors of a model are the same in every frame of a held contact, such as its approximation error and the errors of
+the gains. Smoothing does not reduce these constant errors. The filters therefore use only the variance of the other
+errors, and the variance of the constant errors is added to the results.
 """
 
 import math
@@ -17,13 +18,13 @@ from isocharge.serve.tracking.motion import FORCE_MOTION, POSITION_MOTION, MAX_G
 from isocharge.serve.tracking.two_mode_filter import Estimate, TwoModeFilter
 
 FLAG_VARIANCE_FACTORS = {SATURATED: 100.0, BEYOND: 100.0, MISFIT: 10.0}
-"""Factor by which the variance of a frame with a flag is multiplied, by the flag."""
+"""Factor by which the variance of a frame is multiplied, for each flag of the frame."""
 
 MAX_OUTLIERS = 1
-"""Number of successive frames that are ignored because they do not belong to the contact. The next one starts anew."""
+"""Number of successive outliers that are ignored. The next frame that is far away starts a new contact."""
 
 MAX_SPEED_mm_per_s = 300.0
-"""Speed up to which a sudden movement belongs to the contact, mm/s. A faster frame is an outlier."""
+"""Largest speed of a contact, mm/s. A frame that is farther away from the previous frame is an outlier."""
 
 MIN_FORCE_N = 1e-6
 """Smallest force whose logarithm is computed, N."""
@@ -38,7 +39,7 @@ class MeasuredContact(NamedTuple):
         position_variance: Square root of the determinant of the covariance of the position, mm^2.
         log_force: Logarithm of the force in N.
         log_force_std: Standard deviation of the logarithm of the force.
-        white_share: Factor by which the variances are multiplied for the part that is independent from frame to frame.
+        white_share: Variance of the noise that is independent from frame to frame, relative to the stated variances.
     """
 
     position: complex
@@ -56,8 +57,8 @@ class ContactFilter:
         """Begin without a contact.
 
         Args:
-            constant_variance_share: Share of the variance stated by the model that is the same in every frame of a
-                held contact, 0 to 1.
+            constant_variance_share: Share of the variance stated by the model that belongs to errors that are the same
+                in every frame of a held contact, 0 to 1.
         """
         self._constant_share = constant_variance_share
         self.reset()
@@ -93,8 +94,10 @@ class ContactFilter:
             position = self._position_filter.step(measured.position, dt_s, measured.shape, position_noise)
             if position is not None:
                 log_force = self._force_filter.step(measured.log_force, dt_s, SCALAR_SHAPE, force_noise)
-            elif self._is_outlier(measured.position, self._tracked, dt_s):
-                return self._tracked
+            elif _is_too_far(measured.position, self._tracked, dt_s):
+                self._outliers += 1
+                if self._outliers <= MAX_OUTLIERS:
+                    return self._tracked
 
         if position is None:
             self._position_filter = TwoModeFilter.start(measured.position, position_noise, POSITION_MOTION)
@@ -112,8 +115,8 @@ class ContactFilter:
 
         Args:
             contact: Contact predicted by the model.
-            flags: Flags of the frame. Some flags reduce the share of the variance that is noise, because the error of
-                the model is larger.
+            flags: Flags of the frame. Some flags increase the variance of the noise, so that the frame has a smaller
+                weight.
         """
         correlation = contact.xy_correlation
         if math.isnan(correlation):  # the model provides no correlations
@@ -131,22 +134,6 @@ class ContactFilter:
             contact.force_std_N / force_N,
             white_share,
         )
-
-    def _is_outlier(self, position: complex, previous: TrackedContact, dt_s: float) -> bool:
-        """Return whether to ignore a frame that is far from the contact, and count such frames.
-
-        After `MAX_OUTLIERS` consecutive frames, the position counts as the position of a new contact.
-
-        Args:
-            position: Measured position x + iy, mm.
-            previous: Smoothed contact of the previous frame.
-            dt_s: Time since the previous frame, s.
-        """
-        distance_mm = abs(position - complex(previous.x_mm, previous.y_mm))
-        if distance_mm < MAX_SPEED_mm_per_s * dt_s:
-            return False
-        self._outliers += 1
-        return self._outliers <= MAX_OUTLIERS
 
     def _tracked_contact(
         self, contact: Contact, measured: MeasuredContact, position: Estimate, log_force: Estimate
@@ -177,3 +164,15 @@ class ContactFilter:
             vy_mm_s=velocity.imag,
             moving=moving_probability,
         )
+
+
+def _is_too_far(position: complex, previous: TrackedContact, dt_s: float) -> bool:
+    """Return whether a contact would have to move faster than `MAX_SPEED_mm_per_s` to reach a position.
+
+    Args:
+        position: Measured position x + iy, mm.
+        previous: Smoothed contact of the previous frame.
+        dt_s: Time since the previous frame, s.
+    """
+    distance_mm = abs(position - complex(previous.x_mm, previous.y_mm))
+    return distance_mm >= MAX_SPEED_mm_per_s * dt_s

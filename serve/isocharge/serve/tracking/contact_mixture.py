@@ -1,7 +1,7 @@
 """Gaussian mixture that follows a contact on a film whose map from contacts to charges folds.
 
 Where the map folds, several contacts have the same charges, and a single frame cannot distinguish them. A sequence of
-frames can: a contact that keeps moving crosses the fold, whereas a contact that stays on its side turns back there.
+frames can distinguish them, because one contact crosses the fold while the other contact turns back at the fold.
 
 The state of a component is the position, the logarithm of the force, the rates of these three, and the logarithms of
 the electrode gains. The distribution of the state is a sum of Gaussians (Alspach and Sorenson 1972). Each component is
@@ -52,13 +52,13 @@ STEP_s = 0.005
 """Time over which charges are averaged, s."""
 
 CLOCK_TOLERANCE_s = 1e-5
-"""Amount by which a step may be shorter than `STEP_s`, because clocks are not exact, s."""
+"""Amount by which a step may be shorter than `STEP_s`, s. The times of frames are not exact."""
 
 GAIN_STD = 0.01
 """Standard deviation of an electrode gain about its calibrated value, dimensionless."""
 
 SLOW_NOISE_STD = 0.003
-"""Standard deviation, relative to the charge, of noise that lasts for several frames and does not average out."""
+"""Standard deviation of slow noise, relative to the charge. Slow noise lasts for several frames."""
 
 INITIAL_LOG_FORCE_STD = 2.0
 """Standard deviation of ln F when a touch begins, dimensionless."""
@@ -76,23 +76,25 @@ SEARCH_INTERVAL_s = 0.05
 """Shortest time between two searches over the whole film, each of which takes milliseconds, s."""
 
 MAX_SQUARE = 60.0
-"""Squared distance of the charges and of the state from their predictions above which a component does not explain the
-charges, dimensionless."""
+"""Largest squared distance of a component that explains the charges, dimensionless.
+
+The squared distance is the sum of the squared misfit of the charges and the squared change of the state.
+"""
 
 MAX_RELATIVE_RADIUS = 1.1
 """Distance from the centre, relative to the radius of the film, beyond which components are removed."""
 
 FOLD_DISTANCE = 4.0
-"""Distance, in standard deviations, within which a fold causes two components to be added.
+"""Distance of a fold from the most probable component, in standard deviations, below which two components are added.
 
-The distance is large because a gain error displaces the fold, and the contact then seems to stop in front of it.
+The distance is large, because an error of a gain displaces the fold. The contact then seems to stop in front of it.
 """
 
 SPLIT_DISTANCE = 2.5
 """Distance of an added component from the component that extends across a fold, in standard deviations."""
 
 SPLIT_STD_RATIO = 0.5
-"""Standard deviation of such an added component along the axis of the split, relative to the original component."""
+"""Standard deviation of a component added at a fold along the axis of the split, relative to the original component."""
 
 MIN_SPLIT_STD_mm = 0.05
 """Standard deviation of the position below which a component is not split, mm."""
@@ -139,7 +141,7 @@ class LinearisedUpdate(NamedTuple):
         cross_covariance: Covariance of the charges and the state, shape (n, n_electrode, 6 + n_electrode).
         charge_covariance: Covariance of the charges that the uncertain state causes, shape
             (n, n_electrode, n_electrode), pC^2.
-        innovation_covariance: The same with the noise of the measurement.
+        innovation_covariance: Sum of `charge_covariance` and the noise of the measurement, the same shape, pC^2.
         weighted_innovation: Innovation multiplied by the inverse of its covariance, shape (n, n_electrode, 1), 1/pC.
     """
 
@@ -151,7 +153,10 @@ class LinearisedUpdate(NamedTuple):
 
 
 class ContactMixture:
-    """Follows one contact by its charges; belongs to one thread. The same frames give the same results, bit for bit."""
+    """Follows one contact by its charges.
+
+    An object belongs to one thread. The same frames give the same results, bit for bit.
+    """
 
     def __init__(self, charges: ChargeSeries, noise: ModelNoise) -> None:
         """Begin without a contact.
@@ -239,12 +244,18 @@ class ContactMixture:
         return self._update(components, measurement, INITIAL_ITERATIONS)
 
     def _advance(self, components: Components, measurement: Measurement, dt_s: float) -> Components | None:
-        """Predict the components, and update them; return None if no component explains the charges.
+        """Predict the components, and update them with the charges of a step.
+
+        A component with another velocity is added if the innovation of the most probable component is large, or if
+        the most probable component is fast.
 
         Args:
             components: Components after the previous step.
             measurement: Charges of this step.
             dt_s: Time since the previous step, s.
+
+        Returns:
+            The updated components; None if no component explains the charges.
         """
         predicted = predict_components(components, dt_s)
         best = predicted.best
@@ -252,9 +263,9 @@ class ContactMixture:
         added_covariance = predicted.covariance[best].copy()
         added_log_weight = predicted.log_weight[best] + math.log(SUDDEN_CHANGE_RATE * dt_s)
 
-        is_surprising = self._squared_innovation(predicted, measurement) > SQUARED_GATE
+        has_large_innovation = self._squared_innovation(predicted, measurement) > SQUARED_GATE
         is_fast = np.hypot(added_mean[X_RATE], added_mean[Y_RATE]) > SPEED_STD
-        if is_surprising:  # the velocity may have changed
+        if has_large_innovation:  # the velocity may have changed
             rate_variance = np.array([NEW_SPEED_STD, NEW_SPEED_STD, FORCE_RATE_STD]) ** 2
             added_covariance[RATES, RATES] += np.diag(rate_variance)
             added_covariance[CONTACT, CONTACT] += np.diag(rate_variance * dt_s**2)
@@ -325,7 +336,7 @@ class ContactMixture:
         Args:
             prior: Predicted components.
             measurement: Charges of this step.
-            iterations: Number of iterations towards the most probable state of each component.
+            iterations: Number of iterations of the search for the most probable state of each component.
 
         Returns:
             The components, or None if no component explains the charges.
@@ -466,7 +477,7 @@ def _limit_iteration_step(step: Array) -> Array:
 def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
     """Return contacts (x, y, ln F) of medium force on a spiral that covers the film, shape (n, 3).
 
-    On this spiral (Vogel 1979), each contact takes the same share of the area.
+    On this spiral (Vogel 1979), the contacts cover equal areas of the film.
     """
     number = np.arange(N_INITIAL_COMPONENTS)
     angle = GOLDEN_ANGLE * number

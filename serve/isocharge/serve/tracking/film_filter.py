@@ -1,21 +1,20 @@
-"""Bayesian filter for the pretension of a film, its other unknowns, its gains, and a charge that warmth adds to all.
+"""Bayesian filter that estimates the pretension of a film and its other unknowns from touches.
 
-Every touch gives one misfit vector, which depends on
+Every touch has one misfit vector: the part of its charges that no contact explains. The misfit vector depends on
 
 - the pretension of the film, non-linearly: the pretension is estimated on a grid;
-- the directions in which the calibration left the film uncertain (`FilmDirections`), the drift of the gain of each
-  electrode, and a common offset, i.e. a charge that is added to all electrodes while a touch lasts (the pyroelectric
-  charge of a warm finger). The misfit vector is linearised in these unknowns.
+- the linear unknowns, in which the misfit vector is linearised: the directions in which the calibration left the film
+  uncertain (`FilmDirections`), the drift of the gain of each electrode, and a common offset. The common offset is a
+  charge that is added to all electrodes while a touch lasts, such as the pyroelectric charge of a warm finger.
 
-At each pretension a Kalman filter estimates the linear unknowns (a Rao-Blackwellised filter, Doucet et al. 2000). A
-change of the misfit that a gain, an offset or an error of the calibration explains is therefore not taken for a change
-of the pretension.
+At each pretension, a Kalman filter estimates the linear unknowns (a Rao-Blackwellised filter, Doucet et al. 2000). If a
+gain, an offset or an error of the calibration explains a change of the misfit, the estimated pretension therefore
+hardly changes.
 
-How large offsets are is not known beforehand. The filter therefore compares several offset levels: films that are
-touched without any offset, and films whose offsets have a small or a large standard deviation. Each level has a Kalman
-filter of its own at each pretension, and the levels are weighted by their evidence. The film may change from one level
-to another between two touches, as when a warm hand comes or goes (an interacting multiple model, Blom and Bar-Shalom
-1988).
+The size of the offsets is unknown at first. The filter therefore compares several offset levels. At the first level,
+touches have no offset. At the other levels, offsets have standard deviations from small to large. Each level has a
+Kalman filter at each pretension, and the levels are weighted by their evidence. The level may change between two
+touches, because a warm hand may come or go (an interacting multiple model, Blom and Bar-Shalom 1988).
 """
 
 import math
@@ -29,47 +28,55 @@ from isocharge.serve.model.film_directions import FilmDirections
 from isocharge.serve.model.pretensions import Pretensions
 
 GRID_STEP_MPa = 0.02
-"""Distance of the pretensions that are compared."""
+"""Distance between neighbouring pretensions of the grid, MPa."""
 
 NETWORK_STEP_MPa = 0.1
-"""Distance of the pretensions at which the network is evaluated. In between, misfit vectors are interpolated."""
+"""Distance between the pretensions at which the network is evaluated, MPa.
 
-JUMP_PROBABILITY = 5e-4
-"""Probability that the film changes between two touches by more than a drift. All pretensions are then equally likely.
+The misfit vectors of other pretensions are interpolated.
 """
 
+JUMP_PROBABILITY = 5e-4
+"""Probability that the pretension jumps between two touches. After a jump, all pretensions are equally likely."""
+
 OUTLIER_PROBABILITY = 0.05
-"""Share of touches that are no single contact on this film."""
+"""Probability that a touch is an outlier, for example because two fingers touch the film."""
 
 OUTLIER_DENSITY = math.exp(-4.5)
-"""Density of the misfit of an outlier, relative to the density of a good touch with a misfit of zero."""
+"""Probability density of the misfit of an outlier, relative to the density of a good touch with a misfit of zero."""
 
 GAIN_STD = 0.01
 """Standard deviation of the drift of a gain, and step of the finite differences with respect to a gain."""
 
 GAIN_TIME_CONSTANT_s = 1800.0
-"""Time constant of the gains (Ornstein-Uhlenbeck process). With a shorter one a changing film is followed late."""
+"""Time constant of the gains (Ornstein-Uhlenbeck process), s.
+
+With a shorter time constant, the filter would at first explain a change of the film by the gains.
+"""
 
 SMALLEST_OFFSET_STEP_pC = 1.0
-"""Smallest step of the finite differences with respect to the common offset."""
+"""Smallest step of the finite differences with respect to the common offset, pC."""
 
 OFFSET_TIME_CONSTANT_s = 600.0
-"""Time constant of the mean offset (Ornstein-Uhlenbeck process)."""
+"""Time constant of the mean offset (Ornstein-Uhlenbeck process), s."""
 
 RELATIVE_LEVELS = (0.0, 0.15, 0.33, 1.0, 3.3)
-"""Standard deviation of the mean offset at each level, over the largest that the filter tolerates.
+"""Standard deviation of the mean offset at each level, relative to the largest standard deviation that is tolerated.
 
 Offsets of the last level are too large.
 """
 
-LARGEST_RATIO = 2.0
-"""Mean offset, over the largest standard deviation that the filter tolerates, above which offsets are too large."""
-
 RELATIVE_SCATTER = (0.0, 0.03, 0.1, 0.3, 1.0)
-"""Standard deviation of the offset of a touch about the mean offset at each level, over the same."""
+"""Standard deviation of the offset of a single touch about the mean offset at each level.
+
+The values are relative to the largest standard deviation of the mean offset that is tolerated.
+"""
+
+MAX_RELATIVE_OFFSET = 2.0
+"""Mean offset above which offsets are too large, relative to the largest standard deviation that is tolerated."""
 
 NO_OFFSET_PROBABILITY = 0.9
-"""Probability, before the first touch, that touches have no offset. The other levels are equally likely."""
+"""Probability before the first touch that touches have no offset. The other levels have equal probabilities."""
 
 LEVEL_CHANGE_PROBABILITY = 0.0003
 """Probability that the level of the offsets changes between two touches."""
@@ -109,13 +116,15 @@ class UnknownsLayout:
 
 
 class TouchResiduals(NamedTuple):
-    """Squared misfits of a touch that the most likely offset level leaves, in units of a good touch's mean square.
+    """Squared misfits of a touch after the corrections of the most likely offset level.
+
+    All values are relative to the mean squared misfit of good touches.
 
     Attributes:
-        filtered: With the estimated gains and offset, at each pretension, shape (n_pretension,).
-        without_gains: With the estimated offset and directions only, at each pretension, shape (n_pretension,).
-        offset_variance: Variance that the unknown offset of this touch adds to its misfit, over that of a good touch
-            with a known offset.
+        filtered: Squared misfit after the correction by all linear unknowns, at each pretension, shape (n_pretension,).
+        without_gains: Squared misfit after the correction by the offset and the directions, but not by the gains, at
+            each pretension, shape (n_pretension,).
+        offset_variance: Variance that the unknown offset of this touch adds to its misfit.
     """
 
     filtered: Array
@@ -124,10 +133,10 @@ class TouchResiduals(NamedTuple):
 
 
 class FilmFilter:
-    """Estimates the pretension of one film by touches of unknown place and force.
+    """Estimates the pretension of one film by touches of unknown position and force.
 
     Attributes:
-        grid_MPa: Pretensions that are compared, shape (n_pretension,), MPa.
+        grid_MPa: Grid of pretensions, shape (n_pretension,), MPa.
     """
 
     def __init__(
@@ -141,11 +150,13 @@ class FilmFilter:
         """Begin with the film as it was calibrated.
 
         Args:
-            pretensions: The network of the film at any pretension.
+            pretensions: Weights of the network at any pretension.
             directions: Directions in which the film is uncertain at a given pretension.
-            drift_MPa_per_root_hour: Standard deviation of the pretension's change in an hour.
-            largest_offset_pC: Standard deviation of the largest offsets that the filter tolerates; 0 for none.
-            offset_ratio: Charge of each electrode over the common offset, shape (n_electrode,).
+            drift_MPa_per_root_hour: Standard deviation of the change of the pretension in an hour.
+            largest_offset_pC: Largest standard deviation of the offsets that the filter tolerates; 0 if touches have
+                no offsets.
+            offset_ratio: Charge that an offset adds to each electrode, relative to the common offset, shape
+                (n_electrode,).
         """
         low, high = pretensions.range_MPa
         self.grid_MPa = _evenly_spaced(low, high, GRID_STEP_MPa)
@@ -157,23 +168,25 @@ class FilmFilter:
         self._directions = directions
         self._layout = UnknownsLayout(pretensions.typical_pC.size, directions.count)
 
-        relative_levels = RELATIVE_LEVELS if largest_offset_pC > 0.0 else RELATIVE_LEVELS[:1]
-        self._level_std = largest_offset_pC * np.array(relative_levels)
-        self._scatter_std = largest_offset_pC * np.array(RELATIVE_SCATTER[: len(relative_levels)])
+        level_count = len(RELATIVE_LEVELS) if largest_offset_pC > 0.0 else 1
+        self._level_std = largest_offset_pC * np.array(RELATIVE_LEVELS[:level_count])
+        self._scatter_std = largest_offset_pC * np.array(RELATIVE_SCATTER[:level_count])
         self.reset()
 
     def reset(self) -> None:
         """Return to the distribution before the first touch."""
+        # Joint probability of the offset level and the pretension, shape (n_level, n_pretension).
         level_count = self._level_std.size
         level_probability = np.full(level_count, (1.0 - NO_OFFSET_PROBABILITY) / max(level_count - 1, 1))
         level_probability[0] = 1.0 - level_probability[1:].sum()
-        calibrated = _normal(self.grid_MPa - self._pretensions.calibrated_MPa, self._pretensions.std_MPa)
-        self._probability = np.outer(level_probability, calibrated)
+        change_MPa = self.grid_MPa - self._pretensions.calibrated_MPa
+        pretension_probability = _normal(change_MPa, self._pretensions.std_MPa)
+        self._probability = np.outer(level_probability, pretension_probability)
 
+        # Mean and covariance of the linear unknowns at each level and pretension.
         shape = self._probability.shape
         size = self._layout.size
         self._mean = np.zeros((*shape, size))
-        change_MPa = self.grid_MPa - self._pretensions.calibrated_MPa
         self._mean[..., self._layout.directions] = np.outer(change_MPa, self._directions.by_pretension)
         self._covariance = np.zeros((*shape, size, size))
         self._covariance[:] = self._stationary_covariance()[:, None]
@@ -192,18 +205,18 @@ class FilmFilter:
 
     @property
     def mean_MPa(self) -> float:
-        """Mean of the pretension."""
+        """Mean of the pretension, MPa."""
         return float(self.probability @ self.grid_MPa)
 
     @property
     def offset_correction_MPa(self) -> float:
-        """Difference between the mean of the pretension and the mean if touches had no offset."""
-        without_offset = self._probability[0] / self._probability[0].sum()
-        return self.mean_MPa - float(without_offset @ self.grid_MPa)
+        """Difference between the mean of the pretension and its mean at the level without offsets, MPa."""
+        probability_without_offset = self._probability[0] / self._probability[0].sum()
+        return self.mean_MPa - float(probability_without_offset @ self.grid_MPa)
 
     @property
     def nearest(self) -> int:
-        """Index of the grid's pretension that is nearest to the mean."""
+        """Index of the pretension of the grid that is nearest to the mean."""
         return int(np.abs(self.grid_MPa - self.mean_MPa).argmin())
 
     @property
@@ -211,12 +224,12 @@ class FilmFilter:
         """Whether the offsets are probably larger than the filter tolerates."""
         if self._level_std.size == 1:
             return False
-        last_level = self._level_std.size - 1
-        return self._likeliest_level == last_level or abs(self._mean_offset_pC) > LARGEST_RATIO * self._largest_offset
+        is_at_last_level = self._likeliest_level == self._level_std.size - 1
+        return is_at_last_level or abs(self._mean_offset_pC) > MAX_RELATIVE_OFFSET * self._largest_offset
 
     @property
     def offset_pC(self) -> Array:
-        """Estimated offset of each electrode at the most likely level of offsets, shape (n_electrode,), pC."""
+        """Estimated offset of each electrode at the most likely offset level, shape (n_electrode,), pC."""
         return np.asarray(self._mean_offset_pC * self._offset_ratio)
 
     @property
@@ -229,9 +242,10 @@ class FilmFilter:
 
     def direction_means(self, pretension_MPa: float) -> Array:
         """Return the means of the directions at one pretension, shape (n_direction,), in standard deviations."""
-        share = self._probability / self._probability.sum(axis=0)
-        means = (share[..., None] * self._mean[..., self._layout.directions]).sum(axis=0)
-        return np.array([np.interp(pretension_MPa, self.grid_MPa, column) for column in means.T])
+        level_weight = self._probability / self.probability
+        level_means = self._mean[..., self._layout.directions]
+        grid_means = (level_weight[..., None] * level_means).sum(axis=0)  # shape (n_pretension, n_direction)
+        return np.array([np.interp(pretension_MPa, self.grid_MPa, direction_mean) for direction_mean in grid_means.T])
 
     def _stationary_covariance(self) -> Array:
         """Return the covariance of the linear unknowns before any touch, shape (n_level, n_unknown, n_unknown)."""
@@ -241,10 +255,10 @@ class FilmFilter:
         return covariance
 
     def predict(self, clock_s: float) -> None:
-        """Advance the distribution to the time of a touch.
+        """Predict the distribution at the time of a touch.
 
         Args:
-            clock_s: Time on a clock that does not jump, s.
+            clock_s: Time of the touch on a clock that does not jump, s.
         """
         elapsed_s = 0.0 if self._last_touch_s is None else max(clock_s - self._last_touch_s, 0.0)
         self._last_touch_s = clock_s
@@ -253,7 +267,13 @@ class FilmFilter:
         self._change_pretension(elapsed_s)
 
     def _relax_unknowns(self, elapsed_s: float) -> None:
-        """Move the distributions of the linear unknowns towards their stationary distributions, as the time passes."""
+        """Let the distributions of the gains and of the offset relax towards their stationary distributions.
+
+        The directions do not change with time.
+
+        Args:
+            elapsed_s: Time since the previous touch, s.
+        """
         layout = self._layout
         decay = np.empty(layout.size)
         decay[layout.gains] = math.exp(-elapsed_s / GAIN_TIME_CONSTANT_s)
@@ -265,48 +285,51 @@ class FilmFilter:
         self._covariance = decay_of_products * self._covariance + (1.0 - decay_of_products) * stationary
 
     def _change_level(self) -> None:
-        """Let the level of the offsets change with a small probability.
+        """Account for a change of the offset level, which has a small probability.
 
-        This is the mixing step of an interacting multiple model (Blom and Bar-Shalom 1988). The mean offset of a new
-        level does not depend on the mean offset of the old level.
+        This is the mixing step of an interacting multiple model (Blom and Bar-Shalom 1988). The mean offset of the new
+        level does not depend on the mean offset of the previous level. The other linear unknowns stay the same.
         """
         level_count = self._level_std.size
         if level_count == 1:
             return
         offset = self._layout.offset
-        pretension_probability = self._probability.sum(axis=0)  # over all levels, shape (n_pretension,)
-        staying_probability = (1.0 - LEVEL_CHANGE_PROBABILITY) * self._probability
-        arriving_probability = LEVEL_CHANGE_PROBABILITY / level_count * pretension_probability
+        pretension_probability = self.probability
+        unchanged_probability = (1.0 - LEVEL_CHANGE_PROBABILITY) * self._probability
+        changed_probability = LEVEL_CHANGE_PROBABILITY / level_count * pretension_probability
 
-        # A film arrives at a new level with the gains that are averaged over all levels, and with a new offset.
-        level_share = self._probability / pretension_probability
-        arriving_mean = (level_share[..., None] * self._mean).sum(axis=0)
-        arriving_mean[:, offset] = 0.0
-        average_covariance = (level_share[..., None, None] * self._covariance).sum(axis=0)
-        arriving_covariance = np.repeat(average_covariance[None], level_count, 0)
-        arriving_covariance[:, :, offset, :] = 0.0
-        arriving_covariance[:, :, :, offset] = 0.0
-        arriving_covariance[:, :, offset, offset] = self._level_std[:, None] ** 2
+        # After a change of the level, the offset is new, and the other unknowns are averaged over the previous levels.
+        level_weight = self._probability / pretension_probability
+        changed_mean = (level_weight[..., None] * self._mean).sum(axis=0)
+        changed_mean[:, offset] = 0.0
+        average_covariance = (level_weight[..., None, None] * self._covariance).sum(axis=0)
+        changed_covariance = np.repeat(average_covariance[None], level_count, 0)
+        changed_covariance[:, :, offset, :] = 0.0
+        changed_covariance[:, :, :, offset] = 0.0
+        changed_covariance[:, :, offset, offset] = self._level_std[:, None] ** 2
 
-        self._probability = staying_probability + arriving_probability
-        arrived = arriving_probability / self._probability  # share of the films that have just arrived
-        stayed = 1.0 - arrived
-        self._mean = stayed[..., None] * self._mean + arrived[..., None] * arriving_mean
-        self._covariance = stayed[..., None, None] * self._covariance + arrived[..., None, None] * arriving_covariance
+        self._probability = unchanged_probability + changed_probability
+        changed_share = changed_probability / self._probability
+        mean_share = changed_share[..., None]
+        self._mean = (1.0 - mean_share) * self._mean + mean_share * changed_mean
+        covariance_share = changed_share[..., None, None]
+        self._covariance = (1.0 - covariance_share) * self._covariance + covariance_share * changed_covariance
 
     def _change_pretension(self, elapsed_s: float) -> None:
-        """Let the pretension drift, and jump to any other pretension with a small probability.
+        """Account for a drift of the pretension, and for a jump to any pretension, which has a small probability.
 
-        Means and covariances of the linear unknowns at a pretension are averaged over the pretensions that the film may
-        have had before, weighted by their probabilities.
+        The means and covariances of the linear unknowns at a pretension are averages over the previous pretensions from
+        which the film may have come. The averages are weighted by the probabilities of these pretensions.
 
         Args:
-            elapsed_s: Time since the latest touch, s.
+            elapsed_s: Time since the previous touch, s.
         """
         self._pending_variance += self._drift**2 * elapsed_s / 3600.0
         level_count, grid_size = self._probability.shape
         size = self._layout.size
-        # Columns: probability, mean and covariance, each multiplied by the probability, so that they can be added.
+
+        # The probability, the mean and the covariance of each state are one row of `moments`. The mean and the
+        # covariance are multiplied by the probability, so that a weighted average is a sum of rows.
         moments = np.concatenate(
             [
                 np.ones((level_count, grid_size, 1)),
@@ -316,16 +339,19 @@ class FilmFilter:
             axis=2,
         )
         moments *= self._probability[..., None]
+
+        # The grid cannot represent a drift that is smaller than its step. Such a drift is added to the next one.
         drift_std = math.sqrt(self._pending_variance)
-        if drift_std >= GRID_STEP_MPa:  # a smaller drift is added to the next one, because the grid cannot represent it
+        if drift_std >= GRID_STEP_MPa:
             moments = _convolve(moments, drift_std)
             self._pending_variance = 0.0
         moments /= moments[..., 0].sum()
         moments = (1.0 - JUMP_PROBABILITY) * moments + JUMP_PROBABILITY * moments.mean(axis=1, keepdims=True)
+
         self._probability = moments[..., 0]
-        moments = moments / self._probability[..., None]
-        self._mean = moments[..., 1 : 1 + size]
-        self._covariance = moments[..., 1 + size :].reshape(level_count, grid_size, size, size)
+        normalised = moments / self._probability[..., None]
+        self._mean = normalised[..., 1 : 1 + size]
+        self._covariance = normalised[..., 1 + size :].reshape(level_count, grid_size, size, size)
 
     def update(self, charge_pC: Array, log_changes: Array) -> TouchResiduals:
         """Update the distribution by a touch.
@@ -334,51 +360,81 @@ class FilmFilter:
             charge_pC: Touch charges, shape (n_electrode,), pC.
             log_changes: Changes of the logarithms of the charges by one unit of each direction at the contact, shape
                 (n_direction, n_electrode).
+
+        Returns:
+            The squared misfits that remain after the update.
         """
         misfit, jacobian = self._linearise(charge_pC, log_changes)
-        by_offset = jacobian[..., self._layout.offset]
-        scatter = self._scatter_std[:, None, None, None] ** 2 * (by_offset[..., :, None] * by_offset[..., None, :])
-        noise = np.eye(charge_pC.size) + scatter
+        noise_covariance = self._noise_covariance(jacobian)
 
+        # Kalman update of the linear unknowns at each level and pretension.
         cross_covariance = jacobian @ self._covariance
-        innovation_covariance = noise + cross_covariance @ jacobian.swapaxes(-1, -2)
-        innovation = misfit - (jacobian @ self._mean[..., None])[..., 0]
-        right_sides = np.concatenate([innovation[..., None], cross_covariance], axis=-1)
-        solved = np.linalg.solve(innovation_covariance, right_sides)
-        square = (innovation * solved[..., 0]).sum(axis=-1)
-        density = np.exp(-0.5 * square) / np.sqrt(np.linalg.det(innovation_covariance))
+        transposed = cross_covariance.swapaxes(-1, -2)
+        innovation_covariance = noise_covariance + cross_covariance @ jacobian.swapaxes(-1, -2)
+        innovation = (misfit - (jacobian @ self._mean[..., None])[..., 0])[..., None]  # a column for each system
+        right_sides = np.concatenate([innovation, cross_covariance], axis=-1)
+        solutions = np.linalg.solve(innovation_covariance, right_sides)
+        weighted_innovation = solutions[..., :1]
+        weighted_covariance = solutions[..., 1:]
+        mean_change = (transposed @ weighted_innovation)[..., 0]
+        covariance_reduction = transposed @ weighted_covariance
 
-        good = (1.0 - OUTLIER_PROBABILITY) * density
-        outlier = OUTLIER_PROBABILITY * OUTLIER_DENSITY
-        weight = good / (good + outlier)
-        gain = cross_covariance.swapaxes(-1, -2)
-        self._mean = self._mean + weight[..., None] * (gain @ solved[..., :1])[..., 0]
-        self._covariance = self._covariance - weight[..., None, None] * (gain @ solved[..., 1:])
-        posterior = self._probability * (good + outlier)
+        # The update is weighted by the probability that the touch is not an outlier.
+        squared_distance = (innovation * weighted_innovation).sum(axis=(-1, -2))
+        density = np.exp(-0.5 * squared_distance) / np.sqrt(np.linalg.det(innovation_covariance))
+        good_density = (1.0 - OUTLIER_PROBABILITY) * density
+        total_density = good_density + OUTLIER_PROBABILITY * OUTLIER_DENSITY
+        good_probability = good_density / total_density
+        self._mean = self._mean + good_probability[..., None] * mean_change
+        self._covariance = self._covariance - good_probability[..., None, None] * covariance_reduction
+        posterior = self._probability * total_density
         self._probability = posterior / posterior.sum()
-        return self._residuals(misfit, jacobian, noise)
+        return self._residuals(misfit, jacobian, noise_covariance)
+
+    def _noise_covariance(self, jacobian: Array) -> Array:
+        """Return the covariance of the misfit vector of a touch whose linear unknowns are known.
+
+        The covariance is the identity matrix for a good touch, plus a term for the scatter of the offset from touch to
+        touch.
+
+        Args:
+            jacobian: Jacobian of the misfit vector, as `_linearise` returns it.
+
+        Returns:
+            Shape (n_level, n_pretension, n_electrode, n_electrode).
+        """
+        offset_jacobian = jacobian[..., self._layout.offset]
+        scatter_variance = self._scatter_std[:, None, None, None] ** 2
+        scatter = scatter_variance * (offset_jacobian[..., :, None] * offset_jacobian[..., None, :])
+        return np.asarray(np.eye(self._layout.electrodes) + scatter)
 
     def _linearise(self, charge_pC: Array, log_changes: Array) -> tuple[Array, Array]:
-        """Return the misfit vector of a touch at each pretension, and its Jacobian for the linear unknowns.
+        """Compute the misfit vector of a touch at each pretension, and its Jacobian for the linear unknowns.
 
-        The derivative with respect to the offset is the difference quotient between the charges and the charges
-        without the estimated mean offset of the level. The misfit without that offset is therefore exact.
+        The derivatives are finite differences. The step of the offset is the estimated mean offset of the level, so
+        that the misfit vector without this offset is exact.
+
+        Args:
+            charge_pC: Touch charges, shape (n_electrode,), pC.
+            log_changes: As in `update`.
 
         Returns:
             Misfit vectors, shape (n_pretension, n_electrode), and their Jacobian, shape (n_level, n_pretension,
-            n_electrode, n_unknown), both in units of a good touch's root mean square.
+            n_electrode, n_unknown), both in units of the root mean square of good touches.
         """
         layout = self._layout
         offset_step_pC = self._offset_steps()
-        changes = [
+
+        # The network evaluates the charges of the touch and all changed charges at once.
+        changed_charges = [
             charge_pC[None],
             charge_pC + GAIN_STD * np.diag(charge_pC),
             charge_pC - np.outer(offset_step_pC, self._offset_ratio),
             charge_pC * np.exp(log_changes),
         ]
-        vectors = self._network.vectors(np.concatenate(changes), self.grid_MPa) / self._pretensions.misfit_rms
-        split = np.cumsum([len(rows) for rows in changes])[:-1]
-        (misfit,), with_gain, without_offset, with_direction = np.split(vectors, split)
+        vectors = self._network.vectors(np.concatenate(changed_charges), self.grid_MPa) / self._pretensions.misfit_rms
+        group_ends = np.cumsum([len(group) for group in changed_charges])
+        (misfit,), with_gain, without_offset, with_direction = np.split(vectors, group_ends[:-1])
 
         jacobian = np.empty((*self._probability.shape, layout.electrodes, layout.size))
         jacobian[..., layout.gains] = np.moveaxis(with_gain - misfit, 0, 2)
@@ -387,38 +443,53 @@ class FilmFilter:
         return misfit, jacobian
 
     def _offset_steps(self) -> Array:
-        """Return the steps of the finite differences with respect to the offset, shape (n_level,), pC."""
+        """Return the step of the finite difference with respect to the offset at each level, shape (n_level,), pC.
+
+        The step is the mean offset of the level, or `SMALLEST_OFFSET_STEP_pC` if the mean offset is smaller.
+        """
         weight = self._probability / self._probability.sum(axis=1, keepdims=True)
         mean_offset_pC = (weight * self._mean[..., self._layout.offset]).sum(axis=1)
         is_small = np.abs(mean_offset_pC) < SMALLEST_OFFSET_STEP_pC
         return np.where(is_small, SMALLEST_OFFSET_STEP_pC, mean_offset_pC)
 
-    def _residuals(self, misfit: Array, jacobian: Array, noise: Array) -> TouchResiduals:
-        """Return the squared misfits that remain after the corrections of the most likely offset level."""
+    def _residuals(self, misfit: Array, jacobian: Array, noise_covariance: Array) -> TouchResiduals:
+        """Return the squared misfits of a touch after the corrections of the most likely offset level.
+
+        Args:
+            misfit: Misfit vectors, as `_linearise` returns them.
+            jacobian: Their Jacobian, as `_linearise` returns it.
+            noise_covariance: Covariance of the misfit vectors, as `_noise_covariance` returns it.
+        """
         level = self._likeliest_level
+        level_jacobian = jacobian[level]
+        precision = np.linalg.inv(noise_covariance[level])
+
         mean = self._mean[level]
-        by_offset = jacobian[level, :, :, self._layout.offset]
-        filtered = misfit - (jacobian[level] @ mean[:, :, None])[:, :, 0]
         mean_without_gains = mean.copy()
         mean_without_gains[:, self._layout.gains] = 0.0
-        without_gains = misfit - (jacobian[level] @ mean_without_gains[:, :, None])[:, :, 0]
-        precision = np.linalg.inv(noise[level])
-        offset_variance = self._scatter_std[level] ** 2 * (by_offset[self.nearest] ** 2).sum()
+        residual = misfit - (level_jacobian @ mean[:, :, None])[:, :, 0]
+        residual_without_gains = misfit - (level_jacobian @ mean_without_gains[:, :, None])[:, :, 0]
+
+        offset_jacobian = level_jacobian[self.nearest, :, self._layout.offset]
+        offset_variance = self._scatter_std[level] ** 2 * (offset_jacobian**2).sum()
         return TouchResiduals(
-            np.einsum("ge,gef,gf->g", filtered, precision, filtered),
-            np.einsum("ge,gef,gf->g", without_gains, precision, without_gains),
-            float(offset_variance),
+            filtered=np.einsum("ge,gef,gf->g", residual, precision, residual),
+            without_gains=np.einsum("ge,gef,gf->g", residual_without_gains, precision, residual_without_gains),
+            offset_variance=float(offset_variance),
         )
 
 
 def _evenly_spaced(low: float, high: float, step: float) -> Array:
-    """Return numbers from low to high at distances of about a step."""
-    intervals = max(round((high - low) / step), 1)
-    return np.linspace(low, high, intervals + 1)
+    """Return evenly spaced numbers from `low` to `high`, whose distance is as near to `step` as possible."""
+    interval_count = max(round((high - low) / step), 1)
+    return np.linspace(low, high, interval_count + 1)
 
 
 def _normal(deviation: Reals, std: float) -> Array:
-    """Return the probabilities of a normal distribution at evenly spaced deviations from its mean."""
+    """Return the probabilities of evenly spaced deviations from the mean of a normal distribution.
+
+    The probabilities add up to 1.
+    """
     density = np.exp(-0.5 * (deviation / std) ** 2)
     return np.asarray(density / density.sum())
 
@@ -428,7 +499,7 @@ def _convolve(moments: Array, std: float) -> Array:
 
     Args:
         moments: Moments at each pretension of the grid, shape (n_level, n_pretension, n_moment). Beyond the ends of the
-            grid they are taken as constant.
+            grid, the moments are assumed to be constant.
         std: Standard deviation of the normal distribution, MPa.
 
     Returns:
@@ -439,6 +510,6 @@ def _convolve(moments: Array, std: float) -> Array:
     kernel = _normal(GRID_STEP_MPa * np.arange(-reach, reach + 1.0), std)
     padded = np.pad(moments, ((0, 0), (reach, reach), (0, 0)), mode="edge")
     smoothed = np.zeros_like(moments)
-    for start, share in enumerate(kernel):
-        smoothed += share * padded[:, start : start + grid_size]
+    for start, weight in enumerate(kernel):
+        smoothed += weight * padded[:, start : start + grid_size]
     return smoothed

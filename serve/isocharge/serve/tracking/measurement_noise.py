@@ -1,21 +1,21 @@
 """Noise of the measured contacts: the shape of its covariance, and its size as estimated from the frames.
 
-A model states the standard deviations for the noise of its training. The noise of a board may be smaller or larger. The
-noise changes from frame to frame, whereas a contact moves smoothly. Its size is therefore estimated from the residuals
-of a linear extrapolation through the two previous frames.
+The standard deviations that a model reports are those of the noise in its training. The noise of a board may be smaller
+or larger. Noise changes from frame to frame, but a contact moves smoothly. The size of the noise is therefore estimated
+from the residuals of a linear extrapolation through the two previous frames.
 """
 
 import math
 from typing import NamedTuple
 
 PRIOR_FRAMES = 5
-"""Number of frames whose weight the variance stated by the model has."""
+"""Weight of the variance stated by the model, as a number of frames."""
 
 MAX_FRAMES = 100
 """Number of frames over which the estimate is averaged."""
 
 MIN_INTERVAL_s = 0.0045
-"""Time after which the noise is independent, s. A board may filter its charges over a shorter time."""
+"""Time after which the noise of two frames is independent, s. Boards filter their charges over shorter times."""
 
 MAX_RELATIVE_SQUARE = 6.0
 """Largest squared residual of a frame, relative to the present estimate. Sudden movements are not noise."""
@@ -35,8 +35,8 @@ class CovarianceShape(NamedTuple):
 
     Attributes:
         inverse_xx: Element xx of the inverse of this matrix, divided by the number of dimensions.
-        inverse_yy: Element yy of the same.
-        inverse_xy: Element xy of the same.
+        inverse_yy: Element yy of the inverse, divided by the number of dimensions.
+        inverse_xy: Element xy of the inverse, divided by the number of dimensions.
         dimensions: Number of dimensions: 2 for a position, 1 for the logarithm of a force.
     """
 
@@ -99,7 +99,7 @@ class NoiseEstimate(NamedTuple):
 
     @classmethod
     def start(cls, measured: complex) -> "NoiseEstimate":
-        """Return the estimate after the first measured value: the variance that the model states."""
+        """Return the estimate after the first measured value, which is the variance stated by the model."""
         return cls(relative_variance=1.0, frames=PRIOR_FRAMES, measured=measured, rate=0j, dt_s=0.0)
 
     def updated(
@@ -107,8 +107,8 @@ class NoiseEstimate(NamedTuple):
     ) -> "NoiseEstimate":
         """Return the estimate after another measured value.
 
-        The value is compared with the linear extrapolation of the two previous values. The mean of the squared errors,
-        relative to the variance that the model states, is the estimate.
+        The value is compared with the linear extrapolation of the two previous values. The estimate is the mean of the
+        squared errors of these extrapolations, relative to the variance stated by the model.
 
         Args:
             measured: The measured value: a position x + iy, mm, or the logarithm of a force.
@@ -121,7 +121,8 @@ class NoiseEstimate(NamedTuple):
         if self.dt_s <= 0.0:  # there is no previous rate yet
             return self._replace(measured=measured, rate=rate, dt_s=dt_s)
 
-        # The error is x2 - (1 + r) x1 + r x0, with the ratio r of the intervals, so the variances of three values add.
+        # The error is x2 - (1 + r) x1 + r x0, where r is the ratio of the two intervals. The noise of the three values
+        # is independent, so that their variances add up.
         time_ratio = dt_s / self.dt_s
         extrapolation_variance = stated_variance * (1.0 + time_ratio * time_ratio + (1.0 + time_ratio) ** 2)
         extrapolation_error = change - self.rate * dt_s

@@ -1,4 +1,4 @@
-"""Components of the Gaussian mixture of `contact_mixture`, with their prediction, pruning and combination."""
+"""Components of the Gaussian mixture in `contact_mixture`: their prediction, pruning and combination."""
 
 import math
 from typing import NamedTuple
@@ -58,7 +58,7 @@ MIN_LOG_WEIGHT = -14.0
 """Logarithm of the weight, relative to the largest weight, below which a component is removed."""
 
 MERGE_DISTANCE = 0.7
-"""Distance in each motion state, in standard deviations, below which two components are merged."""
+"""Distance between two components, in standard deviations of each entry of `MOTION`, below which they are merged."""
 
 
 class ContactHypothesis(NamedTuple):
@@ -78,7 +78,13 @@ class ContactHypothesis(NamedTuple):
     misfit: float
 
     def extrapolated(self, dt_s: float) -> "ContactHypothesis":
-        """Return the hypothesis at a time that is `dt_s` later, s. The covariance is kept, because `dt_s` is short."""
+        """Return the hypothesis at a later time.
+
+        The covariance stays the same, because the time is short.
+
+        Args:
+            dt_s: Time by which the hypothesis is extrapolated, s.
+        """
         mean = self.mean.copy()
         mean[CONTACT] += dt_s * mean[RATES]
         return self._replace(mean=mean)
@@ -113,7 +119,10 @@ class ContactHypothesis(NamedTuple):
 
     @property
     def moving_probability(self) -> float:
-        """Probability that a contact at rest would be estimated to be slower (chi-squared test of the velocity)."""
+        """Probability that the estimated velocity of a contact at rest would be smaller than the present velocity.
+
+        This is the result of a chi-squared test of the velocity.
+        """
         velocity = self.mean[VELOCITY]
         covariance = self.covariance[VELOCITY, VELOCITY]
         squared_distance = float(velocity @ np.linalg.solve(covariance, velocity))
@@ -141,7 +150,7 @@ class Components(NamedTuple):
         return int(self.log_weight.argmax())
 
     def select(self, rows: "list[int] | Integers") -> "Components":
-        """Return some of the components."""
+        """Return the components with the indices `rows`."""
         return self._replace(mean=self.mean[rows], covariance=self.covariance[rows], log_weight=self.log_weight[rows])
 
     def with_component(self, mean: Array, covariance: Array, log_weight: float) -> "Components":
@@ -173,7 +182,7 @@ def predict_components(components: Components, dt_s: float) -> Components:
     transition[CONTACT, RATES] = dt_s * np.eye(3)
     covariance = transition @ components.covariance @ transition.T
 
-    # The process noise of the position is proportional to the squared speed, because a resting contact rarely starts.
+    # The process noise of the position is proportional to the squared speed, because resting contacts rarely move off.
     squared_speed = (mean[:, VELOCITY] ** 2).sum(axis=1)
     relative_density = np.maximum(squared_speed / POSITION_MOTION.velocity_variance, MIN_ACCELERATION_SHARE)
     position_density = POSITION_MOTION.acceleration_density * relative_density
@@ -200,9 +209,9 @@ def _add_process_noise(covariance: Array, value: int, rate: int, density: Array 
 
 
 def prune_components(components: Components) -> Components:
-    """Return the components without improbable components, and with similar components merged.
+    """Remove improbable components, and merge similar components.
 
-    Of the other components, the `MAX_COMPONENTS` most probable ones are selected.
+    At most the `MAX_COMPONENTS` most probable components remain.
     """
     log_weight = components.log_weight.copy()
     descending_rows = np.argsort(-log_weight, kind="stable")
@@ -212,7 +221,7 @@ def prune_components(components: Components) -> Components:
         similar_row = _similar_component(components, row, selected)
         if similar_row is None:
             selected.append(row)
-        else:  # add the probability of this component to the similar component
+        else:  # add the weight of this component to the weight of the similar component
             log_weight[similar_row] = np.logaddexp(log_weight[similar_row], log_weight[row])
     return components._replace(log_weight=log_weight).select(selected[:MAX_COMPONENTS])
 

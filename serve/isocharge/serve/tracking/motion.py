@@ -1,15 +1,15 @@
-"""How contacts move: the process noise that the filters of the tracking assume."""
+"""Motion of contacts: the process noise that the filters of the tracking assume."""
 
 from typing import NamedTuple
 
 SPEED_STD = 30.0
-"""Standard deviation of the velocity along x or y with which a movement begins, mm/s."""
+"""Standard deviation of the velocity along x or y at the beginning of a movement, mm/s."""
 
 FORCE_RATE_STD = 10.0
-"""Standard deviation of the rate of ln F with which a change of the force begins, 1/s."""
+"""Standard deviation of the rate of ln F at the beginning of a change of the force, 1/s."""
 
 MIN_ACCELERATION_SHARE = 0.2
-"""Smallest share of the acceleration density that a slow contact has, dimensionless."""
+"""Acceleration density of a slow contact, relative to `MotionModel.acceleration_density`, dimensionless."""
 
 MAX_GAP_s = 1.0
 """Time without a frame after which the tracked contact is discarded, s."""
@@ -20,10 +20,11 @@ class MotionModel(NamedTuple):
 
     Attributes:
         held_drift: Growth of the variance of a held contact, mm^2/s or 1/s.
-        velocity_variance: Variance of the velocity with which a movement begins, mm^2/s^2 or 1/s^2.
+        velocity_variance: Variance of the velocity at the beginning of a movement, mm^2/s^2 or 1/s^2.
         acceleration_density: Spectral density of the white acceleration of a contact whose squared speed is
-            `velocity_variance`, mm^2/s^3 or 1/s^3. The density is proportional to the squared speed, because fast
-            contacts change their velocity more than slow ones, but at least `MIN_ACCELERATION_SHARE` of this value.
+            `velocity_variance`, mm^2/s^3 or 1/s^3. At other speeds the density is proportional to the squared speed,
+            because fast contacts change their velocity more than slow contacts. The density is at least
+            `MIN_ACCELERATION_SHARE` of this value.
     """
 
     held_drift: float
@@ -32,7 +33,7 @@ class MotionModel(NamedTuple):
 
 
 POSITION_MOTION = MotionModel(held_drift=5e-4, velocity_variance=SPEED_STD**2, acceleration_density=800.0)
-"""Motion of a finger: a held finger drifts by 0.02 mm in a second, and a moving one has speeds of about 30 mm/s."""
+"""Motion of a finger: a held finger drifts by 0.02 mm in a second, and a moving finger moves at about 30 mm/s."""
 
 FORCE_MOTION = MotionModel(held_drift=5e-4, velocity_variance=FORCE_RATE_STD**2, acceleration_density=1e3)
-"""Change of ln F: a held force drifts by 2 % in a second, and a changing one grows by a factor of e in 0.1 s."""
+"""Change of ln F: a held force drifts by 2 % in a second, and a changing force grows by a factor of e in 0.1 s."""

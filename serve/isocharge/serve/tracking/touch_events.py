@@ -3,19 +3,19 @@
 from isocharge.serve.record.record import TrackedContact
 
 HOLD_TIME_s = 0.2
-"""Time at rest after which a contact is held, s."""
+"""Time at rest after which a hold begins, s."""
 
 MAX_TAP_TIME_s = 0.25
-"""Longest time of a tap, s."""
+"""Longest duration of a tap, s."""
 
 SLIDE_DISTANCE_mm = 0.3
-"""Distance from the place of rest above which a moving contact slides, mm."""
+"""Distance from the latest position of rest above which a moving contact slides, mm."""
 
 SLIDE_PROBABILITY = 0.95
-"""Probability of a movement above which a contact may slide."""
+"""Probability that the contact moves, above which it may slide."""
 
 REST_PROBABILITY = 0.5
-"""Probability of a movement below which a contact is at rest."""
+"""Probability that the contact moves, below which it is at rest."""
 
 
 class TouchEvents:

@@ -1,7 +1,8 @@
 """Tracking of a contact from frame to frame: its position, force and velocity, and the events of the touch.
 
-A `ContactFilter` smooths the contacts that a model predicts. Where the map from contacts to charges folds, the model
-describes only one side of the fold. A `ContactMixture` then follows the contact by the charges instead.
+A `ContactFilter` smooths the contacts that a model predicts. If the map from contacts to charges has a fold, the model
+describes only the contacts on one side of the fold. For such films, a `ContactMixture` follows the contact by the
+charges instead.
 """
 
 from isocharge.common.arrays import Array
@@ -22,30 +23,32 @@ class TrackRule(Rule, frozen=True, kw_only=True):
     """Settings of the tracking; the section `[track]` of a device file.
 
     Attributes:
-        lasting: Share of the model's standard deviations that is the same in every frame of a held contact, 0 to 1.
-            The default of 0.12 is the measured share of the model's approximation errors. If the gains are known to
-            only a few percent, set this to about 1.
+        lasting: Share of the standard deviations stated by the model that is the same in every frame of a held contact,
+            0 to 1. The default of 0.12 is the measured share of the approximation errors of a model. If the gains are
+            known to only a few percent, set this to about 1.
     """
 
     lasting: Share = 0.12
 
 
 class Tracker:
-    """Tracks one contact at a time; belongs to one thread. The same frames give the same results, bit for bit.
+    """Tracks one contact at a time.
+
+    A tracker belongs to one thread. The same frames give the same results, bit for bit.
 
     Attributes:
-        mixture: The mixture that follows the contact by its charges where the map folds; None where it does not fold.
-        mixture_contact: The contact of the latest frame according to the mixture, which replaces that of the model;
-            None without a mixture.
-        other: Another contact that explains the charges as well; None if there is none, as always without a mixture.
+        mixture: The mixture that follows the contact by its charges; None for a film whose map has no fold.
+        mixture_contact: The contact of the latest frame as estimated by the mixture. It replaces the contact of the
+            model. None without a mixture.
+        other: Another contact that also explains the charges; None if there is no such contact, or without a mixture.
     """
 
     def __init__(self, rule: TrackRule | None = None, mixture: ContactMixture | None = None) -> None:
         """Begin without a contact.
 
         Args:
-            rule: Settings; by default those of an empty section.
-            mixture: The mixture of a film whose map folds; None for other films.
+            rule: Settings; by default the default values of all settings.
+            mixture: The mixture for a film whose map has a fold; None for other films.
         """
         rule = rule or TrackRule()
         self.mixture = mixture
@@ -71,11 +74,12 @@ class Tracker:
             contact: Contact predicted by the model; None if nothing touches, or the frame is invalid.
             t_s: Time of the frame on any clock, s.
             flags: Flags of the frame.
-            charge_pC: Touch charges of the frame, shape (n_electrode,), pC; only needed where the map folds.
+            charge_pC: Touch charges of the frame, shape (n_electrode,), pC; only needed with a mixture.
 
         Returns:
-            The tracked contact, or None if nothing touches or no contact explains the charges. The event that begins
-            with this frame: `press`, `hold`, `slide`, `tap` or `release`; None if there is none.
+            The tracked contact, and the event that begins with this frame. The contact is None if nothing touches or no
+            contact explains the charges. The event is `press`, `hold`, `slide`, `tap` or `release`; None if no event
+            begins.
         """
         self.mixture_contact = None
         if contact is None:
@@ -104,6 +108,7 @@ class Tracker:
     def _end_touch(self, t_s: float) -> str | None:
         """Discard the contact, and return the event with which its touch ends; None if there was no touch."""
         if self._tracked is None:
+            # The mixture may have received charges that no contact explains. Discard them before the next touch.
             if self.mixture is not None:
                 self.mixture.reset()
             return None
@@ -117,7 +122,7 @@ def _tracked_contact(hypothesis: ContactHypothesis, contact: Contact) -> Tracked
 
     Args:
         hypothesis: A contact that explains the charges.
-        contact: The same as a contact of a model.
+        contact: The contact of the hypothesis.
     """
     vx_mm_s, vy_mm_s = hypothesis.velocity_mm_per_s
     return TrackedContact(

@@ -30,18 +30,18 @@ SQUARED_GATE = 30.0
 """Squared Mahalanobis distance of the innovation above which a frame does not belong to this contact."""
 
 MAX_LOG_LIKELIHOOD_RATIO = 60.0
-"""Largest logarithm of the likelihood ratio of the two modes. It prevents an overflow of the exponential function."""
+"""Largest logarithm of the likelihood ratio of the two modes. The limit prevents an overflow of `math.exp`."""
 
 MIN_PROBABILITY = 1e-6
 """Smallest probability of a mode."""
 
 
 class Estimate(NamedTuple):
-    """A position x + iy, mm, or the logarithm of a force.
+    """Estimate of a position or of the logarithm of a force.
 
     Attributes:
-        value: The estimated value.
-        variance: Its variance, mm^2, or dimensionless for a force.
+        value: Position x + iy, mm, or logarithm of the force.
+        variance: Variance of the value, mm^2, or dimensionless for a force.
     """
 
     value: complex
@@ -50,7 +50,9 @@ class Estimate(NamedTuple):
 
 @dataclass(slots=True)
 class TwoModeFilter:
-    """The filter with its state. The units are mm and s for a position, and s for the logarithm of a force.
+    """A filter with two modes, and its state.
+
+    The unit of a value is mm for a position, and the logarithm of a force is dimensionless. Times are in s.
 
     Attributes:
         motion: Process noise.
@@ -120,7 +122,8 @@ class TwoModeFilter:
         held_drift, initial_velocity_variance, acceleration_density = self.motion
         noise_variance = stated_variance * self.noise.relative_variance
 
-        # Probability of each mode at this frame, and share of each mode that was in the other mode before.
+        # Probability of each mode at this frame. `started_share` is the probability that a moving contact was held at
+        # the previous frame, and `stopped_share` is the probability that a held contact was moving.
         start_probability = dt_s / MEAN_HELD_TIME_s
         if start_probability > MAX_CHANGE_PROBABILITY:
             start_probability = MAX_CHANGE_PROBABILITY
@@ -134,7 +137,7 @@ class TwoModeFilter:
         stopped_share = stopped / (1.0 - moving_probability)
         continued_share = 1.0 - started_share
 
-        # Mixing of the two modes.
+        # Mixing of the two modes. A movement that has just started has the velocity zero on average.
         difference = self.moving_value - self.held_value
         x = difference.real
         y = difference.imag
@@ -162,7 +165,7 @@ class TwoModeFilter:
         )
         velocity = self.velocity * continued_share
 
-        # Prediction. The acceleration density is proportional to the squared speed.
+        # Prediction of both modes. The acceleration density is proportional to the squared speed.
         relative_density = (
             continued_share
             * continued_share

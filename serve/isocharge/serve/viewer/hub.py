@@ -30,7 +30,7 @@ from isocharge.serve.viewer.messages import (
 )
 
 LIVE_SAMPLES = 1 << 14
-"""Number of samples of a live stream that are stored: 16 s at 1 kHz. A browser that is farther behind misses some."""
+"""Number of stored samples of a live stream, which is 16 s at 1 kHz. Slower browsers miss samples."""
 
 MAX_PIECES = 600
 """Largest number of pieces in the overview of a recording."""
@@ -48,6 +48,7 @@ class Tape:
     """
 
     def __init__(self, dtype: "np.dtype[Any]", capacity: int = LIVE_SAMPLES) -> None:
+        """Begin without samples; the arguments are described in the class."""
         self.total = 0
         self._ring: Samples = np.zeros(capacity, dtype)
 
@@ -93,6 +94,7 @@ class RecordedTape(Tape):
     """
 
     def __init__(self, dtype: "np.dtype[Any]") -> None:
+        """Create the temporary file; the argument is described in the class."""
         super().__init__(dtype)
         self._file = tempfile.TemporaryFile()  # noqa: SIM115
         self._piece_s = 0.01
@@ -102,8 +104,8 @@ class RecordedTape(Tape):
     def append(self, samples: Samples) -> None:
         """Append samples, and update the overview.
 
-        Times that are missing or decrease are replaced by the latest time before them, so that the times never
-        decrease. The memory is doubled as often as necessary.
+        Missing or decreasing times are replaced by the previous time, so that the times never decrease. The memory is
+        doubled repeatedly if necessary.
 
         Args:
             samples: The samples, shape (n,).
@@ -164,7 +166,7 @@ class Playhead:
         at_s: Time since the start of the recording, s.
         speed: Speed relative to the recorded speed.
         is_playing: Whether the position advances.
-        has_jumped: Whether the viewer has selected another position and not yet received samples of it.
+        has_jumped: Whether the viewer has selected another position and has not yet received samples from there.
     """
 
     at_s: float = 0.0
@@ -209,6 +211,7 @@ class Playhead:
                     self._jump(0.0)
 
     def _jump(self, at_s: float) -> None:
+        """Set the position to a time since the start of the recording, s."""
         self.at_s = at_s
         self.has_jumped = True
 
@@ -258,10 +261,10 @@ class Hub:
         requests: Type of the requests that the page may send.
         tape: The samples.
         description: Description of the film for the page.
-        state: Values for the page that change rarely: counters, recording, notes.
+        state: Values for the page that change rarely, such as counters and markers.
         version: Number of changes of `state`.
         viewers: The connected viewers.
-        has_ended: Whether the reader has ended.
+        has_ended: Whether the process that reads the stream has ended.
     """
 
     def __init__(self, link: PageEnd, description: dict[str, Any], *, is_recording: bool) -> None:
@@ -303,6 +306,7 @@ class Hub:
         self._wake_viewers()
 
     def _wake_viewers(self) -> None:
+        """Let all viewers check whether there is something to send."""
         for viewer in self.viewers:
             viewer.wake.set()
 
@@ -362,7 +366,7 @@ class Viewer:
         self._must_send_playhead = True
 
     def confirm(self, number: int) -> None:
-        """Note that the page has drawn the message with this number."""
+        """Store that the page has drawn the message with this number."""
         self._confirmed_messages = max(self._confirmed_messages, min(number, self._sent_messages))
         self.wake.set()
 
@@ -373,7 +377,7 @@ class Viewer:
             self._must_send_playhead = True
 
     def messages(self, now_s: float) -> list[bytes | str]:
-        """Return the messages to send now; none if the viewer has not confirmed the earlier ones.
+        """Return the messages to send now. There are none while too many messages are unconfirmed.
 
         Args:
             now_s: Unix time, s.
@@ -420,10 +424,10 @@ class Viewer:
         return samples_message(self._sent_messages, now_s, samples, self._missed_samples, begin_anew=begins_anew)
 
     def _first_hidden_sample(self) -> int:
-        """Return the number of the first sample that the viewer does not see yet.
+        """Return the number of the first sample that the viewer must not receive yet.
 
-        In a recording, this is the first sample after the position. In a live stream, it is the number after the latest
-        sample.
+        In a recording, this is the first sample after the position. In a live stream, it is the number of the next
+        sample that will arrive. After a jump, the next message begins with the samples before the new position.
         """
         tape = self._hub.tape
         playhead = self._playhead
@@ -451,5 +455,6 @@ class Viewer:
             self._must_send_playhead = True
 
     def _length_s(self) -> float:
+        """Return the length of the part of the recording that has been read, s."""
         start_s, end_s = self._hub.tape.span()
         return end_s - start_s

@@ -1,8 +1,8 @@
-"""Link between the process that reads a port and the process that serves the live page.
+"""Link between the process that reads a port (the reader) and the process that serves the live page.
 
-Samples are sent through a pipe, in which the operating system never splits a write of this size. Messages in both
-directions are JSON, one datagram of a socket pair each. The reader never waits: if the pipe is full, a sample is
-discarded and counted.
+Samples are sent through a pipe. The operating system never splits a write of this size. Messages in both directions are
+JSON. Each message is one datagram of a socket pair. The reader never waits. If the pipe is full, a sample is discarded
+and counted.
 """
 
 import fcntl
@@ -19,7 +19,7 @@ import msgspec
 from isocharge.serve.viewer.messages import LiveRequest
 
 PIPE_BYTES = 1 << 20
-"""Size of the pipe with the samples that the page's process has not read yet, bytes: about 10 s at 1 kHz."""
+"""Size of the pipe, bytes. It has room for the samples of about 10 s at 1 kHz."""
 
 MAX_MESSAGE_BYTES = 1 << 16
 """Largest size of a message, bytes."""
@@ -44,7 +44,7 @@ class LinkEnd:
     is_open: bool = True
 
     def close_here(self) -> None:
-        """Close this process's copy of the end. Another process may have a copy of its own."""
+        """Close the copy of this end in this process. Another process may have its own copy."""
         self.messages.close()
         self.samples.close()
 
@@ -89,7 +89,7 @@ class ReaderEnd(LinkEnd):
         return self._send(json.dumps(content).encode(), flags)
 
     def wait_for_request(self) -> LiveRequest | None:
-        """Wait for a request of the page, and return it; return None after the page's process has ended."""
+        """Wait for a request of the page, and return it; return None if the process of the page has ended."""
         try:
             data = self.messages.recv(MAX_MESSAGE_BYTES)
         except OSError:
@@ -106,7 +106,7 @@ class ReaderEnd(LinkEnd):
 
 @dataclass
 class PageEnd(LinkEnd):
-    """The end in the page's process."""
+    """The end in the process of the page."""
 
     _incomplete: bytes = b""
 

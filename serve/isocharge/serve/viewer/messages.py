@@ -1,8 +1,9 @@
 """Messages between the server and the live page: the description of the film, binary samples, and requests.
 
-The page reads the description before the first sample. It contains the geometry, the electrodes, the model and the
-deflection field. The geometry is taken from the sensor in the model's metadata; parts that are missing there are not
-drawn. The deflection field lies beside the model, or is shipped with isocharge for the films of the released models.
+The page reads the description before the first sample. The description contains the geometry, the electrodes, the model
+and the deflection field. The geometry comes from the sensor in the metadata of the model. Parts that are missing there
+are not drawn. The deflection field is a file in the folder of the model. For the films of the released models, it is a
+file of isocharge.
 
 A binary message to the page is little-endian: kind (u8, 1), zero (u8), number of samples (u16), number of the message
 (u32), time of sending (Unix time in seconds, f64), number of records that this page has missed (u32), options (u32, bit
@@ -10,9 +11,9 @@ A binary message to the page is little-endian: kind (u8, 1), zero (u8), number o
 with the number of the message (u32).
 
 A sample is a prediction record of fixed size. If contacts are tracked, it contains the tracked contact instead of the
-contact of the frame. Several records are coalesced to one sample if there are more than a browser can show. A sample is
-little-endian: the timestamp (Unix time in seconds, f64); the numbers that the declaration of the record marks for the
-live page (f32 each); the numbers of the other contact (f32 each); the flags (u32, one bit for each word of
+contact of the frame. Several records are coalesced to one sample if there are more records than a browser can show. A
+sample is little-endian: the timestamp (Unix time in seconds, f64); the numbers that the declaration of the record marks
+for the live page (f32 each); the numbers of the other contact (f32 each); the flags (u32, one bit for each flag of
 `isocharge.serve.flags`, and the highest bit for a contact); the number of coalesced records (u32); and the touch
 charges (pC, f32 for each electrode). Zeros fill the sample up to a multiple of eight bytes. An unknown number is NaN.
 The description of the film contains the offset of each number.
@@ -58,7 +59,7 @@ OTHER_PREFIX = "other_"
 
 
 def _live_numbers() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the numbers of a record, and of its `other` contact, that the samples contain."""
+    """Return the names of the numbers in a sample: those of the record, and those of its `other` contact."""
 
     def live_names(fields: Sequence[Field]) -> tuple[str, ...]:
         """Return the names of the fields that are numbers and are shown on the live page."""
@@ -70,6 +71,7 @@ def _live_numbers() -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 RECORD_NUMBERS, OTHER_NUMBERS = _live_numbers()
+"""Names of the numbers of a record and of its other contact that a sample contains."""
 
 
 class SampleFormat:
@@ -106,9 +108,11 @@ class SampleFormat:
         self.dtype = np.dtype(fields)
 
     def describe(self) -> dict[str, Any]:
-        """Return the layout for the page: the size of a sample, and the place of each number in it, bytes."""
-        offsets = {name: self.dtype.fields[name][1] for name in self.dtype.names or () if self.dtype.fields}
-        offsets.pop("padding", None)
+        """Return the layout for the page: the size of a sample, and the offset of each number in it, bytes."""
+        offsets = {}
+        for name, (_type, offset, *_title) in (self.dtype.fields or {}).items():
+            if name != "padding":
+                offsets[name] = offset
         return {"bytes": self.dtype.itemsize, "offsets": offsets}
 
     def pack(self, record: PredictionRecord) -> bytes:
@@ -142,18 +146,18 @@ def _clip(values: Sequence[float]) -> list[float]:
 
 
 def coalesce(samples: Samples, max_samples: int) -> Samples:
-    """Coalesce samples, each of which then stands for a run of neighbouring samples.
+    """Coalesce samples. Each returned sample represents a run of neighbouring samples.
 
-    The latest sample of a run is shown. If it is no contact, the sample with the largest force of the run is shown
-    instead, so that a short tap is not lost. The flags are those of all samples of the run, the latency is the largest
-    one, and the numbers of records are added.
+    The latest sample of a run is returned. If it is not a contact, the sample of the run with the largest force is
+    returned instead, so that a short tap is not lost. The returned sample has the flags of all samples of the run,
+    their largest latency, and the sum of their numbers of records.
 
     Args:
-        samples: Shape (n,).
+        samples: The samples, shape (n,).
         max_samples: Largest number of samples to return, at least 1.
 
     Returns:
-        Shape (max_samples,), or the unchanged samples if there are no more than that.
+        The coalesced samples, shape (max_samples,); the unchanged samples if n is at most `max_samples`.
     """
     if len(samples) <= max_samples:
         return samples
@@ -169,10 +173,10 @@ def coalesce(samples: Samples, max_samples: int) -> Samples:
 
 
 def _shown_positions(samples: Samples, edges: np.ndarray) -> np.ndarray:
-    """Return the position of the sample that is shown of each run, shape (n_run,).
+    """Return the position of the sample that represents each run, shape (n_run,).
 
     Args:
-        samples: Shape (n,).
+        samples: The samples, shape (n,).
         edges: Start of each run, and the end of the last run, shape (n_run + 1,).
     """
     is_contact = (samples["flags"] & CONTACT_BIT) != 0
@@ -190,7 +194,7 @@ SAMPLES_KIND = 1
 """Kind of a binary message with samples."""
 
 BEGIN_ANEW_OPTION = 1
-"""Option bit of a message after which the page discards what was shown before."""
+"""Option bit of a message with which the page discards all earlier samples."""
 
 MAX_MARKER_CHARACTERS = 80
 """Largest number of characters of a marker's text."""
@@ -259,7 +263,7 @@ def samples_message(number: int, sent_s: float, samples: Samples, missed: int, *
         sent_s: Unix time of sending, s.
         samples: At most 65535 samples.
         missed: Number of records that the page has missed.
-        begin_anew: Whether the page discards what was shown before.
+        begin_anew: Whether the page discards all earlier samples.
     """
     options = BEGIN_ANEW_OPTION if begin_anew else 0
     header = HEADER.pack(SAMPLES_KIND, 0, len(samples), number & 0xFFFFFFFF, sent_s, missed & 0xFFFFFFFF, options)

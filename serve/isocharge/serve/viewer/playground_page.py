@@ -1,8 +1,8 @@
-"""The playground: one HTML file in which a visitor presses a simulated film and sees the answer of a released network.
+"""The playground: an HTML file in which a visitor presses a simulated film and sees the contact of a network.
 
-The file contains everything that it needs: the networks as compressed ONNX files, the stress of the film as a series,
-and the scripts. It loads nothing from the network. Its charges come from `isocharge.common.stress_series`, so it can
-show every model of a biaxial film that this series describes.
+The file contains the networks as compressed ONNX files, the stress of the film as a series, and the scripts. It loads
+no other files. The charges are computed by `isocharge.common.stress_series`, so the playground can show every model of
+a biaxial film that this series describes.
 """
 
 import base64
@@ -41,10 +41,10 @@ SERIES_FILE = "playground/film-25um.json"
 """File with the stress of the film of the models."""
 
 MODULE_SYNTAX = re.compile(r"^import .*;\n|^export (?=\w)", re.MULTILINE)
-"""Import statements and the word `export`, which the joined scripts do not need."""
+"""Import statements and the word `export`, which are removed when the scripts are joined."""
 
 QUADRILATERAL = 4
-"""Number of corners of an electrode that the page can integrate over."""
+"""Number of corners of an electrode over which the page can integrate the stress."""
 
 
 def playground_html(models: tuple[str, ...] = MODELS) -> str:
@@ -112,5 +112,5 @@ def _describe_model(name: str, series: StressSeries) -> dict[str, Any]:
 
 
 def _as_json(data: dict[str, Any]) -> str:
-    """Return data as JSON that can stand in an HTML script element."""
+    """Return data as JSON that can be put into an HTML script element."""
     return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")

@@ -1,4 +1,4 @@
-"""The process that serves the live page, separate from the process that reads the port."""
+"""The process that serves the live page. It is separate from the process that reads the port, the reader."""
 
 import asyncio
 import os
@@ -20,13 +20,13 @@ from isocharge.serve.viewer.link import PageEnd
 from isocharge.serve.viewer.server import Access, PageServer
 
 NICE = 10
-"""Increase of the nice value of the page's process, so that the reader has priority on a busy core."""
+"""Increase of the nice value of the process, so that the reader has priority on a busy core."""
 
 START_TIMEOUT_S = 60.0
-"""Longest time until the page's process listens, s."""
+"""Longest time until the process listens, s."""
 
 STOP_TIMEOUT_S = 5.0
-"""Time after which the page's process is terminated if it has not ended, s."""
+"""Longest time until the process ends by itself, s. Afterwards it is terminated."""
 
 BACKLOG = 128
 """Largest number of connections that wait to be accepted."""
@@ -55,7 +55,12 @@ class Page:
 
 @contextmanager
 def page_process(page: Page) -> Iterator[str]:
-    """Run the page in its own process. The process ends when the reader closes its end of the link.
+    """Serve the page in its own process while the block runs.
+
+    The process ends when the reader, which is the calling process, closes its end of `page.link`.
+
+    Args:
+        page: Settings of the page.
 
     Yields:
         The URL of the page.
@@ -69,6 +74,7 @@ def page_process(page: Page) -> Iterator[str]:
     process = context.Process(target=_run, args=(page, url_sender), name="page", daemon=True)
     with _interrupts_ignored():
         process.start()
+    # The new process has its own copies of these ends. A pipe reports its end only if all copies are closed.
     url_sender.close()
     page.link.close_here()
     try:
@@ -121,11 +127,14 @@ def _run(page: Page, url_sender: Connection) -> None:
 
 
 def _receive_url(url_receiver: Connection) -> str:
-    """Wait for the URL of the page's process.
+    """Wait for the URL of the page, and return it.
+
+    Args:
+        url_receiver: Pipe from the process of the page.
 
     Raises:
-        IsochargeError: The error that the process raised.
-        ListenError: If the process ends or sends nothing in time.
+        IsochargeError: The error that prevents the page from starting.
+        ListenError: If the process ends or sends nothing within `START_TIMEOUT_S`.
     """
     try:
         result = url_receiver.recv() if url_receiver.poll(START_TIMEOUT_S) else None
@@ -140,9 +149,9 @@ def _receive_url(url_receiver: Connection) -> str:
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C during the block, which a process that is started in the block inherits.
+    """Ignore Ctrl-C during the block. A process that is started in the block also ignores Ctrl-C.
 
-    The page's process ends when its reader ends.
+    The process of the page therefore ends only when the reader ends.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -6,8 +6,8 @@ message, and sends pings to each viewer. This module limits the number of viewer
 the time for which they read nothing.
 
 A browser sends no Authorization header with a WebSocket. The page therefore sends its token as a subprotocol,
-`bearer.TOKEN` in base64url; other clients send the header. Requests from pages of other sites are refused by
-`isocharge.serve.network.browser_check`.
+`bearer.TOKEN` in base64url. Other clients send the header. The module `isocharge.serve.network.browser_check` refuses
+requests from pages of other sites.
 """
 
 import asyncio
@@ -52,11 +52,12 @@ class Access:
     """Checks whether a request for data may be answered.
 
     Args:
-        token: Token that requests must carry; None answers everybody.
+        token: Token that requests must contain; None if no token is needed.
         host: Name or address on which the page is served.
     """
 
     def __init__(self, token: Token | None = None, host: str = "127.0.0.1") -> None:
+        """Set up the checks; the arguments are described in the class."""
         self._token = token
         self._browser_check = BrowserCheck(host, any_host=token is not None)
 
@@ -149,6 +150,7 @@ class RateLimit:
     """
 
     def __init__(self, burst_bytes: float, bytes_per_s: float, now_s: float) -> None:
+        """Begin with the full amount of data; the arguments are described in the class."""
         self._burst_bytes = burst_bytes
         self._bytes_per_s = bytes_per_s
         self._available_bytes = burst_bytes
@@ -177,7 +179,7 @@ class PageConnection(ServerConnection):
         super().connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        """Process received data.
+        """Process received data, or end the connection if there are too many.
 
         Reading is paused while the client does not read, because responses would otherwise fill the memory.
         """
@@ -203,6 +205,7 @@ class PageServer:
     """
 
     def __init__(self, hub: Hub, access: Access) -> None:
+        """Read the files of the page; the arguments are described in the class."""
         self._hub = hub
         self._access = access
         self._files = page_files()
@@ -321,11 +324,12 @@ class PageServer:
 
 
 def _select_subprotocol(_connection: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+    """Return the subprotocol of the page if the client offers it."""
     return Subprotocol(PROTOCOL) if PROTOCOL in offered else None
 
 
 def _last_response(response: Response) -> http11.Response:
-    """Convert a response for `websockets`. The connection is closed after it."""
+    """Convert a response to a response of `websockets` after which the connection is closed."""
     headers = Headers([(name.decode(), value.decode()) for name, value in response.headers])
     headers["Connection"] = "close"
     return http11.Response(response.status, HTTPStatus(response.status).phrase, headers, response.body)
@@ -341,6 +345,7 @@ def page_files() -> dict[str, Response]:
 
 
 def _file_response(path: Path) -> Response:
+    """Return the response with the content of a file of the page."""
     response = response_of(200, CONTENT_TYPES[path.suffix], path.read_bytes())
     response.headers.append((b"content-security-policy", CONTENT_SECURITY_POLICY))
     response.headers.append((b"cache-control", b"no-cache"))

@@ -60,6 +60,7 @@ class Script:
             raise SceneError(f"script: expected a positive rate, got {self.rate_Hz} Hz")
 
     def __len__(self) -> int:
+        """Return the number of frames."""
         return len(self.force_N)
 
     @property

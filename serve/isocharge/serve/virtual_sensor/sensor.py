@@ -1,8 +1,8 @@
 """Virtual sensor: a pseudo-terminal that sends the frames of a board, with charges from any forward map.
 
 The touch charges of the whole script are computed before the first frame is sent. The amplifier, whose output depends
-on earlier charges, processes them block by block. Frames are written at absolute times, so the frame rate does not
-drift. The sensor never waits for a reader: a frame that does not fit into the buffer of the port is discarded and
+on earlier charges, processes the charges block by block. Frames are written at absolute times, so the frame rate does
+not drift. The sensor never waits for a reader. A frame that does not fit into the buffer of the port is discarded and
 counted, and the reader receives a gap in the frame numbers.
 """
 
@@ -27,8 +27,10 @@ from isocharge.serve.frames.frame import SEQ_MODULUS, T_US_MODULUS, Frame
 from isocharge.serve.virtual_sensor.script import Faults, Script, corrupt
 
 PORT_BUFFER_BYTES = 3840
-"""Largest number of bytes that wait for the reader. The buffer of Linux has 4095 bytes; if it were full, a frame could
-be written incompletely."""
+"""Largest number of bytes that wait for the reader.
+
+The buffer of Linux has 4095 bytes. If it were filled completely, a frame could be written incompletely.
+"""
 
 
 class PseudoPort:
@@ -42,7 +44,7 @@ class PseudoPort:
         """Open a pseudo-terminal.
 
         Raises:
-            PortError: If the operating system has no pseudo-terminals, as Windows.
+            PortError: If the operating system has no pseudo-terminals. Windows has none.
         """
         tty, self._fcntl, self._termios = posix_modules()
         # The reader's end also stays open here, so that the port is not hung up when a reader closes it.
@@ -66,7 +68,7 @@ class PseudoPort:
         return False
 
     def close(self) -> None:
-        """Close the pseudo-terminal. For the reader this is like pulling the cable."""
+        """Close the pseudo-terminal. For the reader, this has the same effect as unplugging the cable."""
         os.close(self._writer)
         os.close(self._reader)
 
@@ -331,7 +333,7 @@ class VirtualSensor:
         if self._link is None and self._faults.unplug_every_s > 0.0:
             self._folder = tempfile.TemporaryDirectory(prefix="isocharge-")
             self._link = Path(self._folder.name) / "film"
-        self.port_path = self._plug().url
+        self.port_path = self._open_port().url
         self._stop.clear()
         self._writer = threading.Thread(target=self._play, name="virtual sensor", daemon=True)
         self._writer.start()
@@ -342,7 +344,7 @@ class VirtualSensor:
         self._stop.set()
         if self._writer is not None:
             self._writer.join()
-        self._unplug()
+        self._close_port()
         self._writer = None
         if self._folder is not None:
             self._folder.cleanup()
@@ -360,15 +362,19 @@ class VirtualSensor:
             # Count the frame before it is written, because a reader may ask for its truth as soon as it has the frame.
             self._frame_count = number + 1
             if self._faults.is_unplugged(self._script_time_s(number)):
-                self._unplug()
+                self._close_port()
             elif self._port is None:
-                self._plug()
+                self._open_port()
                 self.unplugged += 1
             if data and self._port is not None and not self._port.write_whole(data):
                 self.withheld += 1
 
-    def _plug(self) -> PseudoPort:
-        """Open the port and create the link."""
+    def _open_port(self) -> PseudoPort:
+        """Open the port, create the link, and return the port.
+
+        Raises:
+            InputError: If the link cannot be created.
+        """
         port = PseudoPort()
         try:
             if self._link:
@@ -381,8 +387,8 @@ class VirtualSensor:
         self._port = port
         return port
 
-    def _unplug(self) -> None:
-        """Remove the link and close the port."""
+    def _close_port(self) -> None:
+        """Remove the link and close the port. If the port is closed already, do nothing."""
         if self._port is None:
             return
         if self._link:

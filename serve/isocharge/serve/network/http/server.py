@@ -13,10 +13,10 @@ from isocharge.serve.network.http.connection import Connection, close_overdue
 from isocharge.serve.network.protocol import Handler
 
 GRACE_SECONDS = 10.0
-"""Time that requests which have begun have to finish when the server stops, s."""
+"""Longest time to finish the requests that have begun when the server stops, s."""
 
 TICK_SECONDS = 0.1
-"""Time between two checks of all deadlines, and before the next attempt after a failure to accept, s."""
+"""Time between two checks of all deadlines, and pause after a failure to accept a connection, s."""
 
 BACKLOG = 2048
 """Largest number of connections that wait to be accepted."""
@@ -26,7 +26,7 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class HttpServer:
-    """A server that listens from its construction until `close`, and answers requests while `run` runs.
+    """A server that listens from its construction until `close`. Requests are answered while `run` is executed.
 
     Attributes:
         url: URL for clients.

@@ -46,7 +46,7 @@ def _tensor(name: str, width: int) -> dict[str, Any]:
 
 
 def model_config(loaded: LoadedVersion, limits: ServerLimits) -> dict[str, Any]:
-    """Return the configuration of a model in the form of Triton. Unlike Triton by default, every version serves."""
+    """Return the configuration of a model in the form of Triton. All versions of the model are available."""
     return {
         "name": loaded.metadata.name,
         "platform": PLATFORM,
@@ -84,5 +84,5 @@ def statistics_of(store: ModelStore, name: str = "", version: str = "") -> dict[
 
 
 def repository_index(store: ModelStore, *, ready: bool) -> list[dict[str, str]]:
-    """Return a row for every version in the repository, or, if `ready` is true, for every version that is loaded."""
+    """Return one row for each version in the repository, or only for each loaded version if `ready` is true."""
     return [row for row in store.index() if row["state"] == "READY" or not ready]

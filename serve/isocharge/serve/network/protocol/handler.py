@@ -1,7 +1,8 @@
-"""Answers requests of the Open Inference Protocol: method, path, headers and body in; status, headers and body out.
+"""Responses to requests of the Open Inference Protocol, independent of the transport.
 
-This module knows no transport. A request may be answered from any thread. Most answers take microseconds, and the
-largest batch takes milliseconds. The method `may_block` states for which paths a server should use another thread.
+A request consists of method, path, headers and body. A response consists of status, headers and body. Requests may be
+answered in any thread. Most responses take microseconds, and the largest batch takes milliseconds. The method
+`may_block` returns whether a server should use another thread for a path.
 """
 
 import re
@@ -25,7 +26,7 @@ Headers = Iterable[tuple[bytes, bytes]]
 """Headers of a request: names in lower case, values as they were sent."""
 
 MAX_REMEMBERED_PATHS = 64
-"""Number of paths, the latest ones, whose route is remembered."""
+"""Number of recent paths whose route is cached."""
 
 
 class Match(NamedTuple):
@@ -87,10 +88,10 @@ class Handler:
 
         Args:
             store: The models.
-            limits: Bounds of body and batch, and of the connections, which the transport observes.
+            limits: Limits of the body and of the batch. The transport observes the limits of the connections.
             traffic: Counters and log of the requests.
             token: Token that requests must carry; None if no token is needed.
-            browser_check: Check that refuses requests by web pages of other sites. Without one, requests for the host
+            browser_check: Check that refuses requests from web pages of other sites. By default, requests for the host
                 names of this machine are accepted, or requests for any host name if there is a token.
         """
         self.store = store
@@ -123,7 +124,7 @@ class Handler:
         match = match_path(path)
         try:
             response = self._answer(method, path, match, dict(headers), body)
-        except Exception as error:  # the one place where an error becomes an answer
+        except Exception as error:  # every error becomes a response here
             response = error_response(error)
         self.traffic.count("http", match.label, response.status)
         log = self.traffic.log

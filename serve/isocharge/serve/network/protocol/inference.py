@@ -1,7 +1,7 @@
 """One inference of the Open Inference Protocol: reading the request, running the model, writing the response.
 
-A body is JSON, which may be followed by binary tensors; a header then states the length of the JSON. The gRPC service
-converts its messages to the same JSON objects and uses `parse_request`, too.
+A body is JSON, which may be followed by binary tensors. If there are binary tensors, a header contains the length of
+the JSON. The gRPC service converts its messages to the same JSON objects and also uses `parse_request`.
 """
 
 import struct
@@ -176,7 +176,7 @@ def parse_request(
     else:
         names = loaded.outputs
         binary_names = frozenset(names if default_is_binary else ())
-    charges = _charges(body.inputs[0], binary, loaded.metadata.electrodes, batch)
+    charges = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, batch)
     return InferRequest(body.id, charges, names, binary_names)
 
 
@@ -210,7 +210,7 @@ def _requested_outputs(
     return names, frozenset(binary_names)
 
 
-def _charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[str, ...], batch: int) -> Singles:
+def _read_charges(tensor: InputTensor, binary: bytes | memoryview, electrodes: tuple[str, ...], batch: int) -> Singles:
     """Return the charges of an input tensor, shape (n, electrodes), pC.
 
     The shape is checked before any memory of that size is used.
@@ -265,13 +265,13 @@ def _from_values(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> 
         Charges, shape (n, electrodes), pC.
 
     Raises:
-        RequestError: If the values are no numbers, or do not have this shape.
+        RequestError: If the values are not numbers, or do not have this shape.
         ChargeError: If a charge is not finite.
     """
     press_count, electrode_count = shape
     is_flat_list = type(values) is list and len(values) == press_count * electrode_count
-    # For a few numbers, struct is several times faster than creating and testing arrays. It converts True to 1.0, so
-    # that a list with a number that equals True or False is converted by `_from_array`.
+    # For a few numbers, struct is several times faster than creating and testing arrays. However, struct converts True
+    # to 1.0. A list that contains True or False, or the equal numbers 1 and 0, is therefore converted by `_from_array`.
     if is_flat_list and not (True in values or False in values):
         charges = np.empty(shape, np.float32)
         write_into_charges = partial(_packer(len(values)), charges.data, 0)
@@ -282,7 +282,7 @@ def _from_values(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> 
 
 @lru_cache(64)
 def _packer(count: int) -> Callable[..., None]:
-    """Return a function that packs this many float32 numbers into a buffer."""
+    """Return a function that packs `count` float32 numbers into a buffer."""
     return struct.Struct(f"={count}f").pack_into
 
 
@@ -309,8 +309,8 @@ def _from_array(values: Any, shape: list[int], electrodes: tuple[str, ...]) -> S
 def _as_array(values: Any) -> np.ndarray[Any, Any]:
     """Convert a list, or a list of lists, to an array.
 
-    If the values contain true or false, the array has the type object, because NumPy would convert them to 1 and 0. If
-    the values form no array, the result is an array of None.
+    If the values contain true or false, the array has the type object, because NumPy would convert these values to 1
+    and 0. If the values do not form an array, the result is an array of None.
     """
     try:
         is_nested = isinstance(values, list) and bool(values) and isinstance(values[0], list)
@@ -340,7 +340,10 @@ def write_answer(answer: InferAnswer) -> tuple[bytes, int | None]:
 
 
 def binary_tensor(rows: Rows) -> bytes:
-    """Return an output as bytes, little-endian: float32 numbers, or texts that each follow their length (u32)."""
+    """Return an output as little-endian bytes.
+
+    Numbers are float32. Each text is preceded by its length in bytes (u32).
+    """
     if not rows.dtype.hasobject:
         return rows.astype("<f4", copy=False).tobytes()
     return b"".join(struct.pack("<I", len(text)) + text.encode() for text in rows.ravel().tolist())
@@ -429,7 +432,7 @@ def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
         loaded: The model.
         outputs: Outputs of the model for these presses, each of shape (n, width).
     """
-    correlations = np.zeros_like(outputs["contact"])  # they do not influence the flags
+    correlations = np.zeros_like(outputs["contact"])  # the flags do not depend on the correlations
     parts = [outputs["contact"], outputs["contact_std"], outputs["misfit"], correlations]
     columns = np.concatenate(parts, axis=1).T  # one row for each attribute of Contacts
     contacts = Contacts(*columns)

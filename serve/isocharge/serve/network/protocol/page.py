@@ -1,7 +1,7 @@
-"""The start page of the HTTP server, for people.
+"""The start page of the HTTP server, which shows the models and an example of a request.
 
-Names of models, model cards and reasons for refusals come from files and are escaped. In addition, the headers of the
-page forbid a browser to run scripts and to load anything.
+Names of models, model cards and reasons for refusals come from files and are therefore escaped. In addition, the
+headers of the page prevent that a browser runs scripts or loads other files.
 """
 
 import base64
@@ -44,16 +44,16 @@ PAGE_HEADERS = (
     (b"referrer-policy", b"no-referrer"),
     (b"cross-origin-resource-policy", b"same-origin"),
 )
-"""Headers of every page. They allow one style sheet, which is identified by its hash, and nothing else."""
+"""Headers of every page. They allow only one style sheet, which is identified by its hash."""
 
 MAX_CARD_BYTES = 1 << 18
 """Largest size of a card that the page shows, bytes."""
 
 
 def page(store: ModelStore) -> str:
-    """Return the page for people as HTML. It loads nothing else.
+    """Return the start page as HTML. The page loads no other files.
 
-    It begins with an example of a request, because this is what most visitors look for.
+    The page begins with an example of a request, because most visitors look for it.
     """
     refused = "".join(f'<p class="refused">Refused: {escape(reason)}</p>' for reason in store.refusals())
     served = store.loaded_versions()

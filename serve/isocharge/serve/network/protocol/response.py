@@ -26,7 +26,7 @@ _STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
 """Class of an error, its HTTP status and its gRPC status. The first matching class of the list is used."""
 
 INTERNAL_MESSAGE = "internal error; the server's log says more"
-"""Message to the client for an error that is no IsochargeError."""
+"""Message to the client for an error that is not an IsochargeError."""
 
 
 def statuses(error: Exception) -> tuple[int, str]:
@@ -35,7 +35,7 @@ def statuses(error: Exception) -> tuple[int, str]:
 
 
 def client_message(error: Exception) -> str:
-    """Return the message to the client. An error that is no IsochargeError is written to the log instead."""
+    """Return the message to the client. An error that is not an IsochargeError is written to the log instead."""
     if isinstance(error, errors.IsochargeError):
         return str(error)
     log.exception("a request failed", exc_info=error)
@@ -86,7 +86,7 @@ def error_response(error: Exception) -> Response:
 
 
 MIN_COMPRESSED_BYTES = 1024
-"""Smallest size of a body that is compressed, bytes. Sending a shorter body is faster than setting up a compressor."""
+"""Smallest size of a body that is compressed, bytes. A shorter body is sent faster without compression."""
 
 _WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
 """Argument `wbits` of zlib for each encoding. The encoding `deflate` of HTTP is the zlib format."""

@@ -1,7 +1,7 @@
 """The routes of the HTTP server. Each route is one entry of `ROUTES`.
 
-The entry has the method, the paths, the summary, the schemas of request and answer, and the function that answers. The
-dispatch of the requests and the OpenAPI document are derived from it.
+An entry has the method, the paths, the summary, the schemas of the request and of the answer, and the function that
+answers requests. The dispatch of requests and the OpenAPI document are derived from the entries.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,7 +30,7 @@ Json = dict[str, Any]
 
 
 class Service(NamedTuple):
-    """What the functions that answer need.
+    """Objects of the server that the functions of the routes use.
 
     Attributes:
         store: The models.
@@ -64,7 +64,7 @@ class Request(NamedTuple):
 
     @property
     def loaded(self) -> LoadedVersion:
-        """The model that the path names; raises ModelNotFound if it is not loaded."""
+        """The model that the path names. If it is not loaded, ModelNotFound is raised."""
         return self.service.store.get(self.model, self.version)
 
 
@@ -89,14 +89,15 @@ class Route:
 
     Attributes:
         method: Method of the request. A route with the method GET also answers HEAD, without a body.
-        paths: Templates of the paths. The log and the counters use the first one.
+        paths: Templates of the paths. The log and the counters use the first template.
         respond: Function that answers a request.
-        summary: What the route is for; empty if the OpenAPI document does not list it.
+        summary: Purpose of the route; empty if the OpenAPI document does not list the route.
         answer: Schema of the answer.
         answer_type: Media type of the answer.
         body: Body of the request; None if the route has no body.
-        needs_token: Whether a request needs the token of the server. Programs that start and watch servers have none.
-        may_block: Whether an answer may take so long that the server should use another thread.
+        needs_token: Whether a request needs the token of the server. Health checks need none, because the programs that
+            start and monitor servers have no token.
+        may_block: Whether an answer may take a long time, so that the server should use another thread.
     """
 
     method: str
@@ -111,7 +112,12 @@ class Route:
 
 
 def object_schema(properties: Json, required: list[str] | None = None) -> Json:
-    """Return the schema of an object; all properties are required unless `required` lists them."""
+    """Return the schema of an object.
+
+    Args:
+        properties: Schema of each property by its name.
+        required: Names of the required properties; by default all.
+    """
     return {"type": "object", "properties": properties, "required": required or list(properties)}
 
 
@@ -212,7 +218,7 @@ def _show_statistics(request: Request) -> Response:
 
 
 def _show_index(request: Request) -> Response:
-    """Return the versions in the repository, or, if the body has `ready: true`, the versions that are loaded."""
+    """Return all versions in the repository. If the body has `ready: true`, return only the loaded versions."""
     ready = read_object(request.body).get("ready", False)
     if not isinstance(ready, bool):
         raise RequestError(f"ready: expected true or false, got {ready!r:.100}")
@@ -248,7 +254,7 @@ def _show_config(request: Request) -> Response:
 def _infer(request: Request) -> Response:
     """Compute the contacts of the presses in a request.
 
-    Of all responses only this one is compressed, because the asyncio client of Triton decompresses no other response.
+    Only this response is compressed, because the asyncio client of Triton does not decompress other responses.
     """
     loaded = request.loaded
     header_length = request.headers.get(b"inference-header-content-length")
@@ -267,7 +273,7 @@ def _infer(request: Request) -> Response:
 
 
 def model_paths(ending: str = "") -> tuple[str, str]:
-    """Return the paths of a route that belongs to a model: with its name, and with its name and version."""
+    """Return the two paths of a route for a model: with the name, and with the name and the version of the model."""
     return f"/v2/models/{{model}}{ending}", f"/v2/models/{{model}}/versions/{{version}}{ending}"
 
 
@@ -375,4 +381,4 @@ ROUTES: tuple[Route, ...] = (
         body=Body(INFER_BODY, is_required=True, example=EXAMPLE),
     ),
 )
-"""The routes. A path that fits several templates belongs to the first one."""
+"""The routes. If a path matches several templates, the first of them is used."""
