@@ -27,6 +27,7 @@ from isocharge.serve.flags import FILM
 from isocharge.serve.live import recorded_stream
 from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.model.pretensions import read_pretensions
+from isocharge.serve.signal_chain.thermal import TRIED_PC, ThermalRule
 from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule, HardestFrame
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
@@ -123,12 +124,30 @@ def rms(errors):
     return np.sqrt(np.mean(errors**2, axis=0)) * [1.0, 100.0]
 
 
+def differences_from_known_film(problem, pretension, records):
+    """Return how far records are from the answers to their charges of the network that is told the film: mm, and ln F.
+
+    The noise of the charges changes both answers alike, so that the differences depend little on the touches.
+    """
+    network = problem.films.fold(np.append(pretension, film_of(problem)[1:]))
+    answer, *_ = network.predict(np.array([list(record.charge_pC.values()) for record in records]))
+    position = [np.hypot(one.x_mm - x, one.y_mm - y) for one, (x, y, _) in zip(records, answer, strict=True)]
+    log_force = [np.log(one.force_N / force) for one, (_, _, force) in zip(records, answer, strict=True)]
+    return np.column_stack([position, log_force])
+
+
 def test_it_follows_a_degree_and_goes_back_when_asked(mine, problem, film):
-    """After 60 touches errors are below 0.2 mm and 3 %; as calibrated they would be 0.3 mm and 14 %."""
+    """After 60 touches the answers are within 0.08 mm and 3 % of those for the known film.
+
+    As calibrated, the errors would be 0.3 mm and 14 %. The rms error of the place after 60 touches is between 0.17 and
+    0.20 mm for different sets of touches, of which 0.15 to 0.17 mm are due to the noise of the charges.
+    """
     back = lambda stream, touch: touch == 110 and stream.reset_film()  # noqa: E731
     records, errors = follow(mine, problem, film, [1.0 + DEGREE_MPa] * 118, ask=back)
     start, still = rms(errors[:8]), rms(errors[60:110])
     assert start[1] > 10.0
+    from_known_film = rms(differences_from_known_film(problem, 1.0 + DEGREE_MPa, records[60:110]))
+    assert from_known_film[0] < 0.08
     assert still[0] < 0.2
     assert still[1] < 3.0
     before, after, last = (records[n].film for n in (0, 109, 111))
@@ -282,8 +301,36 @@ def test_offset_that_differs_between_electrodes_is_recognised_by_its_ratio(mine,
     assert abs(follower.film.pretension_MPa - calibrated_MPa) < 2.0 * follower.film.pretension_std_MPa
 
 
+def warming_without_noise(predictor, charge):
+    """Return the warming that minimises the squared misfit of each row of charges, where temperature is separable."""
+    warming_pC = []
+    for row in charge:
+        squared_misfits = np.square(predictor.predict_batch(row - TRIED_PC[:, None]).misfit, dtype=float)
+        curvature, slope, _ = np.polyfit(TRIED_PC, squared_misfits, 2)
+        is_separable = curvature > (ThermalRule().noise / ThermalRule().blind_pC) ** 2
+        if is_separable:
+            warming_pC.append(np.clip(-slope / (2.0 * curvature), TRIED_PC[0], TRIED_PC[-1]))
+    return np.array(warming_pC)
+
+
+def test_followed_film_shows_little_warming_anywhere(mine, problem, film):
+    """A film that is a degree tauter shows 17 pC of warming that is not there, rms over places, as calibrated."""
+    follower = FilmFollower(Predictor(mine))
+    _, charge = touch_charges(problem, film, follower.predictor, 1.0 + DEGREE_MPa, 60, seed=8)
+    contact = draw_contacts(np.random.default_rng(1), problem.domain.within(6.0), 40)
+    held_charge = film(1.0 + DEGREE_MPa).charges(contact)
+    calibrated_pC = warming_without_noise(follower.predictor, held_charge)
+    follow_touches(follower, charge)
+    followed_pC = warming_without_noise(follower.predictor, held_charge)
+    assert np.sqrt(np.mean(calibrated_pC**2)) > 15.0
+    assert np.sqrt(np.mean(followed_pC**2)) < 5.0
+
+
 def test_common_mode_estimates_warming_by_the_followed_film(mine, problem, film):
-    """With the model as calibrated, a film that is a degree tauter shows 19 pC of warming that is not there."""
+    """The signal chain uses the misfit of the followed film, here at one place.
+
+    As calibrated, the mean of the warming at this place would be 15 pC.
+    """
     device = device_from_table({"follow": {"on": True}, "common_mode": {"on": True}}, "test")
     stream = TouchStream(Predictor(mine), device)
     _, charge = touch_charges(problem, film, stream.predictor, 1.0 + DEGREE_MPa, 60, seed=8)
@@ -296,7 +343,7 @@ def test_common_mode_estimates_warming_by_the_followed_film(mine, problem, film)
         record for frame in frames for record in stream.feed(Chunk(encode_frame(frame), 1.7e9 + 0.005 * frame.seq, 0))
     ]
     warming_pC = [record.charge_raw_pC["A"] - record.charge_pC["A"] for record in records[300:]]
-    assert np.abs(warming_pC).max() < 13.0
+    assert abs(np.mean(warming_pC)) < 6.0
 
 
 def estimated_film(problem, gain_std=0.0, coefficients=None):
