@@ -1,4 +1,4 @@
-"""The device file: what it may say, what it does, what is refused."""
+"""Tests of the device file: its settings, their effects, and files that are refused."""
 
 import numpy as np
 import pytest
@@ -98,18 +98,19 @@ def test_format_decides_the_parser(device):
 
 
 def gain_of(chain):
+    """Return the stage with the gain of a signal chain."""
     return Gain(chain.gain_pC, chain.zero)
 
 
 def test_offset_is_subtracted_before_the_gain(device):
-    """Offset binary: half scale is no charge; one number, or one for each electrode."""
+    """The offset is one number, such as half of the range of a converter, or one number for each electrode."""
     for offset, zero in (("8388608", [8388608] * 3), ("{A = 1, B = 2, C = 3}", [1, 2, 3])):
         chain = device(f"[gain]\noffset = {offset}\npC_per_unit = {{A = 0.5, B = -0.5, C = 1}}\n").chain(ELECTRODES)
         np.testing.assert_array_equal(gain_of(chain).convert(np.array(zero) + 10.0), [5.0, -5.0, 10.0])
 
 
 def test_volts_on_a_feedback_capacitance(device):
-    """1 V on 1 nF is 1 nC."""
+    """A voltage of 1 V on a capacitance of 1 nF is a charge of 1 nC."""
     text = "[gain]\nV_per_unit = -0.001\noffset = 1650\nfeedback_pF = {A = 1000, B = 1000, C = 500}\n"
     np.testing.assert_allclose(gain_of(device(text).chain(ELECTRODES)).convert(np.full(3, 1651.0)), [-1.0, -1.0, -0.5])
     assert device(text).gain.charge_pC("C", np.array([1651.0])) == pytest.approx(-0.5)
@@ -176,7 +177,7 @@ def test_device_file_that_is_refused(device, text, message):
 
 
 def test_table_of_a_device_is_unchanged(device):
-    """Recordings hold it; it makes the same device again."""
+    """Recordings contain the table, and the same device can be created from it."""
     board = device(FULL)
     assert device_from_table(board.table, board.where) == board
     assert board.table["tare"] == {"frames": 50}
@@ -241,19 +242,20 @@ def test_unknown_channels_are_refused(names, channels, message):
 
 def test_tare_error_states_the_offset_for_the_device_file():
     stream = ReadingStream(ELECTRODES, device_from_table({"tare": {"frames": 5, "patience": 10}}, "board.toml"))
-    data = b"".join(encode_frame(Frame(k, 5000 * k, (2048.0, 2050.5, 2047.0))) for k in range(20))
+    frames = [Frame(number, 5000 * number, (2048.0, 2050.5, 2047.0)) for number in range(20)]
+    data = b"".join(map(encode_frame, frames))
     with pytest.raises(TareError, match=r"\[gain\] offset = \{A = 2048, B = 2050.5, C = 2047\}"):
         list(stream.feed(Chunk(data, 1e9, 0)))
 
 
 def test_saturation_is_flagged_until_the_press_is_over(device):
     chain = SignalChain(device("[saturation]\nlimit_pC = 1500.0\n[tare]\nframes = 5\n").chain(ELECTRODES), 3)
-    totals = [0.0] * 6 + [800.0, 1500.0, 800.0, 800.0, 0.0, 0.0, 800.0]
-    flags = []
-    for k, total in enumerate(totals):
-        reading = chain.advance(np.full(3, total), 0.005 * k, 0.005)
-        flags.append("saturated" in reading.flags)
-    assert flags == [False] * 7 + [True] * 3 + [False] * 3
+    charges_pC = [0.0] * 6 + [800.0, 1500.0, 800.0, 800.0, 0.0, 0.0, 800.0]
+    is_saturated = []
+    for number, charge_pC in enumerate(charges_pC):
+        reading = chain.advance(np.full(3, charge_pC), 0.005 * number, 0.005)
+        is_saturated.append("saturated" in reading.flags)
+    assert is_saturated == [False] * 7 + [True] * 3 + [False] * 3
 
 
 def test_warming_needs_four_electrodes(device):

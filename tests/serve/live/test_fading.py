@@ -1,4 +1,4 @@
-"""The cause of a decreasing charge, leak or creep, is found if the press is long enough and has little noise."""
+"""Tests of the cause of a decreasing charge, which is found if the press is long and has little noise."""
 
 import re
 
@@ -22,7 +22,11 @@ def sizes_of_press(law, seconds, seed, relative_noise):
     t = np.arange(1, round(seconds * RATE_HZ)) / RATE_HZ
     tremor = np.sqrt(2.0) * np.sin(2.0 * np.pi * 9.0 * t + rng.uniform(0.0, 2.0 * np.pi))
     charge_pC = 500.0 * law(t) * (1.0 + relative_noise * (tremor + rng.standard_normal(t.size)))
-    return [(t[k] + 0.25, float(charge_pC[k : k + 100].mean())) for k in range(99, t.size - 100, 10)]
+    sizes = []
+    for first in range(99, t.size - 100, 10):
+        middle_s = t[first] + 0.25
+        sizes.append((middle_s, float(charge_pC[first : first + 100].mean())))
+    return sizes
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A recording gives the same records again, whatever happened meanwhile."""
+"""Tests of recordings: a replay computes the same records, also after interruptions and errors."""
 
 import base64
 import json
@@ -27,154 +27,198 @@ from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.port.recording import Marker, NewModel
 
 DEVICE = {"tare": {"frames": 10}, "leak": {"tau_s": 10.0}, "hum": {"frequency_Hz": 50.0}}
+"""Content of the device file."""
+
+CHUNK_INTERVAL_S = 0.0063
+"""Time between two chunks, s."""
 
 
-def chunks(film, cuts=37, outage_at=40):
-    """Rest, a press, an outage, rest and a press, cut anyhow."""
+def chunks_of_presses(film, chunk_bytes=37, outage_number=40):
+    """Return the chunks of a stream with two presses, and an outage between the presses.
+
+    Args:
+        film: The film that is pressed.
+        chunk_bytes: Size of a chunk. The chunks do not end at the ends of frames.
+        outage_number: Number of the chunk after the outage.
+    """
     rng = np.random.default_rng(3)
-    press = film.charge_pC([2.0], [1.0], [0.5])[0]
-    rows = [rng.normal(0, 1, 3) + (press if k % 40 > 20 else 0.0) for k in range(80)]
-    data = b"".join(encode_frame(Frame(k, 5000 * k, tuple(row))) for k, row in enumerate(rows))
-    pieces = [data[i : i + cuts] for i in range(0, len(data), cuts)]
-    return [
-        Chunk(piece, 1e9 + 0.0063 * k, time.perf_counter_ns(), 1.5 if k == outage_at else 0.0)
-        for k, piece in enumerate(pieces)
-    ]
+    press_pC = film.charge_pC([2.0], [1.0], [0.5])[0]
+    data = b""
+    for number in range(80):
+        row_pC = rng.normal(0, 1, 3)
+        if number % 40 > 20:
+            row_pC += press_pC
+        data += encode_frame(Frame(number, 5000 * number, tuple(row_pC)))
+
+    chunks = []
+    for number, begin in enumerate(range(0, len(data), chunk_bytes)):
+        outage_s = 1.5 if number == outage_number else 0.0
+        timestamp = 1e9 + CHUNK_INTERVAL_S * number
+        chunks.append(Chunk(data[begin : begin + chunk_bytes], timestamp, time.perf_counter_ns(), outage_s))
+    return chunks
 
 
-def following(path, chunks, predictor, table):
-    """Lines of JSON as they go out while recording, with a new tare before chunk 30."""
+def record_chunks(path, chunks, predictor, table):
+    """Record a stream, and yield its records as JSON. A new tare is requested before chunk 30."""
     stream = TouchStream(predictor, device_from_table(table, "test"))
     with Recorder(path, predictor.metadata.label, "every", table) as recorder:
         live = RecordedStream(stream, recorder)
 
-        def asking():
+        def chunks_with_request():
             for number, chunk in enumerate(chunks):
                 if number == 30:
                     live.request_tare()
                 yield chunk
 
-        yield from (record.to_json() for record in live.follow(asking()))
+        for record in live.follow(chunks_with_request()):
+            yield record.to_json()
 
 
-def record(path, film, predictor):
-    return list(following(path, chunks(film), predictor, DEVICE))
+def record_presses(path, film, predictor):
+    """Record the stream of `chunks_of_presses`, and return its records as JSON."""
+    return list(record_chunks(path, chunks_of_presses(film), predictor, DEVICE))
 
 
-def played(path, predictor):
-    """Lines of a recording that is played again."""
-    recording, clock = Recording(path), RecordedClock()
+def replayed_lines(path, predictor):
+    """Return the records of the replay of a recording as JSON."""
+    recording = Recording(path)
+    clock = RecordedClock()
     stream = TouchStream(predictor, device_from_table(recording.device, "recording"), now_ns=clock)
     return [record.to_json() for record in replay(recording, stream, clock)]
 
 
 def test_replay_repeats_the_records_bit_for_bit(tmp_path, film, predictor):
     path = tmp_path / "touch.rec"
-    lines = record(path, film, predictor)
+    lines = record_presses(path, film, predictor)
     assert len(lines) > 60
-    assert {flag for line in lines for flag in json.loads(line)["flags"]} >= {"tare", "reconnected"}
-    assert any(json.loads(line)["contact"] for line in lines)
-    assert all(json.loads(line)["latency_us"] > 0 for line in lines)
-    assert sum(event.chunk is None for event in Recording(path).events()) == 1
-    assert played(path, predictor) == lines
+    records = [json.loads(line) for line in lines]
+    all_flags = {flag for record in records for flag in record["flags"]}
+    assert all_flags >= {"tare", "reconnected"}
+    assert any(record["contact"] for record in records)
+    assert all(record["latency_us"] > 0 for record in records)
+    tare_requests = [event for event in Recording(path).events() if event.chunk is None]
+    assert len(tare_requests) == 1
+    assert replayed_lines(path, predictor) == lines
 
 
 @pytest.mark.parametrize("leak", [{}, {"leak": {"tau_s": 10.0}}])
 def test_replay_of_a_warming_film_repeats_the_records_bit_for_bit(tmp_path, leak):
-    """A released model of four electrodes; the common charge rises to 60 pC while one press is held."""
-    path, model = tmp_path / "touch.rec", load_model(find_model("four-25um-uniaxial"))
-    predictor, press = Predictor("four-25um-uniaxial"), model.golden.charge_pC[0].astype(float)
-    rows = [np.zeros(4)] * 200 + [press + 60.0 * k / 300 for k in range(300)]
-    data = [encode_frame(Frame(k, 5000 * k, tuple(row.tolist()))) for k, row in enumerate(rows)]
-    arrived = [Chunk(frame, 1e9 + 0.005 * k, time.perf_counter_ns()) for k, frame in enumerate(data)]
-    lines = list(following(path, arrived, predictor, {"tare": {"frames": 10}, "common_mode": {}} | leak))
+    """A released model with four electrodes is used. The common charge rises to 60 pC while a press is held."""
+    path = tmp_path / "touch.rec"
+    predictor = Predictor("four-25um-uniaxial")
+    model = load_model(find_model("four-25um-uniaxial"))
+    press_pC = model.golden.charge_pC[0].astype(float)
+    rows_pC = [np.zeros(4)] * 200 + [press_pC + 60.0 * number / 300 for number in range(300)]
+    chunks = []
+    for number, row_pC in enumerate(rows_pC):
+        data = encode_frame(Frame(number, 5000 * number, tuple(row_pC.tolist())))
+        chunks.append(Chunk(data, 1e9 + 0.005 * number, time.perf_counter_ns()))
+    lines = list(record_chunks(path, chunks, predictor, {"tare": {"frames": 10}, "common_mode": {}} | leak))
     assert "thermal" in json.loads(lines[-1])["flags"]
-    assert played(path, predictor) == lines
+    assert replayed_lines(path, predictor) == lines
 
 
-@pytest.mark.parametrize("where", ["base64.b64encode", "json.dumps", "os.lseek", "os.write"])
-def test_replay_of_an_interrupted_recording_ends_with_the_last_record(tmp_path, film, predictor, monkeypatch, where):
-    """Ctrl-C while the thirtieth chunk is written: before a part of it, or after."""
-    path, calls = tmp_path / "touch.rec", count()
-    module, name = where.split(".")
-    act = getattr({"base64": base64, "json": json, "os": os}[module], name)
+@pytest.mark.parametrize("function", ["base64.b64encode", "json.dumps", "os.lseek", "os.write"])
+def test_replay_of_an_interrupted_recording_ends_with_the_last_record(tmp_path, film, predictor, monkeypatch, function):
+    """Ctrl-C interrupts the recording of a chunk in a function, before it has an effect; `os.write` has its effect."""
+    path = tmp_path / "touch.rec"
+    call_numbers = count()
+    module_name, function_name = function.split(".")
+    module = {"base64": base64, "json": json, "os": os}[module_name]
+    original_function = getattr(module, function_name)
 
-    def interrupted(*arguments, **options):
-        done = act(*arguments, **options) if where == "os.write" else None
-        if next(calls) == 30:
+    def interrupted_function(*arguments, **options):
+        is_interrupted = next(call_numbers) == 30
+        if is_interrupted and function != "os.write":
             raise KeyboardInterrupt
-        return done if where == "os.write" else act(*arguments, **options)
+        result = original_function(*arguments, **options)
+        if is_interrupted:
+            raise KeyboardInterrupt
+        return result
 
-    monkeypatch.setattr(where, interrupted)
+    monkeypatch.setattr(function, interrupted_function)
     lines = []
     with pytest.raises(KeyboardInterrupt):
-        lines.extend(following(path, chunks(film), predictor, DEVICE))
+        lines.extend(record_chunks(path, chunks_of_presses(film), predictor, DEVICE))
     monkeypatch.undo()
     assert 10 < len(lines) < 60
-    assert played(path, predictor) == lines
+    assert replayed_lines(path, predictor) == lines
 
 
 def test_recording_on_a_full_disk_remains_readable(tmp_path, film, predictor, fill_disk, caplog):
-    """The disk takes half a line and then no more; the live path goes on."""
+    """The disk becomes full in the middle of a line. The recording stops, but the stream continues."""
     path = tmp_path / "touch.rec"
     fill_disk(9000)
-    lines = record(path, film, predictor)
+    lines = record_presses(path, film, predictor)
     assert len(lines) > 60
     assert path.stat().st_size < 9000
     assert path.read_bytes().endswith(b"}\n")
     assert [entry.levelname for entry in caplog.records] == ["ERROR"]
     assert "recording stopped (No space left on device)" in caplog.text
-    again = played(path, predictor)
-    assert 3 < len(again) < len(lines)
-    assert again == lines[: len(again)]
+    replayed = replayed_lines(path, predictor)
+    assert 3 < len(replayed) < len(lines)
+    assert replayed == lines[: len(replayed)]
 
 
 @pytest.mark.parametrize("real_time", [False, True])
 def test_replay_in_real_time_waits_between_chunks(tmp_path, film, predictor, monkeypatch, real_time):
-    path, now = tmp_path / "touch.rec", [5e9]
-    record(path, film, predictor)
-    recording, clock = Recording(path), RecordedClock()
-    monkeypatch.setattr(time, "time", lambda: now[0])
-    monkeypatch.setattr(time, "sleep", lambda seconds: now.append(now.pop() + seconds))
+    path = tmp_path / "touch.rec"
+    record_presses(path, film, predictor)
+    recording = Recording(path)
+    slept_s = []
+    monkeypatch.setattr(time, "time", lambda: 5e9 + sum(slept_s))
+    monkeypatch.setattr(time, "sleep", slept_s.append)
+    clock = RecordedClock()
     stream = TouchStream(predictor, device_from_table(recording.device, "recording"), now_ns=clock)
-    assert sum(1 for _ in replay(recording, stream, clock, real_time=real_time)) > 60
-    count = sum(event.chunk is not None for event in recording.events())
-    assert now[0] - 5e9 == pytest.approx(0.0063 * (count - 1) if real_time else 0.0, abs=1e-5)
+    records = list(replay(recording, stream, clock, real_time=real_time))
+    assert len(records) > 60
+
+    chunk_count = sum(event.chunk is not None for event in recording.events())
+    expected_s = CHUNK_INTERVAL_S * (chunk_count - 1) if real_time else 0.0
+    assert sum(slept_s) == pytest.approx(expected_s, abs=1e-5)
 
 
-@pytest.mark.parametrize(("asked_for", "taken_since"), [("linear/1", []), ("linear/2", [NewModel("linear/1")])])
-def test_recording_that_begins_later_restarts_the_stream(film, predictor, tmp_path, asked_for, taken_since):
-    """Begun and ended on request, with a marker: its replay gives its records, and the totals go on."""
-    path, device = tmp_path / "later.rec", device_from_table(DEVICE, "test")
-    stream, pieces = TouchStream(predictor, device), chunks(film)
+@pytest.mark.parametrize(("label", "model_changes"), [("linear/1", []), ("linear/2", [NewModel("linear/1")])])
+def test_recording_that_begins_later_restarts_the_stream(film, predictor, tmp_path, label, model_changes):
+    """A recording begins and ends on request, and has a marker. The replay gives the same records.
+
+    If the label in the request is not that of the present model, the recording contains the change of the model.
+    """
+    path = tmp_path / "later.rec"
+    device = device_from_table(DEVICE, "test")
+    stream = TouchStream(predictor, device)
     live = RecordedStream(stream)
 
-    def asking():
-        for number, chunk in enumerate(pieces):
-            if number == 20:
-                for name in ("never.rec", "later.rec"):  # what is asked for anew takes the place of what waits
-                    live.request_recording(Recorder(tmp_path / name, asked_for, "every", DEVICE))
+    def chunks_with_requests():
+        for number, chunk in enumerate(chunks_of_presses(film)):
+            if number == 20:  # the second request replaces the first one, which has not been executed yet
+                live.request_recording(Recorder(tmp_path / "never.rec", label, "every", DEVICE))
+                live.request_recording(Recorder(path, label, "every", DEVICE))
             if number == 30:
                 live.request_marker(Marker(1e9, "now"))
             if number == 60:
                 live.request_recording(None)
             yield chunk
 
-    lines = [record.to_json() for record in live.follow(asking()) if live.recorder is not None]
+    lines = [record.to_json() for record in live.follow(chunks_with_requests()) if live.recorder is not None]
     assert len(lines) > 20
-    assert stream.totals().frames == 78  # outage and beginning cut a frame in two each
-    clock, markers = RecordedClock(), []
-    again = TouchStream(predictor, device, now_ns=clock)
-    events = replay(Recording(path), again, clock, on_marker=markers.append, load=lambda _: predictor)
-    replayed = [record.to_json() for record in events]
-    assert [event for event in Recording(path).events() if isinstance(event, NewModel)] == taken_since
-    assert (replayed, markers, [*tmp_path.iterdir()]) == (lines, [Marker(1e9, "now")], [path])
+    # The totals continue in spite of the restart. The restart and the outage each cut one of the 80 frames in two.
+    assert stream.totals().frames == 80 - 2
+
+    clock = RecordedClock()
+    markers = []
+    new_stream = TouchStream(predictor, device, now_ns=clock)
+    records = replay(Recording(path), new_stream, clock, on_marker=markers.append, load=lambda _: predictor)
+    assert [record.to_json() for record in records] == lines
+    assert markers == [Marker(1e9, "now")]
+    assert [event for event in Recording(path).events() if isinstance(event, NewModel)] == model_changes
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("marker", ['["x", "y"]', "[1.0]", "[1.0, 2]", '[1e300, "y"]', "1", f'[1.0, "{"x" * 2000}"]'])
 def test_damaged_marker_raises_an_error_with_the_reason(film, predictor, tmp_path, marker):
     path = tmp_path / "touch.rec"
-    record(path, film, predictor)
+    record_presses(path, film, predictor)
     path.write_text(path.read_text() + f'{{"marker": {marker}}}\n')
     with pytest.raises(RecordingError, match="marker"):
         list(Recording(path).events())

@@ -1,4 +1,4 @@
-"""A press is taken with its true charge as soon as it is steady, and otherwise refused with a reason."""
+"""Tests of the press watch: a steady press is taken with its true charge, and other presses are refused."""
 
 import math
 import re
@@ -16,35 +16,52 @@ from isocharge.serve.signal_chain.chain import Reading
 from isocharge.serve.signal_chain.tare import Tare
 
 RATE_HZ = 200.0
+"""Number of frames per second, Hz."""
+
 PRESS = np.array([800.0, 400.0, 300.0, 500.0])
+"""Touch charges of a press, shape (4,), pC."""
+
 NAMES = ("A", "B", "C", "D")
 
 
-def readings(charge_pC, *, noise_pC=1.0, flags=None):
-    """Yield readings of charges with noise, shape (n, 4), pC, in contact where the first charge is above 20 pC."""
-    tare = Tare(np.zeros(4), np.full(4, noise_pC), 100)
+def noise_std(charge_pC, noise_pC=1.0):
+    """Return the standard deviations of noisy charges, shape (4,), pC."""
+    return np.hypot(noise_pC, 0.002 * charge_pC)
+
+
+def readings(charge_pC, *, flags=None):
+    """Yield noisy readings. Something touches if the first charge is above 20 pC.
+
+    Args:
+        charge_pC: Charges without noise, shape (n, 4), pC.
+        flags: Function from the number of a frame to its flags.
+    """
+    tare = Tare(np.zeros(4), np.ones(4), 100)
     rng = np.random.default_rng(1)
-    for k, clean in enumerate(charge_pC):
-        noisy = clean + np.hypot(noise_pC, 0.002 * clean) * rng.standard_normal(4)
-        contact = clean[0] > 20.0
-        frame_flags = flags(k) if flags else ()
+    for number, clean_pC in enumerate(charge_pC):
+        noisy_pC = clean_pC + noise_std(clean_pC) * rng.standard_normal(4)
+        frame_flags = flags(number) if flags else ()
         has_tare = TARE not in frame_flags
-        charge_pC = noisy if has_tare else None
-        reading = Reading(noisy, charge_pC, tare, contact=contact and has_tare, flags=frame_flags)
-        yield TimedReading(reading, ReadingTime(1e9 + k / RATE_HZ, round(1e6 * k / RATE_HZ), 1.0 / RATE_HZ))
+        is_contact = has_tare and clean_pC[0] > 20.0
+        reading = Reading(noisy_pC, noisy_pC if has_tare else None, tare, contact=is_contact, flags=frame_flags)
+        time = ReadingTime(1e9 + number / RATE_HZ, round(1e6 * number / RATE_HZ), 1.0 / RATE_HZ)
+        yield TimedReading(reading, time)
 
 
-def watched(*parts, **options):
+def watch_presses(*parts, **options):
+    """Return the results of a press watch for the readings of successive parts; see `rest` and `held`."""
     watch = PressWatch(NAMES)
     return [watch.feed(reading) for reading in readings(np.concatenate(parts), **options)]
 
 
 def rest(seconds, level=0.0):
+    """Return the charges of a film at rest, shape (n, 4), pC."""
     return np.full((round(seconds * RATE_HZ), 4), level)
 
 
 def held(seconds, change=lambda _: 1.0, press=PRESS):
-    return np.array([press * change(k / RATE_HZ) for k in range(round(seconds * RATE_HZ))])
+    """Return the charges of a press, shape (n, 4), pC, multiplied by a function of the time since the touch, s."""
+    return np.array([press * change(number / RATE_HZ) for number in range(round(seconds * RATE_HZ))])
 
 
 def taken_presses(results):
@@ -52,34 +69,41 @@ def taken_presses(results):
     return [result.press for result in results if result.press]
 
 
-def events(seen):
+def reasons_of(results):
+    """Return the reasons of the refused presses."""
+    return [result.reason for result in results if result.phase is Phase.refused]
+
+
+def phases_of(results):
     """Return the phases in their order, without repetitions."""
-    phases = [result.phase.value for result in seen]
+    phases = [result.phase.value for result in results]
     return [phases[0], *(after for before, after in pairwise(phases) if after != before)]
 
 
 def test_press_is_taken_once_and_the_next_press_after_a_lift():
-    seen = watched(rest(1), held(2), rest(1), held(2, press=PRESS / 2), rest(1))
-    assert events(seen) == ["waiting", "settling", "taken", "lift"] * 2 + ["waiting"]
-    for press, clean in zip(taken_presses(seen), (PRESS, PRESS / 2), strict=True):
-        standard_error = np.hypot(1.0, 0.002 * clean) * math.sqrt(1 / press.frames + 1 / 50)
-        assert (np.abs(press.charge_pC - clean) < 4 * standard_error).all()
-        np.testing.assert_allclose(press.scatter_pC, np.hypot(1.0, 0.002 * clean), rtol=0.35)
+    results = watch_presses(rest(1), held(2), rest(1), held(2, press=PRESS / 2), rest(1))
+    assert phases_of(results) == ["waiting", "settling", "taken", "lift"] * 2 + ["waiting"]
+    rest_frames = 50
+    for press, clean_pC in zip(taken_presses(results), (PRESS, PRESS / 2), strict=True):
+        standard_error_pC = noise_std(clean_pC) * math.sqrt(1 / press.frames + 1 / rest_frames)
+        assert (np.abs(press.charge_pC - clean_pC) < 4 * standard_error_pC).all()
+        np.testing.assert_allclose(press.scatter_pC, noise_std(clean_pC), rtol=0.35)
         assert press.held_s < 0.8
         assert press.frames == pytest.approx(100, abs=2)
 
 
 def test_drift_before_the_touch_is_subtracted():
     """The amplifier has drifted by 9 pC since the tare, which is below the touch threshold."""
-    (press,) = taken_presses(watched(rest(1, 9.0), held(2) + 9.0, rest(1, 9.0)))
+    (press,) = taken_presses(watch_presses(rest(1, 9.0), held(2) + 9.0, rest(1, 9.0)))
     np.testing.assert_allclose(press.charge_pC, PRESS, atol=1.5)
 
 
 def test_press_whose_force_rises_slowly_is_taken_later():
     """The force rises with a time constant of 0.4 s. The mean may be wrong by the largest allowed drift, 0.5 %."""
-    (seen,) = [result for result in watched(rest(1), held(6, lambda t: 1 - math.exp(-t / 0.4))) if result.press]
-    assert seen.held_s > 1.5
-    np.testing.assert_allclose(seen.press.charge_pC, PRESS, rtol=0.01)
+    rising_press = held(6, lambda t: 1 - math.exp(-t / 0.4))
+    (press,) = taken_presses(watch_presses(rest(1), rising_press))
+    assert press.held_s > 1.5
+    np.testing.assert_allclose(press.charge_pC, PRESS, rtol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -96,57 +120,70 @@ def test_press_whose_force_rises_slowly_is_taken_later():
     ],
 )
 def test_press_that_creeps_moves_or_shakes_is_refused_with_a_reason(change, reason):
-    seen = watched(rest(1), held(9, change), rest(1))
-    assert events(seen) == ["waiting", "settling", "refused", "lift", "waiting"]
-    (refused,) = [result for result in seen if result.phase is Phase.refused]
-    assert refused.reason.startswith("not steady within 8 s: ")
-    assert re.search(reason, refused.reason), refused.reason
+    results = watch_presses(rest(1), held(9, change), rest(1))
+    assert phases_of(results) == ["waiting", "settling", "refused", "lift", "waiting"]
+    (refusal,) = reasons_of(results)
+    assert refusal.startswith("not steady within 8 s: ")
+    assert re.search(reason, refusal), refusal
 
 
 def test_reason_of_each_press_is_its_own_leak_or_creep_and_not_the_release():
-    release = lambda t: min(1.0, 10.0 * (5.0 - t))  # noqa: E731
+    """The force of each press falls to 0 in the last tenth of a second."""
+
+    def release(t):
+        return min(1.0, 10.0 * (5.0 - t))
+
     leak = held(5, lambda t: release(t) * math.exp(-t / 5.0))
     creep = held(5, lambda t: release(t) * (1.0 - 0.3 * math.log10(t + 0.01)))
-    seen = watched(rest(1), leak, rest(1), creep, rest(1), leak, rest(1))
-    reasons = [result.reason for result in seen if result.phase is Phase.refused]
+    reasons = reasons_of(watch_presses(rest(1), leak, rest(1), creep, rest(1), leak, rest(1)))
     for expected, reason in zip(("tau_s = 5 ", "the film creeps", "tau_s = 5 "), reasons, strict=True):
         assert expected in reason
 
 
 def test_press_of_a_trembling_hand_is_taken():
     """The charge varies by 1 % at 9 Hz, and its mean is nevertheless correct."""
-    (press,) = taken_presses(watched(rest(1), held(4, lambda t: 1 + 0.014 * math.sin(56.0 * t))))
+    (press,) = taken_presses(watch_presses(rest(1), held(4, lambda t: 1 + 0.014 * math.sin(56.0 * t))))
     np.testing.assert_allclose(press.charge_pC, PRESS, rtol=0.005)
 
 
 def test_press_without_a_rest_before_it_is_refused():
     """The charge at rest before the touch is unknown, so the touch charge could have any error."""
-    seen = watched(rest(1), held(2), rest(0.05), held(2), rest(1))
-    assert events(seen) == ["waiting", "settling", "taken", "lift", "waiting", "settling", "refused", "lift", "waiting"]
-    assert "too soon" in next(result.reason for result in seen if result.phase is Phase.refused)
+    results = watch_presses(rest(1), held(2), rest(0.05), held(2), rest(1))
+    first_press = ["waiting", "settling", "taken", "lift"]
+    second_press = ["waiting", "settling", "refused", "lift", "waiting"]
+    assert phases_of(results) == first_press + second_press
+    (reason,) = reasons_of(results)
+    assert "too soon" in reason
 
 
 def test_short_press_is_refused_and_a_very_short_touch_is_ignored():
-    seen = watched(rest(1), held(0.3), rest(1), held(0.05), rest(1))
-    assert [result.reason for result in seen if result.phase is Phase.refused] == [
-        "released after 0.3 s, before it was steady: hold it longer"
-    ]
-    assert not [result for result in seen if result.press]
+    results = watch_presses(rest(1), held(0.3), rest(1), held(0.05), rest(1))
+    assert reasons_of(results) == ["released after 0.3 s, before it was steady: hold it longer"]
+    assert not taken_presses(results)
 
 
 def test_saturated_press_is_refused_and_the_next_press_is_taken():
-    seen = watched(rest(1), held(2), rest(1), held(2), flags=lambda k: (SATURATED,) if k == 220 else ())
-    assert events(seen) == ["waiting", "settling", "refused", "lift", "waiting", "settling", "taken", "lift"]
-    assert [result.reason for result in seen if result.phase is Phase.refused] == [
-        "an amplifier is at its limit: press less hard"
-    ]
+    def flags(number):
+        return (SATURATED,) if number == 220 else ()
+
+    results = watch_presses(rest(1), held(2), rest(1), held(2), flags=flags)
+    assert phases_of(results) == ["waiting", "settling", "refused", "lift", "waiting", "settling", "taken", "lift"]
+    assert reasons_of(results) == ["an amplifier is at its limit: press less hard"]
 
 
 def test_press_is_refused_after_the_port_was_lost():
-    """The film is tared again. Neither the press that was under way nor its continuation is taken."""
-    words = lambda k: ((RECONNECTED,) if k == 220 else ()) + ((TARE,) if k < 50 or 220 <= k < 320 else ())  # noqa: E731
-    seen = watched(rest(1), held(0.5), rest(1), held(2), flags=words)
-    assert events(seen) == [
+    """The port is lost during a press. The film is then tared again, and the rest of this press is not taken."""
+
+    def flags(number):
+        frame_flags = []
+        if number == 220:
+            frame_flags.append(RECONNECTED)
+        if number < 50 or 220 <= number < 320:
+            frame_flags.append(TARE)
+        return tuple(frame_flags)
+
+    results = watch_presses(rest(1), held(0.5), rest(1), held(2), flags=flags)
+    assert phases_of(results) == [
         "taring",
         "waiting",
         "settling",
@@ -157,20 +194,29 @@ def test_press_is_refused_after_the_port_was_lost():
         "taken",
         "lift",
     ]
-    assert "the port was away" in next(result.reason for result in seen if result.phase is Phase.refused)
+    (reason,) = reasons_of(results)
+    assert "the port was away" in reason
 
 
 def test_an_armed_watch_takes_no_press_that_has_begun():
-    watch, seen = PressWatch(NAMES), []
-    for k, reading in enumerate(readings(np.concatenate([rest(1), held(2), rest(1), held(2)]))):
-        if k == 240:
+    watch = PressWatch(NAMES)
+    results = []
+    for number, reading in enumerate(readings(np.concatenate([rest(1), held(2), rest(1), held(2)]))):
+        if number == 240:  # in the first press
             watch.arm()
-        seen.append(watch.feed(reading))
-    assert events(seen) == ["waiting", "settling", "lift", "waiting", "settling", "taken", "lift"]
+        results.append(watch.feed(reading))
+    assert phases_of(results) == ["waiting", "settling", "lift", "waiting", "settling", "taken", "lift"]
 
 
 def test_window_is_checked_ten_times_in_its_length_at_any_frame_rate(monkeypatch):
-    calls = []
-    monkeypatch.setattr(steady_press, "unsteadiness", lambda *_: calls.append(1) or "no")
-    watched(rest(1), held(2.0))
-    assert len(calls) == pytest.approx(10 * 1.5 / 0.5, abs=2)
+    """A press of 2 s is checked from 0.5 s on, ten times in each 0.5 s."""
+    call_count = 0
+
+    def count_call(*_):
+        nonlocal call_count
+        call_count += 1
+        return "never steady"
+
+    monkeypatch.setattr(steady_press, "unsteadiness", count_call)
+    watch_presses(rest(1), held(2.0))
+    assert call_count == pytest.approx(10 * 1.5 / 0.5, abs=2)

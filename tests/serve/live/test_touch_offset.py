@@ -7,7 +7,10 @@ from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Frame, Predictor, TouchStream, device_from_table, encode_frame
 
 LIGHT_pC = np.array([60.0, 80.0, 50.0, 70.0])
+"""Charges of a light press, shape (4,), pC."""
+
 STRONG_pC = 8.0 * LIGHT_pC
+"""Charges of a strong press, shape (4,), pC."""
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +19,13 @@ def predictor() -> Predictor:
 
 
 def held_record(predictor, charge_pC, **sections):
-    """Return the record of a press with these charges, on a board that begins at rest."""
+    """Return the last record of a press.
+
+    Args:
+        predictor: The model.
+        charge_pC: Charges of the press, shape (4,), pC. The film is at rest before the press.
+        sections: Sections of the device file.
+    """
     stream = TouchStream(predictor, device_from_table(sections, "test"))
     rows = np.vstack([np.zeros((110, 4)), np.tile(charge_pC, (5, 1))])
     records = []
@@ -27,6 +36,7 @@ def held_record(predictor, charge_pC, **sections):
 
 
 def stds(record):
+    """Return the standard deviations of x and y, mm, and of the force, N, of a record."""
     return np.array([record.x_std_mm, record.y_std_mm, record.force_std_N])
 
 

@@ -1,4 +1,4 @@
-"""The signal chain: what is tared, what counts as touch."""
+"""Tests of the signal chain: tare, detection of touches, and invalid frames."""
 
 import numpy as np
 import pytest
@@ -10,23 +10,29 @@ from isocharge.serve.signal_chain.contact import Touch, TouchRule, update_contac
 from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.tare import TareRule, measure_tare
 
-RULE, OFFSET = TareRule(), np.array([12.0, -7.0, 3.0])
+OFFSET = np.array([12.0, -7.0, 3.0])
+"""Charges at rest, shape (3,), pC."""
+
 RATE_HZ = 200.0
+"""Number of frames per second, Hz."""
+
 ONE_PC = np.ones(3)
+"""Standard deviation of the noise of each electrode, shape (3,), pC."""
 
 
-def rest(n, seed=0, sigma=1.0):
-    return OFFSET + sigma * np.random.default_rng(seed).standard_normal((n, 3))
+def rest(n, seed=0, std_pC=1.0):
+    """Return noisy charges at rest, shape (n, 3), pC."""
+    return OFFSET + std_pC * np.random.default_rng(seed).standard_normal((n, 3))
 
 
-def run(frames, chain=None):
-    """All readings of raw frames, shape (n, 3)."""
-    running = SignalChain(chain or Chain(), 3)
-    return [running.advance(raw, k / RATE_HZ, 1 / RATE_HZ) for k, raw in enumerate(frames)]
+def run(frames_pC, settings=None):
+    """Return the readings of frames with charges of shape (n, 3), pC."""
+    chain = SignalChain(settings or Chain(), 3)
+    return [chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ) for number, raw_pC in enumerate(frames_pC)]
 
 
 def test_tare_is_mean_and_noise():
-    tare = measure_tare(RULE, rest(10_000))
+    tare = measure_tare(TareRule(), rest(10_000))
     np.testing.assert_allclose(tare.charge_pC, OFFSET, atol=0.05)
     np.testing.assert_allclose(tare.noise_pC, 1.0, rtol=0.03)
     assert tare.frames == 10_000
@@ -34,44 +40,48 @@ def test_tare_is_mean_and_noise():
 
 def test_tare_under_a_resting_weight_is_refused():
     with pytest.raises(TareError, match=r"rests at 81\d.* pC, expected at most 100 pC; take off"):
-        measure_tare(RULE, rest(100) + 800.0)
+        measure_tare(TareRule(), rest(100) + 800.0)
 
 
 def test_tare_takes_the_first_hundred_frames():
     readings = run(rest(150))
-    assert [r.tare is None for r in readings] == [True] * 100 + [False] * 50
-    assert {r.flags for r in readings[:100]} == {("tare",)}
+    assert [reading.tare is None for reading in readings] == [True] * 100 + [False] * 50
+    assert {reading.flags for reading in readings[:100]} == {("tare",)}
     np.testing.assert_allclose(readings[100].tare.charge_pC, rest(150)[:100].mean(axis=0))
-    np.testing.assert_allclose(np.mean([r.charge_pC for r in readings[100:]], axis=0), 0.0, atol=0.5)
+    mean_charge_pC = np.mean([reading.charge_pC for reading in readings[100:]], axis=0)
+    np.testing.assert_allclose(mean_charge_pC, 0.0, atol=0.5)
 
 
 def test_tare_waits_for_quiet():
-    frames = rest(400)
-    frames[:220] += np.linspace(900.0, 300.0, 220)[:, None]  # a finger that leaves after 220 frames
-    readings = run(frames)
-    assert 300 < next(i for i, r in enumerate(readings) if r.tare is not None) <= 321
+    """A finger leaves the film after 220 frames."""
+    frames_pC = rest(400)
+    frames_pC[:220] += np.linspace(900.0, 300.0, 220)[:, None]
+    readings = run(frames_pC)
+    has_tare = [reading.tare is not None for reading in readings]
+    assert 300 < has_tare.index(True) <= 321
     np.testing.assert_allclose(readings[-1].tare.charge_pC, OFFSET, atol=2.0)
 
 
 def test_tare_gives_up_with_the_reason():
     with pytest.raises(TareError, match="varies by"):
-        run(rest(300, sigma=50.0), Chain(tare=TareRule(patience=250)))
+        run(rest(300, std_pC=50.0), Chain(tare=TareRule(patience=250)))
 
 
 def test_second_tare_never_gives_up():
-    """In the middle of a live run, a finger that rests on the film is no reason to stop."""
+    """A finger that rests on the film does not stop a live stream."""
     chain = SignalChain(Chain(tare=TareRule(frames=20, patience=50)), 3)
-    for k, raw in enumerate(rest(60)):
-        chain.advance(raw, k / RATE_HZ, 1 / RATE_HZ)
+    for number, raw_pC in enumerate(rest(60)):
+        chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
     chain.reset_tare()
-    tared = []
-    for k, raw in enumerate(np.concatenate([rest(200, sigma=100.0), rest(30)])):
-        reading = chain.advance(raw, k / RATE_HZ, 1 / RATE_HZ)
-        tared.append(reading.tare is not None)
-    assert tared.index(True) == 220
+    has_tare = []
+    for number, raw_pC in enumerate(np.concatenate([rest(200, std_pC=100.0), rest(30)])):
+        reading = chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
+        has_tare.append(reading.tare is not None)
+    assert has_tare.index(True) == 220
 
 
 THRESHOLD_PC = 10.0 + 6.0 * np.sqrt(3.0)
+"""Touch threshold for noise of 1 pC on three electrodes, pC."""
 
 
 @pytest.mark.parametrize(
@@ -81,66 +91,84 @@ THRESHOLD_PC = 10.0 + 6.0 * np.sqrt(3.0)
         ([9.9, 10.1], 0.0 * ONE_PC, [0, 1]),
         ([15.0, 25.0, 15.0, 11.0, 9.0, 15.0], ONE_PC, [0, 1, 1, 1, 0, 0]),
         ([1000.0, 4000.0, 4000.0, 201.0, 199.0], ONE_PC, [1, 1, 1, 1, 0]),
-        # an absolute release threshold under the drift of 60 pC never would release
+        # The charge at rest has drifted to 60 pC, so that an absolute threshold would never release the press.
         ([2060.0, 2060.0, 60.0, 62.0, 58.0, 60.0, 75.0, 79.0], ONE_PC, [1, 1, 0, 0, 0, 0, 0, 1]),
-        # one absurd frame, at the first touch too, neither releases the press nor hides it
+        # One frame with an absurd charge does not release a press and does not prevent its detection.
         *(([*before, 3e38, *[850.0] * 4], ONE_PC, [1] * (len(before) + 5)) for before in ([], [850.0], [850.0] * 5)),
     ],
     ids=["floor and noise", "floor", "hysteresis", "share of the peak", "drifted base", *["spike"] * 3],
 )
 def test_touches_begin_and_end(totals, noise, expected):
-    touch, seen = Touch(), []
-    for total in totals:
-        touch = update_contact(TouchRule(), touch, total, noise)
-        seen.append(touch.contact)
-    assert seen == expected
+    touch = Touch()
+    contacts = []
+    for total_pC in totals:
+        touch = update_contact(TouchRule(), touch, total_pC, noise)
+        contacts.append(touch.contact)
+    assert contacts == expected
+
+
+def contacts_of(readings):
+    """Return whether something touches in each reading."""
+    return [reading.contact for reading in readings]
 
 
 def test_smallest_press_is_detected_at_once():
-    frames = rest(400)
-    frames[200:300] += 340.0 / 3.0
-    assert [r.contact for r in run(frames)] == [False] * 200 + [True] * 100 + [False] * 100
+    """The total charge of the press is 340 pC."""
+    frames_pC = rest(400)
+    frames_pC[200:300] += 340.0 / 3.0
+    assert contacts_of(run(frames_pC)) == [False] * 200 + [True] * 100 + [False] * 100
 
 
 def test_negative_charges_are_no_touch_and_are_flagged():
-    """A press stretches the film: charges that fall say that an amplifier inverts, which the device file can mend."""
-    frames = rest(200)
-    frames[150:] -= 200.0
-    readings = run(frames)
-    assert not any(r.contact for r in readings)
-    assert [r.flags for r in readings[100:]] == [()] * 50 + [("negative",)] * 50
-    inverted = run(frames, Chain(gain_pC=-ONE_PC))
-    assert [r.contact for r in inverted] == [False] * 150 + [True] * 50
+    """A press increases the charges, because it stretches the film. With an inverting amplifier, they decrease."""
+    frames_pC = rest(200)
+    frames_pC[150:] -= 200.0
+    readings = run(frames_pC)
+    assert not any(contacts_of(readings))
+    assert [reading.flags for reading in readings[100:]] == [()] * 50 + [("negative",)] * 50
+    corrected = run(frames_pC, Chain(gain_pC=-ONE_PC))
+    assert contacts_of(corrected) == [False] * 150 + [True] * 50
 
 
 def test_noise_of_a_minute_gives_no_touch():
-    assert not any(r.contact for r in run(rest(12_000, seed=3)))
+    assert not any(contacts_of(run(rest(12_000, seed=3))))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.01e9, 1.7e308])
 @pytest.mark.parametrize("gain", [None, 0.5, 2.0])
 def test_invalid_frame_passes_no_stage(value, gain):
-    """The frames after it give the same readings as without it."""
+    """The readings after the invalid frame are the same as in a chain that did not receive this frame."""
     settings = Chain(gain_pC=None if gain is None else np.full(3, gain))
-    chain, undisturbed = SignalChain(settings, 3), SignalChain(settings, 3)
-    for k, raw in enumerate(rest(150)):
-        chain.advance(raw, k / RATE_HZ, 1 / RATE_HZ)
-        undisturbed.advance(raw, k / RATE_HZ, 1 / RATE_HZ)
-    bad = np.array([1.0, value / (gain or 1.0), 2.0])
-    reading = chain.advance(bad, 150 / RATE_HZ, 0.25, flags=("gap",))
-    for k, raw in enumerate(rest(20, seed=1)):
-        after = chain.advance(raw, 151 / RATE_HZ, 1 / RATE_HZ)
-        expected = undisturbed.advance(raw, 151 / RATE_HZ, 1 / RATE_HZ + (0.25 if k == 0 else 0.0))
-        np.testing.assert_array_equal(after.charge_pC, expected.charge_pC)
-    assert (reading.charge_pC, reading.tare, reading.contact, reading.flags) == (None, None, False, ("gap", "invalid"))
+    chain = SignalChain(settings, 3)
+    undisturbed_chain = SignalChain(settings, 3)
+    for number, raw_pC in enumerate(rest(150)):
+        chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
+        undisturbed_chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
+
+    invalid_s = 0.25
+    invalid_values = np.array([1.0, value / (gain or 1.0), 2.0])
+    invalid = chain.advance(invalid_values, 150 / RATE_HZ, invalid_s, flags=("gap",))
+    assert (invalid.charge_pC, invalid.tare, invalid.contact) == (None, None, False)
+    assert invalid.flags == ("gap", "invalid")
+
+    for number, raw_pC in enumerate(rest(20, seed=1)):
+        dt_s = 1 / RATE_HZ
+        dt_with_invalid_s = dt_s + invalid_s if number == 0 else dt_s
+        reading = chain.advance(raw_pC, 151 / RATE_HZ, dt_s)
+        expected = undisturbed_chain.advance(raw_pC, 151 / RATE_HZ, dt_with_invalid_s)
+        np.testing.assert_array_equal(reading.charge_pC, expected.charge_pC)
 
 
 def test_time_of_invalid_frames_counts_for_the_next():
-    """A leak is undone over all the time since the last valid frame: exp(-0.5 s / 1 s) of the output is left."""
+    """The leak is corrected for the time since the last valid frame.
+
+    This time is 0.5 s, of which 0.2 s belong to invalid frames. The time constant is 1 s.
+    """
     chain = SignalChain(Chain(tare=None, touch=None, tau_s=np.ones(3), leak=LeakRule(learn=False)), 3)
     for charge_pC, dt_s in ((0.0, 0.1), (0.0, 0.1), (100.0, 0.1), (np.nan, 0.05), (np.inf, 0.15)):
         chain.advance(np.full(3, charge_pC), 0.0, dt_s)
-    reading = chain.advance(100.0 * np.exp(np.full(3, -0.5)), 0.0, 0.3)
+    decayed_pC = 100.0 * np.exp(np.full(3, -0.5))
+    reading = chain.advance(decayed_pC, 0.0, 0.3)
     np.testing.assert_allclose(reading.charge_pC, 100.0)
 
 
@@ -150,15 +178,16 @@ def test_flags_of_the_frame_come_before_those_of_the_chain():
 
 
 def test_base_that_relaxes_to_zero_is_no_touch():
-    """A long press may leave the charge below zero; as it relaxes, so does the base that a touch is measured from."""
-    totals, decay = -100.0 * np.exp(-np.arange(1000) / 200.0), float(np.exp(-1.0 / 200.0))
+    """After a long press, the charge may be below zero. If the base decays like the charge, no touch is detected."""
+    totals_pC = -100.0 * np.exp(-np.arange(1000) / 200.0)
 
-    def contacts(decay):
-        touch, seen = Touch(last_pC=-100.0, base_pC=-100.0), False
-        for total in totals.tolist():
-            touch = update_contact(TouchRule(), touch, total, ONE_PC, decay)
-            seen |= touch.contact
-        return seen
+    def has_touch(base_decay):
+        touch = Touch(last_pC=-100.0, base_pC=-100.0)
+        contacts = []
+        for total_pC in totals_pC.tolist():
+            touch = update_contact(TouchRule(), touch, total_pC, ONE_PC, base_decay)
+            contacts.append(touch.contact)
+        return any(contacts)
 
-    assert not contacts(decay)
-    assert contacts(1.0)
+    assert not has_touch(base_decay=float(np.exp(-1.0 / 200.0)))
+    assert has_touch(base_decay=1.0)

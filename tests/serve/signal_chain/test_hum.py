@@ -1,4 +1,4 @@
-"""Hum is followed and taken out; touches are not."""
+"""Tests of the removal of mains hum, which must not change touches."""
 
 import numpy as np
 import pytest
@@ -6,38 +6,48 @@ import pytest
 from isocharge.serve.signal_chain.hum import Hum, HumRule, remove_hum
 
 
-def clean(raw_pC, rate_Hz, rule=None):
-    hum, out = Hum.start(raw_pC.shape[1]), []
-    for k, row in enumerate(raw_pC):
-        hum, quiet = remove_hum(rule or HumRule(), hum, row, k / rate_Hz, 1 / rate_Hz)
-        out.append(quiet)
-    return np.array(out)
+def without_hum(raw_pC, rate_Hz):
+    """Return charges, shape (n, electrodes), pC, from which the hum is removed."""
+    hum = Hum.start(raw_pC.shape[1])
+    rows = []
+    for number, row_pC in enumerate(raw_pC):
+        hum, clean_pC = remove_hum(HumRule(), hum, row_pC, number / rate_Hz, 1 / rate_Hz)
+        rows.append(clean_pC)
+    return np.array(rows)
 
 
-def mains(n, rate_Hz, amplitude_pC, frequency_Hz=50.0):
+def mains_hum(n, rate_Hz, amplitude_pC, frequency_Hz=50.0):
+    """Return the hum of three electrodes with different phases, shape (n, 3), pC."""
     t = np.arange(n)[:, None] / rate_Hz
-    return amplitude_pC * np.sin(2 * np.pi * frequency_Hz * t + np.array([0.3, 1.9, 4.0]))
+    phases = np.array([0.3, 1.9, 4.0])
+    return amplitude_pC * np.sin(2 * np.pi * frequency_Hz * t + phases)
 
 
 @pytest.mark.parametrize("rate_Hz", [200.0, 1000.0])
 @pytest.mark.parametrize("frequency_Hz", [50.0, 50.05])
 def test_hum_is_gone_after_two_seconds(rate_Hz, frequency_Hz):
-    """The mains wander by 0.05 Hz; an eighth of the hum may then be left."""
-    residual_pC = clean(mains(int(4 * rate_Hz), rate_Hz, 5.0, frequency_Hz), rate_Hz)[int(2 * rate_Hz) :]
-    assert np.abs(residual_pC).max() < (0.1 if frequency_Hz == 50.0 else 1.0)
+    """If the frequency of the mains is wrong by 0.05 Hz, a fifth of the hum may remain."""
+    hum_pC = mains_hum(int(4 * rate_Hz), rate_Hz, 5.0, frequency_Hz)
+    settled_pC = without_hum(hum_pC, rate_Hz)[int(2 * rate_Hz) :]
+    max_residual_pC = 0.1 if frequency_Hz == 50.0 else 1.0
+    assert np.abs(settled_pC).max() < max_residual_pC
 
 
 def test_touch_passes_hum_removal_without_delay_and_ringing():
-    """A fixed notch of half a second rings with the step times its relative width, 850 * 2 / (50 pi): 11 pC."""
-    rate_Hz, at = 1000.0, 3000
-    step = np.where(np.arange(6000)[:, None] < at, 0.0, 850.0) * np.ones(3)
-    assert np.abs(clean(step + mains(6000, rate_Hz, 1.0), rate_Hz)[at + 1 :] - 850.0).max() < 0.5
+    """A fixed notch filter with a time constant of 0.5 s would ring with 11 pC after this step of 850 pC."""
+    rate_Hz = 1000.0
+    touch_frame = 3000
+    step_pC = np.where(np.arange(6000)[:, None] < touch_frame, 0.0, 850.0)
+    clean_pC = without_hum(step_pC + mains_hum(6000, rate_Hz, 1.0), rate_Hz)
+    assert np.abs(clean_pC[touch_frame + 1 :] - 850.0).max() < 0.5
 
 
 def test_noise_is_hardly_raised_by_hum_removal():
-    assert clean(np.random.default_rng(0).normal(0.0, 0.3, (20_000, 3)), 1000.0)[2000:].std() < 1.05 * 0.3
+    noise_pC = np.random.default_rng(0).normal(0.0, 0.3, (20_000, 3))
+    assert without_hum(noise_pC, 1000.0)[2000:].std() < 1.05 * 0.3
 
 
 def test_hum_that_does_not_turn_between_frames_is_left():
-    raw = np.random.default_rng(0).normal(0.0, 1.0, (100, 3))
-    np.testing.assert_array_equal(clean(raw, 50.0), raw)
+    """At 50 frames per second, the hum of 50 Hz is the same in all frames."""
+    raw_pC = np.random.default_rng(0).normal(0.0, 1.0, (100, 3))
+    np.testing.assert_array_equal(without_hum(raw_pC, 50.0), raw_pC)

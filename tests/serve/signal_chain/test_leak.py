@@ -1,4 +1,4 @@
-"""The leak undone, against the closed form of a leaky integrator: v decays, q stays."""
+"""Tests of the leak correction with the output of a leaky integrator in closed form."""
 
 import numpy as np
 import pytest
@@ -8,108 +8,149 @@ from isocharge.serve.signal_chain.chain import SignalChain
 from isocharge.serve.signal_chain.leak import Leak, LeakRule, undo_leak
 from isocharge.serve.signal_chain.tare import TareRule
 
-RATE_HZ, TAU_S = 200.0, 2.0
+RATE_HZ = 200.0
+"""Number of frames per second, Hz."""
+
+TAU_S = 2.0
+"""Time constant of the amplifiers, s."""
 
 
-def integrator(charge_pC):
-    """v[n] = a v[n-1] + q[n] - q[n-1] by its impulse response, from rest, for charges (n,)."""
+def amplifier_output(charge_pC):
+    """Compute the output of an amplifier, v[n] = a v[n-1] + q[n] - q[n-1], by its impulse response, shape (n,), pC."""
     n = np.arange(len(charge_pC))
-    return np.convolve(np.diff(charge_pC, prepend=0.0), np.exp(-n / (RATE_HZ * TAU_S)))[: len(n)]
+    impulse_response = np.exp(-n / (RATE_HZ * TAU_S))
+    return np.convolve(np.diff(charge_pC, prepend=0.0), impulse_response)[: len(n)]
 
 
-def pressed(*presses, seconds=20.0):
-    """Charge (n,) of presses (start s, seconds, pC) with edges of 50 ms."""
-    t, charge = np.arange(round(seconds * RATE_HZ)) / RATE_HZ, np.zeros(round(seconds * RATE_HZ))
-    for start, length, height in presses:
-        charge += height * np.clip(np.minimum(t - start, start + length - t) / 0.05, 0.0, 1.0)
-    return charge
+def touch_charge(*presses, seconds=20.0):
+    """Compute the touch charge of presses whose charge rises and falls within 50 ms, shape (n,), pC.
+
+    Args:
+        presses: Begin, s, duration, s, and charge, pC, of each press.
+        seconds: Length of the simulation, s.
+    """
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    charge_pC = np.zeros_like(t)
+    for begin_s, duration_s, height_pC in presses:
+        charge_pC += height_pC * np.clip(np.minimum(t - begin_s, begin_s + duration_s - t) / 0.05, 0.0, 1.0)
+    return charge_pC
 
 
-def undo(output_pC, rule=None, every=1, tau_s=TAU_S):
-    """Touch charges (n, 3) and contact (n,) of one output (n,) on three electrodes; only every so many frames come."""
+def correct_leak(output_pC, rule=None, every=1, tau_s=TAU_S):
+    """Correct the leak of three electrodes with the same output.
+
+    Args:
+        output_pC: Output of the amplifiers, shape (n,), pC.
+        rule: Settings of the leak correction.
+        every: Only every such frame arrives.
+        tau_s: Time constant that the correction assumes, s.
+
+    Returns:
+        Touch charges, shape (m, 3), pC, NaN before the tare; and whether something touches, shape (m,).
+    """
     settings = Chain(tare=TareRule(frames=20), tau_s=np.full(3, tau_s), leak=rule or LeakRule())
     chain = SignalChain(settings, 3)
-    charges, contact, last = [], [], 0.0
-    for k, v in enumerate(output_pC):
-        if k % every:
-            continue
-        reading = chain.advance(np.full(3, v), k / RATE_HZ, k / RATE_HZ - last)
-        last = k / RATE_HZ
+    charges = []
+    contact = []
+    previous_s = 0.0
+    for number in range(0, len(output_pC), every):
+        t_s = number / RATE_HZ
+        reading = chain.advance(np.full(3, output_pC[number]), t_s, t_s - previous_s)
+        previous_s = t_s
         charges.append(np.full(3, np.nan) if reading.charge_pC is None else reading.charge_pC)
         contact.append(reading.contact)
     return np.array(charges), np.array(contact)
 
 
 def test_held_press_keeps_its_charge_despite_the_leak():
-    output = integrator(pressed((3.0, 8.0, 400.0)))
-    assert output[2150] < 20.0  # what the amplifier still shows at the end of the press
-    got, contact = undo(output)
+    output_pC = amplifier_output(touch_charge((3.0, 8.0, 400.0)))
+    assert output_pC[2150] < 20.0  # the output of the amplifier at the end of the press
+    charge_pC, contact = correct_leak(output_pC)
     held = slice(700, 2180)
-    np.testing.assert_allclose(got[held, 0], 400.0, atol=0.5)
+    np.testing.assert_allclose(charge_pC[held, 0], 400.0, atol=0.5)
     assert contact[held].all()
     assert not contact[2250:].any()
-    np.testing.assert_allclose(got[2900:], 0.0, atol=0.05)
+    np.testing.assert_allclose(charge_pC[2900:], 0.0, atol=0.05)
 
 
 def test_inflow_is_learned_out_of_contact():
-    """5 pC/s from the tare on; unlearned, they add 50 pC to each electrode in a press of 10 s."""
-    charge = pressed((8.0, 10.0, 300.0), seconds=22.0)
-    since_s = np.maximum(0.0, np.arange(charge.size) / RATE_HZ - 0.5)
-    output = integrator(charge) + 5.0 * TAU_S * (1.0 - np.exp(-since_s / TAU_S))
-    np.testing.assert_allclose(undo(output)[0][3550, 0], 300.0, atol=8.0)
-    assert undo(output, LeakRule(learn=False))[0][3550, 0] > 340.0
+    """The inflow is 5 pC/s after the tare. Without its estimate, it adds 50 pC to each electrode in a press of 10 s."""
+    inflow_pC_per_s = 5.0
+    charge_pC = touch_charge((8.0, 10.0, 300.0), seconds=22.0)
+    since_tare_s = np.maximum(0.0, np.arange(charge_pC.size) / RATE_HZ - 0.5)
+    inflow_output_pC = inflow_pC_per_s * TAU_S * (1.0 - np.exp(-since_tare_s / TAU_S))
+    output_pC = amplifier_output(charge_pC) + inflow_output_pC
+    end_of_press = 3550
+    with_estimate, _ = correct_leak(output_pC)
+    without_estimate, _ = correct_leak(output_pC, LeakRule(learn=False))
+    np.testing.assert_allclose(with_estimate[end_of_press, 0], 300.0, atol=8.0)
+    assert without_estimate[end_of_press, 0] > 340.0
 
 
 def test_two_presses_in_a_row_do_not_spoil_each_other():
-    got, contact = undo(integrator(pressed((3.0, 4.0, 400.0), (7.3, 4.0, 200.0))))
-    np.testing.assert_allclose(got[1300, 0], 400.0, atol=0.5)
-    np.testing.assert_allclose(got[2200, 0], 200.0, atol=4.0)  # the foot of the second is lost to the relaxing base
-    assert np.count_nonzero(np.diff(contact.astype(int)) == 1) == 2
+    charge_pC, contact = correct_leak(amplifier_output(touch_charge((3.0, 4.0, 400.0), (7.3, 4.0, 200.0))))
+    np.testing.assert_allclose(charge_pC[1300, 0], 400.0, atol=0.5)
+    # The charge before the detection of the second touch decays with the base, so the tolerance is larger.
+    np.testing.assert_allclose(charge_pC[2200, 0], 200.0, atol=4.0)
+    touch_count = np.count_nonzero(np.diff(contact.astype(int)) == 1)
+    assert touch_count == 2
 
 
 def test_lost_frames_hardly_change_the_charge():
-    """Every second frame lost while pressed: the step is twice as long, and a is taken for it."""
-    got, _ = undo(integrator(pressed((3.0, 8.0, 400.0))), every=2)
-    np.testing.assert_allclose(got[1000, 0], 400.0, atol=3.0)
+    """Every second frame is lost. The correction uses the time since the previous frame that has arrived."""
+    charge_pC, _ = correct_leak(amplifier_output(touch_charge((3.0, 8.0, 400.0))), every=2)
+    np.testing.assert_allclose(charge_pC[1000, 0], 400.0, atol=3.0)
 
 
 @pytest.mark.parametrize("error", [0.005, 0.05])
 def test_error_of_tau_has_the_theoretical_effect(error):
-    """q' = q (1 + (tau / tau' - 1)(1 - exp(-t / tau))) in the limit of small steps, for a step held for t."""
-    got, _ = undo(integrator(pressed((3.0, 8.0, 400.0))), tau_s=TAU_S * (1 + error))
-    expected = 400.0 * (1 + (1 / (1 + error) - 1) * (1 - np.exp(-7.0 / TAU_S)))
-    assert got[2000, 0] == pytest.approx(expected, abs=1.0)
+    """The expected charge is q' = q (1 + (tau / tau' - 1)(1 - exp(-t / tau))) at a time t after the touch.
+
+    Here tau' is the assumed time constant. The formula holds in the limit of short steps.
+    """
+    charge_pC, _ = correct_leak(amplifier_output(touch_charge((3.0, 8.0, 400.0))), tau_s=TAU_S * (1 + error))
+    expected_pC = 400.0 * (1 + (1 / (1 + error) - 1) * (1 - np.exp(-7.0 / TAU_S)))
+    assert charge_pC[2000, 0] == pytest.approx(expected_pC, abs=1.0)
 
 
 def test_slow_common_warming_is_no_touch():
-    output = integrator(3.0 * np.arange(4000) / RATE_HZ)  # 3 pC/s on each electrode
-    got, contact = undo(output)
+    warming_pC_per_s = 3.0
+    output_pC = amplifier_output(warming_pC_per_s * np.arange(4000) / RATE_HZ)
+    charge_pC, contact = correct_leak(output_pC)
     assert not contact.any()
-    assert np.abs(got[1000:]).max() < 4.0
+    assert np.abs(charge_pC[1000:]).max() < 4.0
 
 
-def leak_after(surplus_pC, noise_pC=1.0, **state):
-    """What is known after one frame of 5 ms in which so much came, nothing touching."""
-    rule = LeakRule()
-    leak = Leak.start(np.zeros(3))._replace(learned_s=10.0, **state)
-    return undo_leak(rule, np.full(3, TAU_S), leak, np.full(3, surplus_pC), np.full(3, noise_pC), 0.005, contact=False)
+def advance(leak, output_pC, noise_pC=1.0, *, contact=False):
+    """Return the state after a frame of 5 ms in which all amplifiers have the same output."""
+    output = np.full(3, output_pC)
+    noise = np.full(3, noise_pC)
+    return undo_leak(LeakRule(), np.full(3, TAU_S), leak, output, noise, 0.005, contact=contact)
+
+
+SETTLED_LEAK = Leak.start(np.zeros(3))._replace(learned_s=10.0)
+"""State after a long time at rest."""
 
 
 def test_spike_is_clipped_in_learning():
-    """Four standard deviations of an innovation, sqrt(2) pC each, over 3 s of settling."""
-    assert leak_after(1.0).inflow_pC_per_s == pytest.approx(np.full(3, 1.0 / 3.0))
-    assert leak_after(1000.0).inflow_pC_per_s == pytest.approx(np.full(3, 4.0 * np.sqrt(2.0) / 3.0))
-    assert leak_after(-1000.0, noise_pC=0.0).inflow_pC_per_s == pytest.approx(np.full(3, -0.1 / 3.0))
+    """An innovation changes the inflow by 1/3 of its size, because the time constant of the estimate is 3 s.
+
+    An innovation is clipped to four standard deviations, which are sqrt(2) pC each, or to 0.1 pC without noise.
+    """
+    small = advance(SETTLED_LEAK, 1.0)
+    large = advance(SETTLED_LEAK, 1000.0)
+    without_noise = advance(SETTLED_LEAK, -1000.0, noise_pC=0.0)
+    assert small.inflow_pC_per_s == pytest.approx(np.full(3, 1.0 / 3.0))
+    assert large.inflow_pC_per_s == pytest.approx(np.full(3, 4.0 * np.sqrt(2.0) / 3.0))
+    assert without_noise.inflow_pC_per_s == pytest.approx(np.full(3, -0.1 / 3.0))
 
 
 def test_learning_pauses_after_a_release():
-    """A finger that leaves takes the last twentieth of its charge after the release."""
-    rule = LeakRule()
-    leak = Leak.start(np.zeros(3))._replace(learned_s=10.0)
-    leak = undo_leak(rule, np.full(3, TAU_S), leak, np.full(3, 40.0), np.ones(3), 0.005, contact=True)
-    for k in range(99):
-        leak = undo_leak(rule, np.full(3, TAU_S), leak, np.full(3, 40.0 - 0.4 * k), np.ones(3), 0.005, contact=False)
+    """After the release, the charge of a finger that leaves the film still falls for half a second."""
+    leak = advance(SETTLED_LEAK, 40.0, contact=True)
+    for number in range(99):
+        leak = advance(leak, 40.0 - 0.4 * number)
     assert not leak.inflow_pC_per_s.any()
-    for k in range(20):
-        leak = undo_leak(rule, np.full(3, TAU_S), leak, np.full(3, -0.4 * k), np.ones(3), 0.005, contact=False)
+    for number in range(20):
+        leak = advance(leak, -0.4 * number)
     assert leak.inflow_pC_per_s.any()
