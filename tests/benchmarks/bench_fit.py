@@ -30,6 +30,7 @@ from isocharge.simulate import Circle, Domain, Sweep, load_sensor, noise_model
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
 from isocharge.train.baselines.learned import SubsetProcess, on_logarithms
 from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
+from isocharge.train.films.fit import muon_and_adam
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fit import contact_stage, threads_and_seed
@@ -40,7 +41,6 @@ NOISE = noise_model("reference")
 FORMER_BATCH = 1024
 FORMER_RATE = 5e-3
 FORMER_WARM_UP_FRACTION = 0.15
-MUON_RATE_FACTOR = 6.0
 N_COPIES = 4
 """Number of copies of the presses with noise from which the regressors of scikit-learn learn."""
 
@@ -144,17 +144,6 @@ def former_training(case: Case, steps: int) -> Predict:
         for _ in range(steps):
             descent.take_step()
     return predictor(network)
-
-
-def muon_and_adam(stage: TrainingStage) -> list[torch.optim.Optimizer]:
-    """Return Muon for the weights between hidden layers and Adam for all others."""
-    network = stage.network
-    assert isinstance(network, TrainablePerceptron)
-    hidden = network.hidden_matrices()
-    hidden_ids = {id(matrix) for matrix in hidden}
-    others = [parameter for parameter in network.parameters() if id(parameter) not in hidden_ids]
-    muon = torch.optim.Muon([{"params": hidden, "rate_factor": MUON_RATE_FACTOR}], weight_decay=0.0)
-    return [muon, torch.optim.Adam([{"params": others, "rate_factor": 1.0}], betas=(0.9, 0.98))]
 
 
 def predictor(network: InverseNetwork) -> Predict:

@@ -329,7 +329,7 @@ def test_followed_film_shows_little_warming_anywhere(mine, problem, film):
 def test_common_mode_estimates_warming_by_the_followed_film(mine, problem, film):
     """The signal chain uses the misfit of the followed film, here at one place.
 
-    As calibrated, the mean of the warming at this place would be 15 pC.
+    As calibrated, the mean of the warming at this place would be -16 pC.
     """
     device = device_from_table({"follow": {"on": True}, "common_mode": {"on": True}}, "test")
     stream = TouchStream(Predictor(mine), device)

@@ -42,7 +42,7 @@ from isocharge.train.training.losses import (
     warm_up_loss,
     with_fresh_noise,
 )
-from isocharge.train.training.network import as_tensor, compress_length
+from isocharge.train.training.network import TrainablePerceptron, as_tensor, compress_length
 
 RADIUS_MARGIN = 1.5
 """Distance by which the forward maps reach beyond the domain, mm. A calibration moves presses whose position is
@@ -236,10 +236,10 @@ def muon_and_adam(stage: TrainingStage) -> list[torch.optim.Optimizer]:
     """Return Muon (Jordan et al. 2024) for the constant weights between hidden layers, and Adam for all other weights.
 
     Args:
-        stage: The training of a `ConditionalPerceptron`.
+        stage: The training of a `ConditionalPerceptron` or a `TrainablePerceptron`.
     """
     network = stage.network
-    assert isinstance(network, ConditionalPerceptron)
+    assert isinstance(network, ConditionalPerceptron | TrainablePerceptron)
     hidden_matrices = network.hidden_matrices()
     hidden_ids = {id(matrix) for matrix in hidden_matrices}
     other_parameters = [parameter for parameter in network.parameters() if id(parameter) not in hidden_ids]
