@@ -37,9 +37,9 @@ from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, par
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import CalibrationProblem, read_earlier
-from isocharge.train.calibration.calibrate import film_without_presses
 from isocharge.train.calibration.calibration_file import film_table
 from isocharge.train.calibration.problem import Warming
+from isocharge.train.calibration.result import film_without_presses
 from isocharge.train.films.films_file import _checksum as films_checksum
 from isocharge.train.films.films_file import films_from_bytes
 from isocharge.train.training.config import load_config

@@ -13,7 +13,7 @@ from isocharge.common.errors import PressError
 from isocharge.common.json_values import plain_values
 from isocharge.serve import write_presses
 from isocharge.train import calibrate, next_presses, read_earlier
-from isocharge.train.calibration import calibrate as calibrate_module
+from isocharge.train.calibration import result as result_module
 from isocharge.train.calibration.calibration_file import film_table, read_film
 from isocharge.train.calibration.folder import result_table
 from isocharge.train.calibration.problem import Warming
@@ -100,7 +100,7 @@ def test_the_summary_plans_further_presses_once(bent, monkeypatch):
     """A plan of thirty presses takes seconds; the command, the card and the file all take the summary."""
     result = replace(bent)  # nothing is remembered yet
     plans = []
-    monkeypatch.setattr(calibrate_module, "next_presses", lambda *plan: plans.append(plan) or next_presses(*plan))
+    monkeypatch.setattr(result_module, "next_presses", lambda *plan: plans.append(plan) or next_presses(*plan))
     assert result.summary == result.summary
     assert len(plans) == 1
 

@@ -32,9 +32,9 @@ from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule, Har
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
 from isocharge.train.calibration import contact_error
-from isocharge.train.calibration.calibrate import film_without_presses
 from isocharge.train.calibration.film_directions import film_directions
 from isocharge.train.calibration.problem import FilmEstimate
+from isocharge.train.calibration.result import film_without_presses
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
 

@@ -22,10 +22,11 @@ from isocharge.common.versions import version_attribute
 with require("train"):
     from isocharge.common.contact_errors import ContactErrorStatistics
     from isocharge.train.bayes.limit import BayesProblem, bayes_estimate, bayes_limit
-    from isocharge.train.calibration.calibrate import CalibrationResult, calibrate
+    from isocharge.train.calibration.calibrate import calibrate
     from isocharge.train.calibration.contact_error import ProposedPress, next_presses
     from isocharge.train.calibration.folder import read_earlier, write_calibration
     from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
+    from isocharge.train.calibration.result import CalibrationResult
     from isocharge.train.calibration.session import PressSession
     from isocharge.train.data.presses import LabelledPresses
     from isocharge.train.films.films_file import read_films

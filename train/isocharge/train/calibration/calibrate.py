@@ -1,21 +1,15 @@
 """Calibration: from measured presses to the film they were made on, with its remaining uncertainty."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import scipy  # loads a part when it is used
 from threadpoolctl import threadpool_limits
 
-from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import MeasuredPresses, row_words
-from isocharge.common.statistics import rms
-from isocharge.simulate import Circle, Sensor
 from isocharge.train.calibration.closed_back import CLOSED_BACK_CAUTION, has_closed_back, refuse_closed_back
-from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
-from isocharge.train.calibration.cross_validation import HeldOutAnswers, cross_validate
 from isocharge.train.calibration.diagnosis import (
     FAR_FROM_ALL_FILMS,
     MOSTLY_OUTSIDE,
@@ -27,13 +21,10 @@ from isocharge.train.calibration.diagnosis import (
     unexplained_error,
 )
 from isocharge.train.calibration.film_fit import MISTAKE_PROBABILITY, PROBABLE, FilmPosterior, fit_film
-from isocharge.train.calibration.hypotheses import Hypothesis
-from isocharge.train.calibration.nuisances import NUISANCES, NuisanceEstimate, film_warming_sentences
-from isocharge.train.calibration.press_data import PressData, no_presses, temperatures
+from isocharge.train.calibration.nuisances import NUISANCES
+from isocharge.train.calibration.press_data import PressData, temperatures
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
-from isocharge.train.calibration.quantities import Quantity, quantities, summarise
-from isocharge.train.films.films_model import AddedVariance
-from isocharge.train.training.fitted import Fitted
+from isocharge.train.calibration.result import CalibrationResult
 
 UNEXPLAINED_PROBABILITY = 1e-6
 """Probability of the residuals for presses of a possible film, below which no film explains the presses, provided that
@@ -61,210 +52,8 @@ FEW = 3
 BOUND_DISTANCE = 0.1
 """Distance from its bound within which a parameter counts as limited by the bound, in prior standard deviations."""
 
-PLANNED_PRESSES = 30
-"""Number of further presses whose benefit is stated if the film has a discrepancy."""
-
-VISIBLE_TRACE = 2.0
-"""Smallest width of a trace, in its standard deviations, for which the trace is named."""
-
 CLOSE_MM = 1.0
 """Distance within which all presses lie too close to each other to determine the positions of the electrodes, mm."""
-
-
-@dataclass(frozen=True)
-class CalibrationResult:
-    """Calibration of a film: its estimate, and what follows from it.
-
-    Attributes:
-        problem: The films that were considered.
-        presses: The presses that were fitted.
-        posterior: Best parameters, covariance, residuals.
-        cautions: Warnings for the user, a sentence each.
-        moved: How an earlier calibration was moved to another temperature, without presses; empty with presses.
-    """
-
-    problem: CalibrationProblem
-    presses: MeasuredPresses
-    posterior: FilmPosterior
-    cautions: tuple[str, ...] = ()
-    moved: str = ""
-
-    @cached_property
-    def film(self) -> tuple[Sensor, Circle]:
-        """The calibrated sensor and probe."""
-        return self.problem.prior.film(self.posterior.parameters)
-
-    @cached_property
-    def quantities(self) -> Mapping[str, Quantity]:
-        """Quantities of the film by name, beside what its description alone gives."""
-        return quantities(self.problem.prior, self.posterior)
-
-    @cached_property
-    def sensitivity(self) -> ContactSensitivity:
-        """How contacts respond to noise and to a wrong film, at the calibrated film."""
-        return ContactSensitivity.at(self.problem, self.posterior.unknowns)
-
-    @cached_property
-    def error_left(self) -> ContactError:
-        """Error of contacts that the remaining uncertainty of the film causes."""
-        return self.sensitivity.contact_error(self.posterior.joint)
-
-    @cached_property
-    def error_left_before(self) -> ContactError:
-        """The same error before the presses, or before the film was moved to another temperature."""
-        before = self.problem.before
-        count = len(self.posterior.joint)
-        estimated = slice(0, len(before.unknowns))
-        covariance = np.zeros((count, count))
-        covariance[estimated, estimated] = before.unknown_covariance
-        if not self.moved:
-            return self.sensitivity.contact_error(covariance)
-        unknowns = np.zeros(count)
-        unknowns[estimated] = before.unknowns
-        return ContactSensitivity.at(self.problem, unknowns).contact_error(covariance)
-
-    @property
-    def fitted(self) -> Fitted:
-        """The network of this film, for `evaluate` and `release`.
-
-        Its standard deviations include the uncertainty of the film. If there are enough presses, its errors are those
-        of calibrations on presses that they did not use; see `held_out`.
-        """
-        fitted = self.fitted_film(self.posterior.parameters, release=True)
-        if self.held_out is None:
-            return fitted
-        return replace(fitted, test=self.held_out.presses, cross_validated=self.held_out.answers)
-
-    @cached_property
-    def held_out(self) -> HeldOutAnswers | None:
-        """Answers to presses from calibrations that did not use them; None if there are too few presses.
-
-        See `cross_validate`. The answers are computed when they are first used, which takes about as long as the
-        calibration.
-        """
-        if self.moved:
-            return None
-        warming = self.posterior.warming
-        at_C = None if warming is None else warming.at_C
-
-        def network_of(film: FilmPosterior) -> Fitted:
-            return self._network_of(film.unknowns, film.joint)
-
-        return cross_validate(self.problem, self.presses, self.posterior, network_of, at_C)
-
-    def fitted_film(self, parameters: Array, *, release: bool = False) -> Fitted:
-        """Return the network of a film near this one, with the same coefficients and the same uncertainty.
-
-        Args:
-            parameters: Parameters of the film, shape (n_parameter,).
-            release: Whether the network will be released; see `CalibrationProblem.fitted`.
-        """
-        unknowns = np.concatenate([parameters, self.posterior.coefficients])
-        return self._network_of(unknowns, self.posterior.joint, release=release)
-
-    def _network_of(self, unknowns: Array, covariance: Array, *, release: bool = False) -> Fitted:
-        """Return the network of a film with the variances of contacts by a covariance of its unknowns.
-
-        The variances are linearised at the calibrated film.
-        """
-        contact_covariance = self.sensitivity.contact_covariance(covariance)
-        added_variance = AddedVariance(self.sensitivity.contact, np.einsum("nii->ni", contact_covariance))
-        parameters = unknowns[self.problem.charges.layout.parameters]
-        factor = partial(self.problem.charges.factor, unknowns)
-        return self.problem.fitted(parameters, added_variance, factor, release=release)
-
-    @property
-    def reduced_chi2(self) -> float:
-        """Mean squared residual of the fitted presses over its expected value, about 1; NaN without any redundancy."""
-        chi2, degrees_of_freedom = self.posterior.total
-        if degrees_of_freedom == 0.0:
-            return np.nan
-        return chi2 / degrees_of_freedom
-
-    @property
-    def bad_lines(self) -> tuple[int, ...]:
-        """Lines of the presses that were left out because they do not agree with the others."""
-        return self.presses[self.posterior.bad].lines
-
-    @cached_property
-    def summary(self) -> tuple[str, ...]:
-        """The result in sentences. They are computed once, because they contain a plan of further presses."""
-        after = self.error_left
-        before = self.error_left_before
-        noise = self.sensitivity.noise_error
-        event = "it was moved" if self.moved else "these presses"
-        film_errors = (
-            f"The uncertainty of the film causes errors of {after.position_mm:.2g} mm and {after.force_percent:.2g} % "
-            f"of the force (root mean square); before {event} they were {before.position_mm:.2g} mm and "
-            f"{before.force_percent:.2g} %. Noise alone causes {noise.position_mm:.2g} mm and "
-            f"{noise.force_percent:.2g} %."
-        )
-        film_quantities = summarise(self.quantities)
-        if self.moved:
-            film_quantities = (f"The film was {self.moved}, without presses.",)
-        rig_errors = (
-            "Errors of the load cell, and of the origin and the axes of the stage, affect every answer in addition to "
-            "these errors."
-        )
-        return (
-            film_errors,
-            *self._held_out_sentences(),
-            *film_quantities,
-            *self._temperature_sentences(),
-            *film_warming_sentences(self.posterior.nuisances),
-            rig_errors,
-            *self._discrepancy_sentences(),
-            *self.cautions,
-        )
-
-    def _held_out_sentences(self) -> Iterator[str]:
-        """Yield the errors on presses that were held out, if there are enough."""
-        if self.held_out is None:
-            return
-        held_out_errors = self.held_out.errors
-        yield (
-            f"On {len(self.held_out.presses)} presses, calibrations without a fifth of the positions have errors of "
-            f"{held_out_errors['position_rms_mm']:.2g} mm and {held_out_errors['force_rms_percent']:.2g} % at these "
-            "positions (root mean square, including the errors of the measured positions and forces)."
-        )
-
-    def _temperature_sentences(self) -> Iterator[str]:
-        """Yield a sentence on how the pretension changes with the temperature, if temperatures are known."""
-        warming = self.posterior.warming
-        if warming is None:
-            return
-        if not warming.identified:
-            yield (
-                f"The presses were made at about {warming.at_C:.1f} C; presses over a wider range of temperatures "
-                "would determine how the pretension changes with the temperature."
-            )
-            return
-        yield (
-            f"The pretension changes by {warming.MPa_per_K:.3g} +- {warming.std:.2g} MPa per kelvin. The result holds "
-            f"at {warming.at_C:.1f} C; --from with --temperature computes the film at another temperature."
-        )
-
-    def _discrepancy_sentences(self) -> Iterator[str]:
-        """Yield sentences on the discrepancy, if there is one, and on the benefit of further presses."""
-        if not self.posterior.imperfect:
-            return
-        factor = self.problem.charges.factor(self.posterior.unknowns, self.sensitivity.contact)
-        percent = 100.0 * rms(np.log(factor))
-        plan = next_presses(self.problem, PLANNED_PRESSES, self.posterior)
-        places = ", ".join(f"{press.force_N:.2f} N at ({press.x_mm:g}, {press.y_mm:g}) mm" for press in plan[:3])
-        yield (
-            f"The charges of this film differ from those of its parameters by {percent:.2g} % (root mean square), "
-            f"smoothly over the film. The remaining error is {self.error_left.position_mm:.2g} mm. {PLANNED_PRESSES} "
-            f"more presses would reduce it to {plan[-1].position_mm:.2g} mm. The first of them are {places}; --next "
-            "lists more."
-        )
-        if self.posterior.probability("traces") > PROBABLE:
-            widths = self.problem.charges.trace_widths(self.posterior.unknowns, self.posterior.joint)
-            visible = [f"{name} {width:.2g} mm" for name, (width, std) in widths.items() if width > VISIBLE_TRACE * std]
-            yield (
-                "Most of this difference is charge that electrodes collect outside their pads, like traces to the rim "
-                f"of this width: {', '.join(visible)}. If the sensor file describes the traces, the error is smaller."
-            )
 
 
 def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> CalibrationResult:
@@ -341,39 +130,6 @@ def _scaled_by_scatter(posterior: FilmPosterior) -> tuple[FilmPosterior, list[st
         "certain as assumed?"
     )
     return posterior.scaled(variance_ratio), [caution]
-
-
-def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved: str) -> CalibrationResult:
-    """Return an estimate of a film as a calibration result without presses.
-
-    Args:
-        problem: The calibration.
-        film: The estimate.
-        moved: Words that describe how an earlier calibration was moved to another temperature.
-    """
-    layout = problem.charges.layout
-    joint = np.zeros((layout.film_count, layout.film_count))
-    estimated = slice(0, len(film.unknowns))
-    joint[estimated, estimated] = film.unknown_covariance
-    has_coefficients = film.coefficients.size > 0
-    warming = film.warming
-    if warming is not None:
-        warming = warming.with_unknowns(layout.film_count)
-    posterior = FilmPosterior(
-        parameters=film.parameters,
-        covariance=film.covariance,
-        coefficients=film.coefficients if has_coefficients else np.zeros(layout.coefficient_count),
-        joint=joint,
-        warming=warming,
-        contact=np.empty((0, 3)),
-        chi2=np.empty(0),
-        degrees_of_freedom=np.empty(0),
-        bad=np.empty(0, dtype=bool),
-        nuisances={nuisance.name: NuisanceEstimate(0.0, 0.0) for nuisance in NUISANCES},
-        force_scatter=0.0,
-        probabilities={Hypothesis(modes=float(has_coefficients)): 1.0},
-    )
-    return CalibrationResult(problem, no_presses(problem.electrodes), posterior, moved=moved)
 
 
 def _check_enough_measured(presses: MeasuredPresses, problem: CalibrationProblem) -> None:

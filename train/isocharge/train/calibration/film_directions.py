@@ -14,7 +14,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.model.film_directions import FilmDirections
 from isocharge.simulate import Domain
-from isocharge.train.calibration.calibrate import CalibrationResult
+from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.data.charge_field import fit_series
 
 DEGREES = ((5, 3), (3, 1), (1, 1))

@@ -36,7 +36,6 @@ from isocharge.serve.model.model_folder import check_target, version_folders
 from isocharge.serve.model.pretensions import FILE as PRETENSIONS
 from isocharge.simulate.plots.figure import picture_bytes
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
-from isocharge.train.calibration.calibrate import CalibrationResult, film_without_presses
 from isocharge.train.calibration.calibration_file import film_table, read_film
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.cross_validation import FOLD_COUNT
@@ -44,6 +43,7 @@ from isocharge.train.calibration.film_directions import film_directions
 from isocharge.train.calibration.following import pretensions_of
 from isocharge.train.calibration.picture import calibration_picture
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
+from isocharge.train.calibration.result import CalibrationResult, film_without_presses
 from isocharge.train.model_release.release import release
 from isocharge.train.training.fitted import Provenance
 

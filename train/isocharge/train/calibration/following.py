@@ -14,7 +14,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.perceptron import Layer
 from isocharge.common.statistics import rms
 from isocharge.serve.model.pretensions import Pretensions
-from isocharge.train.calibration.calibrate import CalibrationResult
+from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE, draw_contacts
 from isocharge.train.model_release.onnx_graph import write_graph
 from isocharge.train.training.folded_network import MISFIT_UNIT, FoldedNetwork

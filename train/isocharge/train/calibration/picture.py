@@ -10,9 +10,9 @@ from matplotlib.tri import Triangulation
 
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_layout
-from isocharge.train.calibration.calibrate import CalibrationResult
 from isocharge.train.calibration.contact_error import ContactError
 from isocharge.train.calibration.quantities import NORMAL_95
+from isocharge.train.calibration.result import CalibrationResult
 
 LEVELS_MM = (0.02, 5.0)
 """Errors at the ends of the colours, mm."""

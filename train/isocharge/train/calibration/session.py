@@ -15,10 +15,11 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
-from isocharge.train.calibration.calibrate import FEW, CalibrationResult, calibrate
+from isocharge.train.calibration.calibrate import FEW, calibrate
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.press_data import no_presses
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
+from isocharge.train.calibration.result import CalibrationResult
 
 MIN_PRESSES = 2
 """Number of presses from which on the remaining error is reported; a single press says too little."""
