@@ -18,6 +18,7 @@ from isocharge.train.training.fit import Split, fit_identity, train_network
 from isocharge.train.training.losses import (
     STD_EXPONENT,
     distillation_loss,
+    focused_squared_distance,
     likelihood_loss,
     warm_up_loss,
     weighted_likelihood_loss,
@@ -314,6 +315,20 @@ def test_keys_left_out_keep_their_defaults(tmp_path):
     assert load_config(CONFIGS / "quick.toml").network == NetworkConfig()
 
 
+def test_misfit_network_is_wider_for_more_than_four_electrodes():
+    default = NetworkConfig(hidden=(32, 32))
+    assert [default.misfit_widths(count) for count in (3, 4, 5, 8)] == [(64, 64), (64, 64), (96, 96), (96, 96)]
+    assert NetworkConfig(hidden=(32, 32), misfit_hidden=(24, 16)).misfit_widths(8) == (24, 16)
+
+
+def test_focused_distance_is_a_mean_with_smaller_weights_for_long_targets():
+    vector = torch.tensor([[1.0, 0.0], [0.0, 2.0]])
+    target = torch.tensor([[0.0, 0.0], [3.0, 4.0]])
+    # squared distances 1 and 13, weights 1 and 1 / (1 + 25 / 4)
+    expected = (1.0 + 13.0 / 7.25) / (1.0 + 1.0 / 7.25)
+    assert focused_squared_distance(vector, target, focus=2.0).item() == pytest.approx(expected, rel=1e-6)
+
+
 def test_noise_of_ones_own():
     mine = NoiseModel("mine", 0.5, 1e-3)
     config = FitConfig(training=TrainingConfig(noise=mine))
@@ -335,7 +350,7 @@ def test_noise_of_ones_own():
         ("[training]\nnoise = 3\n", "training.noise: expected a text, got 3"),
         ("[network]\nhidden = [true]\n", "network.hidden[0]: expected a whole number from 1 to 4096, got True"),
         ("[network]\nhidden = []\n", "network.hidden: expected widths"),
-        ("[network]\nhidden = [64]\n", "as many layers as network.hidden"),
+        ("[network]\nhidden = [64]\nmisfit_hidden = [64, 64]\n", "as many layers as network.hidden"),
         ("[network]\nelectrodes = 2\n", "network.electrodes: expected 0 (as the dataset) or 3 to 64, got 2"),
         ("[network]\nweights = 'int4'\n", "network.weights: expected one of float32, int8, got 'int4'"),
         ("network = 3\n", "network: expected a table, got 3"),

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy  # loads each of its subpackages on first use
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import INNER_RADIUS
@@ -20,6 +20,10 @@ STEPS = 8
 CANDIDATES = 4096
 """Number of contacts among which the starts are chosen. They are spread over the domain, with a quarter of them on the
 edge of the disk."""
+
+START_SEPARATION = 0.25
+"""Smallest distance between the starts of one search in unit coordinates, in which the radius of the domain is one.
+Starts that are nearer to each other mostly lead to the same local minimum."""
 
 CHUNK = 2048
 """Number of charges that are compared with all candidates at once, which limits the memory."""
@@ -141,13 +145,16 @@ def search(
     Returns:
         Contacts and residuals, as of `explain`.
     """
-    candidate_contacts = charge_map.domain.to_contact(INNER_RADIUS * _unit_candidates(candidates))
+    unit_candidates = _unit_candidates(candidates)
+    candidate_contacts = charge_map.domain.to_contact(INNER_RADIUS * unit_candidates)
     candidate_contacts[:, 2] = np.clip(candidate_contacts[:, 2], *charge_map.domain.force_range)
     candidate_charges = charge_map.charges(candidate_contacts)
+    difference = unit_candidates[:, None, :2] - unit_candidates[:, :2]
+    is_neighbour = np.hypot(difference[..., 0], difference[..., 1]) < START_SEPARATION
     start_rows = []
     for first in range(0, max(len(charge), 1), CHUNK):
         chunk = slice(first, first + CHUNK)
-        start_rows.append(_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, starts))
+        start_rows.append(_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, is_neighbour, starts))
     rows_of_starts = np.concatenate(start_rows).T  # shape (starts, n)
     solutions = [
         explain(charge_map, charge, sigma, candidate_contacts[rows], min_change=min_change) for rows in rows_of_starts
@@ -175,8 +182,10 @@ def _unit_candidates(count: int) -> Array:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), 2.0 * force_sample - 1.0], axis=1)
 
 
-def _nearest_rows(charge: Array, sigma: Array, candidate_charges: Array, count: int) -> Integers:
-    """Return the numbers of the nearest candidates, shape (n, count).
+def _nearest_rows(
+    charge: Array, sigma: Array, candidate_charges: Array, is_neighbour: Booleans, count: int
+) -> Integers:
+    """Return the numbers of the nearest candidates that are not neighbours of each other, shape (n, count).
 
     The squared distance is expanded, so that it is a matrix product. The term that does not depend on the candidate is
     omitted. A few searches for the smallest distance are ten times as fast as a partition of the distances.
@@ -185,9 +194,8 @@ def _nearest_rows(charge: Array, sigma: Array, candidate_charges: Array, count: 
     weights = np.hstack([weight, -2.0 * charge * weight])
     powers = np.hstack([candidate_charges**2, candidate_charges])
     squared_distance = weights @ powers.T
-    row = np.arange(len(charge))
     nearest = np.empty((len(charge), count), dtype=np.intp)
     for number in range(count):
         nearest[:, number] = squared_distance.argmin(axis=1)
-        squared_distance[row, nearest[:, number]] = np.inf
+        squared_distance[is_neighbour[nearest[:, number]]] = np.inf
     return nearest

@@ -6,6 +6,8 @@ two presses at the same time; presses outside the working area; and charges from
 charges of two presses at the same time are approximated from those of the single presses.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -58,6 +60,7 @@ def draw_misfit_examples(
     seed: int,
     *,
     candidates: int = CANDIDATES,
+    starts: int = 2,
     limits: tuple[Array | float, Array | float] = (LOWEST_CHARGE, HIGHEST_CHARGE),
 ) -> Array:
     """Draw charges of every kind, and compute their distance from the charges of the nearest contact.
@@ -68,7 +71,8 @@ def draw_misfit_examples(
         noise: Noise of good presses, which is also the unit of the distance; a `ChannelNoise` for charges of any sign.
         count: Number of examples.
         seed: Seed of the random numbers.
-        candidates: Number of contacts from which a search starts.
+        candidates: Number of contacts among which the starts of a search are chosen.
+        starts: Number of starts of a search.
         limits: Smallest and largest charge, pC. Charges are clipped to these limits, as in the network.
 
     Returns:
@@ -80,7 +84,8 @@ def draw_misfit_examples(
     kinds, charge = draw_charges(rng, chosen.charge, presses.charge, noise)
     near = np.isin(kinds, ("noisy", "moved"))
     charge = np.clip(charge, *limits)
-    return np.stack([charge, _residuals(charge_map, charge, noise.sigma(charge), chosen, near, candidates)])
+    find_nearest = partial(search, starts=starts, candidates=candidates, min_change=MIN_CHANGE)
+    return np.stack([charge, _residuals(charge_map, charge, noise.sigma(charge), chosen, near, find_nearest)])
 
 
 def draw_outside_examples(
@@ -91,6 +96,7 @@ def draw_outside_examples(
     seed: int,
     *,
     candidates: int = CANDIDATES,
+    starts: int = 2,
     limits: tuple[Array | float, Array | float] = (LOWEST_CHARGE, HIGHEST_CHARGE),
 ) -> Array:
     """Draw noisy charges of presses outside the working area, and compute their distance from the nearest contact.
@@ -101,7 +107,8 @@ def draw_outside_examples(
         noise: Noise of good presses, which is also the unit of the distance.
         count: Number of examples.
         seed: Seed of the random numbers.
-        candidates: Number of contacts from which a search starts.
+        candidates: Number of contacts among which the starts of a search are chosen.
+        starts: Number of starts of a search.
         limits: Smallest and largest charge, pC, to which charges are clipped.
 
     Returns:
@@ -111,12 +118,18 @@ def draw_outside_examples(
     chosen = outside[rng.integers(len(outside), size=count)]
     factor = np.exp(OUTSIDE_SCATTER * rng.standard_normal((count, 1)))
     charge = np.clip(noise.add(chosen * factor, rng), *limits)
-    _, residual = search(charge_map, charge, noise.sigma(charge), candidates=candidates, min_change=MIN_CHANGE)
+    sigma = noise.sigma(charge)
+    _, residual = search(charge_map, charge, sigma, starts=starts, candidates=candidates, min_change=MIN_CHANGE)
     return np.stack([charge, residual])
 
 
 def _residuals(
-    charge_map: ChargeMap, charge: Array, sigma: Array, chosen: LabelledPresses, near: Booleans, candidates: int
+    charge_map: ChargeMap,
+    charge: Array,
+    sigma: Array,
+    chosen: LabelledPresses,
+    near: Booleans,
+    find_nearest: Callable[[ChargeMap, Array, Array], tuple[Array, Array]],
 ) -> Array:
     """Compute the residuals of charges at the nearest contact.
 
@@ -130,7 +143,8 @@ def _residuals(
         sigma: Standard deviations of the noise of these charges, same shape, pC.
         chosen: Presses from which the charges were made.
         near: Whether each of the charges is similar to those of its press, shape (n,).
-        candidates: Number of candidates of a search.
+        find_nearest: Function from a charge map, charges and their standard deviations to the nearest contacts and the
+            residuals; see `search`.
 
     Returns:
         Residuals (Q - Q(c)) / sigma, shape (n, n_electrode).
@@ -145,9 +159,7 @@ def _residuals(
 
     # A large residual near the press may be a local minimum, so a search is made for these charges, too.
     searched_rows = np.flatnonzero(~near | (np.linalg.norm(residual, axis=1) > FAR))
-    _, searched_residual = search(
-        charge_map, charge[searched_rows], sigma[searched_rows], candidates=candidates, min_change=MIN_CHANGE
-    )
+    _, searched_residual = find_nearest(charge_map, charge[searched_rows], sigma[searched_rows])
     near_residual = residual[searched_rows]
     is_near_smaller = (near_residual**2).sum(axis=1) < (searched_residual**2).sum(axis=1)
     use_near = near[searched_rows] & is_near_smaller

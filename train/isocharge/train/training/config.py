@@ -13,6 +13,15 @@ from isocharge.simulate import NoiseModel, noise_model
 MAX_ELECTRODES = 64
 """Largest number of electrodes that a configuration can require."""
 
+FEW_ELECTRODES = 4
+"""Largest number of electrodes for which a misfit network with the width `MISFIT_WIDTH` is sufficient."""
+
+MISFIT_WIDTH = 64
+"""Width of the hidden layers of the misfit network for few electrodes."""
+
+MANY_MISFIT_WIDTH = 96
+"""Width of the hidden layers of the misfit network for more electrodes, whose charges have more dimensions."""
+
 Width = Annotated[int, Meta(ge=1, le=4096)]
 Widths = Annotated[tuple[Width, ...], Meta(min_length=1, description="widths from 1 to 4096")]
 Count = Annotated[int, Meta(ge=1, le=10_000_000)]
@@ -23,7 +32,8 @@ class NetworkConfig(Settings, frozen=True):
 
     Attributes:
         hidden: Widths of the hidden layers of the contact network.
-        misfit_hidden: Widths of the hidden layers of the misfit network, which has as many.
+        misfit_hidden: Widths of the hidden layers of the misfit network, which has as many; None for
+            `MISFIT_WIDTH`, or `MANY_MISFIT_WIDTH` for more than four electrodes.
         electrodes: Number of electrodes that the dataset must have; 0 for any number.
         activation: Name of the activation of the hidden layers (`isocharge.common.activations`).
         weights: "int8" rounds the weights between hidden layers to 8 bits and then trains the other weights further.
@@ -31,19 +41,26 @@ class NetworkConfig(Settings, frozen=True):
     """
 
     hidden: Widths = (96, 96, 96)
-    misfit_hidden: Widths = (64, 64, 64)
+    misfit_hidden: Widths | None = None
     electrodes: int = 0
     activation: str = TANH.name
     weights: Literal["float32", "int8"] = "float32"
 
     def __post_init__(self) -> None:
-        if len(self.hidden) != len(self.misfit_hidden):
+        if self.misfit_hidden is not None and len(self.hidden) != len(self.misfit_hidden):
             layers = f"as many layers as network.hidden ({len(self.hidden)}; they run side by side)"
             raise WrongKey("misfit_hidden", layers, list(self.misfit_hidden))
         if self.activation not in ACTIVATIONS:
             raise WrongKey("activation", f"one of {', '.join(ACTIVATIONS)}", self.activation)
         if not (self.electrodes == 0 or 3 <= self.electrodes <= MAX_ELECTRODES):
             raise WrongKey("electrodes", f"0 (as the dataset) or 3 to {MAX_ELECTRODES}", self.electrodes)
+
+    def misfit_widths(self, n_electrode: int) -> tuple[int, ...]:
+        """Return the widths of the hidden layers of the misfit network for a number of electrodes."""
+        if self.misfit_hidden is not None:
+            return self.misfit_hidden
+        width = MISFIT_WIDTH if n_electrode <= FEW_ELECTRODES else MANY_MISFIT_WIDTH
+        return (width,) * len(self.hidden)
 
 
 class TrainingConfig(Settings, frozen=True):

@@ -31,14 +31,15 @@ from isocharge.train.data.charge_field import ChargeField, invertible_domain
 from isocharge.train.data.misfit_charges import draw_misfit_examples, draw_outside_examples, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses, held_out, split_by_position
-from isocharge.train.training.config import FitConfig, TrainingConfig
+from isocharge.train.training.config import FEW_ELECTRODES, FitConfig, TrainingConfig
 from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fitted import Fitted
+from isocharge.train.training.folded_network import MISFIT_UNIT
 from isocharge.train.training.losses import (
     distillation_loss,
-    mean_squared_distance,
+    focused_squared_distance,
     validation_score,
     warm_up_loss,
     weighted_likelihood_loss,
@@ -73,6 +74,20 @@ N_OUTSIDE_PRESSES = 6_000
 OUTSIDE_SHARE = 0.15
 """Share of the examples of the misfit network that are presses outside the working area, if those are simulated,
 dimensionless."""
+
+MANY_OUTSIDE_SHARE = 0.3
+"""The same share with more than `FEW_ELECTRODES` electrodes, dimensionless. They can notice nearly all presses outside
+the working area."""
+
+SEARCH_STARTS = 2
+"""Number of starts of a search for the nearest contact."""
+
+MANY_SEARCH_STARTS = 4
+"""The same number with more than `FEW_ELECTRODES` electrodes, whose charges have more local minima of the misfit."""
+
+FOCUS_MISFIT = 10.0
+"""Misfit at which the weight of an example of the misfit network is half of the largest weight, in standard deviations.
+It is twice the smallest limit of the flag `misfit`."""
 
 SIGNED_FEATURE_SCALE = 0.1
 """Charge above which features of charges of both signs are logarithmic, relative to the charge above which the noise is
@@ -396,7 +411,9 @@ class MisfitExamples:
 
         The shape is (2, n, n_electrode); see `draw_misfit_examples`.
         """
-        draw = partial(draw_misfit_examples, self.split.train, self.split.field, self._noise())
+        draw = partial(
+            draw_misfit_examples, self.split.train, self.split.field, self._noise(), starts=self._search_starts
+        )
         return self._kept("misfit-charges", partial(draw, self.config.misfit_charges, self.config.seed))
 
     def with_outside(self, inner_examples: Array, outside: OutsidePresses | None) -> Array:
@@ -412,12 +429,22 @@ class MisfitExamples:
         if outside is None:
             return inner_examples
         seed = self.config.seed
-        n_outside = round(OUTSIDE_SHARE * self.config.misfit_charges)
+        outside_share = MANY_OUTSIDE_SHARE if self._has_many_electrodes else OUTSIDE_SHARE
+        n_outside = round(outside_share * self.config.misfit_charges)
         charge = outside.draw(N_OUTSIDE_PRESSES, seed).charge
-        draw = partial(draw_outside_examples, charge, self.split.field, self._noise(), n_outside, seed)
-        outside_examples = self._kept("misfit-outside", draw)
+        draw = partial(draw_outside_examples, charge, self.split.field, self._noise(), starts=self._search_starts)
+        outside_examples = self._kept("misfit-outside", partial(draw, n_outside, seed))
         examples = np.concatenate([inner_examples[:, n_outside:], outside_examples], axis=1)
         return np.random.default_rng(seed).permutation(examples, axis=1)
+
+    @property
+    def _has_many_electrodes(self) -> bool:
+        return self.features.charge_features.n_electrode > FEW_ELECTRODES
+
+    @property
+    def _search_starts(self) -> int:
+        """Number of starts of a search for the nearest contact."""
+        return MANY_SEARCH_STARTS if self._has_many_electrodes else SEARCH_STARTS
 
     def _noise(self) -> Noise:
         """Return the noise of good presses; for charges of any sign, the noise of each channel."""
@@ -454,18 +481,20 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     n_validation = max(1, round(VALIDATION_FRACTION * config.hold_out * len(inputs)))
     n_train = len(inputs) - n_validation
 
-    def squared_distance(rows: Tensor | slice) -> Tensor:
-        """Return the mean squared distance between outputs and targets, for some rows of the examples."""
-        return mean_squared_distance(network.misfit_vector(inputs[rows]), targets[rows])
+    focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_UNIT))
+
+    def distance(rows: Tensor | slice) -> Tensor:
+        """Return the weighted mean squared distance between outputs and targets, for some rows of the examples."""
+        return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows], focus)
 
     def loss(_: int, random: torch.Generator) -> Tensor:
-        """Return the mean squared distance for a random batch."""
+        """Return the weighted mean squared distance for a random batch."""
         batch_rows = torch.randint(n_train, (config.batch,), generator=random)
-        return squared_distance(batch_rows)
+        return distance(batch_rows)
 
     def score() -> tuple[float, str]:
-        """Return the mean squared distance for the validation examples, and a text with it."""
-        validation_loss = squared_distance(slice(n_train, None)).item()
+        """Return the weighted mean squared distance for the validation examples, and a text with it."""
+        validation_loss = distance(slice(n_train, None)).item()
         return validation_loss, f"{validation_loss:.4f} on watched charges"
 
     return TrainingStage(

@@ -108,6 +108,22 @@ def mean_squared_distance(vector: Tensor, target: Tensor) -> Tensor:
     return torch.sum((vector - target) ** 2, dim=-1).mean()
 
 
+def focused_squared_distance(vector: Tensor, target: Tensor, focus: float) -> Tensor:
+    """Compute the mean of the squared distances between vectors, in which long targets count less.
+
+    The weight is proportional to 1 / (1 + |target|^2 / focus^2). The network is then accurate where the misfit is
+    near the threshold of the flag. The exact value of a large misfit matters little.
+
+    Args:
+        vector: Estimated vectors, shape (n, n_electrode).
+        target: True vectors, same shape.
+        focus: Length of a target at which its weight is half of the largest weight.
+    """
+    squared_distance = torch.sum((vector - target) ** 2, dim=-1)
+    weight = 1.0 / (1.0 + torch.sum(target**2, dim=-1) / focus**2)
+    return (weight * squared_distance).sum() / weight.sum()
+
+
 def validation_score(mean: Tensor, log_std: Tensor, target: Tensor, domain: Domain, samples: str) -> tuple[float, str]:
     """Compute the likelihood loss on validation data, and a text with the errors for the progress report.
 

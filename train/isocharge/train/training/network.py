@@ -158,7 +158,9 @@ class InverseNetwork(nn.Module):
         activation = ACTIVATIONS[config.activation]
         self.contact = TrainablePerceptron(n_electrode, config.hidden, N_CONTACT_ANSWERS, activation)
         self.contact.sharpen_first_layer()
-        self.misfit_vector = TrainablePerceptron(n_electrode, config.misfit_hidden, n_electrode, activation)
+        self.misfit_vector = TrainablePerceptron(
+            n_electrode, config.misfit_widths(n_electrode), n_electrode, activation
+        )
         self.centre = nn.Buffer(as_tensor(domain.centre))
         self.scale = nn.Buffer(as_tensor(domain.scale))
         self.features_mean = nn.Buffer(as_tensor(features.mean))
