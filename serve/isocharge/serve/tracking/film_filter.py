@@ -23,12 +23,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Reals
+from isocharge.common.arrays import Array
 from isocharge.serve.model.film_directions import FilmDirections
 from isocharge.serve.model.pretensions import Pretensions
-
-GRID_STEP_MPa = 0.02
-"""Distance between neighbouring pretensions of the grid, MPa."""
+from isocharge.serve.tracking.pretension_grid import (
+    GRID_STEP_MPa,
+    evenly_spaced,
+    normal_probabilities,
+    smooth_moments,
+)
 
 NETWORK_STEP_MPa = 0.1
 """Distance between the pretensions at which the network is evaluated, MPa.
@@ -159,9 +162,9 @@ class FilmFilter:
                 (n_electrode,).
         """
         low, high = pretensions.range_MPa
-        self.grid_MPa = _evenly_spaced(low, high, GRID_STEP_MPa)
+        self.grid_MPa = evenly_spaced(low, high, GRID_STEP_MPa)
         self._pretensions = pretensions
-        self._network = pretensions.at(_evenly_spaced(low, high, NETWORK_STEP_MPa))
+        self._network = pretensions.at(evenly_spaced(low, high, NETWORK_STEP_MPa))
         self._drift = drift_MPa_per_root_hour
         self._largest_offset = largest_offset_pC
         self._offset_ratio = offset_ratio
@@ -180,7 +183,7 @@ class FilmFilter:
         level_probability = np.full(level_count, (1.0 - NO_OFFSET_PROBABILITY) / max(level_count - 1, 1))
         level_probability[0] = 1.0 - level_probability[1:].sum()
         change_MPa = self.grid_MPa - self._pretensions.calibrated_MPa
-        pretension_probability = _normal(change_MPa, self._pretensions.std_MPa)
+        pretension_probability = normal_probabilities(change_MPa, self._pretensions.std_MPa)
         self._probability = np.outer(level_probability, pretension_probability)
 
         # Mean and covariance of the linear unknowns at each level and pretension.
@@ -343,7 +346,7 @@ class FilmFilter:
         # The grid cannot represent a drift that is smaller than its step. Such a drift is added to the next one.
         drift_std = math.sqrt(self._pending_variance)
         if drift_std >= GRID_STEP_MPa:
-            moments = _convolve(moments, drift_std)
+            moments = smooth_moments(moments, drift_std)
             self._pending_variance = 0.0
         moments /= moments[..., 0].sum()
         moments = (1.0 - JUMP_PROBABILITY) * moments + JUMP_PROBABILITY * moments.mean(axis=1, keepdims=True)
@@ -477,39 +480,3 @@ class FilmFilter:
             without_gains=np.einsum("ge,gef,gf->g", residual_without_gains, precision, residual_without_gains),
             offset_variance=float(offset_variance),
         )
-
-
-def _evenly_spaced(low: float, high: float, step: float) -> Array:
-    """Return evenly spaced numbers from `low` to `high`, whose distance is as near to `step` as possible."""
-    interval_count = max(round((high - low) / step), 1)
-    return np.linspace(low, high, interval_count + 1)
-
-
-def _normal(deviation: Reals, std: float) -> Array:
-    """Return the probabilities of evenly spaced deviations from the mean of a normal distribution.
-
-    The probabilities add up to 1.
-    """
-    density = np.exp(-0.5 * (deviation / std) ** 2)
-    return np.asarray(density / density.sum())
-
-
-def _convolve(moments: Array, std: float) -> Array:
-    """Smooth moments over the pretensions by a normal distribution.
-
-    Args:
-        moments: Moments at each pretension of the grid, shape (n_level, n_pretension, n_moment). Beyond the ends of the
-            grid, the moments are assumed to be constant.
-        std: Standard deviation of the normal distribution, MPa.
-
-    Returns:
-        The smoothed moments, of the same shape.
-    """
-    grid_size = moments.shape[1]
-    reach = min(round(4.0 * std / GRID_STEP_MPa), grid_size)
-    kernel = _normal(GRID_STEP_MPa * np.arange(-reach, reach + 1.0), std)
-    padded = np.pad(moments, ((0, 0), (reach, reach), (0, 0)), mode="edge")
-    smoothed = np.zeros_like(moments)
-    for start, weight in enumerate(kernel):
-        smoothed += weight * padded[:, start : start + grid_size]
-    return smoothed
