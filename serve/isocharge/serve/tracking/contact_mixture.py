@@ -18,7 +18,6 @@ Charges are averaged over `STEP_s` before an update. Shorter steps are hardly mo
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -45,6 +44,13 @@ from isocharge.serve.tracking.mixture_components import (
     combine_components,
     predict_components,
     prune_components,
+)
+from isocharge.serve.tracking.mixture_update import (
+    Measurement,
+    charges_and_jacobian,
+    limit_iteration_step,
+    linearise_update,
+    updated_covariance,
 )
 from isocharge.serve.tracking.motion import FORCE_RATE_STD, SPEED_STD, MAX_GAP_s
 
@@ -111,45 +117,8 @@ UPDATE_ITERATIONS = 3
 INITIAL_ITERATIONS = 20
 """Number of iterations of the Kalman filter when a touch begins."""
 
-MAX_ITERATION_STEP_mm = 0.5
-"""Largest change of the position in one iteration, mm. The linearisation is not accurate beyond it."""
-
-MAX_ITERATION_LOG_STEP = 0.2
-"""Largest change of ln F in one iteration. The linearisation is not accurate beyond it."""
-
 GOLDEN_ANGLE = 2.399963
 """Angle between successive points of a spiral that covers a disk evenly, rad (Vogel 1979)."""
-
-
-class Measurement(NamedTuple):
-    """Charges averaged over a step.
-
-    Attributes:
-        charge_pC: Touch charges, shape (n_electrode,), pC.
-        variance: Variances of the charges, shape (n_electrode,), pC^2.
-    """
-
-    charge_pC: Array
-    variance: Array
-
-
-class LinearisedUpdate(NamedTuple):
-    """Quantities of a Kalman update, linearised about a state of each component.
-
-    Attributes:
-        charge_pC: Charges of the state, shape (n, n_electrode), pC.
-        cross_covariance: Covariance of the charges and the state, shape (n, n_electrode, 6 + n_electrode).
-        charge_covariance: Covariance of the charges that the uncertain state causes, shape
-            (n, n_electrode, n_electrode), pC^2.
-        innovation_covariance: Sum of `charge_covariance` and the noise of the measurement, the same shape, pC^2.
-        weighted_innovation: Innovation multiplied by the inverse of its covariance, shape (n, n_electrode, 1), 1/pC.
-    """
-
-    charge_pC: Array
-    cross_covariance: Array
-    charge_covariance: Array
-    innovation_covariance: Array
-    weighted_innovation: Array
 
 
 class ContactMixture:
@@ -284,51 +253,11 @@ class ContactMixture:
             measurement: Charges of this step.
         """
         best = components.best
-        charge_pC, jacobian = self._charges_and_jacobian(components.mean)
+        charge_pC, jacobian = charges_and_jacobian(self.charges, components.mean)
         charge_covariance = jacobian @ components.covariance @ jacobian.swapaxes(1, 2)
         innovation_covariance = charge_covariance[best] + np.diag(measurement.variance)
         innovation = measurement.charge_pC - charge_pC[best]
         return float(innovation @ np.linalg.solve(innovation_covariance, innovation))
-
-    def _charges_and_jacobian(self, mean: Array) -> tuple[Array, Array]:
-        """Compute the charges of states, and their derivatives with respect to the state.
-
-        Args:
-            mean: States, shape (n, 6 + n_electrode).
-
-        Returns:
-            The charges, shape (n, n_electrode), pC, and their derivatives, shape (n, n_electrode, 6 + n_electrode).
-        """
-        film_charge_pC, film_jacobian = self.charges.linearised(mean[:, CONTACT])
-        gains = np.exp(mean[:, GAINS])  # the state has the logarithms of the gains
-        charge_pC = film_charge_pC * gains
-
-        # Derivatives with respect to the contact, its rates and the logarithms of the gains.
-        contact_jacobian = film_jacobian * gains[:, :, None]
-        rate_jacobian = np.zeros((*charge_pC.shape, 3))
-        gain_jacobian = charge_pC[:, :, None] * np.eye(charge_pC.shape[1])
-        jacobian = np.concatenate([contact_jacobian, rate_jacobian, gain_jacobian], axis=2)
-        return charge_pC, jacobian
-
-    def _linearise_update(self, state: Array, prior: Components, measurement: Measurement) -> LinearisedUpdate:
-        """Linearise the Kalman update of the components.
-
-        Args:
-            state: State of each component about which the charges are linearised, shape (n, 6 + n_electrode).
-            prior: Predicted components.
-            measurement: Charges of this step.
-        """
-        charge_pC, jacobian = self._charges_and_jacobian(state)
-        transposed = jacobian.swapaxes(1, 2)
-        cross_covariance = jacobian @ prior.covariance
-        charge_covariance = cross_covariance @ transposed
-        innovation_covariance = charge_covariance + np.diag(measurement.variance)
-        state_correction = ((prior.mean - state)[:, None] @ transposed)[:, 0]
-        innovation = measurement.charge_pC - charge_pC - state_correction
-        weighted_innovation = np.linalg.solve(innovation_covariance, innovation[:, :, None])
-        return LinearisedUpdate(
-            charge_pC, cross_covariance, charge_covariance, innovation_covariance, np.asarray(weighted_innovation)
-        )
 
     def _update(self, prior: Components, measurement: Measurement, iterations: int) -> Components | None:
         """Update the components with the charges, and prune and split them.
@@ -342,13 +271,13 @@ class ContactMixture:
             The components, or None if no component explains the charges.
         """
         state = prior.mean
-        linearised = self._linearise_update(state, prior, measurement)
+        linearised = linearise_update(self.charges, state, prior, measurement)
         for _ in range(iterations):
             transposed = linearised.cross_covariance.swapaxes(1, 2)
             state_correction = (transposed @ linearised.weighted_innovation)[:, :, 0]
             step = prior.mean + state_correction - state
-            state = state + _limit_iteration_step(step)
-            linearised = self._linearise_update(state, prior, measurement)
+            state = state + limit_iteration_step(step)
+            linearised = linearise_update(self.charges, state, prior, measurement)
 
         # Likelihood of each component: -2 ln p = squared misfit + squared change of the state + ln det(covariance).
         weighted = linearised.weighted_innovation
@@ -364,7 +293,7 @@ class ContactMixture:
         if not is_explained:
             return None
 
-        covariance = _updated_covariance(prior, linearised)
+        covariance = updated_covariance(prior, linearised)
         misfit = math.sqrt(squared_misfit[best])
         updated = Components(state, covariance, log_weight - log_weight[best], misfit)
         return self._split_at_fold(prune_components(updated))
@@ -450,28 +379,6 @@ class ContactMixture:
         is_same = is_near & ~self._is_across_fold(components.mean[first], mean)
         is_same[0] = True
         return np.asarray(is_same)
-
-
-def _updated_covariance(prior: Components, linearised: LinearisedUpdate) -> Array:
-    """Return the covariances of the components after a Kalman update, shape (n, 6 + n_electrode, 6 + n_electrode).
-
-    Args:
-        prior: Predicted components.
-        linearised: The update, linearised about the new states.
-    """
-    cross_covariance = linearised.cross_covariance
-    gain = np.linalg.solve(linearised.innovation_covariance, cross_covariance)
-    covariance = prior.covariance - cross_covariance.swapaxes(1, 2) @ gain
-    symmetric = 0.5 * (covariance + covariance.swapaxes(1, 2))  # rounding errors would make it asymmetric
-    return np.asarray(symmetric)
-
-
-def _limit_iteration_step(step: Array) -> Array:
-    """Shorten steps of the state, shape (n, 6 + n_electrode), to those within which the linearisation is accurate."""
-    position_excess = np.hypot(step[:, X], step[:, Y]) / MAX_ITERATION_STEP_mm
-    force_excess = np.abs(step[:, LOG_FORCE]) / MAX_ITERATION_LOG_STEP
-    excess = np.maximum(position_excess, force_excess)
-    return np.asarray(step / np.maximum(excess, 1.0)[:, None])
 
 
 def _evenly_distributed_contacts(charges: ChargeSeries) -> Array:
