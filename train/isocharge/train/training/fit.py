@@ -52,6 +52,7 @@ from isocharge.train.training.network import (
     compress_length,
     fold_network,
 )
+from isocharge.train.training.output_regression import fit_std
 from isocharge.train.training.source import Teacher, TrainingData
 
 _log = logging.getLogger(__name__)
@@ -67,6 +68,9 @@ VALIDATION_FRACTION = 0.5
 
 MISFIT_RATE_FACTOR = 1.5
 """Learning rate of the misfit network, whose targets have no noise, relative to that of the contact network."""
+
+N_STD_PRESSES = 60_000
+"""Number of presses with noise to which the standard deviations of a trained network are fitted."""
 
 N_OUTSIDE_PRESSES = 6_000
 """Number of presses outside the working area from which charges for the misfit network are drawn."""
@@ -119,7 +123,11 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run:
     split = trained.split
     noise = settings.training.noise_model
     with threads_and_seed(settings.training.threads, settings.training.seed):
-        network = with_correlation(fold_network(trained.network), split.train, noise, settings.training.seed)
+        network = fold_network(trained.network)
+        if not split.train.measured:
+            repeated = split.train[np.arange(max(N_STD_PRESSES, len(split.train))) % len(split.train)]
+            network = fit_std(network, repeated.noisy(noise, settings.training.seed + 1), repeated.contact)
+        network = with_correlation(network, split.train, noise, settings.training.seed)
 
     made_with: dict[str, object] = {"config": settings.to_dict(), "torch": torch.__version__}
     if split.cautions:

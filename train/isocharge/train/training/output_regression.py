@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import norm
 
 from isocharge.common.arrays import Array
 from isocharge.common.perceptron import Layer, Perceptron, evaluate, evaluate_hidden_layers
@@ -23,6 +24,15 @@ larger error would change the logarithm of the standard deviation too much in on
 
 N_SCORING_STEPS = 3
 """Number of steps of Fisher's scoring for the standard deviations."""
+
+CORE_ERROR = 2.0
+"""Largest error, in standard deviations, that `fit_std` distinguishes."""
+
+N_CORE_STEPS = 5
+"""Number of scoring steps of `fit_std`. The limitation of the errors makes each step shorter."""
+
+CORE_RIDGE = 1e-3
+"""Ridge of `fit_std`, relative to the mean square of a feature of unit size."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +95,39 @@ def adapt_to_charges(network: FoldedNetwork, charge: Array, equivalent: Array, c
     return replace(network, layers=refit_last_layer(transformed, features, [contact_regression, *std_regressions]))
 
 
+def fit_std(network: FoldedNetwork, charge: Array, contact: Array) -> FoldedNetwork:
+    """Fit the standard deviations of a trained network to its errors, by a change of the last layer.
+
+    At places where the map from contacts to charges nearly folds, the errors have longer tails than a normal
+    distribution, and the intervals of a Gaussian likelihood contain more than the stated share of the contacts. Errors
+    are therefore limited to `CORE_ERROR` standard deviations, and their mean square is compared with that of a limited
+    normal variable (Huber 1964, proposal 2).
+
+    Args:
+        network: The trained network.
+        charge: Charges with noise, shape (n, n_electrode), pC.
+        contact: True contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        The network with other standard deviations.
+    """
+    log_contact = np.column_stack([contact[:, :2], np.log(contact[:, 2])])
+    central_share = norm.cdf(CORE_ERROR) - norm.cdf(-CORE_ERROR)
+    central_square = central_share - 2.0 * CORE_ERROR * norm.pdf(CORE_ERROR)
+    limited_square = central_square + CORE_ERROR**2 * (1.0 - central_share)
+
+    def std_targets(outputs: Array) -> Array:
+        """Return outputs whose standard deviations are changed by one scoring step, from the present outputs."""
+        relative_error = np.abs(outputs[:, MEAN] - log_contact) * np.exp(-relative_log_std(outputs))
+        targets = outputs.copy()
+        targets[:, LOG_STD] += 0.5 * (np.minimum(relative_error, CORE_ERROR) ** 2 / limited_square - 1.0)
+        return targets
+
+    regressions = [Regression(std_targets, CORE_RIDGE)] * N_CORE_STEPS
+    features = network.features.evaluate(charge)
+    return replace(network, layers=refit_last_layer(network.layers, features, regressions))
+
+
 def add_variance(network: FoldedNetwork, charge: Array, variance: Array) -> FoldedNetwork:
     """Return the network with larger standard deviations.
 
@@ -123,15 +166,16 @@ def refit_last_layer(
     n_input = features.shape[1]
     design = np.column_stack([hidden_output, features, np.ones(n_sample)])
     weights = np.vstack([perceptron.last.weight, perceptron.skip, perceptron.last.bias])
-    is_skip_or_bias = np.ones(n_input + 1, dtype=bool)
+    is_skip_or_bias = np.ones((n_input + 1, weights.shape[1]), dtype=bool)
+    is_used = np.vstack([weights[:n_hidden] != 0.0, is_skip_or_bias])
+    normal_matrix = design.T @ design
     for regression in regressions:
         outputs = design @ weights
         change = regression.target(outputs) - outputs
+        moment = design.T @ change
         for column in np.flatnonzero(change.any(axis=0)):
-            is_used = np.append(weights[:n_hidden, column] != 0.0, is_skip_or_bias)
-            used_design = design[:, is_used]
-            normal_matrix = used_design.T @ used_design
-            normal_matrix += regression.ridge * n_sample * np.eye(len(normal_matrix))
-            weights[is_used, column] += np.linalg.solve(normal_matrix, used_design.T @ change[:, column])
+            used = np.flatnonzero(is_used[:, column])
+            damped_matrix = normal_matrix[np.ix_(used, used)] + regression.ridge * n_sample * np.eye(len(used))
+            weights[used, column] += np.linalg.solve(damped_matrix, moment[used, column])
     last, skip, bias = np.split(weights, [n_hidden, n_hidden + n_input])
     return replace(perceptron, last=Layer(last, bias[0]), skip=skip)

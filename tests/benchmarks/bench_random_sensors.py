@@ -1,0 +1,143 @@
+"""Train a network for sensors drawn at random, and compare its errors with the Bayes limit of each sensor.
+
+    python tests/benchmarks/bench_random_sensors.py [--sensors 20] [--first 0] [--presses 600] [--samples 24000]
+        [--json]
+
+A sensor has three to eight electrodes on one or two rings, a film of 5 to 200 um with a pretension of up to 2 MPa, and
+a round probe with a radius of 1 to 12 mm. Each network is trained with the default configuration on simulated presses
+of 0.05 to 2 N within 8 mm, or within the fold of the map. Errors are measured on fresh presses with `reference` noise,
+for which the limit is computed, too. A sensor that is refused is listed with the reason.
+One sensor needs about a minute of CPU time.
+"""
+
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from shared import arguments, print_results
+
+from isocharge.common.contact_errors import ContactErrorStatistics
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
+from isocharge.common.errors import IsochargeError
+from isocharge.simulate import (
+    Circle,
+    Domain,
+    Electrode,
+    Film,
+    ForwardMap,
+    Piezo,
+    Sensor,
+    Sweep,
+    load_sensor,
+    noise_model,
+)
+from isocharge.train import LabelledPresses, TrainingData, fit
+from isocharge.train.bayes.limit import BayesProblem, bayes_estimate
+
+NOISE = noise_model("reference")
+LARGEST_RATIO = 1.08
+"""Error over the limit up to which a network counts as good."""
+
+
+def random_sensor(number: int) -> tuple[Sensor, Circle]:
+    """Draw a sensor and a probe.
+
+    Args:
+        number: Seed of the random numbers.
+    """
+    rng = np.random.default_rng([50, number])
+    film: Film = load_sensor("four-25um-biaxial").film
+    thickness_mm = 1e-3 * np.exp(rng.uniform(np.log(5.0), np.log(200.0)))
+    pretension_MPa = rng.choice([0.0, rng.uniform(0.0, 2.0)], p=[0.25, 0.75])
+    probe_radius = np.exp(rng.uniform(0.0, np.log(12.0)))
+    n_electrode = int(rng.integers(3, 9))
+    side = rng.uniform(2.0, 4.0)
+    ring_radius = rng.uniform(6.0, 16.0)
+    angle = 2.0 * np.pi * (np.arange(n_electrode) + rng.uniform(-0.15, 0.15, n_electrode)) / n_electrode
+    distance = ring_radius * np.where(np.arange(n_electrode) % 2 == 0, 1.0, rng.uniform(0.6, 1.4))
+    electrodes = tuple(
+        Electrode.of_square(name, (float(x), float(y)), float(side))
+        for name, x, y in zip("ABCDEFGH", distance * np.cos(angle), distance * np.sin(angle), strict=False)
+    )
+    is_biaxial = rng.random() < 0.5
+    piezo = Piezo(8.0, 8.0) if is_biaxial else Piezo(20.0, 2.0)
+    described_film = Film(film.radius, float(thickness_mm), film.young, film.poisson, float(pretension_MPa))
+    return Sensor(f"random-{number}", described_film, piezo, electrodes), Circle(round(float(probe_radius), 2))
+
+
+def describe(sensor: Sensor, probe: Circle) -> dict[str, Any]:
+    """Return the drawn quantities of a sensor for the table."""
+    return {
+        "electrodes": len(sensor.electrodes),
+        "thickness_um": round(1e3 * sensor.film.thickness, 1),
+        "pretension_MPa": round(sensor.film.pretension, 2),
+        "d31_d32": f"{sensor.piezo.d31:g}/{sensor.piezo.d32:g}",
+        "probe": probe.notation,
+    }
+
+
+def measure(sensor: Sensor, probe: Circle, n_sample: int, n_press: int) -> dict[str, Any]:
+    """Train a network for a sensor, and return its errors over the limit.
+
+    Args:
+        sensor: The sensor.
+        probe: The probe.
+        n_sample: Number of presses for training.
+        n_press: Number of presses on which the errors are measured.
+
+    Raises:
+        IsochargeError: If the sensor is refused.
+    """
+    charge_map = ForwardMap.build(sensor, probe, DEFAULT_RADIUS, DEFAULT_FORCE_RANGE)
+    contact = Sweep(DEFAULT_RADIUS, DEFAULT_FORCE_RANGE, n_sample, 0).contacts()
+    presses = LabelledPresses(contact, charge_map.charges(contact))
+    domain = Domain(DEFAULT_RADIUS, DEFAULT_FORCE_RANGE)
+    data = TrainingData(sensor=sensor, probes=(probe.notation,), domain=domain, presses=presses, sha256="random")
+    started = time.process_time()
+    fitted = fit(data)
+    seconds = time.process_time() - started
+
+    radius = fitted.domain.radius
+    truth = Sweep(radius, DEFAULT_FORCE_RANGE, n_press, 1, sampling="random").contacts()
+    charge = NOISE.add(charge_map.charges(truth), np.random.default_rng(2))
+    estimate, std, _ = fitted.predict(charge)
+    limit_estimate, _ = bayes_estimate(BayesProblem(sensor, probe, radius), charge, charge_map=charge_map)
+    errors = ContactErrorStatistics.of(estimate, truth)
+    limit = ContactErrorStatistics.of(limit_estimate, truth)
+    deviation = np.abs(estimate - truth) / std
+    return {
+        "radius_mm": radius,
+        "limit_mm": round(limit.position_rms_mm, 4),
+        "position_over_limit": round(errors.position_rms_mm / limit.position_rms_mm, 3),
+        "limit_percent": round(limit.force_rms_percent, 3),
+        "force_over_limit": round(errors.force_rms_percent / limit.force_rms_percent, 3),
+        "coverage_68": round(float(np.mean(deviation < 1.0)), 3),
+        "training_cpu_s": round(seconds, 1),
+        "cautions": len(fitted.cautions),
+    }
+
+
+def main() -> None:
+    """Train for all sensors and print a row for each."""
+    options = arguments(__doc__, sensors=20, first=0, presses=600, samples=24_000, json=False)
+    rows: dict[str, dict[str, Any]] = {}
+    n_good = 0
+    n_refused = 0
+    for number in range(options.first, options.first + options.sensors):
+        sensor, probe = random_sensor(number)
+        row = describe(sensor, probe)
+        try:
+            row |= measure(sensor, probe, options.samples, options.presses)
+            n_good += max(row["position_over_limit"], row["force_over_limit"]) <= LARGEST_RATIO
+        except IsochargeError as error:
+            row["refused"] = str(error)
+            n_refused += 1
+        rows[sensor.name] = row
+        print(sensor.name, row, file=sys.stderr, flush=True)
+    rows["total"] = {"good": n_good, "refused": n_refused, "worse": options.sensors - n_good - n_refused}
+    print_results("random_sensors", options, rows)
+
+
+if __name__ == "__main__":
+    main()
