@@ -18,8 +18,8 @@ HERE = Path(__file__).parent
 def backends(pytriton: Path) -> Path:
     """Create a folder with the two backends that Triton needs, and return its path.
 
-    It contains the Python backend of the wheel, the stub that starts the Python of this environment, and the backend
-    `onnxruntime` of this folder.
+    The folder contains the Python backend of the wheel, the stub that starts the Python of this environment, and the
+    backend `onnxruntime` that is beside this script.
 
     Args:
         pytriton: Folder of the installed package `pytriton`.

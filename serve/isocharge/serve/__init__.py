@@ -95,7 +95,7 @@ __version__: str
 
 
 def __dir__() -> list[str]:
-    """List the public names only, for tab completion."""
+    """Return only the public names, which tab completion then suggests."""
     return list(__all__)
 
 

@@ -1,6 +1,6 @@
 """Measurement of the duration of calls.
 
-The contenders take turns, so that a machine that becomes slower affects all of them alike.
+The contenders are measured in turns, so that a change of the speed of the machine affects all of them equally.
 """
 
 import os

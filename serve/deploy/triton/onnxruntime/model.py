@@ -1,8 +1,8 @@
 """A backend `onnxruntime` for Triton, written in Python: it runs the `model.onnx` of a version without changes.
 
 Triton's own backend of this name is a library, which the containers of Triton contain and the wheel `nvidia-pytriton`
-does not contain. This folder is copied into Triton's folder of backends, beside `python`. The configuration of a model
-needs no entry for the backend.
+does not contain. The folder of this file is copied into Triton's folder of backends, beside `python`. The configuration
+of a model needs no entry for the backend.
 """
 
 import json

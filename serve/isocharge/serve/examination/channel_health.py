@@ -20,7 +20,9 @@ SHORTEST_S = 0.5
 
 @dataclass(frozen=True)
 class ChannelHealth:
-    """Health of one channel, in pC after the gain. Values are None if no value of the channel is a charge.
+    """Health of one channel.
+
+    All values are in pC, after the conversion by the gain. Values are None if no value of the channel is a charge.
 
     Attributes:
         name: Name that the device uses, or the number of the channel from 1.
@@ -45,7 +47,7 @@ class ChannelHealth:
 def measure_channel_health(name: str, charge_pC: Array, times_s: Array, rate_Hz: float) -> ChannelHealth:
     """Measure the health of a channel, by a fit of a constant, a slope and the hum to its values.
 
-    Values whose magnitude is larger than `LARGEST_PC`, and NaN, are left out.
+    The function ignores NaN and values whose magnitude is larger than `LARGEST_PC`.
 
     Args:
         name: Name of the channel.

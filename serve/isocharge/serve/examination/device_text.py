@@ -1,4 +1,4 @@
-"""The text of the device file that fits a board."""
+"""Text of the device file that fits a board."""
 
 from collections.abc import Iterator
 
@@ -24,7 +24,8 @@ LINES_TO_FILL_IN = {
 def device_text(examination: Examination) -> str:
     """Return the device file of a board as TOML text.
 
-    The section `[gain]` comes last. Keys of the section that are not known are comments for the user to complete.
+    The section `[gain]` comes last. If keys of this section are not known, they are written as comments, which the user
+    completes.
     """
     other_sections = {key: value for key, value in examination.device.items() if key != "gain"}
     text = to_toml(other_sections, (*HEAD, *_description(examination)))

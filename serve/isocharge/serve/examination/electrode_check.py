@@ -1,7 +1,7 @@
 """Check which channel belongs to which electrode, by a press near each electrode in turn.
 
-The electrode next to a press collects the largest charge. The gains of the channels need not be known or equal, because
-the change of each channel is compared with the changes of the same channel under the other presses.
+The electrode next to a press collects the largest charge. The change of a channel under one press is compared with its
+changes under the other presses. The gains of the channels therefore need not be known or equal.
 """
 
 import math
@@ -143,8 +143,8 @@ def check_electrodes(
 def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
     """Find the channel that changes most under the press near each electrode.
 
-    The forces of the presses and the gains of the channels differ. They are removed by dividing rows and columns
-    alternately by their means (Sinkhorn and Knopp 1967).
+    The forces of the presses and the gains of the channels differ. Dividing the rows and columns of the changes
+    alternately by their means removes both (Sinkhorn and Knopp 1967).
 
     Args:
         changes: Change of each channel under the press near each electrode, shape (electrodes, channels), any unit.
@@ -179,7 +179,7 @@ def assign_channels(changes: Array, electrodes: Sequence[str]) -> list[int]:
 
 
 def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str, Any]:
-    """Return the content of a device file in which every electrode has the channel that answered to its press.
+    """Return the content of a device file that assigns each electrode to the channel that the presses have shown.
 
     Settings for single electrodes, such as gains and offsets, belong to the amplifiers and move with the channels.
 
@@ -266,7 +266,7 @@ def _wait_for_press(blocks: _Blocks, electrode: str, timeout_s: float) -> Array:
     """Wait for a press that begins and ends, and return the largest change of each channel, shape (channels,).
 
     The change is the difference between a block and the rest level, which follows a slow drift until the press begins.
-    The press has ended when the change is small again.
+    The press ends when the change has become small again.
 
     Args:
         blocks: Source of the averaged values.

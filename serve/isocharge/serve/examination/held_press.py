@@ -1,4 +1,6 @@
-"""Description of a press that is held during the port check. Its charge is constant, leaks, creeps or drifts.
+"""Description of a press that is held during the port check.
+
+The charge of the press is constant, leaks, creeps or drifts.
 
 The gain of the board may be unknown, so a press is not defined by a charge in pC. The press begins with the first large
 change of the channels within 0.2 s. The size of the press is the component of the channels along this change, minus the
@@ -142,7 +144,9 @@ def _block_means(values: Array, times_s: Array) -> Array | None:
 
 
 def _end_of_press(component: Array, settled: int, step_size: float) -> int:
-    """Return the first block after the press, or the number of blocks if the press is held to the end.
+    """Return the number of the first block after the press.
+
+    If the press is held to the end, return the number of blocks.
 
     Args:
         component: Mean of each block along the change of the press, shape (blocks,).

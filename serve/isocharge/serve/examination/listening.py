@@ -65,7 +65,7 @@ class ReceivedData:
     def span_s(self) -> float:
         """Time span in which the bytes arrived, s.
 
-        The time from the first chunk to the last is extended by the mean time between two chunks.
+        The result is the time from the first chunk to the last chunk plus the mean time between two chunks.
         """
         if len(self.chunks) < 2:
             return max(self.seconds, MIN_SPAN_S)

@@ -54,7 +54,7 @@ class BoardFindings:
 
 
 def missing_sentences(findings: BoardFindings) -> Iterator[str]:
-    """Yield one sentence for each setting or property that the board needs for a contact and does not have."""
+    """Yield one sentence for each missing setting or property that the board needs before contacts can be computed."""
     capture = findings.capture
     if not capture.bytes_seen:
         yield "not one byte came: check power and cable, and whether the board sends unasked (if not: --request)"
@@ -80,7 +80,7 @@ def missing_sentences(findings: BoardFindings) -> Iterator[str]:
 
 
 def _transmission_sentences(capture: Capture) -> Iterator[str]:
-    """Yield a sentence if bytes are damaged, and one if frames are missing."""
+    """Yield a sentence if bytes are damaged, and another sentence if frames are missing."""
     if capture.intact_share < CLEAN_SHARE:
         damaged_share = 1.0 - capture.intact_share
         yield f"{damaged_share:.1%} of the bytes are no good frames: a bad cable, or a rate that is a little off"

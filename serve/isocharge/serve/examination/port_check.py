@@ -1,4 +1,5 @@
-"""The port check: format and rate of the frames, health of the channels, a device file, and what is missing."""
+"""The port check, which reports the format and the rate of the frames, the health of the channels, a device file, and
+missing settings."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -110,7 +111,7 @@ def examine(
 
 
 def _is_clear(received: ReceivedData, device: Device) -> bool:
-    """Return whether most of the bytes are frames, so that the baud rate is right."""
+    """Return whether most of the bytes belong to frames, which shows that the baud rate is right."""
     if device is ANY_BOARD:
         frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
         device = device_from_table({"frames": frames or {}}, "board")

@@ -168,8 +168,8 @@ def unit_of(capture: Capture) -> str:
 def _choose_channels(capture: Capture, values: Array, electrodes: tuple[str, ...]) -> dict[str, int]:
     """Choose the channel of each electrode.
 
-    If there are channels with the names of the electrodes, these are chosen. Otherwise as many varying channels as
-    there are electrodes are assigned in their order. Without a model, each varying channel is an electrode.
+    If there are channels with the names of the electrodes, these are chosen. Otherwise the electrodes are assigned in
+    their order to channels whose values vary. Without a model, each varying channel is an electrode.
 
     Args:
         capture: The frames.
@@ -274,7 +274,8 @@ def _largest_pC(gain: Mapping[str, Any]) -> float:
 def _offset(column: Array) -> float | int:
     """Return the value of a channel without charge.
 
-    This is half of the range of a converter if the rest level is near it, and otherwise the rest level.
+    If the rest level is near half of the range of a converter, half of the range is returned. Otherwise the rest level
+    is returned.
     """
     rest = rest_of(column)
     has_whole_numbers = bool((column == np.round(column)).all())

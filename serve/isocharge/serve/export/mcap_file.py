@@ -7,8 +7,8 @@
 | `/isocharge/pose` | `geometry_msgs/msg/PoseWithCovarianceStamped` | every record with a position |
 
 Log time and publish time are the `timestamp` of the record. The file is written in complete chunks at least once per
-second. If the process is killed, the file has no index; `mcap recover` and viewers can then read everything except the
-last second.
+second. If the process is killed, the file has no index. The command `mcap recover` and viewers can then read all
+records except those of the last second.
 """
 
 import json
@@ -67,7 +67,7 @@ class McapFile:
         encoding: RecordEncoding = RecordEncoding.json,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Store the settings of the file, which is created when the context is entered.
+        """Store the settings of the file. The file is created when the context is entered.
 
         Args:
             path: The file, which must not exist.

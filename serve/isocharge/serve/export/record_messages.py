@@ -1,8 +1,8 @@
 """Conversion of prediction records to ROS 2 messages in CDR: the wrench of the press, its pose, and the record as text.
 
 The name of the coordinate frame of the messages is the `frame_id` of the record, which is the name of the sensor. The
-section Coordinates of README.md defines its origin and its axes x and y. ROS requires right-handed frames, so z points
-towards the probe, against the direction of the push.
+section Coordinates of README.md defines the origin and the axes x and y of this frame. ROS requires right-handed
+frames, so z points towards the probe, against the direction of the push.
 
 The wrench is the load of the probe on the film. A press of F at (x, y) has the force (0, 0, -F) and the torque (-y F, x
 F, 0) about the origin. The pose is the point of contact in the plane of the unloaded film, without rotation, with the

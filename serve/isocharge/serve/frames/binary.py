@@ -2,7 +2,7 @@
 
 The fields are (version u8, seq u16, t_us u32, n u8, flags u8, n x f32 pC, CRC u16). All numbers are little-endian. The
 CRC is CRC-16/CCITT-FALSE over all bytes before it. A zero byte ends each frame and occurs nowhere else. After damaged
-bytes, the parser therefore continues with the frame that follows the next zero, and a damaged frame does not affect its
+bytes, the parser therefore continues with the frame after the next zero. A damaged frame does not affect its
 neighbours.
 """
 

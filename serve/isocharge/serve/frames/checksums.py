@@ -90,7 +90,8 @@ class Crc:
 def _fletcher_16(data: bytes) -> int:
     """Compute Fletcher's checksum (1982).
 
-    The low byte is the sum of the bytes, the high byte is the sum of all intermediate sums, both modulo 255.
+    The low byte of the checksum is the sum of the bytes, and the high byte is the sum of all intermediate sums, both
+    modulo 255.
     """
     byte_sum = 0
     sum_of_sums = 0

@@ -23,7 +23,7 @@ class AutoParser(Parser):
     """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
-        """Begin with the parsers of all formats; the arguments are described in the class."""
+        """Begin with the parsers of all formats. The class describes the arguments."""
         super().__init__("nothing recognised yet")
         self._candidates: tuple[Parser, ...] = (BinaryParser(), TextParser(columns, meanings))
 

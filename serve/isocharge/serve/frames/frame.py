@@ -34,7 +34,7 @@ Raw = TypeVar("Raw")
 
 
 class SequenceGaps:
-    """Detects missing frames, repeated frames and restarts in the sequence of frame counters.
+    """Detects missing frames, repeated frames and restarts of the board by the frame counters.
 
     Attributes:
         lost: Number of frames that are missing between received frames.
@@ -89,8 +89,9 @@ class SequenceGaps:
 class CounterWrap:
     """Learns the value at which a counter in text wraps to 0, because text does not show the width of a counter.
 
-    If the counter decreases, it has either wrapped or restarted. A wrap is assumed if there is a usual modulus that is
-    larger than all previous values, and if the step modulo this modulus is not much larger than the previous steps.
+    If the counter decreases, it has either wrapped or restarted. A wrap is assumed if a usual modulus explains the
+    decrease. Such a modulus is larger than all previous values, and the step modulo this modulus is about as small as
+    the previous steps.
 
     Args:
         usual_moduli: Moduli that boards use, in ascending order.
@@ -99,7 +100,7 @@ class CounterWrap:
     """
 
     def __init__(self, usual_moduli: Iterable[int], initial_modulus: int, max_steps: int) -> None:
-        """Begin without any value; the arguments are described in the class."""
+        """Begin without any value. The class describes the arguments."""
         self._usual_moduli = tuple(usual_moduli)
         self._modulus = initial_modulus
         self._max_steps = max_steps
@@ -264,7 +265,7 @@ class Columns:
 
 
 class Parser(ABC):
-    """Base class of all parsers: takes bytes and returns frames.
+    """Base class of all parsers, which convert bytes to frames.
 
     Args:
         format: Description of the format, for the user.
@@ -276,7 +277,7 @@ class Parser(ABC):
     """
 
     def __init__(self, format: str, seq_modulus: int = SEQ_MODULUS, t_us_modulus: int = T_US_MODULUS) -> None:
-        """Begin without bytes; the arguments are described in the class."""
+        """Begin without bytes. The class describes the arguments."""
         self.format = format
         self.seq_modulus = seq_modulus
         self.t_us_modulus = t_us_modulus
@@ -322,7 +323,7 @@ class DelimitedParser(Parser):
     """
 
     def __init__(self, delimiter: bytes, max_length: int, *parser_arguments: Any) -> None:
-        """Begin without bytes; the arguments are described in the class."""
+        """Begin without bytes. The class describes the arguments."""
         super().__init__(*parser_arguments)
         self._delimiter = delimiter
         self._max_length = max_length
@@ -331,7 +332,7 @@ class DelimitedParser(Parser):
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
-        Bytes after the last delimiter are stored for the next call. If there are more of them than any frame has, they
+        Bytes after the last delimiter are stored for the next call. If the stored bytes are longer than any frame, they
         are dropped together with all bytes up to the next delimiter.
         """
         *pieces, tail = (self._tail + data).split(self._delimiter)
@@ -371,7 +372,7 @@ class StuffedParser(DelimitedParser):
     def __init__(
         self, delimiter: bytes, max_length: int, decode: Callable[[bytes], Frame], *parser_arguments: Any
     ) -> None:
-        """Begin without bytes; the arguments are described in the class."""
+        """Begin without bytes. The class describes the arguments."""
         super().__init__(delimiter, max_length, *parser_arguments)
         self._decode = decode
 

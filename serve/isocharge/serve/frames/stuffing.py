@@ -1,4 +1,4 @@
-"""Byte stuffing: encodings in which the byte that separates frames never occurs inside a frame.
+"""Byte stuffing, which encodes frames so that the byte that separates frames never occurs inside a frame.
 
 - COBS, Consistent Overhead Byte Stuffing (Cheshire and Baker 1999), ends a frame with a zero. Each zero in the data is
   replaced by the distance to the next zero. The first byte is the distance to the first zero. A distance of 255 stands

@@ -67,7 +67,7 @@ class Layout:
     """
 
     def __init__(self, notation: Notation, names: tuple[str, ...], width: int, lines: int = 1) -> None:
-        """Store the layout; the arguments are described in the class."""
+        """Store the layout. The class describes the arguments."""
         self.notation = notation
         self.names = names
         self.width = width
@@ -87,7 +87,7 @@ class TextParser(DelimitedParser):
     """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
-        """Begin without a layout; the arguments are described in the class."""
+        """Begin without a layout. The class describes the arguments."""
         super().__init__(b"\n", MAX_LINE_LENGTH, "text of a layout that is not clear yet")
         self.layout: Layout | None = None
         self._columns = columns
@@ -103,7 +103,7 @@ class TextParser(DelimitedParser):
         self._cycle_bytes = 0
 
     def reset(self) -> None:
-        """Drop the bytes of an unfinished frame, because the next bytes come from another connection."""
+        """Drop an unfinished frame, because the next bytes come from another connection."""
         super().reset()
         self._drop_cycle()
         self._is_first_line = True
@@ -163,8 +163,8 @@ class TextParser(DelimitedParser):
     def _name_columns(self, header: Line, size: int) -> list[Frame]:
         """Use the names in a header as the names of the columns, unless the columns already have names.
 
-        The header is counted as rejected if the columns cannot have its names. Then the board was reset, or the line
-        only looks like a header. The result is always empty.
+        The header is counted as rejected if the columns cannot have its names. Such a header appears if the board was
+        reset, or if a line only looks like a header. The result is always empty.
 
         Args:
             header: The header.
@@ -250,7 +250,7 @@ class TextParser(DelimitedParser):
     def _read_cycle_line(self, layout: Layout, line: Line, size: int) -> list[Frame]:
         """Store the values of a line of a cycle, and return the frame if the cycle is complete.
 
-        A clock may accompany every value of a cycle.
+        Each line of a cycle may contain the clock in addition to its value.
 
         Args:
             layout: The layout of the lines.
@@ -286,7 +286,7 @@ class TextParser(DelimitedParser):
         self._cycle_bytes = 0
 
     def _frame(self, layout: Layout, values: Sequence[float], size: int) -> list[Frame]:
-        """Return the frame with some values in a list, and update the moduli of the counter and the clock.
+        """Return a list with the frame that the values form, and update the moduli of the counter and the clock.
 
         Args:
             layout: The layout of the lines.

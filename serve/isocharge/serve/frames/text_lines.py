@@ -174,7 +174,7 @@ def _json(text: str) -> Line:
 def _numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, float]]:
     """Return every number of a JSON value with the path to it, such as `charge.A` or `charge.0.re`.
 
-    Numbers more than `MAX_JSON_LEVEL` levels deep are left out.
+    The function ignores numbers that are more than `MAX_JSON_LEVEL` levels deep.
 
     Args:
         path: Path to the value; empty for the whole text.

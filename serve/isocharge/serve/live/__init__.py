@@ -1,4 +1,4 @@
-"""The live path: device file, channels, stream of prediction records, outputs, and the check of a port.
+"""Processing of a live stream: device file, channels, stages of a contact, and prediction records.
 
 May import: port, frames, signal_chain, prediction, flags.
 """

@@ -1,12 +1,12 @@
-"""Stages that turn a reading of the charges into the contact of a record.
+"""Stages that compute the contact of a record from a reading of the charges.
 
-The stages are, in this order:
+The stages process each frame in this order:
 
-1. prediction: predicts the contact with the model, and adds the flags of the model;
-2. film: follows the pretension of the film from touch to touch (section `[follow]` of the device file);
-3. tracking: follows the contact from frame to frame (section `[track]`);
-4. charge scale: increases the standard deviations if the scale of all charges is uncertain (section `[memory]`);
-5. touch offset: increases the standard deviations if touches may have a common offset (section `[touch_offset]`).
+- `PredictionStage` predicts the contact with the model, and adds the flags of the model.
+- `FilmStage` follows the pretension of the film from touch to touch (section `[follow]` of the device file).
+- `TrackingStage` follows the contact from frame to frame (section `[track]`).
+- `ChargeScaleStage` increases the standard deviations if the scale of all charges is uncertain (section `[memory]`).
+- `TouchOffsetStage` increases the standard deviations if touches may have a common offset (section `[touch_offset]`).
 """
 
 from abc import ABC, abstractmethod

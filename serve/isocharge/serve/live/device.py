@@ -73,7 +73,7 @@ class Gain(Rule, frozen=True, kw_only=True):
     offset: Finite | dict[str, Finite] | None = None
 
     def __post_init__(self) -> None:
-        """Check that the charge of one unit is given in one of the two ways; raise WrongKey otherwise."""
+        """Check that either `pC_per_unit`, or `V_per_unit` and `feedback_pF`, are given; raise WrongKey otherwise."""
         if self.V_per_unit is not None and self.pC_per_unit is not None:
             raise WrongKey("V_per_unit", "either pC_per_unit, or V_per_unit and feedback_pF", self.V_per_unit)
         if self.V_per_unit is None and self.feedback_pF is not None:
@@ -95,7 +95,7 @@ class Gain(Rule, frozen=True, kw_only=True):
         return self.pC_per_unit if self.V_per_unit is None else self.V_per_unit
 
     def charge_pC(self, electrode: str, values: Array) -> Array:
-        """Convert values of one electrode to charges; a setting that does not exist has no effect.
+        """Convert values of one electrode to charges. A setting that is missing has no effect.
 
         Args:
             electrode: Name of the electrode.
@@ -126,7 +126,7 @@ def _setting_of(setting: float | Mapping[str, float] | None, electrode: str, def
 
 
 class Saturation(Rule, frozen=True, kw_only=True):
-    """Range of the converter: the largest charge that it can represent, pC."""
+    """Range of the converter, given by the largest charge that the converter can represent, pC."""
 
     limit_pC: Setting
 
@@ -334,7 +334,9 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
 
 
 def with_settings(device: Device, section: str, **settings: Any) -> Device:
-    """Return the settings of a board with changes in one section, which also change its table for recordings.
+    """Return the settings of a board with changes in one section.
+
+    The table that recordings store contains the same changes.
 
     Args:
         device: The settings of the board.

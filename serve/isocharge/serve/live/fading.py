@@ -1,14 +1,15 @@
 """Cause of a decrease of the charges of a held press: a leak of the amplifier, or creep of the film.
 
-A leak removes the same share of the charge in every second. Creep removes the same share in every decade of time:
+A leak removes the same share of the charge in every second. Creep removes the same share in every decade of time. The
+two laws are straight lines:
 
     leak:   ln Q = a - t / tau
     creep:  ln Q = a + b ln t
 
 where t is the time since the touch. Both lines are fitted to the charges of a press. A law is only reported if the
 squared residuals of the other law are at least `MIN_RESIDUAL_RATIO` times as large. Creep with a thermoelastic step
-(see `isocharge.serve.signal_chain.memory`) is reported if it reduces the squared residuals of both lines by this
-factor.
+(see `isocharge.serve.signal_chain.memory`) is reported if its squared residuals are smaller by this factor than those
+of both lines.
 
 The section [leak] of a device file corrects a leak, and the section [memory] corrects creep. If [leak] is used for
 creep, the error grows with time.
@@ -140,7 +141,7 @@ def _fit_creep_and_step(held_s: Array, size_pC: Array, max_squared_residual: flo
 
 
 def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
-    """Return the possible cause of a decrease of the charges, and what the user can do, as the end of a sentence.
+    """Return the possible cause of a decrease of the charges with advice to the user, as the end of a sentence.
 
     Args:
         sizes: Times since the touch, s, and mean magnitudes of the charges at these times, positive, pC.

@@ -1,6 +1,6 @@
 """Path from chunks of bytes to touch charges: parser, clock, assignment of the channels, and signal chain.
 
-No model of a film is needed for these readings, unless the signal chain estimates warming.
+The readings do not depend on a model of the film, unless the signal chain estimates warming.
 """
 
 from collections.abc import Iterator, Mapping
@@ -73,7 +73,7 @@ class ChannelPicker:
     def _look_up(self, frame: Frame) -> tuple[int, ...]:
         """Return the position of each electrode's channel among the values of a frame.
 
-        The class describes how the channels are assigned.
+        The description of the class explains how the channels are assigned.
 
         Raises:
             ChargeError: If the device file assigns no channels, the names differ, and the number of values is wrong.
@@ -267,7 +267,7 @@ class ReadingStream:
         return TimedReading(reading, time_of_reading)
 
     def arrived(self, frames: list[Frame], chunk: Chunk) -> None:
-        """End a chunk: adjust the clock to its arrival.
+        """End a chunk, and adjust the clock to the arrival of the chunk.
 
         Args:
             frames: The frames that ended in the chunk.
@@ -290,7 +290,10 @@ class ReadingStream:
         _check_recognised(self.parser, max_bytes=-1)
 
     def _reconnect(self) -> None:
-        """Discard the state after an outage. Frames are missing, and the film may have been touched meanwhile."""
+        """Discard the state after an outage.
+
+        After an outage, frames are missing, and the film may have been touched.
+        """
         self.parser.reset()
         self.gaps.reset()
         self.clock.reset()
@@ -299,7 +302,7 @@ class ReadingStream:
 
 
 def _check_recognised(parser: Parser, max_bytes: int = BYTES_TO_RECOGNISE) -> None:
-    """Raise NoFramesError if there has been no intact frame among more than `max_bytes` bytes."""
+    """Raise NoFramesError if more than `max_bytes` bytes have arrived without an intact frame."""
     counts = parser.counts
     if counts.frames == 0 and counts.bytes_dropped > max_bytes:
         raise NoFramesError(

@@ -1,7 +1,7 @@
 """A touch stream whose chunks and records are written to a recording, and the replay of such a recording.
 
-`replay` feeds the chunks of a recording to a stream with the same settings. With the same models, its records are the
-same, bit for bit.
+`replay` feeds the chunks of a recording to a stream with the same settings. With the same models, the records of a
+replay are the same, bit for bit.
 """
 
 import logging
@@ -60,7 +60,10 @@ class RecordedStream:
         self._requests.append(self._tare)
 
     def request_film_reset(self) -> None:
-        """Request a reset of the followed film to its calibration. It may also be called from a signal handler."""
+        """Request a reset of the followed film to its calibration.
+
+        The method may also be called from a signal handler.
+        """
         self._requests.append(self._reset_film)
 
     def request_recording(self, recorder: Recorder | None) -> None:
@@ -82,8 +85,9 @@ class RecordedStream:
     def request_model(self, load: Load) -> None:
         """Request another model, which is loaded in the background.
 
-        The model is used from the next chunk after it is loaded. If it cannot be loaded, or has other electrodes, an
-        error is logged and the present model is kept. The method may also be called from a signal handler.
+        The model is used from the next chunk after it is loaded. If the model cannot be loaded, or has other
+        electrodes, an error is logged and the present model is kept. The method may also be called from a signal
+        handler.
 
         Args:
             load: Function that loads the model.
@@ -151,7 +155,7 @@ class RecordedStream:
                 recorder.model(present_label)
 
     def _end_recording(self) -> None:
-        """End the present recording, and close it if this object opened it."""
+        """End the present recording. If this object has opened the recording, close it."""
         recorder = self.recorder
         self.recorder = None
         if recorder is not None and recorder is not self._given_recorder:
@@ -175,7 +179,9 @@ class RecordedStream:
             loader.shutdown(wait=False)
 
     def _use(self, loaded: "Future[Predictor]") -> None:
-        """Use a loaded model from now on. If that fails, log an error and continue with the present model.
+        """Use a loaded model from now on.
+
+        If the loaded model cannot be used, log an error and continue with the present model.
 
         Args:
             loaded: Result of the thread that has loaded the model.

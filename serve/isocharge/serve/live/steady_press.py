@@ -2,7 +2,7 @@
 
 A press is steady if, within a window of time, the scatter and the drift of each charge are small. The charge of the
 press is the mean over the window minus the mean at rest just before the touch. A slow drift of the amplifiers, or of
-the temperature of the film, therefore has no influence. A press is refused, with a reason, if it saturates an
+the temperature of the film, therefore does not affect the charge. A press is refused, with a reason, if it saturates an
 amplifier, moves, creeps or ends too early.
 """
 
@@ -79,7 +79,8 @@ class SteadyRule(NamedTuple):
 
 
 class Phase(StrEnum):
-    """State of a press watch: what the watch waits for, or the result of the latest reading."""
+    """State of a press watch, which is either the event that the watch waits for, or the result of the latest
+    reading."""
 
     taring = "taring"
     lift = "lift"
@@ -283,8 +284,8 @@ class PressWatch:
     def _steady_press(self, reading: Reading) -> SteadyPress | None:
         """Return the press in the window if it is steady; otherwise store the reason and return None.
 
-        Windows with a much larger scatter than earlier windows contain a jerk. Their size is not used to determine the
-        law of a decrease, and their reason is not stored.
+        Windows with a much larger scatter than earlier windows contain a jerk. The sizes of such windows are not used
+        to determine the law of a decrease, and their reasons are not stored.
 
         Args:
             reading: The latest frame, which has the noise of the charges at rest.

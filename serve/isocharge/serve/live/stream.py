@@ -1,4 +1,7 @@
-"""The stream from chunks of bytes to prediction records: readings of the charges, each with its contact."""
+"""The stream that computes prediction records from chunks of bytes.
+
+Each record has the charges of a frame and its contact.
+"""
 
 import math
 import time
@@ -34,7 +37,7 @@ LASTING_FLAGS = (RECONNECTED, GAP, REPEAT, RESTART)
 
 
 class Policy(StrEnum):
-    """Which frames have a record. The signal chain processes all frames with either policy."""
+    """Which frames have a record. With both policies, the signal chain processes all frames."""
 
     every = "every"
     latest = "latest"
@@ -42,7 +45,7 @@ class Policy(StrEnum):
 
 @dataclass(slots=True)
 class StreamCounts:
-    """Counts of a stream that are not among the counts of its parser and of its frame numbers.
+    """Counts of a stream, in addition to the counts of its parser and of its frame numbers.
 
     Attributes:
         records: Number of records.
@@ -243,7 +246,7 @@ class TouchStream:
             stage.reset()
 
     def restart(self) -> None:
-        """Return to the state of a new stream, so that all further records depend only on further bytes.
+        """Return to the state of a new stream, so that later records depend only on later bytes.
 
         The counts of `totals` continue.
         """

@@ -53,7 +53,7 @@ N_CHECKED_FORCES = 5
 
 @dataclass(frozen=True)
 class ChargeSeries:
-    """The charges of all contacts up to a distance from the centre.
+    """Charges of all contacts within a distance from the centre of the film.
 
     Attributes:
         series: Series of ln Q, where Q is the charge in pC.

@@ -1,4 +1,4 @@
-"""Files that belong to one `model.onnx` and lie beside it, such as `charges.npz`.
+"""Companion files, such as `charges.npz`, which belong to one `model.onnx` and are in the same folder.
 
 `golden.json` contains the checksum of each companion file. A companion file of another model has the right format, but
 would give wrong contacts. A file whose checksum differs or is missing is therefore refused. Models that were written
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
-    """Read a file that lies beside a `model.onnx`.
+    """Read a companion file from the folder of a `model.onnx`.
 
     Args:
         version_folder: The folder that holds `model.onnx`.

@@ -1,8 +1,8 @@
 """Metadata of a model, stored in the `metadata_props` of its ONNX graph as one JSON value per key.
 
 The metadata describe the sensor for which the model was trained, the order of its charges, the domain in which it is
-valid, and its measured errors. The complete description of the sensor is stored, but this module reads only its name,
-which is the frame to which x and y refer.
+valid, and its measured errors. The complete description of the sensor is stored, but this module reads only the name of
+the sensor. The name is also the name of the coordinate frame of x and y.
 """
 
 import json
@@ -154,7 +154,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
     unnoticed: UnnoticedPresses | None = None
 
     def __post_init__(self) -> None:
-        """Check the keys that must fit each other; raise WrongKey for the first key that does not."""
+        """Check that the keys are consistent with each other; raise WrongKey for the first key that is not."""
         if "name" not in self.sensor:
             raise WrongKey("sensor.name")
         sensor_name = self.sensor["name"]
@@ -181,7 +181,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
 
     @property
     def frame_id(self) -> str:
-        """Name of the sensor, which is the name of the frame of x and y."""
+        """Name of the sensor, which is also the name of the coordinate frame of x and y."""
         return str(self.sensor["name"])
 
     def to_props(self) -> dict[str, str]:
@@ -220,7 +220,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
 
 
 class _Version(Struct):
-    """The key that metadata of every format version contain."""
+    """The version of the format, which metadata of every version contain."""
 
     format_version: Annotated[int, Meta(ge=1)]
 

@@ -9,8 +9,9 @@
 A version is written under a temporary name, read back with all checks of a reader, and then renamed. Other processes
 therefore never see an incomplete version.
 
-A model repository is a folder of such folders; other files in it are ignored. Names are looked up in the repository
-that the caller gives, in `$ISOCHARGE_MODELS`, in `./models`, and in the models that ship with isocharge, in this order.
+A model repository is a folder with the folders of several models. Other files in a repository are ignored. Names are
+looked up in the repository that the caller gives, in `$ISOCHARGE_MODELS`, in `./models`, and in the models that ship
+with isocharge, in this order.
 """
 
 import os
@@ -357,7 +358,7 @@ def _write_triton_config(path: Path, metadata: ModelMetadata, *, has_correlation
 def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Path:
     """Check that a version of a model can be written, and return its folder.
 
-    A training calls this function before it starts, so that it does not fail at its end.
+    A training calls this function before it starts, so that an invalid folder is reported at once.
 
     Args:
         folder: The model's folder, which has the name of the model.
@@ -441,6 +442,9 @@ def triton_config(name: str, electrodes: int, *, correlation: bool = True) -> st
 
 
 def _tensor_list(kind: str, widths: dict[str, int]) -> str:
-    """Return the part of `config.pbtxt` that lists tensors; Triton adds the batch dimension to their shapes."""
+    """Return the part of `config.pbtxt` that lists tensors.
+
+    Triton adds the batch dimension to the shapes of the tensors.
+    """
     lines = [f'  {{ name: "{name}" data_type: TYPE_FP32 dims: [ {width} ] }}' for name, width in widths.items()]
     return f"{kind} [\n" + ",\n".join(lines) + "\n]\n"

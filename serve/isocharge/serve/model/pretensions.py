@@ -128,7 +128,8 @@ class Pretensions:
     def interpolation_weights(self, pretension_MPa: Array) -> Array:
         """Return the weights with which the values at the k pretensions `node_MPa` are interpolated.
 
-        The weights are the Lagrange polynomials: the product of (p - p_j) / (p_i - p_j) over all j other than i.
+        The weights are the Lagrange polynomials. The weight of node i is the product of (p - p_j) / (p_i - p_j) over
+        all j other than i.
 
         Args:
             pretension_MPa: Pretensions p, shape (n,), MPa.
@@ -173,7 +174,7 @@ class Pretensions:
     def vectors(self, charge_pC: Array, pretension_MPa: Array) -> Array:
         """Compute the vectors whose lengths are the misfits of presses at several pretensions.
 
-        The vectors are interpolated linearly between the pretensions of `node_MPa`. These must therefore be close to
+        The vectors are interpolated linearly between the pretensions of `node_MPa`, which must therefore be close to
         each other. Use `at` to obtain a network with close pretensions.
 
         Args:
@@ -300,7 +301,7 @@ def _check_nodes(node_MPa: Array, calibrated_MPa: float) -> None:
 def _checked_weights(arrays: Mapping[str, np.ndarray], about: _About, n_node: int) -> list[str]:
     """Check the shapes of the weights, and return their names in the order of the layers.
 
-    The names of the hidden layers are pairs: the weight and the bias of each layer. They are followed by the names of
+    The names of the hidden layers are pairs: the weight and the bias of each layer. The last three names are those of
     the skip layer, which connects the inputs with the outputs, and of the bias and the weight of the output layer.
 
     Args:

@@ -78,7 +78,8 @@ def open_session(
 
 
 def _decode_texts(session: ort.InferenceSession) -> None:
-    """Read the metadata and the names of a session, which raises an exception if they are not valid UTF-8."""
+    """Read the metadata and the names of a session, so that onnxruntime raises an exception if they are not valid
+    UTF-8."""
     _ = session.get_modelmeta().custom_metadata_map
     _ = [tensor.name for tensor in (*session.get_inputs(), *session.get_outputs())]
 
@@ -180,7 +181,7 @@ def _check_tensors(kind: str, tensors: list[ort.NodeArg], widths: dict[str, int]
 def _row_width(shape: list[int | str | None]) -> object:
     """Return the width of a tensor of shape [variable, width].
 
-    The whole shape is returned if the tensor does not have such a shape. It then differs from every expected width.
+    If a tensor has another shape, the whole shape is returned. It then differs from every expected width.
     """
     is_batch = len(shape) == 2 and not isinstance(shape[0], int)
     return shape[1] if is_batch else shape

@@ -1,4 +1,4 @@
-"""What every server shares: model store, statistics, bounds, address, TLS, token.
+"""Common parts of the HTTP and the gRPC server, such as the model store, the statistics, the limits and the token.
 
 May import: prediction, model.
 """

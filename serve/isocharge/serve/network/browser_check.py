@@ -6,10 +6,11 @@ rebinding, an attacker changes the address of a name to this machine after the p
 the page as a page of this server, and the page can also read the responses. Pages cannot change the following headers,
 by which such requests are recognised:
 
-- `Host` is the name that the browser has requested. A rebound name is neither an IP address nor a name of this server.
+- `Host` is the name that the browser has requested. After DNS rebinding, this name is neither an IP address nor a name
+  of this server.
 - `Origin` is the site of the page that sent the request.
-- `Sec-Fetch-Site` states whether the page belongs to the same site. Browsers also send it with
-  requests without `Origin`.
+- `Sec-Fetch-Site` states whether the page belongs to the same site. Browsers also send this header with requests that
+  have no `Origin`.
 
 Programs other than browsers send neither `Origin` nor `Sec-Fetch-Site`, so only their `Host` is checked.
 """
@@ -121,7 +122,7 @@ class BrowserCheck:
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
         """Return whether a request was sent by a page of this server.
 
-        The page belongs to this server if its origin is the requested host. It also belongs to this server if its
+        The page belongs to this server if its origin is the requested host. The page also belongs to this server if its
         origin is an allowed name and a proxy has replaced the `Host`. A page on another port of the requested host
         belongs to another server.
 

@@ -43,7 +43,7 @@ class Metrics(Collector):
     """
 
     def __init__(self, store: ModelStore, traffic: Traffic, server_version: str) -> None:
-        """Register the metrics of the server and of its process; the arguments are described in the class."""
+        """Register the metrics of the server and of its process. The class describes the arguments."""
         self._store = store
         self._traffic = traffic
         self._version = server_version

@@ -160,7 +160,9 @@ class ModelStore:
         return [reason for _, reason in sorted(self._refused.items())]
 
     def check_ready(self) -> None:
-        """Check that at least one version is loaded. The error message is sent to any client and names no files.
+        """Check that at least one version is loaded.
+
+        The error message contains no names of files, because it is sent to any client.
 
         Raises:
             ModelError: If no version is loaded.

@@ -55,7 +55,7 @@ class Exchange(NamedTuple):
 
 
 class RequestLog(logging.Handler):
-    """Log in lines of JSON, for requests and for the messages of Python's loggers.
+    """Log with one line of JSON for each request and for each message of a logger of Python.
 
     Args:
         write: Function that takes a line without a line feed. It is called from any thread and must not block.
@@ -104,7 +104,7 @@ class RequestLog(logging.Handler):
     def _clean(self, text: str) -> str:
         """Return a text as valid UTF-8 without the secret.
 
-        Of a text with more than `MAX_TEXT_CHARACTERS` characters, the middle is replaced by " [...] ".
+        If the text has more than `MAX_TEXT_CHARACTERS` characters, its middle is replaced by " [...] ".
         """
         cleaned = text.encode("utf-8", "replace").decode()
         if self._secret:
@@ -132,7 +132,7 @@ class Traffic:
         self._lock = threading.Lock()
 
     def count(self, transport: str, route: str, status: int | str) -> None:
-        """Count a request that was answered, also by an error."""
+        """Count a request that was answered. The answer may be an error."""
         key = transport, route, status
         with self._lock:
             self._requests[key] = self._requests.get(key, 0) + 1
@@ -231,7 +231,7 @@ class Statistics:
         return self.presses - self.unchecked
 
     def snapshot(self) -> "Statistics":
-        """Return a copy whose counters all belong to the same moment."""
+        """Return a copy of all counters at the same moment."""
         with self._lock:
             return replace(self, latency=[*self.latency], stages_ns=[*self.stages_ns], _lock=threading.Lock())
 

@@ -1,7 +1,7 @@
 """Destinations of prediction records: standard output, files, datagrams, and those that other packages add.
 
-`output` defines what an output is. Each kind of output has a module of its own, and `targets` registers the kinds and
-chooses one of them by the form of a target, such as `touch.csv` or `udp://127.0.0.1:9870`.
+`output` defines what an output is. Each kind of output has its own module. The module `targets` registers the kinds,
+and chooses one of them by the form of a target, such as `touch.csv` or `udp://127.0.0.1:9870`.
 
 May import: export, record.
 """

@@ -19,8 +19,9 @@ from isocharge.serve.record.record import PredictionRecord
 class Output(Protocol):
     """A destination of prediction records.
 
-    An output may have a method `discard()`. It is called instead of `close` if the records are incomplete because of
-    an error, or because a replay was stopped, so that a file with only a part of the records can be removed.
+    An output may have a method `discard()`. This method is called instead of `close` if the records are incomplete
+    because of an error, or because a replay was stopped. An output can then remove a file that contains only a part of
+    the records.
     """
 
     def write(self, record: PredictionRecord, /) -> None:

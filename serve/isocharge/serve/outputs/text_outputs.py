@@ -41,8 +41,8 @@ class StandardOutput:
 class TextFile:
     """Writes a line for each record into a new file.
 
-    On the live path the file has its name from the beginning and grows by whole lines. In a replay it gets its name
-    when it is complete.
+    If the records come from a sensor, the file has its name from the beginning and grows by whole lines. In a replay,
+    the file gets its name when it is complete.
     """
 
     def __init__(self, path: Path, line_of: LineOf, header: str | None = None, *, is_live: bool) -> None:
@@ -72,11 +72,11 @@ class TextFile:
         self._write_line(self._line_of(record))
 
     def close(self) -> None:
-        """Close the file; in a replay it gets its name now."""
+        """Close the file. In a replay, the file gets its name now."""
         self._stack.close()
 
     def discard(self) -> None:
-        """Close the file; in a replay it is removed."""
+        """Close the file. In a replay, the file is removed."""
         # The contexts are left with an error, so that they remove an incomplete file. The error itself is suppressed.
         incomplete = OutputError(f"{self._path}: incomplete")
         try:

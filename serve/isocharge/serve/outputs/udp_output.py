@@ -1,8 +1,8 @@
 """Records as UDP datagrams, one JSON object in each.
 
-The UDP server of PlotJuggler with the JSON protocol can read the records without a conversion. It expects one object in
-each datagram, uses the number `timestamp`, ignores nulls, and shows a series for every other number under the path to
-the number, such as `charge_pC/A`.
+The UDP server of PlotJuggler with the JSON protocol can read the records without a conversion. PlotJuggler expects one
+object in each datagram, and uses the number `timestamp` as the time. Nulls are ignored. Each other number is shown as a
+series under the path to the number, such as `charge_pC/A`.
 """
 
 import socket
@@ -45,7 +45,7 @@ class UdpOutput:
         self._socket.setblocking(False)
 
     def write(self, record: PredictionRecord) -> None:
-        """Send a record, or drop it if the network is not ready, because the live path never waits."""
+        """Send a record. If the network is not ready, drop the record, because a live stream never waits."""
         with suppress(OSError):  # the receiver is unreachable, or the buffer is full
             self._socket.sendto(record.to_json().encode(), self._address)
 

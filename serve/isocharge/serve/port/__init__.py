@@ -1,4 +1,4 @@
-"""Sources of bytes and their times: serial ports, files, recordings, and the clock of the device.
+"""Sources of bytes and their times, such as serial ports, files and recordings, and the clock of the device.
 
 May import: nothing else of isocharge.serve.
 """

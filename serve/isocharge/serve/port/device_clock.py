@@ -49,7 +49,7 @@ class ReadingTime(NamedTuple):
 
 
 class DeviceClock:
-    """Clock of one device. Its method `read` must be called for every reading in order.
+    """Clock of one device. The method `read` must be called for every reading in order.
 
     Attributes:
         rate: Seconds of the host per second of the device.
@@ -63,7 +63,7 @@ class DeviceClock:
         self.reset()
 
     def reset(self) -> None:
-        """Treat the next reading as the first one of a new connection."""
+        """Treat the next reading as the first reading of a new connection."""
         self._raw_us: int | None = None
         self._device_us = 0
         self._last_arrival_s: float | None = None
@@ -105,7 +105,7 @@ class DeviceClock:
     def _is_ahead_of(self, arrived_s: float) -> bool:
         """Return whether the fitted clock is so far ahead of an arrival that the clock must have been set.
 
-        The chunks of a file all arrive at the same time. Such an arrival contains no information about the clock.
+        The chunks of a file all arrive at the same time, so their arrival contains no information about the clock.
 
         Args:
             arrived_s: Arrival of the chunk, unix seconds.
@@ -118,7 +118,8 @@ class DeviceClock:
     def arrived(self, arrival_s: float) -> None:
         """Fit the clock to the arrival of a chunk, whose last reading must be the latest reading.
 
-        The chunks of a file all arrive at the same time, so an arrival is used only if it differs from the one before.
+        The chunks of a file all arrive at the same time, so an arrival is used only if it differs from the previous
+        arrival.
 
         Args:
             arrival_s: Arrival of the chunk, unix seconds.

@@ -55,7 +55,7 @@ class Requester:
     """
 
     def __init__(self, request: Request, now_s: Callable[[], float] = time.monotonic) -> None:
-        """Begin with a request that is due; the arguments are described in the class."""
+        """Begin with a request that is due. The class describes the arguments."""
         self._request = request
         self._now_s = now_s
         self._requests = 0
@@ -68,7 +68,7 @@ class Requester:
         return self._echoes / max(1, self._requests)
 
     def reset(self) -> None:
-        """Make a request due now, because the line was opened again."""
+        """Make the next request due at once, because the line was opened again."""
         self._requested_s = -float("inf")
         self._received_s = -float("inf")
         self._expected_echo = b""
@@ -76,7 +76,8 @@ class Requester:
     def wait_s(self) -> float:
         """Return the time until the next request is due, s; 0 if it is due now.
 
-        The time after a request without an answer is longer. No request is due while bytes are arriving.
+        After a request without an answer, the time until the next request is longer. No request is due while bytes are
+        arriving.
         """
         now_s = self._now_s()
         due_s = self._requested_s + 1.0 / self._request.rate_Hz
@@ -150,7 +151,7 @@ class SerialLine:
     """
 
     def __init__(self, url: str, baud: int) -> None:
-        """Open the line without delays for the collection of bytes; the arguments are described in the class."""
+        """Open the line without delays for the collection of bytes. The class describes the arguments."""
         # pyserial is imported only here, so that programs that only predict need not wait for the import.
         serial = importlib.import_module("serial")
         if url.startswith("tcp://"):
@@ -235,7 +236,7 @@ class UdpSocket:
     """
 
     def __init__(self, url: str) -> None:
-        """Open the socket and bind it to the address; the argument is described in the class."""
+        """Open the socket and bind it to the address. The class describes the argument."""
         parts = urlsplit(url)
         if parts.port is None or parts.path or parts.query:
             raise ValueError(f"expected {UDP_SCHEME}HOST:PORT, got {url!r}")

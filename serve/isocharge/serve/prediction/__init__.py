@@ -1,4 +1,4 @@
-"""From charges to contacts in process: predictor, validity, record, tables of charges and of measured presses.
+"""Prediction of contacts from charges in the same process, for single presses, tables of charges and measured presses.
 
 May import: model, flags.
 """

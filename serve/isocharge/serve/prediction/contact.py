@@ -81,14 +81,15 @@ class Contact(NamedTuple):
         return fields
 
     def __repr__(self) -> str:
-        """Return each number with its standard deviation, which is rounded to two digits."""
+        """Return each number with its standard deviation. The standard deviation is rounded to two digits."""
         numbers = ", ".join(f"{name}={value} +- {std}" for name, value, std in self._rounded())
         return f"Contact({numbers}, misfit={self.misfit:.2g})"
 
     def _rounded(self) -> Iterator[tuple[str, str, str]]:
         """Yield the name, the rounded value and the rounded standard deviation of x, y and the force.
 
-        Both numbers have as many decimals as are needed for two significant digits of the standard deviation.
+        The value and the standard deviation have so many decimals that the standard deviation has two significant
+        digits.
         """
         stds = {"x_mm": self.x_std_mm, "y_mm": self.y_std_mm, "force_N": self.force_std_N}
         for name, std in stds.items():
@@ -295,7 +296,7 @@ class Validity:
     def inscribed_radius_squared_mm2(self) -> float:
         """Squared radius of the largest circle around the origin inside the working area, mm^2.
 
-        It is 0 if the origin is outside the working area.
+        The result is 0 if the origin is outside the working area.
         """
         zero = np.zeros(1)
         if not inside_polygon(zero, zero, self.corners_mm)[0]:
@@ -313,8 +314,8 @@ class Validity:
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the flags of one contact.
 
-        Most contacts take about a microsecond. Contacts near the edge of the working area are compared with its
-        polygon, which takes about 30 us.
+        Most contacts take about a microsecond. If a contact is near the edge of the working area, it is compared with
+        the polygon of the area, which takes about 30 us.
         """
         return _flag_words(
             is_outside=self._is_outside(contact),

@@ -1,7 +1,7 @@
 """Prediction of contacts from charges in the same process.
 
-A single press uses memory that is bound to the session once. Its prediction allocates no arrays and is faster than
-`session.run`. Batches use `session.run`.
+A single press uses memory that is bound to the session once. The prediction of a single press therefore allocates no
+arrays and is faster than `session.run`. Batches use `session.run`.
 
 `predict` checks the charges and returns a named tuple. `predict_into` is for fast loops: it writes the contact into an
 existing array and does not check the charges.
@@ -181,7 +181,7 @@ class Predictor:
         )
 
     def _warn_once(self, charge_pC: object, contact: Contact) -> None:
-        """Log that a contact cannot be a measurement, the first time that this happens."""
+        """Log a warning for the first contact that cannot be a measurement."""
         if self._has_warned:
             return
         self._has_warned = True
@@ -205,7 +205,7 @@ def _describe(value: object) -> str:
 
 
 def _check_bound_memory(press: BoundPress, model: Model) -> None:
-    """Check that this version of onnxruntime computes in the bound memory and not in copies of it.
+    """Check that this version of onnxruntime reads and writes the bound memory and not copies of it.
 
     Args:
         press: Bound memory for one press of the model.

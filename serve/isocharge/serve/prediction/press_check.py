@@ -1,8 +1,8 @@
 """Comparison of a model with measured presses: its errors, the part that noise and rig explain, and a verdict.
 
 If the noise of the charges and the uncertainty of the rig do not explain the errors, the model does not describe the
-film. Either the film was never calibrated, or it has aged or crept since then. Such a drift first appears as a common
-scale of the forces and as a common shift of the positions.
+film. Either the film was never calibrated, or it has aged or crept since then. A drift of the film first appears as a
+common scale of the forces and as a common shift of the positions.
 """
 
 import math
@@ -190,8 +190,8 @@ def _bad_presses(errors: PressErrors) -> Booleans:
 def _improbable_presses(errors: PressErrors, is_compared: Booleans) -> Booleans:
     """Return which of the compared presses have errors that noise and rig hardly cause, shape (n,).
 
-    The limit of the probability is divided by the number of presses (Bonferroni), so that all presses together exceed
-    it by chance with the probability `BAD_PRESS_PROBABILITY`.
+    The limit of the probability is divided by the number of presses (Bonferroni). If all presses are good, the
+    probability that at least one of them is improbable is then `BAD_PRESS_PROBABILITY`.
 
     Args:
         errors: Errors of all presses.
@@ -249,8 +249,8 @@ def _frequent_misfits(errors: PressErrors, rows: Booleans, metadata: ModelMetada
 def _probability_of_fewer(misfit_count: int, count: int) -> float:
     """Return the probability that fewer than `misfit_count` of `count` good presses have a misfit above the limit.
 
-    The number of such presses follows a binomial distribution with the probability `MISFIT_FRACTION`. Its terms are
-    computed by logarithms, because the binomial coefficients overflow.
+    The number of such presses follows a binomial distribution with the probability `MISFIT_FRACTION`. The terms of the
+    distribution are computed by logarithms, because the binomial coefficients overflow.
     """
     log_odds = math.log(MISFIT_FRACTION / (1.0 - MISFIT_FRACTION))
     log_probability_of_none = count * math.log1p(-MISFIT_FRACTION)
@@ -318,7 +318,7 @@ def _explaining_rig_std(errors: ErrorSummary) -> float:
 
 
 def _exclusion_notes(errors: PressErrors, metadata: ModelMetadata) -> Iterator[str]:
-    """Yield a note for each reason for which presses were excluded, with the numbers of these presses.
+    """Yield a note for each reason why presses were excluded, with the numbers of these presses.
 
     Args:
         errors: Errors of all presses, with the reasons.

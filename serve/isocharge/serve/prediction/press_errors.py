@@ -1,8 +1,8 @@
 """Errors of a model on measured presses, and statistical tests whether noise and rig explain them.
 
-The expected variance of an error is the sum of two parts: the variance that the model reports for the noise of the
-charges, and the variance of the position or force that the rig sets. The tests use the sum of the squared errors and
-the mean error of all presses.
+The expected variance of an error is the sum of two variances. The model reports the variance that the noise of the
+charges causes. The other variance is the uncertainty of the position or force that the rig sets. The tests use the sum
+of the squared errors and the mean error of all presses.
 """
 
 import math
@@ -188,8 +188,7 @@ def _flags(metadata: ModelMetadata, predicted: Array) -> tuple[tuple[str, ...], 
 def _exclusion_reasons(metadata: ModelMetadata, presses: MeasuredPresses) -> tuple[str, ...]:
     """Return the reason why each press is excluded; empty if the press is compared.
 
-    Whether a press lies in the domain of the model is decided by the measured position and force, not by the predicted
-    position and force.
+    The measured position and force, not the predicted ones, determine whether a press lies in the domain of the model.
     """
     x_mm, y_mm, force_N = presses.contact.T
     min_force_N, max_force_N = metadata.force_range_N

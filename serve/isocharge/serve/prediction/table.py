@@ -143,8 +143,8 @@ def blocks(rows: Array) -> Iterator[Array]:
 def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
     """Yield a record for each row of charges.
 
-    A table has no times, counters and raw charges, so these fields are None. A row whose charges do not exceed the
-    noise of the model is out of contact. Its force is 0, and it has no position.
+    A table has no times, counters and raw charges, so these fields are None. If the charges of a row do not exceed the
+    noise of the model, nothing touches the film. The record of such a row has a force of 0 and no position.
 
     Args:
         charge_pC: Charges, shape (n, electrodes), pC.

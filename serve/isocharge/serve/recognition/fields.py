@@ -1,8 +1,8 @@
 """Recognition of the fields of a frame: sync bytes, frame counter, clock and channels.
 
 Every division of the bytes into fields has a score in bits. The score is the number of bits that the values of a frame
-need if the previous frame is known, plus the `Weights` of the fields. The division with the lowest score is chosen. Due
-to the weights, simple divisions are preferred, such as adjacent channels of one type.
+need if the previous frame is known, plus the `Weights` of the fields. The division with the lowest score is chosen. The
+weights give simple divisions, such as adjacent channels of one type, a lower score.
 `tests/benchmarks/fit_recognition.py` fits the weights on random boards.
 """
 

@@ -72,9 +72,9 @@ class Windows(NamedTuple):
     length: int
 
     def rows(self) -> Bytes:
-        """Return the bytes of each window and as many bytes after it, shape (frames, 2 * length).
+        """Return the bytes of each window and the same number of bytes after it, shape (frames, 2 * length).
 
-        A frame begins at the same, unknown position of every window.
+        The position at which a frame begins is unknown, but it is the same in every window.
         """
         starts = self.starts[self.starts + 2 * self.length <= len(self.stream)]
         return np.asarray(self.stream[starts[:, None] + np.arange(2 * self.length)])

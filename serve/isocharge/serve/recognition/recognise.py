@@ -62,7 +62,9 @@ def described_frames(
 
 
 def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterator[tuple[float, dict[str, Any]]]:
-    """Yield every possible description of the frames with its score: for each start, checksum and byte order.
+    """Yield the possible descriptions of the frames with their scores.
+
+    There is one description for each start, checksum and byte order.
 
     Descriptions without a checksum are tried only if no checksum fits. The score is in bits for each byte of the
     stream, including the bytes outside of all frames, so that frames of different lengths can be compared.

@@ -1,6 +1,6 @@
 """The prediction record: its fields, declared once, and the forms that are derived from the declaration.
 
 `record` declares the fields with their types, units and meanings. `fields` reads the declaration. `csv_rows`, `schema`
-and `reference` derive the columns of CSV, the JSON Schema and the table of the documentation from it; the live page
-derives the layout of its binary samples.
+and `reference` derive the columns of CSV, the JSON Schema and the table of the documentation from this declaration. The
+live page derives the layout of its binary samples from it.
 """

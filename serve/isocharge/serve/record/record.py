@@ -1,4 +1,4 @@
-"""The prediction record: one reading of a sensor and the answer of a model.
+"""The prediction record, which contains one reading of a sensor and the contact that a model computed from it.
 
 The fields are declared only here. JSON, CSV, the JSON Schema, the samples of the live page and the table in the
 documentation are derived from the declaration. An unknown value is None, which is `null` in JSON. For example, a CSV
@@ -168,14 +168,14 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
 
     @property
     def json_values(self) -> dict[str, Any]:
-        """The values of the record by name as JSON shows them, numbers rounded to six decimals."""
+        """The values of the record for JSON by name. Numbers are rounded to six decimals."""
         values = structs.asdict(self)
         if self.tracking is not None:
             values |= structs.asdict(self.tracking)
         return {name: _json_value(values[name]) for name in self.field_names}
 
     def to_json(self) -> str:
-        """Return the record as one line of strictly valid JSON, numbers rounded to six decimals.
+        """Return the record as one line of strictly valid JSON, in which numbers are rounded to six decimals.
 
         The text is computed once for each record.
 

@@ -42,7 +42,7 @@ def record_schema(electrodes: Sequence[str]) -> dict[str, Any]:
 
 
 def _object(electrodes: Sequence[str], *, allows_null: bool) -> dict[str, Any]:
-    """Return the schema of the record; the fields that every record has are required.
+    """Return the schema of the record, in which the fields that every record has are required.
 
     Args:
         electrodes: Names of the electrodes.

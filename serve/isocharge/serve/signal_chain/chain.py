@@ -1,21 +1,19 @@
-"""The signal chain: from the numbers of a board to touch charges and the detection of a touch.
+"""The signal chain, which computes touch charges from the numbers of a board and detects touches.
 
 `Chain` has the settings of all stages. `SignalChain` has the stages that these settings request, in this order:
 
-1. gain: converts the unit of the device to pC, with the offset, the sign and the gain of each channel;
-2. limit: marks frames with a charge at the limit of the converter;
-3. hum: estimates and subtracts mains hum (`isocharge.serve.signal_chain.hum`);
-4. tare: measures the mean and the noise of quiet frames, and subtracts the mean from all later frames
-   (`isocharge.serve.signal_chain.tare`);
-5. leak: corrects the leak of the amplifiers, and estimates their inflow (`isocharge.serve.signal_chain.leak`); or
-   memory: also corrects creep, the thermoelastic step and the warmth of the film
-   (`isocharge.serve.signal_chain.memory`);
-6. touch: detects touches with hysteresis (`isocharge.serve.signal_chain.contact`);
-7. press flags: flags saturated presses, and charges below zero;
-8. warming: estimates the common charge of a warming film with the model, and subtracts it
-   (`isocharge.serve.signal_chain.thermal`).
+- `Gain` converts the unit of the device to pC, with the offset, the sign and the gain of each channel.
+- `Limit` marks frames with a charge at the limit of the converter.
+- `HumStage` estimates and subtracts mains hum.
+- `TareStage` measures the mean and the noise of quiet frames, and subtracts the mean from all later frames.
+- `LeakStage` corrects the leak of the amplifiers, and estimates their inflow. It is replaced by `MemoryStage`, which
+  also corrects creep, the thermoelastic step and the warmth of the film, if the settings have a memory.
+- `TouchStage` detects touches with hysteresis.
+- `PressFlags` flags saturated presses, and charges below zero.
+- `Warming` estimates the common charge of a warming film with the model, and subtracts it.
 
-A frame with a value that cannot be a charge passes no stage. Its time is added to the time of the next frame.
+A frame with a value that cannot be a charge is not processed by the stages. The time of such a frame is added to the
+time of the next frame.
 """
 
 import math

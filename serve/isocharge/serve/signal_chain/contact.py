@@ -1,7 +1,8 @@
 """Detection of a touch by the total charge, with hysteresis.
 
-A touch begins when the total charge rises out of the noise. It ends when the total charge falls below a share of the
-peak of this press. An absolute threshold would never end a touch after the charge at rest has drifted above it.
+A touch begins when the total charge rises out of the noise. A touch ends when the total charge falls below a share of
+the peak of this press. With an absolute threshold, a touch would never end after the charge at rest has drifted above
+the threshold.
 """
 
 import math

@@ -134,7 +134,8 @@ def in_touch(leak: Leak, charge_pC: Array, output_pC: Array, hold_off_s: float) 
 def learn_inflow(rule: LeakRule, leak: Leak, surplus_pC: Array, noise_pC: Array, dt_s: float) -> Leak:
     """Return the state with a corrected inflow.
 
-    The inflow follows the mean of the surplus over `settle_s`. Large values are clipped, because they are touches.
+    The inflow follows the mean of the surplus over `settle_s`. Large surpluses are clipped, because they are caused by
+    touches.
 
     Args:
         rule: Settings of the estimate of the inflow.

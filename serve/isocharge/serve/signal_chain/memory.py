@@ -100,7 +100,7 @@ MIN_CREEP_PC = 1e-9
 
 
 class MemoryRule(Rule, frozen=True, kw_only=True):
-    """Memory of the film: how a held press changes its charges; the section `[memory]` of a device file.
+    """Memory of the film, which changes the charges of a held press; the section `[memory]` of a device file.
 
     Attributes:
         creep: Share of a charge that is lost in each decade of time.
@@ -215,7 +215,7 @@ class Memory(NamedTuple):
 
     @property
     def is_recently_touched(self) -> bool:
-        """Whether something touches, or has just been released."""
+        """Whether something touches the film, or a touch has just ended."""
         return self.learn_s > LEARN_S
 
     @classmethod

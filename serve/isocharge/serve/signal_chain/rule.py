@@ -1,4 +1,4 @@
-"""Base class of the settings of the stages, which are sections of a device file, and types with bounds for them."""
+"""Base class of the settings of a stage, which are a section of a device file, and types of settings with bounds."""
 
 from typing import Annotated
 

@@ -119,7 +119,10 @@ class TareStage(OffsetStage):
             frame.flags.append(SATURATED)
 
     def reset(self) -> None:
-        """Measure the tare again from the next quiet frames. This search does not end with an error."""
+        """Measure the tare again from the next quiet frames.
+
+        Unlike the first search, this search does not end with an error.
+        """
         self._tare = None
         self._waiting_pC = self._waiting_pC[:0]
         self._searched_frames = 0

@@ -1,4 +1,4 @@
-"""Measurement of the tare: mean and noise of the charge of each electrode at rest, from quiet frames."""
+"""Measurement of the tare, which is the mean and the noise of the charge of each electrode in quiet frames."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from isocharge.serve.signal_chain.rule import Count, Rule, Setting
 
 
 class TareRule(Rule, frozen=True, kw_only=True):
-    """Which frames are quiet enough for a tare; the section `[tare]` of a device file.
+    """Conditions for frames from which the tare is measured; the section `[tare]` of a device file.
 
     Attributes:
         frames: Number of frames in a tare; 100 are 0.5 s at 200 Hz.

@@ -4,14 +4,15 @@ A change of temperature adds a charge to every electrode (pyroelectricity). The 
 have known ratios. During a touch, the charge at rest cannot be measured. A contact has three unknowns, so four
 electrodes have one charge more than the contact needs.
 
-The common charge p is estimated as the charge that has to be subtracted so that the charges fit a single contact best.
-The squared misfit is a parabola in p, and its curvature gives the variance of the estimate. A Kalman filter describes p
-as a random walk that begins at 0 with every touch. If the memory of the film predicts the warmth, the slope of p is the
-random walk.
+The estimate of the common charge p is the charge whose subtraction makes the remaining charges fit a single contact
+best. The squared misfit is a parabola in p, and its curvature gives the variance of the estimate. A Kalman filter
+describes p as a random walk that begins at 0 with every touch. If the memory of the film predicts the warmth, the slope
+of p is the random walk.
 
 At positions where a press increases all charges equally, warming cannot be distinguished from force, and the curvature
 vanishes. With three electrodes, this is the case at every position. With four electrodes, it is the case near the
-centre of a biaxial film. Then p is not changed, and the record has the flag `blind`.
+centre of a biaxial film. If warming cannot be distinguished from force, p is not changed, and the record has the flag
+`blind`.
 """
 
 import math

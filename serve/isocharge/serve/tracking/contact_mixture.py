@@ -9,7 +9,7 @@ updated with the measured charges by an iterated extended Kalman filter (Bell an
 
 Components are added in four cases:
 
-- When a touch begins, components are placed all over the film. Those that do not explain the charges are removed.
+- When a touch begins, components are placed all over the film. Components that do not explain the charges are removed.
 - If the most probable component extends across a fold, two components are added, one towards each side.
 - If the innovation of the most probable component exceeds the gate, a component with an uncertain velocity is added.
 - If the most probable component is fast, a component with zero velocity is added, because the contact may have stopped.

@@ -290,8 +290,8 @@ class FilmFilter:
     def _change_level(self) -> None:
         """Account for a change of the offset level, which has a small probability.
 
-        This is the mixing step of an interacting multiple model (Blom and Bar-Shalom 1988). The mean offset of the new
-        level does not depend on the mean offset of the previous level. The other linear unknowns stay the same.
+        The method is the mixing step of an interacting multiple model (Blom and Bar-Shalom 1988). The mean offset of
+        the new level does not depend on the mean offset of the previous level. The other linear unknowns stay the same.
         """
         level_count = self._level_std.size
         if level_count == 1:

@@ -121,7 +121,7 @@ class ContactHypothesis(NamedTuple):
     def moving_probability(self) -> float:
         """Probability that the estimated velocity of a contact at rest would be smaller than the present velocity.
 
-        This is the result of a chi-squared test of the velocity.
+        The probability is the result of a chi-squared test of the velocity.
         """
         velocity = self.mean[VELOCITY]
         covariance = self.covariance[VELOCITY, VELOCITY]
@@ -169,7 +169,7 @@ class Components(NamedTuple):
 
 
 def predict_components(components: Components, dt_s: float) -> Components:
-    """Predict the components: constant velocity with white acceleration.
+    """Predict the components by a motion with constant velocity and white acceleration.
 
     Args:
         components: Components after the previous step.

@@ -1,8 +1,9 @@
 """Distribution of the samples of a stream to the viewers of the live page.
 
 The tape stores the samples by number: the latest samples of a live stream, or all samples of a recording. A viewer
-confirms each message that it has drawn. It receives the next message only after this confirmation. All samples that
-arrived in the meantime are coalesced in this message. No messages are queued for a slow viewer.
+confirms each message that it has drawn. The next message is sent only after this confirmation, and contains all samples
+that have arrived in the meantime. If there are too many samples, they are coalesced. No messages are queued for a slow
+viewer.
 """
 
 import asyncio
@@ -48,7 +49,7 @@ class Tape:
     """
 
     def __init__(self, dtype: "np.dtype[Any]", capacity: int = LIVE_SAMPLES) -> None:
-        """Begin without samples; the arguments are described in the class."""
+        """Begin without samples. The class describes the arguments."""
         self.total = 0
         self._ring: Samples = np.zeros(capacity, dtype)
 
@@ -58,7 +59,7 @@ class Tape:
         return max(0, self.total - len(self._ring))
 
     def append(self, samples: Samples) -> None:
-        """Append samples. They replace the oldest samples if the buffer is full."""
+        """Append samples. If the buffer is full, the new samples replace the oldest samples."""
         latest = samples[-len(self._ring) :]
         first = self.total + len(samples) - len(latest)
         self._ring[np.arange(first, first + len(latest)) % len(self._ring)] = latest
@@ -87,14 +88,16 @@ class Tape:
 
 
 class RecordedTape(Tape):
-    """All samples of a recording, stored in a temporary file. Times that decrease are replaced by the latest time.
+    """All samples of a recording, stored in a temporary file.
+
+    A time that is smaller than the previous time is replaced by the previous time.
 
     Args:
         dtype: NumPy type of a sample.
     """
 
     def __init__(self, dtype: "np.dtype[Any]") -> None:
-        """Create the temporary file; the argument is described in the class."""
+        """Create the temporary file. The class describes the argument."""
         super().__init__(dtype)
         self._file = tempfile.TemporaryFile()  # noqa: SIM115
         self._piece_s = 0.01
@@ -268,7 +271,7 @@ class Hub:
     """
 
     def __init__(self, link: PageEnd, description: dict[str, Any], *, is_recording: bool) -> None:
-        """Begin without samples and without viewers; the arguments are described in the class."""
+        """Begin without samples and without viewers. The class describes the arguments."""
         self.description = description
         self.state: dict[str, Any] = {}
         self.version = 0

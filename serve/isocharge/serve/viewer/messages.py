@@ -148,9 +148,9 @@ def _clip(values: Sequence[float]) -> list[float]:
 def coalesce(samples: Samples, max_samples: int) -> Samples:
     """Coalesce samples. Each returned sample represents a run of neighbouring samples.
 
-    The latest sample of a run is returned. If it is not a contact, the sample of the run with the largest force is
-    returned instead, so that a short tap is not lost. The returned sample has the flags of all samples of the run,
-    their largest latency, and the sum of their numbers of records.
+    The latest sample of a run is returned. If the latest sample is not a contact, the sample of the run with the
+    largest force is returned instead, so that a short tap is not lost. The returned sample has the flags of all samples
+    of the run, their largest latency, and the sum of their numbers of records.
 
     Args:
         samples: The samples, shape (n,).

@@ -1,4 +1,7 @@
-"""The process that serves the live page. It is separate from the process that reads the port, the reader."""
+"""The process that serves the live page.
+
+This process is separate from the reader, which is the process that reads the port.
+"""
 
 import asyncio
 import os

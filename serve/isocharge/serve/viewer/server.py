@@ -57,7 +57,7 @@ class Access:
     """
 
     def __init__(self, token: Token | None = None, host: str = "127.0.0.1") -> None:
-        """Set up the checks; the arguments are described in the class."""
+        """Set up the checks. The class describes the arguments."""
         self._token = token
         self._browser_check = BrowserCheck(host, any_host=token is not None)
 
@@ -150,7 +150,7 @@ class RateLimit:
     """
 
     def __init__(self, burst_bytes: float, bytes_per_s: float, now_s: float) -> None:
-        """Begin with the full amount of data; the arguments are described in the class."""
+        """Begin with the full amount of data. The class describes the arguments."""
         self._burst_bytes = burst_bytes
         self._bytes_per_s = bytes_per_s
         self._available_bytes = burst_bytes
@@ -205,7 +205,7 @@ class PageServer:
     """
 
     def __init__(self, hub: Hub, access: Access) -> None:
-        """Read the files of the page; the arguments are described in the class."""
+        """Read the files of the page. The class describes the arguments."""
         self._hub = hub
         self._access = access
         self._files = page_files()

@@ -1,4 +1,4 @@
-"""A ROS 2 node that publishes the contacts of a film. Its parameters are model, port, device and wait_s."""
+"""A ROS 2 node that publishes the contacts of a film. The parameters of the node are model, port, device and wait_s."""
 
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped

@@ -61,7 +61,7 @@ class Connection(asyncio.Protocol):
     """
 
     def __init__(self, handler: Handler, connections: "set[Connection]", loop: asyncio.AbstractEventLoop) -> None:
-        """Begin a connection without data; the arguments are described in the class."""
+        """Begin a connection without data. The class describes the arguments."""
         self.deadline = math.inf
         self.has_completed_request = False
         self._handler = handler

@@ -103,7 +103,8 @@ class HttpServer:
     async def _accept(self, loop: asyncio.AbstractEventLoop) -> None:
         """Accept connections until the task is cancelled.
 
-        Unfinished TLS handshakes count as connections. If there are too many, the oldest handshake is cancelled.
+        Unfinished TLS handshakes count as connections. If there are too many connections, the oldest handshake is
+        cancelled.
         """
         self._socket.setblocking(False)
         while True:

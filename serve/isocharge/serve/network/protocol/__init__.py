@@ -1,4 +1,5 @@
-"""The Open Inference Protocol, version 2, without a transport: requests in, answers and statuses out.
+"""The Open Inference Protocol, version 2, which converts requests to answers and statuses independently of the
+transport.
 
 May import: network, prediction, model.
 

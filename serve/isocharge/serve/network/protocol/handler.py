@@ -103,7 +103,7 @@ class Handler:
         self._service = Service(store, self.limits, metrics, partial(openapi_document, ROUTES, store))
 
     def may_block(self, path: str) -> bool:
-        """Return whether the answer to this path may take longer than other requests should wait."""
+        """Return whether an answer to this path may take so long that other requests should not wait for it."""
         route = match_path(path).route
         return route is not None and route.may_block
 

@@ -1,7 +1,7 @@
 """The start page of the HTTP server, which shows the models and an example of a request.
 
 Names of models, model cards and reasons for refusals come from files and are therefore escaped. In addition, the
-headers of the page prevent that a browser runs scripts or loads other files.
+headers of the page forbid browsers to run scripts and to load other files.
 """
 
 import base64

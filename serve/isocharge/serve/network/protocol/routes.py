@@ -64,12 +64,15 @@ class Request(NamedTuple):
 
     @property
     def loaded(self) -> LoadedVersion:
-        """The model that the path names. If it is not loaded, ModelNotFound is raised."""
+        """The model that the path names. If the model is not loaded, ModelNotFound is raised."""
         return self.service.store.get(self.model, self.version)
 
 
 class Schema(NamedTuple):
-    """A schema of the OpenAPI document: its name there, and its content or the type that it is derived from."""
+    """A schema of the OpenAPI document with its name.
+
+    Its content is given directly, or as a type from which it is derived.
+    """
 
     name: str
     content: Json | type
