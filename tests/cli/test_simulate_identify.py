@@ -17,8 +17,11 @@ def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_pa
     area = numbers["working_area"]
     assert max(1.5, area["radius_mm"]) < area["fold_radius_mm"] < 5.0
     assert numbers["folds_mm"]
-    assert "on both sides of the fold give the same charges, and no method can tell them apart by one reading" in err
-    assert f"on {100.0 * area['determined_share']:.0f} % of the 3.5 mm searched" in err
+    assert (
+        "on both sides of the fold give the same charges, and no method can distinguish these contacts by one reading"
+        in err
+    )
+    assert f"on {100.0 * area['determined_share']:.0f} % of the disk of 3.5 mm that was searched" in err
     mirror = numbers["mirror_region"]
     assert (mirror["from_mm"], mirror["to_mm"]) == (area["radius_mm"], pytest.approx(42.8))
     assert mirror["words"] in err

@@ -82,7 +82,7 @@ def test_condition_is_the_ratio_of_the_standard_deviations_of_the_position(ident
 def test_summary_states_the_determined_share_if_the_map_folds(identification):
     folded = replace(identification.area, folds=np.ones((1, 2)), radius=2.5)
     message = [replace(identification, area=area).summary for area in (identification.area, folded)]
-    assert ["5 mm searched, of which the working area is 25 %" in text for text in message] == [False, True]
+    assert ["5 mm that was searched. The working area is 25 %" in text for text in message] == [False, True]
 
 
 def test_working_area_with_an_electrode_at_the_centre_is_small(film):

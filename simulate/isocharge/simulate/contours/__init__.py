@@ -1,1 +1,1 @@
-"""Isocharge contours and triangulation: from the field, and graphically as the paper does."""
+"""Isocharge contours and triangulation, computed from a charge map or by the graphical method of the paper."""

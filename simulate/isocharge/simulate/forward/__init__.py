@@ -1,1 +1,1 @@
-"""From presses to charges, fast: the readout, the forward map from few solves, and its spline table."""
+"""Fast computation of charges from presses: readout, forward map from few solves, and splines of a forward map."""

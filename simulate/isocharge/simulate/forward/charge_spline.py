@@ -2,10 +2,10 @@
 
 The charges are divided by the squared amplitude of `mechanics.scaling`, which removes most of their dependence on the
 force. For each of a few forces, the scaled charges are approximated by a cubic spline in (x, y), which is fitted by
-least squares to presses on the disk. A charge changes over the length of the probe only if the press is near the
-electrode. Around each electrode, a second spline with finer knots therefore corrects the charge of this electrode.
-Between the forces, Lagrange polynomials in ln F interpolate. A forward map interpolates its fields in the same way, so
-the interpolation in the force adds no error.
+least squares to presses on the disk. Near an electrode, its charge changes considerably over the length of the probe.
+Around each electrode, a second spline with finer knots therefore corrects the charge of this electrode. Between the
+forces, the charges are interpolated by Lagrange polynomials in ln F. A forward map interpolates its stress fields in
+the same way, so the interpolation in the force adds no error.
 """
 
 from dataclasses import dataclass, replace
@@ -33,9 +33,9 @@ PATCH_MARGIN = 3.0
 MAX_KNOT_SPACING = 0.3
 """Largest distance between the knots near an electrode, mm."""
 
-KNOT_SPACING_SHARE = 1.0 / 6.0
-"""Largest distance between the knots near an electrode, over the reach of the probe, which is the length scale of the
-charges there."""
+RELATIVE_KNOT_SPACING = 1.0 / 6.0
+"""Largest distance between the knots near an electrode, in units of the reach of the probe, dimensionless. The charge
+of an electrode changes over the length of this reach."""
 
 MIN_CELLS = 8
 """Smallest number of cells of the spline across the disk."""
@@ -133,7 +133,7 @@ class ChargeSpline:
         map_domain = forward_map.domain
         domain = map_domain if radius is None else map_domain.within(radius)
         check_radius(domain.radius, map_domain.radius, "forward map")
-        spacing = spacing or min(MAX_KNOT_SPACING, KNOT_SPACING_SHARE * forward_map.probe.reach)
+        spacing = spacing or min(MAX_KNOT_SPACING, RELATIVE_KNOT_SPACING * forward_map.probe.reach)
         sensor = forward_map.sensor
         samples = _ScaledCharges(forward_map, _force_nodes(forward_map))
         coarse = _fit_disk(samples, domain.radius, max(spacing, COARSE_SPACING))
@@ -185,13 +185,13 @@ class ChargeSpline:
         return derivatives
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Compute the results of `charges` and `derivatives` together."""
+        """Return the results of `charges` and `derivatives`, which are computed together in less time."""
         contact = self.domain.check(contact, "table")
-        charge, by_position, by_log_force = self.first_order(contact[:, :2], contact[:, 2])
-        return charge, np.concatenate([by_position, by_log_force[..., None]], axis=2)
+        charge, position_derivative, log_force_derivative = self.first_order(contact[:, :2], contact[:, 2])
+        return charge, np.concatenate([position_derivative, log_force_derivative[..., None]], axis=2)
 
     def first_order(self, position: Array, force: Array | float) -> tuple[Array, Array, Array]:
-        """Compute charges and their derivatives, also for iterates outside the disk.
+        """Compute charges and their derivatives, also for positions outside the disk that a solver may try.
 
         Args:
             position: Positions (x, y), shape (n, 2), mm. Positions outside the disk are moved to its edge.
@@ -216,7 +216,7 @@ class ChargeSpline:
         return charge, position_derivative, log_force_derivative
 
     def force_weights(self, log_force: Array) -> Array:
-        """Compute the weights with which the scaled charges at the forces of the splines give the charges.
+        """Compute the weights whose products with the scaled charges at the forces of the splines sum to the charges.
 
         Args:
             log_force: Logarithms of the forces (N), shape (...).
@@ -264,14 +264,17 @@ class ChargeSpline:
 
 
 def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
-    """Return splines of a forward map, whose fit takes seconds. Return any other map unchanged."""
+    """Fit splines to a forward map, which takes a few seconds. Any other charge map is returned unchanged."""
     if isinstance(charge_map, ForwardMap):
         return ChargeSpline.of(charge_map)
     return charge_map
 
 
 def _force_nodes(forward_map: ForwardMap) -> Array:
-    """Return the force nodes of the splines, which are those of the forward map if d33 is zero, shape (n_force,), N."""
+    """Return the forces of the splines, shape (n_force,), N.
+
+    These are the forces of the forward map, or more forces if d33 is not zero; see `EXTRA_FORCE_NODES`.
+    """
     low, high = np.log(forward_map.domain.force_range)
     if forward_map.sensor.piezo.d33 == 0.0 or low == high:
         return forward_map.family.force
@@ -279,12 +282,21 @@ def _force_nodes(forward_map: ForwardMap) -> Array:
 
 
 def _samples(cells: int) -> Array:
-    """Return the positions of the fitted presses on the unit disk: a lattice, and points on the edge, shape (n, 2)."""
-    inner = lattice(int(PRESSES_PER_CELL * np.pi * (0.5 * cells) ** 2) + 16)
-    edge_count = int(PRESSES_PER_EDGE_CELL * np.pi * cells) + 8
-    edge = np.exp(2j * np.pi * np.arange(edge_count) / edge_count) * (1.0 - 1e-12)
-    at = np.concatenate([inner, edge])
-    return np.stack([at.real, at.imag], axis=1)
+    """Return the positions of the fitted presses on the unit disk: a lattice, and points on the edge.
+
+    Args:
+        cells: Number of cells of the spline across the disk.
+
+    Returns:
+        Positions (x, y), shape (n, 2).
+    """
+    cells_in_disk = np.pi * (0.5 * cells) ** 2
+    cells_along_edge = np.pi * cells
+    inner_positions = lattice(int(PRESSES_PER_CELL * cells_in_disk) + 16)
+    edge_count = int(PRESSES_PER_EDGE_CELL * cells_along_edge) + 8
+    edge_positions = np.exp(2j * np.pi * np.arange(edge_count) / edge_count) * (1.0 - 1e-12)
+    position = np.concatenate([inner_positions, edge_positions])
+    return np.stack([position.real, position.imag], axis=1)
 
 
 @dataclass(frozen=True)
@@ -317,11 +329,14 @@ class _ScaledCharges:
         if forward_map.sensor.piezo.d33 == 0.0:
             return scaled
 
+        # Interpolate to the forces of the splines, and add the charge of the contact pressure, which is proportional to
+        # the force.
         nodes = np.log(solved_force)
-        to_force = lagrange_values(nodes, barycentric_weights(nodes), np.log(self.force))
-        pressure_charge = forward_map.pressure_charges(position)
-        per_force = self.force / amplitude_squared(film, self.force)
-        return np.asarray(to_force @ scaled + pressure_charge[:, None] * per_force[:, None])
+        force_weights = lagrange_values(nodes, barycentric_weights(nodes), np.log(self.force))
+        pressure_charge_per_force = forward_map.pressure_charges(position)
+        scaled_force = self.force / amplitude_squared(film, self.force)
+        scaled_pressure_charge = pressure_charge_per_force[:, None] * scaled_force[:, None]
+        return np.asarray(force_weights @ scaled + scaled_pressure_charge)
 
 
 def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.interpolate.NdBSpline":
@@ -334,9 +349,9 @@ def _fit_disk(samples: _ScaledCharges, radius: float, spacing: float) -> "scipy.
     """
     cells = int(np.clip(np.ceil(2.0 * radius / spacing), MIN_CELLS, MAX_CELLS))
     knots = _knots(-radius, radius, cells)
-    at = radius * _samples(cells)
-    every_electrode = np.ones(len(samples.forward_map.electrodes), dtype=bool)
-    return _least_squares(at, samples.at(at, every_electrode), (knots, knots), fixed=0)
+    position = radius * _samples(cells)
+    is_needed = np.ones(len(samples.forward_map.electrodes), dtype=bool)
+    return _least_squares(position, samples.at(position, is_needed), (knots, knots), fixed=0)
 
 
 def _fit_patch(
@@ -354,7 +369,7 @@ def _fit_patch(
     Returns:
         One correction, or none.
     """
-    # rectangle around the electrode, outside of which its charge is smooth
+    # Rectangle around the electrode, outside of which its charge is smooth
     sensor = samples.forward_map.sensor
     corners = np.concatenate([sensor.calibration.place(part) for part in sensor.electrodes[electrode].parts])
     margin = samples.forward_map.probe.reach + PATCH_MARGIN
@@ -363,7 +378,7 @@ def _fit_patch(
     cells = np.clip(np.ceil((upper_right - lower_left) / spacing), MIN_CELLS, MAX_CELLS).astype(int)
     x_knots, y_knots = (_knots(*axis) for axis in zip(lower_left, upper_right, cells, strict=True))
 
-    # fitted presses: a grid in the part of the rectangle inside the disk, and points on the edge of the disk
+    # Fitted presses: a grid in the part of the rectangle within the disk, and points on the edge of the disk
     line_counts = np.ceil(np.sqrt(PRESSES_PER_CELL) * cells).astype(int)
     x_line, y_line = (np.linspace(*axis) for axis in zip(lower_left, upper_right, line_counts, strict=True))
     x_grid, y_grid = np.meshgrid(x_line, y_line)
@@ -378,6 +393,7 @@ def _fit_patch(
         return []
 
     is_needed = np.arange(len(sensor.electrodes)) == electrode
+    # The patch approximates the error of the coarse spline.
     residual = (samples.at(position, is_needed) - coarse(position))[:, :, electrode]
     table = _least_squares(position, residual, (x_knots, y_knots), fixed=2)
     return [Patch(electrode, lower_left, upper_right, table)]
@@ -388,11 +404,13 @@ def _knots(low: float, high: float, cells: int) -> Array:
     return np.concatenate([[low] * 3, np.linspace(low, high, cells + 1), [high] * 3])
 
 
-def _least_squares(at: Array, values: Array, knots: tuple[Array, Array], fixed: int) -> "scipy.interpolate.NdBSpline":
+def _least_squares(
+    position: Array, values: Array, knots: tuple[Array, Array], fixed: int
+) -> "scipy.interpolate.NdBSpline":
     """Fit a cubic spline by least squares with a penalty on the third differences of its coefficients.
 
     Args:
-        at: Positions (x, y), shape (n, 2), mm.
+        position: Positions (x, y), shape (n, 2), mm.
         values: Values at the positions, shape (n, ...).
         knots: Knots along x and along y.
         fixed: Number of coefficients at each end of each axis that are zero. With two such coefficients, the spline
@@ -404,25 +422,26 @@ def _least_squares(at: Array, values: Array, knots: tuple[Array, Array], fixed: 
     x_count, y_count = (axis_knots.size - 4 for axis_knots in knots)  # numbers of coefficients along x and y
 
     # Values at the positions and weighted third differences, as matrices that multiply the coefficients
-    entries = scipy.interpolate.NdBSpline.design_matrix(at, knots, 3)  # has too few columns
-    design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(at), x_count * y_count))
-    along_x = kron(_third_differences(x_count), eye_array(y_count))
-    along_y = kron(eye_array(x_count), _third_differences(y_count))
-    smooth = SMOOTHING * vstack([along_x, along_y])
+    # (`design_matrix` omits the last columns if they are zero, so the shape is given here).
+    entries = scipy.interpolate.NdBSpline.design_matrix(position, knots, 3)
+    design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(position), x_count * y_count))
+    x_differences = kron(_third_differences(x_count), eye_array(y_count))
+    y_differences = kron(eye_array(x_count), _third_differences(y_count))
+    penalty = SMOOTHING * vstack([x_differences, y_differences])
 
     # Only the coefficients that are not fixed are unknown.
     is_free = np.zeros((x_count, y_count), dtype=bool)
     is_free[fixed : x_count - fixed, fixed : y_count - fixed] = True
     free = np.flatnonzero(is_free)
-    design = design[:, free]
-    smooth = smooth.tocsc()[:, free]
+    free_design = design[:, free]
+    free_penalty = penalty.tocsc()[:, free]
 
     # Normal equations, whose matrix is positive definite and needs no pivoting
-    normal = (design.T @ design + smooth.T @ smooth).tocsc()
-    right = np.ascontiguousarray(design.T @ values.reshape(len(at), -1))
-    factors = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    coefficients = np.zeros((is_free.size, right.shape[1]))
-    coefficients[free] = factors.solve(right)
+    normal_matrix = (free_design.T @ free_design + free_penalty.T @ free_penalty).tocsc()
+    right_side = np.ascontiguousarray(free_design.T @ values.reshape(len(position), -1))
+    factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    coefficients = np.zeros((is_free.size, right_side.shape[1]))
+    coefficients[free] = factors.solve(right_side)
     return scipy.interpolate.NdBSpline(knots, coefficients.reshape(x_count, y_count, *values.shape[1:]), 3)
 
 
@@ -443,9 +462,9 @@ def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:
     """
     position = spline.domain.radius * sunflower(CHECK_COUNT)
     # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly.
-    force_share = np.arange(CHECK_COUNT) * 0.618 % 1.0
+    log_force_fraction = np.arange(CHECK_COUNT) * 0.618 % 1.0
     min_force, max_force = spline.domain.force_range
-    force = np.clip(min_force * (max_force / min_force) ** force_share, min_force, max_force)
+    force = np.clip(min_force * (max_force / min_force) ** log_force_fraction, min_force, max_force)
     contact = np.stack([position.real, position.imag, force], axis=1)
     true_charge = forward_map.charges(contact)
     error = np.abs(spline.charges(contact) - true_charge).max(axis=1)

@@ -1,4 +1,4 @@
-"""Table of the deflection of a film under a circular probe over force and distance, for the live view."""
+"""Computation of the deflection field that the live page shows: the film under a circular probe."""
 
 import numpy as np
 
@@ -27,7 +27,8 @@ DISTANCES = 5
 """Number of distances in the table."""
 
 INNER_RADIUS = 0.999999
-"""Radius of points near the rim that lie on the film in spite of rounding, in film radii."""
+"""Largest radius of the points at which the deflection is computed, in film radii. Points on the rim may lie outside
+the film because of rounding."""
 
 
 def deflection_field(
@@ -54,7 +55,7 @@ def deflection_field(
         equilibrium: Equilibrium | None = None
         for row, force in enumerate(forces):  # each solve starts from the equilibrium under the previous force
             equilibrium = press(film, probe, (distance, 0.0), force, start=equilibrium)
-            deflections[row, column] = _on_rings(equilibrium, distance, rings)
+            deflections[row, column] = _deflection_on_rings(equilibrium, distance, rings)
     return DeflectionField(
         film=film_to_dict(film),
         probe_radius_mm=probe.radius,
@@ -65,20 +66,22 @@ def deflection_field(
     )
 
 
-def _on_rings(solved: Equilibrium, distance: float, rings: Array) -> Array:
-    """Compute the deflection on rings about the probe.
+def _deflection_on_rings(equilibrium: Equilibrium, distance: float, rings: Array) -> Array:
+    """Compute the deflection on rings about the probe; see `isocharge.common.deflection_field`.
 
     Args:
-        solved: The solved press.
+        equilibrium: The solved press.
         distance: Distance of the press from the centre, mm.
-        rings: Positions of the rings between the centre of the probe (0) and the rim (1), shape (n_ring,).
+        rings: Radii of the rings before the automorphism, from 0 for the centre of the probe to 1 for the rim of the
+            film, shape (n_ring,), in film radii.
 
     Returns:
         Deflection, shape (n_ring, n_angle), mm. It is zero at the rim.
     """
-    points = points_mm(
-        solved.film.radius, solved.probe.reach, distance, np.minimum(rings, INNER_RADIUS), ANGLES
-    ).ravel()
-    deflected = deflection(solved, np.stack([points.real, points.imag], axis=1)).reshape(len(rings), ANGLES)
-    deflected[-1] = 0.0
-    return deflected
+    film_radius = equilibrium.film.radius
+    inner_rings = np.minimum(rings, INNER_RADIUS)
+    complex_points = points_mm(film_radius, equilibrium.probe.reach, distance, inner_rings, ANGLES).ravel()
+    points = np.stack([complex_points.real, complex_points.imag], axis=1)
+    deflection_mm = deflection(equilibrium, points).reshape(len(rings), ANGLES)
+    deflection_mm[-1] = 0.0
+    return deflection_mm

@@ -1,4 +1,4 @@
-"""A family of presses of one probe: the presses that are solved, and the interpolation between them."""
+"""Families of presses with one probe. The presses at the nodes are solved, and all others are interpolated."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -27,7 +27,8 @@ from isocharge.simulate.solver.load_case import SolveSettings, check_press
 from isocharge.simulate.solver.press import press
 
 ROTATIONS = 7
-"""Smallest number of orientations. The influence of the distant rim on the probe has only a few harmonics."""
+"""Smallest number of orientations of the probe. A few orientations suffice, because the rim of the film is far from the
+probe, so that the stress depends on the orientation through a few harmonics only."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ class Family:
         force: Forces, at Chebyshev nodes in the logarithm, shape (n_force,), N.
         rotation: Rotations of the probe relative to the direction of the press, evenly spaced over a full turn, shape
             (n_rotation,), rad.
-        folds: Order of the rotational symmetry of the probe: the number of periods in a full turn.
+        symmetry_order: Order of the rotational symmetry of the probe: the number of rotations within a full turn that
+            map the probe onto itself.
     """
 
     domain: Domain
@@ -49,7 +51,7 @@ class Family:
     distance: Array
     force: Array
     rotation: Array
-    folds: int
+    symmetry_order: int
 
     @classmethod
     def spread(
@@ -67,28 +69,30 @@ class Family:
         Returns:
             The family. It has a single force if the range of forces is a single value.
         """
-        distance_count, force_count = count
+        n_distance, n_force = count
+
+        # `tanh` is the inverse of `distance_coordinate`.
+        largest_coordinate = float(distance_coordinate(domain.radius / film_radius))
+        distance = film_radius * np.tanh(chebyshev_nodes(n_distance, 0.0, largest_coordinate))
+
         min_log, max_log = np.log(domain.force_range)
         force = np.array([domain.force_range[0]])
         if max_log > min_log:
-            force = np.exp(chebyshev_nodes(force_count, min_log, max_log))
+            force = np.exp(chebyshev_nodes(n_force, min_log, max_log))
 
         # The rotations cover a full turn, with the same number of rotations in each period of the probe.
-        folds = 1
+        symmetry_order = 1
         n_rotation = 1
         if period > 0.0:
-            folds = round(2.0 * np.pi / period)
-            n_rotation = folds * math.ceil(rotations / folds)
+            symmetry_order = round(2.0 * np.pi / period)
+            n_rotation = symmetry_order * math.ceil(rotations / symmetry_order)
         rotation = 2.0 * np.pi * np.arange(n_rotation) / n_rotation
-
-        largest_coordinate = float(distance_coordinate(domain.radius / film_radius))
-        distance = film_radius * np.tanh(chebyshev_nodes(distance_count, 0.0, largest_coordinate))
-        return cls(domain, film_radius, distance, force, rotation, folds)
+        return cls(domain, film_radius, distance, force, rotation, symmetry_order)
 
     @property
     def solved_rotations(self) -> Array:
         """Orientations that must be solved, which cover one period of the probe, rad."""
-        return self.rotation[: self.rotation.size // self.folds]
+        return self.rotation[: self.rotation.size // self.symmetry_order]
 
     def weights(self, distance: Array, force: Array, rotation: Array) -> Array:
         """Compute the weights of the nodes for the interpolation to presses.
@@ -101,22 +105,34 @@ class Family:
         Returns:
             Shape (n, n_distance * n_force * n_rotation).
         """
-        nodes = distance_coordinate(self.distance / self.film_radius)
-        at = distance_coordinate(distance / self.film_radius)
-        distance_weights = lagrange_values(nodes, barycentric_weights(nodes), at)
-        log_force = np.log(self.force)
-        force_weights = lagrange_values(log_force, barycentric_weights(log_force), np.log(force))
+        distance_nodes = distance_coordinate(self.distance / self.film_radius)
+        press_coordinates = distance_coordinate(distance / self.film_radius)
+        distance_weights = lagrange_values(distance_nodes, barycentric_weights(distance_nodes), press_coordinates)
+        force_nodes = np.log(self.force)
+        force_weights = lagrange_values(force_nodes, barycentric_weights(force_nodes), np.log(force))
+        rotation_weights = self._rotation_weights(rotation)
+
+        # The weight of a node is the product of its weights along the three axes.
         products = distance_weights[:, :, None, None] * force_weights[:, None, :, None]
-        rotation_weights = self._rotation_weights(rotation)[:, None, None, :]
-        return np.asarray((products * rotation_weights).reshape(distance.size, -1))
+        products = products * rotation_weights[:, None, None, :]
+        return np.asarray(products.reshape(distance.size, -1))
 
     def _rotation_weights(self, rotation: Array) -> Array:
-        """Compute the weights of trigonometric interpolation (Dirichlet kernels), shape (n, n_rotation)."""
-        count = self.rotation.size
-        harmonics = np.arange(1, count // 2 + 1)
-        factor = np.where(2 * harmonics == count, 1.0, 2.0)  # the sine of the highest harmonic is zero at all nodes
-        phase = (rotation[:, None] - self.rotation)[..., None] * harmonics
-        return np.asarray((1.0 + np.cos(phase) @ factor) / count)
+        """Compute the weights of the nodes for trigonometric interpolation (Dirichlet kernels).
+
+        Args:
+            rotation: Rotations of the presses, shape (n,), rad.
+
+        Returns:
+            Shape (n, n_rotation).
+        """
+        n_rotation = self.rotation.size
+        harmonics = np.arange(1, n_rotation // 2 + 1)
+
+        # With an even number of nodes, the sine of the highest harmonic is zero at all nodes.
+        factor = np.where(2 * harmonics == n_rotation, 1.0, 2.0)
+        phase = (rotation[:, None] - self.rotation)[..., None] * harmonics  # shape (n, n_rotation, n_harmonic)
+        return np.asarray((1.0 + np.cos(phase) @ factor) / n_rotation)
 
     def solve(self, sensor: Sensor, probe: Probe, settings: SolveSettings, executor: Executor | None) -> Array:
         """Solve the presses of the family.
@@ -140,7 +156,10 @@ class Family:
         return solved.reshape(self.distance.size, self.solved_rotations.size, self.force.size, -1)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
-        """Compute the fields of all orientations from the solved orientations, by the symmetry of the probe.
+        """Compute the stress of all orientations from the solved orientations, by the symmetry of the probe.
+
+        Rotating a probe by one of its periods gives the same press in a rotated mesh. The stress of a further period is
+        therefore the stress of the solved period at rotated elements, with rotated components.
 
         Args:
             solved: Scaled stress in a frame that rotates with the probe, shape
@@ -151,12 +170,13 @@ class Family:
             Shape (n_distance * n_force * n_rotation, n_element * n_local * 3), in the order of `weights`.
         """
         n_distance, n_rotation, n_force, _ = solved.shape
-        field = np.moveaxis(solved, 1, 2).reshape(n_distance, n_force, n_rotation, mesh.n_element, -1, 3)
-        parts = [
-            rotate_stress(field[..., mesh.rotated(fold, self.folds), :, :], -2.0 * np.pi * fold / self.folds)
-            for fold in range(self.folds)
-        ]
-        return np.asarray(np.concatenate(parts, axis=2).reshape(-1, solved.shape[-1]))
+        solved_period = np.moveaxis(solved, 1, 2).reshape(n_distance, n_force, n_rotation, mesh.n_element, -1, 3)
+        periods = []
+        for number in range(self.symmetry_order):
+            rotated_elements = mesh.rotated(number, self.symmetry_order)
+            angle = 2.0 * np.pi * number / self.symmetry_order
+            periods.append(rotate_stress(solved_period[..., rotated_elements, :, :], -angle))
+        return np.asarray(np.concatenate(periods, axis=2).reshape(-1, solved.shape[-1]))
 
 
 class CheckPress(NamedTuple):
@@ -187,14 +207,14 @@ def check_presses(domain: Domain, count: int) -> list[CheckPress]:
         domain: Presses that a family covers.
         count: Number of presses.
     """
-    distance_shares = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
+    relative_distances = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
     min_log, max_log = np.log(domain.force_range)
     presses = []
-    for index, distance_share in enumerate([*distance_shares, 1.0]):
+    for index, relative_distance in enumerate([*relative_distances, 1.0]):
         # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly.
-        force_share = (0.5 + 0.618 * index) % 1.0
-        force = np.clip(np.exp(min_log + (max_log - min_log) * force_share), *domain.force_range)
-        distance = float(domain.radius * distance_share)
+        log_force_fraction = (0.5 + 0.618 * index) % 1.0
+        force = np.clip(np.exp(min_log + (max_log - min_log) * log_force_fraction), *domain.force_range)
+        distance = float(domain.radius * relative_distance)
         presses.append(CheckPress(distance, angle=2.4 * index, force=float(force), rotation=0.7 * index))
     return presses
 
@@ -249,7 +269,7 @@ def probe_frame_stress(solved: Equilibrium, surface: Surface) -> Array:
 
 @dataclass(frozen=True)
 class Chain:
-    """Presses on one film at one position with different forces. Each solve starts from the equilibrium before.
+    """Presses on one film at one position with different forces. Each solve starts from the previous equilibrium.
 
     Attributes:
         film: The film.
@@ -308,19 +328,24 @@ def solve_films(
     chains = []
     for distance, tension, thickness, reach in product(grid.distance, grid.tension, grid.thickness, grid.reach):
         grid_film = replace(film, pretension=float(tension) * film.young, thickness=float(thickness) * radius)
-        forces = grid.load[::-1] * film.young * grid_film.thickness * radius  # from the largest force on
+        forces = grid.load[::-1] * film.young * grid_film.thickness * radius  # begins with the largest force
         probe = Circle(float(reach) * radius)
         chains.append(Chain(grid_film, probe, float(distance) * radius, forces, surface, settings, read))
-    rows = solve_chains(chains, executor)[:, ::-1]
-    by_axis = rows.reshape(*(grid.shape[axis] for axis in (0, 2, 3, 4, 1)), -1)
-    return np.moveaxis(by_axis, 4, 1)
+    ascending_load = solve_chains(chains, executor)[:, ::-1]
+
+    # The order of the solves is (distance, tension, thickness, reach, load); the load becomes the second axis.
+    n_distance, n_load, n_tension, n_thickness, n_reach = grid.shape
+    load_last = ascending_load.reshape(n_distance, n_tension, n_thickness, n_reach, n_load, -1)
+    return np.moveaxis(load_last, 4, 1)
 
 
 def _solve_chain(chain: Chain) -> Array:
-    """Solve one chain, and return the values of its presses, shape (n_force, n_value)."""
-    start: Equilibrium | None = None
-    rows = []
+    """Solve one chain, and return the values that `Chain.read` computes, shape (n_force, n_value)."""
+    equilibrium: Equilibrium | None = None
+    values_of_forces = []
     for force in chain.forces.tolist():
-        start = press(chain.film, chain.probe, (chain.distance, 0.0), force, chain.settings, start=start)
-        rows.append(chain.read(start, chain.surface).ravel())
-    return np.stack(rows)
+        position = (chain.distance, 0.0)
+        equilibrium = press(chain.film, chain.probe, position, force, chain.settings, start=equilibrium)
+        values = chain.read(equilibrium, chain.surface)
+        values_of_forces.append(values.ravel())
+    return np.stack(values_of_forces)

@@ -6,12 +6,13 @@ press depends on five numbers (`mechanics.scaling`):
     distance / a,   F / (E h a),   pretension / E,   h / a,   R / a,
 
 and on Poisson's ratio, which is the same for all films of a family. In a frame that moves with the probe, the stress at
-the nodes of the template is a smooth function of the five numbers. It is solved on a grid of Chebyshev nodes and
-interpolated. The stresses on the grid are stored as a proper orthogonal decomposition with about fifty modes (Sirovich
-1987). The forward map of one film is a contraction over the last three numbers, which takes a millisecond.
+the nodes of the mesh is a smooth function of the five numbers. The stress is solved at the nodes of a Chebyshev grid
+and interpolated between them. The stresses on the grid are stored as a proper orthogonal decomposition with about fifty
+modes (Sirovich 1987). The forward map of one film is interpolated over the last three numbers, which takes a
+millisecond.
 
 Files contain the coefficients and modes as integers. Modes with small contributions have fewer bits. The rounding
-changes a charge by about 3e-5.
+changes a charge by a fraction of about 3e-5.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,7 +56,7 @@ MAX_TRUNCATION_ERROR = 8e-5
 MAX_FAMILY_ERROR = 2e-3
 """Largest relative error of a charge with respect to direct solves that a family may have.
 
-The largest errors are those of small forces on films with a large pretension, whose charges are a few pC.
+The error is largest for small forces on films with a large pretension, where the charges are only a few pC.
 """
 
 CHECK_COUNT = 24
@@ -119,20 +120,25 @@ class FilmFamily:
         """
         domain = Domain(radius, force_range)
         film = prior.sensor.film
-        _check_back(film)
         surface = prior.sensor.surface
         limits = _limits_of(prior, domain)
-        grid = FilmGrid.spread(limits, counts)
         smallest_reach, largest_reach = limits["reach"]
-        check_family(prior.sensor.coated_film, Circle(largest_reach * film.radius), domain)
+        smallest_probe = Circle(smallest_reach * film.radius)
+        largest_probe = Circle(largest_reach * film.radius)
+        _check_back(film)
+        check_family(prior.sensor.coated_film, largest_probe, domain)
+
+        # All solves have the mesh that the smallest probe needs.
         middle_force = float(np.sqrt(force_range[0] * force_range[1]))
         layer = layer_for(film, middle_force)
         settings = SolveSettings(theory=THEORY, layer=layer)
-        smallest_probe = Circle(smallest_reach * film.radius)
         resolution = needed_resolution(film, smallest_probe, (radius, 0.0), middle_force, settings)
         settings = replace(settings, resolution=resolution)
-        coefficients, modes = decompose(solve_films(film, surface, grid, settings, executor), MAX_TRUNCATION_ERROR)
-        family = cls(film.poisson, surface, limits, grid, resolution, layer, coefficients, modes, np.nan)
+
+        grid = FilmGrid.spread(limits, counts)
+        stress = solve_films(film, surface, grid, settings, executor)
+        coefficients, modes = decompose(stress, MAX_TRUNCATION_ERROR)
+        family = cls(film.poisson, surface, limits, grid, resolution, layer, coefficients, modes, error=np.nan)
         error = _check_against_solves(family, prior, domain)
         if error > MAX_FAMILY_ERROR:
             raise SolveError(
@@ -155,18 +161,24 @@ class FilmFamily:
             SceneError: If the film or the probe does not belong to the family.
         """
         film = sensor.film
-        groups = {
+        film_numbers = {
             "tension": film.pretension / film.young,
             "thickness": film.thickness / film.radius,
             "reach": probe.radius / film.radius,
         }
-        self._check_inside(sensor.coated_film, sensor.surface, groups)
-        tension, thickness, reach = (self.grid.weights(name, value) for name, value in groups.items())
-        # weight of every film of the grid: the product of its weights along the three axes
-        film_weights = np.einsum("t,h,p->thp", tension, thickness, reach).ravel()
-        n_distance, n_load, *_, n_mode = self.coefficients.shape
-        coefficients_by_press = self.coefficients.reshape(n_distance * n_load, -1, n_mode)
-        press_coefficients = film_weights @ coefficients_by_press  # shape (n_distance * n_load, n_mode)
+        self._check_inside(sensor.coated_film, sensor.surface, film_numbers)
+
+        # The weight of each film of the grid is the product of its weights along the three axes.
+        tension_weights = self.grid.weights("tension", film_numbers["tension"])
+        thickness_weights = self.grid.weights("thickness", film_numbers["thickness"])
+        reach_weights = self.grid.weights("reach", film_numbers["reach"])
+        film_weights = np.einsum("t,h,r->thr", tension_weights, thickness_weights, reach_weights).ravel()
+
+        # Sum over the films of the grid, separately for each press and each mode
+        n_distance, n_load, _, _, _, n_mode = self.coefficients.shape
+        coefficients = self.coefficients.reshape(n_distance * n_load, film_weights.size, n_mode)
+        press_coefficients = film_weights @ coefficients  # shape (n_distance * n_load, n_mode)
+        table = press_coefficients @ self.modes
 
         force_unit = film.young * film.thickness * film.radius
         min_load, max_load = self.limits["load"]
@@ -177,9 +189,8 @@ class FilmFamily:
             distance=self.grid.distance * film.radius,
             force=self.grid.load * force_unit,
             rotation=np.zeros(1),
-            folds=1,
+            symmetry_order=1,
         )
-        table = press_coefficients @ self.modes
         return ForwardMap(sensor, probe, family, THEORY, self.resolution, self.layer, table, self.error)
 
     def mode_map(self, sensor: Sensor, probe: Circle, names: Sequence[str] = tuple(MODES)) -> ModeMap:
@@ -201,8 +212,8 @@ class FilmFamily:
         """Return the family as arrays, numbers and texts for a file.
 
         Returns:
-            The values by their names. The coefficients and modes are rounded to integers; "mode_scale" is the product
-            of the scales of both for each mode, shape (n_mode, 1).
+            The values by their names. The coefficients and modes are rounded to integers. The value of "mode_scale" is
+            the product of the scales of both, shape (n_mode, 1).
         """
         bits = bits_of(self.coefficients, self.modes, MAX_BITS, EXTRA_BITS)
         coefficients, coefficient_scale = quantised(self.coefficients, (0, 1, 2, 3, 4), bits)
@@ -225,7 +236,7 @@ class FilmFamily:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any]) -> "FilmFamily":
-        """Create the family from the arrays that `to_arrays` returned.
+        """Create a family from the result of `to_arrays`.
 
         Args:
             arrays: Arrays, numbers and texts by their names.
@@ -268,13 +279,13 @@ class FilmFamily:
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise InputError(f"film family: expected the arrays that to_arrays gives ({error})") from error
 
-    def _check_inside(self, film: Film, surface: Surface, groups: dict[str, float]) -> None:
+    def _check_inside(self, film: Film, surface: Surface, film_numbers: dict[str, float]) -> None:
         """Raise an error if a film does not belong to the family.
 
         Args:
             film: The film.
             surface: Surface in the thickness at which the stress is read.
-            groups: Tension, thickness and reach of the film and its probe, dimensionless.
+            film_numbers: Values of the film and its probe along the axes "tension", "thickness" and "reach".
 
         Raises:
             SceneError: If the film does not belong to the family.
@@ -287,7 +298,7 @@ class FilmFamily:
         if not film.is_axisymmetric:
             raise SceneError(f"film: expected an axisymmetric film, got {film.asymmetries}; use modes for these")
         _check_back(film)
-        for name, value in groups.items():
+        for name, value in film_numbers.items():
             smallest, largest = self.limits[name]
             is_above_smallest = value >= smallest * (1.0 - LIMIT_TOLERANCE) - 1e-15
             is_below_largest = value <= largest * (1.0 + LIMIT_TOLERANCE)
@@ -320,10 +331,10 @@ def _check_shapes(arrays: Mapping[str, Any]) -> None:
 
 
 def _check_back(film: Film) -> None:
-    """Raise an error if a film has a closed back or a static pressure, which would add axes to the family.
+    """Raise an error if a film has a closed back or a static pressure, which the axes of a family do not include.
 
     Raises:
-        SceneError: If a pressure acts on the whole film.
+        SceneError: If the film has a closed back or a static pressure.
     """
     if film.has_back_pressure:
         raise SceneError(
@@ -334,7 +345,9 @@ def _check_back(film: Film) -> None:
 
 
 def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) -> float:
-    """Compute the largest relative error of a charge with respect to direct solves, for presses on random films.
+    """Compute the largest relative error of the interpolated charges of presses on random films.
+
+    The charges are compared with those of direct solves.
 
     Args:
         family: The family, from which the charges are interpolated.
@@ -360,7 +373,7 @@ def _check_against_solves(family: FilmFamily, prior: FilmPrior, domain: Domain) 
 
 
 def _limits_of(prior: FilmPrior, domain: Domain) -> FilmLimits:
-    """Return the limits of the dimensionless parameters of the presses on the films that a calibration may find.
+    """Return the limits of the dimensionless parameters of presses on the films within the bounds of a prior.
 
     Args:
         prior: Prior distribution of the films, with the smallest and largest value of each of their parameters.
@@ -373,7 +386,8 @@ def _limits_of(prior: FilmPrior, domain: Domain) -> FilmLimits:
     smallest = dict(zip(prior.names, lower_bounds.tolist(), strict=True))
     largest = dict(zip(prior.names, upper_bounds.tolist(), strict=True))
     film = prior.sensor.film
-    # the parameters "young" and "thickness" are the logarithms of factors, and "probe_radius" is a difference
+
+    # The parameters "young" and "thickness" are logarithms of factors, and "probe_radius" is a difference in mm.
     min_thickness = film.thickness * np.exp(smallest["thickness"])
     max_thickness = film.thickness * np.exp(largest["thickness"])
     min_young = film.young * np.exp(smallest["young"])

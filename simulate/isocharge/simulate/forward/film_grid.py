@@ -1,4 +1,4 @@
-"""The grid of a family of films, and the low-rank decomposition of the stresses at its nodes."""
+"""Grid of films and presses at which a family of films is solved, and low-rank decomposition of the stresses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ THEORY = Theory(stretching=True, bending=True, pretensioned=True)
 SOFTENING = 4e-4
 """Strain that is added to the pretension strain before its logarithm is taken.
 
-It is about the strain that a press of 0.05 N induces. Smaller pretensions have no effect.
+A press of 0.05 N induces about this strain. Smaller pretension strains hardly change its charges.
 """
 
 FilmLimits = dict[str, tuple[float, float]]
@@ -51,21 +51,31 @@ class FilmGrid:
     def spread(cls, limits: FilmLimits, counts: Sequence[int]) -> "FilmGrid":
         """Distribute Chebyshev nodes between limits.
 
-        The nodes of the load, the reach and the tension (plus `SOFTENING`) are Chebyshev nodes in the logarithm, and
-        those of the distance in `distance_coordinate`.
+        The Chebyshev nodes of each axis lie in the coordinate that `_interpolation_coordinate` returns.
 
         Args:
             limits: Smallest and largest value along each axis.
             counts: Number of nodes along each of `AXES`.
         """
-        axes = {name: (_stretched(name, low), _stretched(name, high)) for name, (low, high) in limits.items()}
-        nodes = [chebyshev_nodes(count, *axes[name]) for name, count in zip(AXES, counts, strict=True)]
-        return cls(*(_unstretched(name, values) for name, values in zip(AXES, nodes, strict=True)))
+        nodes = {}
+        for axis, count in zip(AXES, counts, strict=True):
+            smallest, largest = limits[axis]
+            first_coordinate = _interpolation_coordinate(axis, smallest)
+            last_coordinate = _interpolation_coordinate(axis, largest)
+            nodes[axis] = _axis_value(axis, chebyshev_nodes(count, first_coordinate, last_coordinate))
+        return cls(**nodes)
 
-    def weights(self, axis: str, at: float) -> Array:
-        """Compute the weights of the nodes of an axis for the interpolation to a value `at`, shape (n_node,)."""
-        nodes = _stretched(axis, getattr(self, axis))
-        return np.asarray(lagrange_values(nodes, barycentric_weights(nodes), np.array([_stretched(axis, at)]))[0])
+    def weights(self, axis: str, value: float) -> Array:
+        """Compute the weights of the nodes of an axis for the interpolation to a value on this axis, shape (n_node,).
+
+        Args:
+            axis: One of `AXES`.
+            value: Value on the axis, dimensionless.
+        """
+        nodes = _interpolation_coordinate(axis, getattr(self, axis))
+        coordinate = np.array([_interpolation_coordinate(axis, value)])
+        (weights,) = lagrange_values(nodes, barycentric_weights(nodes), coordinate)
+        return np.asarray(weights)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -73,8 +83,11 @@ class FilmGrid:
         return tuple(getattr(self, name).size for name in AXES)
 
 
-def _stretched(axis: str, value: Array | float) -> Any:
-    """Return the coordinate in which the values of an axis are interpolated by polynomials.
+def _interpolation_coordinate(axis: str, value: Array | float) -> Any:
+    """Return the coordinate in which the stress is interpolated along an axis.
+
+    The coordinate of the load and the reach is their logarithm, that of the tension is the logarithm of its sum with
+    `SOFTENING`, and that of the distance is `distance_coordinate`. The thickness is its own coordinate.
 
     Args:
         axis: One of `AXES`.
@@ -89,20 +102,20 @@ def _stretched(axis: str, value: Array | float) -> Any:
     return value
 
 
-def _unstretched(axis: str, value: Array) -> Array:
-    """Convert interpolation coordinates of an axis into values. This is the inverse of `_stretched`.
+def _axis_value(axis: str, coordinate: Array) -> Array:
+    """Convert interpolation coordinates of an axis into values. This is the inverse of `_interpolation_coordinate`.
 
     Args:
         axis: One of `AXES`.
-        value: Interpolation coordinates, any shape.
+        coordinate: Interpolation coordinates, any shape.
     """
     if axis in ("load", "reach"):
-        return np.exp(value)
+        return np.exp(coordinate)
     if axis == "tension":
-        return np.maximum(np.exp(value) - SOFTENING, 0.0)
+        return np.maximum(np.exp(coordinate) - SOFTENING, 0.0)
     if axis == "distance":
-        return np.tanh(value)
-    return value
+        return np.tanh(coordinate)
+    return coordinate
 
 
 def bits_of(coefficients: Array, modes: Array, max_bits: int, extra_bits: float) -> Array:
@@ -119,13 +132,14 @@ def bits_of(coefficients: Array, modes: Array, max_bits: int, extra_bits: float)
     Returns:
         Shape (n_mode,).
     """
-    largest = np.abs(coefficients).reshape(-1, len(modes)).max(axis=0) * np.abs(modes).max(axis=1)
-    relative_bits = np.log2(largest / largest.max())
+    largest_coefficient = np.abs(coefficients).reshape(-1, len(modes)).max(axis=0)
+    largest_contribution = largest_coefficient * np.abs(modes).max(axis=1)
+    relative_bits = np.log2(largest_contribution / largest_contribution.max())  # zero or negative
     return np.asarray(np.clip(np.round(max_bits + extra_bits + relative_bits), 2.0, max_bits))
 
 
 def quantised(values: Array, axis: int | tuple[int, ...], bits: Array | int) -> tuple[np.ndarray, Array]:
-    """Round values to integers with a scale.
+    """Divide values by a scale and round them to integers.
 
     Args:
         values: The values.
@@ -152,18 +166,26 @@ def decompose(stress: Array, max_error: float) -> tuple[Array, Array]:
     Returns:
         Coefficients, shape (..., n_mode), and modes, shape (n_mode, n), with the smallest number of modes.
     """
-    flat = stress.reshape(-1, stress.shape[-1])
-    node_stress = np.sqrt((flat.reshape(len(flat), -1, 3) ** 2).sum(axis=2).mean(axis=0))
-    size = np.repeat(node_stress, 3)
-    relative = flat / size
-    has_fewer_rows = len(relative) < relative.shape[1]
-    gram = relative @ relative.T if has_fewer_rows else relative.T @ relative
-    ascending_values, ascending_vectors = np.linalg.eigh(gram)
-    values = np.maximum(ascending_values[::-1], 0.0)
-    vectors = ascending_vectors[:, ::-1]
-    error = np.sqrt(np.maximum(1.0 - np.cumsum(values) / values.sum(), 0.0))
-    count = int(np.argmax(error <= max_error)) + 1
-    modes = vectors[:, :count].T
-    if has_fewer_rows:
-        modes = modes @ relative / np.sqrt(values[:count, None])
-    return (relative @ modes.T).reshape(*stress.shape[:-1], count), modes * size
+    stress_of_presses = stress.reshape(-1, stress.shape[-1])
+    n_press, n_value = stress_of_presses.shape
+    squared_magnitude = (stress_of_presses.reshape(n_press, -1, 3) ** 2).sum(axis=2)
+    rms_of_nodes = np.sqrt(squared_magnitude.mean(axis=0))
+    rms_of_values = np.repeat(rms_of_nodes, 3)  # a node has three components of the stress
+    relative_stress = stress_of_presses / rms_of_values
+
+    # Singular value decomposition of the relative stress by the eigenvectors of its smaller Gram matrix
+    has_fewer_presses = n_press < n_value
+    vectors = relative_stress if has_fewer_presses else relative_stress.T
+    gram_matrix = vectors @ vectors.T
+    ascending_eigenvalues, ascending_eigenvectors = np.linalg.eigh(gram_matrix)
+    eigenvalues = np.maximum(ascending_eigenvalues[::-1], 0.0)
+    eigenvectors = ascending_eigenvectors[:, ::-1].T  # one eigenvector in each row
+
+    # The error of a truncation follows from the sum of the omitted eigenvalues.
+    relative_error = np.sqrt(np.maximum(1.0 - np.cumsum(eigenvalues) / eigenvalues.sum(), 0.0))
+    n_mode = int(np.argmax(relative_error <= max_error)) + 1
+    modes = eigenvectors[:n_mode]
+    if has_fewer_presses:  # the eigenvectors are left singular vectors, from which the right ones are computed
+        modes = modes @ relative_stress / np.sqrt(eigenvalues[:n_mode, None])
+    coefficients = relative_stress @ modes.T
+    return coefficients.reshape(*stress.shape[:-1], n_mode), modes * rms_of_values

@@ -4,9 +4,10 @@ The tension or the stiffness of a film may depend on the direction, the clamp ma
 rotated, Poisson's ratio may differ from the assumed value, and the wires may have crosstalk. Each of these
 imperfections is a mode: a first-order change of the charges about those of an isotropic round film.
 
-`MODES` declares each mode once, and `ModeMap` computes its charges. The modes of the mechanics need the change of the
-stress field, which `solver.sensitivity` solves. These fields are solved on a grid of distance, load and tension, for
-the middle thickness and the middle probe radius of the family only, because they are small corrections.
+`MODES` declares each mode once, and `ModeMap` computes the charges of all modes. Some modes need the change of the
+stress field that `solver.sensitivity` solves. These fields are solved on a grid of distance, load and tension. Only the
+middle thickness and the middle probe radius of the family are solved, because the charges of the modes are small
+corrections.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,14 +35,15 @@ from isocharge.simulate.solver.sensitivity import FIELDS, IS_ODD, stress_changes
 
 @dataclass(frozen=True)
 class PressedFilm:
-    """Presses on one film, as the functions of the modes receive them.
+    """Presses on one film, from which the functions of the modes compute charges.
 
     Attributes:
         film: Forward map of the film.
         contact: Presses (x, y, F), shape (n, 3), mm and N.
-        fields: Charges of the solved stress fields, by kind of imperfection. A kind has one field (even), or two fields
-            (even and odd about the direction of the press). Each has the shape (n, n_electrode), pC per unit of the
-            imperfection. Only the fields that the modes need are present.
+        fields: Charges of the solved stress fields, by kind of imperfection. Each kind has an even field, and some
+            kinds also have an odd field, with respect to a reflection in the direction of the press. The charges of a
+            field have the shape (n, n_electrode), pC per unit of the imperfection. Only the fields that the requested
+            modes need are present.
     """
 
     film: ForwardMap
@@ -55,7 +57,7 @@ class PressedFilm:
 
     @cached_property
     def tension_scale(self) -> Array:
-        """Tension that corresponds to one unit of the tension fields, shape (n, 1), MPa."""
+        """Tension to which the tension fields are scaled, for each press, shape (n, 1), MPa."""
         film = self.film.sensor.film
         return np.asarray(film.young * amplitude_squared(film, self.contact[:, 2]) + film.pretension)[:, None]
 
@@ -75,7 +77,11 @@ class PressedFilm:
 
 
 def _component_along_axes(kind: str) -> Callable[[PressedFilm], Array]:
-    """Return the function for the component of an imperfection along x and y."""
+    """Return a function that computes the charges of the component of an imperfection along x and y.
+
+    Args:
+        kind: Name of an imperfection with two axes, from `FIELDS`.
+    """
 
     def charges(press: PressedFilm) -> Array:
         even, odd = press.even_and_odd(kind)
@@ -85,7 +91,11 @@ def _component_along_axes(kind: str) -> Callable[[PressedFilm], Array]:
 
 
 def _component_along_diagonals(kind: str) -> Callable[[PressedFilm], Array]:
-    """Return the function for the component of an imperfection along the diagonals between x and y."""
+    """Return a function that computes the charges of the component of an imperfection along the diagonals.
+
+    Args:
+        kind: Name of an imperfection with two axes, from `FIELDS`.
+    """
 
     def charges(press: PressedFilm) -> Array:
         even, odd = press.even_and_odd(kind)
@@ -108,8 +118,9 @@ def _shear_charges(press: PressedFilm) -> Array:
 
 def _crosstalk_charges(press: PressedFilm) -> Array:
     """Return the sum of the charges of all other electrodes, shape (n, n_electrode), pC."""
-    own = press.film.field_charges(press.contact, EVEN_FIELD)[..., 0]
-    return np.asarray(own.sum(axis=1, keepdims=True) - own)
+    own_charge = press.film.field_charges(press.contact, EVEN_FIELD)[..., 0]
+    total_charge = own_charge.sum(axis=1, keepdims=True)
+    return np.asarray(total_charge - own_charge)
 
 
 @dataclass(frozen=True)
@@ -123,7 +134,8 @@ class Mode:
         charges: Function that returns the derivative of the charges with respect to the mode, at the value zero, shape
             (n, n_electrode), pC per unit of the mode.
         field: Key of the stress fields in `sensitivity.FIELDS` that the mode needs; empty if it needs none.
-        is_uneven_tension: Whether the mode lowers the effective tension of the film to second order.
+        is_uneven_tension: Whether the mode is an uneven tension. Such a mode also has a second-order effect, which is
+            that of a lower mean tension.
     """
 
     meaning: str
@@ -168,13 +180,13 @@ MODES = {
     ),
     "crosstalk": Mode("share of every other electrode's charge that an electrode reads", "1", 0.01, _crosstalk_charges),
 }
-"""All modes by name. Their order is the order of the coefficients in files of calibrations."""
+"""All modes by name. The order of the modes is the order of the coefficients in calibration files."""
 
 NODE_COUNTS = (5, 8, 7, 1, 1)
 """Number of grid nodes along each of `AXES`."""
 
 MAX_TRUNCATION_ERROR = 3e-3
-"""Largest share of the fields that their low-rank decomposition may omit, dimensionless."""
+"""Largest relative error of the fields by their low-rank decomposition (root mean square), dimensionless."""
 
 MAX_BITS = 9
 """Number of bits of the values of the largest component in a file; see `bits_of`."""
@@ -220,20 +232,21 @@ class ModeMap:
         return np.stack([MODES[name].charges(press) for name in self.names], axis=2)
 
     def _field_charges(self, contact: Array) -> dict[str, tuple[Array, ...]]:
-        """Return the charges of the fields, each of shape (n, n_electrode), by kind of imperfection."""
+        """Return the charges of the fields by kind of imperfection; see `PressedFilm.fields`."""
         if self.fields is None:
             return {}
-        charges = self.fields.field_charges(contact, IS_ODD[list(self.field_numbers)])
+        is_odd = IS_ODD[list(self.field_numbers)]
+        charges = self.fields.field_charges(contact, is_odd)  # shape (n, n_electrode, n_field)
         charges_of_kind: dict[str, tuple[Array, ...]] = {}
-        for number, charge in zip(self.field_numbers, np.moveaxis(charges, 2, 0), strict=True):
+        for column, number in enumerate(self.field_numbers):
             kind = KINDS[number]
-            charges_of_kind[kind] = (*charges_of_kind.get(kind, ()), charge)
+            charges_of_kind[kind] = (*charges_of_kind.get(kind, ()), charges[..., column])
         return charges_of_kind
 
 
 KINDS = [kind for kind, fields in FIELDS.items() for _ in fields]
-"""Kind of imperfection of each field, in the order of the field numbers. The even field of a kind precedes the odd
-one."""
+"""Kind of imperfection of each field, in the order of the field numbers. The even field of a kind precedes its odd
+field."""
 
 
 class SolvedFilms(Protocol):
@@ -314,7 +327,8 @@ class FilmModes:
         """
         properties = film.sensor.film
         tension_weights = self.grid.weights("tension", properties.pretension / properties.young)
-        # weighted sum over the tensions t, for each distance d, load l and component m of the decomposition
+        # Weighted sum over the tensions t, for each distance d, load l and component m of the decomposition. The axes
+        # of the thickness and the reach have one node each.
         press_coefficients = np.einsum("t,dltm->dlm", tension_weights, self.coefficients[:, :, :, 0, 0])
 
         n_component = len(self.parts)
@@ -331,31 +345,36 @@ class FilmModes:
             distance=self.grid.distance * properties.radius,
             force=self.grid.load * force_unit,
             rotation=np.zeros(1),
-            folds=1,
+            symmetry_order=1,
         )
         probe = Circle(float(self.grid.reach[0]) * properties.radius)
         return replace(film, probe=probe, family=family, table=table)
 
     def to_arrays(self) -> dict[str, Any]:
         """Return the decomposition as arrays for a file. Coefficients and components are rounded to a few bits."""
-        coefficients, scale = quantised(self.coefficients, (0, 1, 2, 3, 4), SCALE_BITS)
-        by_node = self.parts.reshape(len(self.parts), -1, 3)
-        node_size = np.sqrt((by_node**2).sum(axis=(0, 2), keepdims=True)) + np.finfo(np.float32).tiny
-        node_size = np.float32(np.exp2(np.round(np.log2(node_size))))  # powers of two compress well
-        relative = (by_node / node_size).reshape(len(self.parts), -1)
-        parts, size = quantised(relative, 1, bits_of(self.coefficients, relative, MAX_BITS, EXTRA_BITS)[:, None])
+        coefficients, coefficient_scale = quantised(self.coefficients, (0, 1, 2, 3, 4), SCALE_BITS)
+
+        # The components are divided by the size of the stress at each node, rounded to a power of two, which compresses
+        # well.
+        n_component = len(self.parts)
+        node_stress = self.parts.reshape(n_component, -1, 3)
+        exact_node_size = np.sqrt((node_stress**2).sum(axis=(0, 2), keepdims=True)) + np.finfo(np.float32).tiny
+        node_size = np.float32(np.exp2(np.round(np.log2(exact_node_size))))
+        relative_parts = (node_stress / node_size).reshape(n_component, -1)
+        bits = bits_of(self.coefficients, relative_parts, MAX_BITS, EXTRA_BITS)
+        parts, part_scale = quantised(relative_parts, 1, bits[:, None])
         return {
             "grid_shape": np.array(self.grid.shape),
             "grid": np.concatenate([getattr(self.grid, name) for name in AXES]),
             "coefficients": coefficients,
             "parts": parts,
-            "part_scale": np.float32(scale.ravel()[:, None] * size),
+            "part_scale": np.float32(coefficient_scale.ravel()[:, None] * part_scale),
             "node_size": node_size.ravel(),
         }
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any], field_size: int) -> "FilmModes":
-        """Create the decomposition from the arrays that `to_arrays` returned.
+        """Create a decomposition from the result of `to_arrays`.
 
         Args:
             arrays: Arrays of the file.

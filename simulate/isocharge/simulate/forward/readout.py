@@ -5,10 +5,10 @@ collects only the polarisation caused by the in-plane stress (Mirbagheri et al. 
 
     Q = A * mean(d31 * s11 + d32 * s22)
 
-where s is the mid-surface stress in the axes of the film and axis 1 is the drawn direction x. The area readout takes
-the mean over the electrode. The edge readout follows eq. 3 of the paper: it averages s11 over the left and right edges,
-and s22 over the lower and upper edges. The touch charge is the charge under load minus the charge without load, so a
-uniform pretension cancels.
+where s is the mid-surface stress in the axes of the film and axis 1 is the drawn direction x. The area readout computes
+the mean over the electrode. The edge readout computes the mean of s11 over the left and right edges, and the mean of
+s22 over the lower and upper edges, as in eq. 3 of the paper. The touch charge is the charge under load minus the charge
+without load, so a uniform pretension cancels.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,8 @@ from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
 DIRECT = 20
 """Number of Gauss points per side of an electrode for single presses.
 
-The stress has a kink at the edge of the footprint. If this edge crosses an electrode, the relative error is 1e-5.
+The stress has a kink at the edge of the footprint. If this edge crosses an electrode, the relative error of the charge
+is 1e-5.
 """
 
 FINE = 12
@@ -73,10 +74,10 @@ class ReadoutPoints:
             sensor: The sensor.
             per_side: Number of Gauss points per side of an electrode.
         """
-        layout = _on_layout(sensor.electrodes, sensor.readout, per_side)
-        per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
-        weights = sensor.gains[:, None, None] * layout.weights * per_stress
-        return cls(sensor.calibration.place(layout.points), weights, layout.count)
+        layout_points = _layout_points(sensor.electrodes, sensor.readout, per_side)
+        charge_per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
+        weights = sensor.gains[:, None, None] * layout_points.weights * charge_per_stress
+        return cls(sensor.calibration.place(layout_points.points), weights, layout_points.count)
 
     @classmethod
     def along(cls, sensor: Sensor, lines: Array) -> "ReadoutPoints":
@@ -90,15 +91,15 @@ class ReadoutPoints:
             Points for n_electrode * n_line lines, ordered by electrode. The weights are per width of the line,
             pC/(MPa mm).
         """
-        position, shares = gauss_line(LINE_POINTS)
+        position, line_weights = gauss_line(LINE_POINTS)
         start = lines[:, :, :1]
         direction = lines[:, :, 1:] - start
         points = start + position[:, None] * direction
         placed_points = sensor.calibration.place(points.reshape(-1, LINE_POINTS, 2))
 
-        # Weight of a point: gain times part of the length times charge per area and stress (s11, s22, s12)
+        # Weight of a point: gain * share of the length * charge per area and stress (s11, s22, s12)
         length = np.linalg.norm(direction, axis=3)
-        weighted_length = (sensor.gains[:, None, None] * length * shares).reshape(-1, LINE_POINTS, 1)
+        weighted_length = (sensor.gains[:, None, None] * length * line_weights).reshape(-1, LINE_POINTS, 1)
         charge_per_stress = np.array([sensor.piezo.d31, sensor.piezo.d32, 2.0 * sensor.piezo.d12])
         point_counts = np.full(len(placed_points), LINE_POINTS)
         return cls(placed_points, weighted_length * charge_per_stress, point_counts)
@@ -117,8 +118,8 @@ class ReadoutPoints:
 
 
 @lru_cache(maxsize=32)
-def _on_layout(electrodes: tuple[Electrode, ...], readout: Readout, per_side: int) -> ReadoutPoints:
-    """Return the integration points in the layout, before the calibration. The weights are areas, mm^2.
+def _layout_points(electrodes: tuple[Electrode, ...], readout: Readout, per_side: int) -> ReadoutPoints:
+    """Return the integration points at the nominal positions of the electrodes, with areas (mm^2) as weights.
 
     The result is cached, because many films have the same layout.
 
@@ -131,13 +132,14 @@ def _on_layout(electrodes: tuple[Electrode, ...], readout: Readout, per_side: in
         Points and areas. Electrodes with fewer points than others are filled up with points of the area zero.
     """
     rules = [electrode_rule(electrode, readout, per_side) for electrode in electrodes]
-    point_counts = np.array([len(shares) for _, shares in rules])
-    points = np.zeros((len(rules), point_counts.max(), 2))
-    areas = np.zeros((len(rules), point_counts.max(), 3))
-    for index, (electrode, (electrode_points, shares)) in enumerate(zip(electrodes, rules, strict=True)):
-        points[index, : len(electrode_points)] = electrode_points
-        areas[index, : len(electrode_points)] = electrode.area * shares
-    return ReadoutPoints(points, areas, point_counts)
+    n_point = np.array([len(shares) for _, shares in rules])
+    points = np.zeros((len(electrodes), n_point.max(), 2))
+    areas = np.zeros((len(electrodes), n_point.max(), 3))
+    for index, electrode in enumerate(electrodes):
+        electrode_points, shares = rules[index]
+        points[index, : n_point[index]] = electrode_points
+        areas[index, : n_point[index]] = electrode.area * shares
+    return ReadoutPoints(points, areas, n_point)
 
 
 def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
@@ -171,11 +173,11 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
-    """Compute the charge of the contact pressure on the electrodes, d33 * mean(s33) per area.
+    """Compute the charge that the contact pressure induces on the electrodes, d33 * mean(s33) per area.
 
-    The back of the film is free. Through the thickness, s33 changes from minus the pressure under the probe to zero at
-    the back, so its mean is minus half of the pressure. Only the part of an electrode under the footprint contributes.
-    The negative d33 of PVDF gives a positive charge.
+    The back of the film is free. Through the thickness, s33 changes from minus the contact pressure at the probe to
+    zero at the back, so the mean of s33 is minus half of the pressure. Only the part of an electrode under the
+    footprint contributes. The negative d33 of PVDF results in a positive charge.
 
     Args:
         sensor: The sensor.
@@ -188,20 +190,24 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     """
     if sensor.piezo.d33 == 0.0:
         return np.zeros(len(sensor.electrodes))
-    force_share = []
-    for electrode, (centre, radius) in zip(sensor.electrodes, sensor.part_circles, strict=True):
-        near = np.flatnonzero(np.abs(complex(*at) - centre) < radius + probe.reach)
-        force_share.append(
-            sum(probe.force_share(sensor.calibration.place(electrode.parts[i]), complex(*at)) for i in near)
-        )
-    return np.asarray(-0.5 * sensor.piezo.d33 * force * sensor.gains * np.array(force_share))
+    position = complex(*at)
+    force_shares = []
+    for electrode, (part_centres, part_radii) in zip(sensor.electrodes, sensor.part_circles, strict=True):
+        # Only parts whose enclosing circle meets the footprint can contribute.
+        near_parts = np.flatnonzero(np.abs(position - part_centres) < part_radii + probe.reach)
+        force_share = 0.0
+        for part in near_parts:
+            placed_corners = sensor.calibration.place(electrode.parts[part])
+            force_share += probe.force_share(placed_corners, position)
+        force_shares.append(force_share)
+    return np.asarray(-0.5 * sensor.piezo.d33 * force * sensor.gains * np.array(force_shares))
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:
     """Compute the pyroelectric charge of a uniform change of the temperature.
 
-    The clamp is assumed to expand like the film. A clamp that expands differently changes the pretension of the film,
-    which is described by another parameter.
+    The clamp is assumed to expand like the film. If the clamp expands differently, the pretension of the film changes
+    as well; see `mechanics.film_temperature`.
 
     Args:
         sensor: The sensor.
@@ -272,7 +278,7 @@ def _edge_rule(electrode: Electrode, per_side: int) -> tuple[Array, Array]:
     edges = np.roll(corners, -1, axis=0) - corners
     lower, right, upper, left = corners[:, None] + position[:, None] * edges[:, None]
 
-    # Each mean is over two edges, so that an edge has half of the share.
+    # Each mean is over two edges, so each edge contributes half of the mean.
     half_shares = 0.5 * line_shares
     zero = np.zeros_like(line_shares)
     s11_shares = np.stack([half_shares, zero, zero], axis=1)

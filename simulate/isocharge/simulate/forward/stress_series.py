@@ -21,7 +21,7 @@ from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor_file import film_to_dict, load_sensor
 
 SENSOR = "three-25um-biaxial"
-"""Built-in sensor with the film of 25 um. Its electrodes do not matter."""
+"""Built-in sensor with the film of 25 um. The stress does not depend on its electrodes."""
 
 PROBE = Circle(1.0)
 """Probe of the released models."""
@@ -33,14 +33,15 @@ MAX_DISTANCE_mm = 30.0
 """Largest distance of a press from the centre, mm. It is four times the radius of the smallest working area."""
 
 MAX_RING = 0.97
-"""Largest |z| of the series, in film radii. The rim of the film, where no electrode lies, is left out."""
+"""Largest |z| of the series, in film radii. The series omits the rim of the film, where no electrode lies."""
 
 N_DISTANCES = 7
 N_FORCES = 4
 N_INNER_RINGS = 6
 N_OUTER_RINGS = 14
 N_ANGLES = 7
-"""Numbers of Chebyshev polynomials. With them, charges agree with the forward map to 5e-5 (rms) and 4e-4 (largest)."""
+"""Numbers of Chebyshev polynomials. The relative differences between the charges of the series and of the forward map
+are 5e-5 (root mean square) and 4e-4 (largest)."""
 
 
 def stress_series(forward_map: ForwardMap) -> StressSeries:
@@ -58,16 +59,16 @@ def stress_series(forward_map: ForwardMap) -> StressSeries:
     inner = np.empty((N_DISTANCES, N_FORCES, N_INNER_RINGS, N_ANGLES))
     outer = np.empty((N_DISTANCES, N_FORCES, N_OUTER_RINGS, N_ANGLES))
 
-    # Chebyshev nodes from -1 to 1, mapped to shares from 0 to 1 of the ranges of distance, force and ring radius
+    # The Chebyshev nodes are mapped from [-1, 1] to fractions from 0 to 1 of the ranges of distance, force and ring.
     distances_mm = max_distance_mm * 0.5 * (_nodes(N_DISTANCES) + 1.0)
     forces_N = min_force_N * (max_force_N / min_force_N) ** (0.5 * (_nodes(N_FORCES) + 1.0))
-    inner_share = 0.5 * (_nodes(N_INNER_RINGS) + 1.0)
-    outer_share = 0.5 * (_nodes(N_OUTER_RINGS) + 1.0)
+    inner_fraction = 0.5 * (_nodes(N_INNER_RINGS) + 1.0)
+    outer_fraction = 0.5 * (_nodes(N_OUTER_RINGS) + 1.0)
     direction: Complexes = np.exp(1j * np.arccos(_nodes(N_ANGLES)))
     for row, distance_mm in enumerate(distances_mm):
         shift, probe_ring = _automorphism(distance_mm / film.radius, forward_map.probe.reach / film.radius)
-        inner_rings = probe_ring * np.sqrt(inner_share)
-        outer_rings = probe_ring * (MAX_RING / probe_ring) ** outer_share
+        inner_rings = probe_ring * np.sqrt(inner_fraction)
+        outer_rings = probe_ring * (MAX_RING / probe_ring) ** outer_fraction
         for column, force_N in enumerate(forces_N):
             for table, rings in ((inner, inner_rings), (outer, outer_rings)):
                 ring_points: Complexes = rings[:, None] * direction
@@ -90,9 +91,9 @@ def _nodes(count: int) -> Array:
 
 
 def _automorphism(distance: float, probe_radius: float) -> tuple[float, float]:
-    """Return the map of the unit disk onto itself that moves a circle about the centre to the edge of the probe.
+    """Compute the map of the unit disk onto itself that moves a circle about the centre to the edge of the probe.
 
-    The map is (z + c) / (1 + c z).
+    The map has the form (z + c) / (1 + c z) with a parameter c.
 
     Args:
         distance: Distance of the probe from the centre, in film radii.
@@ -118,7 +119,7 @@ def _stress_sum(forward_map: ForwardMap, distance_mm: float, force_N: float, poi
     Returns:
         Sum of the stresses, of the shape of `points_mm`, MPa.
     """
-    # The charge of an "electrode" with one point and these weights is the sum of the stresses.
+    # Each point is treated as an electrode. With these weights, the charge of the electrode is s11 + s22 at the point.
     n_point = points_mm.size
     points = np.stack([points_mm.real.ravel(), points_mm.imag.ravel()], axis=1)
     weights = np.tile([1.0, 1.0, 0.0], (n_point, 1, 1))
@@ -129,11 +130,20 @@ def _stress_sum(forward_map: ForwardMap, distance_mm: float, force_N: float, poi
 
 
 def _coefficients(values: Array) -> Array:
-    """Return the coefficients of the interpolating polynomial in all axes, from values at the Chebyshev nodes."""
+    """Compute the Chebyshev coefficients of the polynomial that interpolates values at the Chebyshev nodes of all axes.
+
+    Args:
+        values: Values at the nodes. The number of nodes of each axis is its length.
+
+    Returns:
+        Coefficients, of the same shape.
+    """
+    coefficients = values
     for axis, count in enumerate(values.shape):
-        inverse = np.linalg.inv(chebyshev.chebvander(_nodes(count), count - 1))
-        values = np.moveaxis(np.tensordot(inverse, values, (1, axis)), 0, axis)
-    return values
+        coefficients_from_values = np.linalg.inv(chebyshev.chebvander(_nodes(count), count - 1))
+        transformed = np.tensordot(coefficients_from_values, coefficients, (1, axis))  # the axis becomes the first one
+        coefficients = np.moveaxis(transformed, 0, axis)
+    return coefficients
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """A coarse forward map that covers nearly the whole film, for presses far outside the working area.
 
-It answers questions such as which presses on the film have the charges of another press. Such questions need charges
-within a few percent, and they need them up to the clamp, where an accurate forward map takes minutes.
+The map is used, for example, to find all presses on the film that have the charges of a given press. This search needs
+charges with an error of a few percent up to the clamp. An accurate forward map up to the clamp would take minutes.
 """
 
 from concurrent.futures import Executor
@@ -39,7 +39,7 @@ FORCES = 4
 
 
 def outermost_distance(film: Film, probe: Probe) -> float:
-    """Return the largest distance of a press from the centre that the coarse map covers, mm. See `RIM_GAP`."""
+    """Return the largest distance of a press from the centre that the coarse map covers, mm; see `RIM_GAP`."""
     return film.radius - (1.0 + RIM_GAP) * probe.reach
 
 

@@ -3,7 +3,7 @@
 With the Jacobian J = d(Q)/d(x, y, ln F, ...), the Fisher information is J' diag(i) J, where i is the information that
 one reading provides about its charge (`NoiseModel.information`). The covariance of an unbiased estimate is at least the
 inverse of the Fisher information (Kay 1993, ch. 3). An estimator that uses a prior may have smaller errors where the
-charges provide little information; the package isocharge.train computes the corresponding Bayes limit.
+charges provide little information. The package isocharge.train computes the limit of such estimators, the Bayes limit.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 
 MIN_EIGENVALUE = 1e-14
 """Lower bound of the eigenvalues of the scaled Fisher information, dimensionless. Smaller eigenvalues are rounding
-errors. The limits then become about 1e7 times larger than the others instead of infinite."""
+errors. With this bound, the limits of undetermined parameters are very large instead of infinite."""
 
 MIN_INFORMATION = 1e-60
 """Fisher information below which a parameter counts as unobservable: 1/mm^2 for x and y, dimensionless for ln F."""
@@ -36,16 +36,18 @@ class CramerRao:
     @property
     def position(self) -> Array:
         """Root mean square distance of the estimate from the true position, shape (n,), mm."""
-        return np.asarray(np.sqrt(self.covariance[:, 0, 0] + self.covariance[:, 1, 1]))
+        variance = np.diagonal(self.covariance, axis1=1, axis2=2)
+        return np.asarray(np.sqrt(variance[:, 0] + variance[:, 1]))  # x and y
 
     @property
     def force(self) -> Array:
         """Standard deviation of the force divided by the force, shape (n,), dimensionless."""
-        return np.asarray(np.sqrt(self.covariance[:, 2, 2]))
+        variance = np.diagonal(self.covariance, axis1=1, axis2=2)
+        return np.asarray(np.sqrt(variance[:, 2]))  # ln F
 
 
 def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Array | None = None) -> CramerRao:
-    """Compute the limits from charges and their derivatives.
+    """Compute the limits of contacts from charges and their derivatives.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC.

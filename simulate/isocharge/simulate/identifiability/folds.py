@@ -1,17 +1,17 @@
 """Folds of a charge map.
 
-Charges determine a contact only where the map from (x, y, ln F) to the charges is one to one. At a fold it is not: the
-derivative J = d(Q)/d(x, y, ln F) is singular there, and the map reverses its orientation across the fold. With three
-electrodes, det J changes its sign, and folds are lines. With more electrodes, J is not square and is singular only at
-isolated points. At such a point the map intersects itself, so that contacts on both sides of the point have the same
-charges (Whitney 1944).
+Charges determine a contact only where the map from (x, y, ln F) to the charges is one to one. The map is not one to one
+near a fold. At a fold, the derivative J = d(Q)/d(x, y, ln F) is singular, and the map reverses its orientation across
+the fold. With three electrodes, det J changes its sign, and folds are lines. With more electrodes, J is not square and
+is singular only at isolated points. At such a point the map intersects itself, so that contacts on both sides of the
+point have the same charges (Whitney 1944).
 
-The orientation is reversed between a and b if det(J(a)' W J(b)) < 0, with the weights W = 1 / sigma^2. For three
-electrodes this is the sign of det J(a) det J(b). With more electrodes, the criterion is reliable only for near
-contacts, because the map may turn by more than a right angle between distant contacts, for example beside an electrode,
-without being singular. A segment with reversed orientation is therefore bisected until it is shorter than
-`SEGMENT_LENGTH`, or until neither half has reversed orientation. Folds smaller than the grid are found by following the
-smallest singular value of J to its minima.
+The orientation is reversed between two contacts a and b if det(J(a)' W J(b)) < 0, with the weights W = 1 / sigma^2. For
+three electrodes, this determinant has the sign of det J(a) det J(b). With more electrodes, the criterion is reliable
+only for contacts that are close to each other. Between distant contacts, for example on both sides of an electrode, the
+map may turn by more than a right angle without being singular. A segment with reversed orientation is therefore
+bisected until it is shorter than `SEGMENT_LENGTH`, or until neither half has reversed orientation. A fold that is
+smaller than the grid is found by a search for the minima of the smallest singular value of J.
 
 If the electrodes lie on one circle, an isotropic film has a fold near this circle for any number of electrodes, because
 the charges hardly change if the press is moved to its mirror image in the circle.
@@ -30,9 +30,9 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, onto_disk
 
 SEGMENT_LENGTH = 0.02
-"""Length of a segment with reversed orientation that counts as a fold, mm. Beside an electrode the orientation may be
-reversed within 0.1 mm without ambiguity of the charges at 1 N. On a circle of four electrodes it is reversed within
-about 0.01 mm."""
+"""Length below which a segment with reversed orientation counts as a fold, mm. Beside an electrode, the orientation may
+be reversed within 0.1 mm although the charges are not ambiguous at 1 N. On a circle of four electrodes, where there is
+a fold, the orientation is reversed within about 0.01 mm."""
 
 MAX_STEPS = 40
 """Largest number of steps of the compass search. Most minima need 8 to 20; minima in narrow valleys need more."""
@@ -58,7 +58,7 @@ def has_reversed_orientation(first: Array, second: Array) -> Booleans:
     """
     first_directions = _unit_columns(first)
     second_directions = _unit_columns(second)
-    # matrix of the scalar products of the columns, with sums over the electrodes e, shape (..., 3, 3)
+    # Scalar products of the columns, with sums over the electrodes e, shape (..., 3, 3)
     products = np.einsum("...ei,...ej->...ij", first_directions, second_directions)
     return np.asarray(np.linalg.det(products) < 0.0)
 
@@ -85,10 +85,10 @@ def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel)
 
 
 def singular_values(scaled: Array) -> Array:
-    """Compute the singular values of J / sigma for the position if the force is unknown.
+    """Compute the singular values of J / sigma with respect to the position, for an unknown force.
 
-    Their inverses are the smallest and the largest standard deviation of the position by direction. At a fold the
-    second singular value is zero.
+    The inverses of the singular values are the standard deviations of the position in the best and in the worst
+    direction. At a fold the second singular value is zero.
 
     Args:
         scaled: J / sigma, shape (n, n_electrode, 3).
@@ -96,13 +96,14 @@ def singular_values(scaled: Array) -> Array:
     Returns:
         Singular values in descending order, shape (n, 2), 1/mm.
     """
-    by_position = scaled[:, :, :2]
-    by_force = scaled[:, :, 2]
-    force_length = np.linalg.norm(by_force, axis=1, keepdims=True)
-    force_direction = by_force / np.maximum(force_length, np.finfo(float).tiny)
-    # A change of the force can cancel the part of a change of the charges along its direction, so this part is removed.
-    along_force = np.einsum("ne,nei->ni", force_direction, by_position)  # sum over the electrodes e
-    across_force = by_position - force_direction[:, :, None] * along_force[:, None]
+    position_derivative = scaled[:, :, :2]
+    force_derivative = scaled[:, :, 2]
+    force_length = np.linalg.norm(force_derivative, axis=1, keepdims=True)
+    force_direction = force_derivative / np.maximum(force_length, np.finfo(float).tiny)
+
+    # A change of the charges along `force_direction` may be caused by the force, so this component is removed.
+    along_force = np.einsum("ne,nei->ni", force_direction, position_derivative)  # sum over the electrodes e
+    across_force = position_derivative - force_direction[:, :, None] * along_force[:, None]
     return np.asarray(np.linalg.svd(across_force, compute_uv=False))
 
 
@@ -112,9 +113,9 @@ class Folds:
 
     Attributes:
         points: Positions on folds, ordered by the distance from the centre, shape (n, 2), mm. With three electrodes
-            they lie on fold lines; with more electrodes they are the points where J is singular.
-        weakest: Local minima of the smallest singular value of J, shape (k, 2), mm. The position error has its local
-            maxima there, which may lie between the positions of a grid.
+            the positions lie on fold lines. With more electrodes they are the points where J is singular.
+        weakest: Local minima of the smallest singular value of J, shape (k, 2), mm. The position error has local maxima
+            at these positions, which may lie between the positions of a grid.
     """
 
     points: Array
@@ -134,8 +135,8 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     scaled = rings.per_ring(search.scaled(rings.position.reshape(-1, 2)))
     weakest = search.weakest_positions(rings, scaled)
     points = np.concatenate([search.folds_between(rings, scaled), search.folds_about(weakest)])
-    from_centre = np.argsort(np.hypot(*points.T), kind="stable")
-    return Folds(points[from_centre], weakest)
+    ascending_distance = np.argsort(np.hypot(*points.T), kind="stable")
+    return Folds(points[ascending_distance], weakest)
 
 
 class _FoldSearch:
@@ -210,7 +211,9 @@ class _FoldSearch:
         return np.concatenate(points)
 
     def weakest_positions(self, rings: Rings, scaled: Array) -> Array:
-        """Find the local minima of the smallest singular value, starting from the minima among the positions of rings.
+        """Find the local minima of the smallest singular value.
+
+        The search starts at each position whose value is not larger than the values of its neighbours on the rings.
 
         Args:
             rings: Positions.
@@ -220,16 +223,18 @@ class _FoldSearch:
             Positions of the minima, shape (n, 2), mm.
         """
         n_ring, n_angle = scaled.shape[:2]
-        values = singular_values(scaled.reshape(-1, *scaled.shape[2:]))[:, 1].reshape(n_ring, n_angle)
-        smallest_nearby = scipy.ndimage.minimum_filter(values, 3, mode=("nearest", "wrap"))
-        is_minimum = values == smallest_nearby
+        scaled_of_positions = scaled.reshape(-1, *scaled.shape[2:])
+        smallest = singular_values(scaled_of_positions)[:, 1].reshape(n_ring, n_angle)
+        smallest_of_neighbours = scipy.ndimage.minimum_filter(smallest, 3, mode=("nearest", "wrap"))
+        is_minimum = smallest == smallest_of_neighbours  # at least at the global minimum
         spacing_on_ring = rings.distance * 2.0 * np.pi / n_angle
-        spacing = np.maximum(rings.distance[0], spacing_on_ring)
-        ring, _ = np.nonzero(is_minimum)  # there is at least one, the global minimum
-        return self._minimise(rings.position[is_minimum], values[is_minimum], spacing[ring])
+        spacing_between_rings = rings.distance[0]
+        first_step = np.maximum(spacing_between_rings, spacing_on_ring)
+        ring, _ = np.nonzero(is_minimum)
+        return self._minimise(rings.position[is_minimum], smallest[is_minimum], first_step[ring])
 
     def folds_about(self, position: Array) -> Array:
-        """Return those positions about which the orientation is reversed within `SEGMENT_LENGTH`.
+        """Select the positions near which the orientation of the map is reversed within `SEGMENT_LENGTH`.
 
         The orientations at opposite points of a small circle about each position are compared.
 
@@ -243,32 +248,39 @@ class _FoldSearch:
         is_fold = has_reversed_orientation(scaled[:, :half], scaled[:, half:]).any(axis=1)
         return np.asarray(position[is_fold])
 
-    def _minimise(self, position: Array, value: Array, step: Array) -> Array:
+    def _minimise(self, start: Array, start_value: Array, first_step: Array) -> Array:
         """Find local minima of the smallest singular value by a compass search (Kolda, Lewis and Torczon 2003).
 
+        In each round, a search moves to the best of eight neighbours, or halves its step if no neighbour has a smaller
+        value than the present position. A search ends when its step falls below `MIN_COMPASS_STEP`.
+
         Args:
-            position: Starting positions, which are overwritten.
-            value: Smallest singular value at these positions, shape (n,), 1/mm.
-            step: First step of each search, shape (n,), mm. It is halved where no neighbour has a smaller value.
+            start: Starting positions, shape (n, 2), mm.
+            start_value: Smallest singular value at these positions, shape (n,), 1/mm.
+            first_step: First step of each search, shape (n,), mm.
 
         Returns:
             Positions of the minima, shape (n, 2), mm.
         """
-        active = np.flatnonzero(step > MIN_COMPASS_STEP)
+        position = start.copy()
+        value = start_value.copy()
+        step = first_step.copy()
+        active = np.flatnonzero(step > MIN_COMPASS_STEP)  # indices of the searches that have not ended
         for _ in range(MAX_STEPS):
             if not active.size:
                 break
-            # Evaluate the neighbours of each position in the directions of the compass.
-            trial = position[active, None] + step[active, None, None] * COMPASS
-            trial = onto_disk(trial.reshape(-1, 2), self.radius)
-            trial_values = self.smallest_singular_value(trial).reshape(-1, len(COMPASS))
-            best_direction = trial_values.argmin(axis=1)
-            best_value = np.take_along_axis(trial_values, best_direction[:, None], axis=1)[:, 0]
-            is_lower = best_value < value[active]
+            neighbours = position[active, None] + step[active, None, None] * COMPASS  # shape (n_active, 8, 2)
+            neighbours = onto_disk(neighbours.reshape(-1, 2), self.radius)
+            neighbour_values = self.smallest_singular_value(neighbours).reshape(-1, len(COMPASS))
+            best_direction = neighbour_values.argmin(axis=1)
+            active_rows = np.arange(active.size)
+            best_neighbour = neighbours.reshape(-1, len(COMPASS), 2)[active_rows, best_direction]
+            best_value = neighbour_values[active_rows, best_direction]
 
-            moved = active[is_lower]
-            position[moved] = trial.reshape(-1, len(COMPASS), 2)[is_lower, best_direction[is_lower]]
-            value[moved] = best_value[is_lower]
+            is_lower = best_value < value[active]
+            moving = active[is_lower]
+            position[moving] = best_neighbour[is_lower]
+            value[moving] = best_value[is_lower]
             step[active[~is_lower]] *= 0.5
             active = active[step[active] > MIN_COMPASS_STEP]
         return position

@@ -1,4 +1,4 @@
-"""Identification: how well the charges of a sensor determine a contact, with limits, folds and the working area."""
+"""Identification of a sensor: error limits, folds and working area, which state how well charges determine contacts."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -34,11 +34,11 @@ from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 MAX_SEARCH_RADIUS = 0.9
-"""Largest search radius in units of the film radius, dimensionless. Farther out, forward maps need finer
-meshes."""
+"""Largest search radius in units of the film radius, dimensionless. Forward maps with larger radii need finer meshes.
+"""
 
 RADIUS_REDUCTION = 0.9
-"""Factor of the search radius if the charges cannot be interpolated, dimensionless."""
+"""Factor by which the search radius is reduced if the charges cannot be interpolated, dimensionless."""
 
 MAX_REDUCTIONS = 3
 """Largest number of reductions of the search radius."""
@@ -128,8 +128,8 @@ class Identification:
         inner_maps: Limits for the same forces within the working area; empty if the working area has the radius 0.
         side_force: Limits for the same forces if the side force of the probe is unknown; empty with fewer than six
             electrodes.
-        mirror: Places outside the working area where a press has the charges of a press inside it. None if they were
-            not computed, or if there is no working area.
+        mirror: Positions outside the working area where a press has the charges of a press inside the working area.
+            None if the positions were not computed, or if there is no working area.
     """
 
     sensor: Sensor
@@ -174,15 +174,15 @@ class Identification:
     def determined_share(self) -> float:
         """Share of the searched disk in which the error does not exceed its limit for any force, dimensionless.
 
-        The disk includes the regions on both sides of folds. There the charges determine the contact only together with
-        other information, such as preceding frames, that tells contacts with the same charges apart.
+        The disk includes the regions on both sides of folds. In these regions, the charges determine the contact only
+        together with other information, such as preceding frames, that distinguishes contacts with the same charges.
         """
         is_allowed = np.all([limits.position <= self.area.error for limits in self.maps], axis=0)
         return float(np.average(is_allowed.mean(axis=1), weights=self.maps[0].rings.distance))
 
     @property
     def summary(self) -> str:
-        """Description of the working area and, with six electrodes or more, of the side force in a few sentences."""
+        """Description of the working area. With six electrodes or more, the side force is described as well."""
         if not self.side_force:
             return self._area_summary
         return f"{self._area_summary} {self._side_force_summary}"
@@ -194,31 +194,29 @@ class Identification:
         if not (len(area.folds) or len(area.pairs)):
             return area.summary
         return (
-            f"{area.summary} If the frames before tell which of the contacts with the same charges it is, the position "
-            f"error is at most {area.error:.3g} mm on {100.0 * self.determined_share:.0f} % of the "
-            f"{area.searched:.3g} mm searched, of which the working area is "
-            f"{100.0 * (area.radius / area.searched) ** 2:.0f} %."
+            f"{area.summary} If preceding frames distinguish contacts with the same charges, the position error is at "
+            f"most {area.error:.3g} mm on {100.0 * self.determined_share:.0f} % of the disk of {area.searched:.3g} mm "
+            f"that was searched. The working area is {100.0 * (area.radius / area.searched) ** 2:.0f} % of this disk."
         )
 
     @property
     def _side_force_summary(self) -> str:
-        """Statement of the forces at which the side force can be estimated, and of its error."""
+        """Sentence that lists the forces at which the side force can be estimated, with its error at each force."""
         estimable = [limits for limits in self.side_force if limits.is_estimable]
         if not estimable:
             return (
                 f"The side force of the probe cannot be estimated to {100.0 * MAX_SIDE_FORCE_ERROR:g} % of the force "
                 "at any of these forces."
             )
-        parts = []
+        errors = []
         for limits in estimable:
             statistics = limits.statistics()
-            parts.append(f"to {statistics['side_force_median_percent']:.2g} % of the force at {limits.force:g} N")
-        return f"The side force of the probe can be estimated {', '.join(parts)} (median)."
+            errors.append(f"to {statistics['side_force_median_percent']:.2g} % of the force at {limits.force:g} N")
+        return f"The side force of the probe can be estimated {', '.join(errors)} (median)."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the results for JSON, in which infinite radii are None."""
         area = self.area
-        pairs = (area.pairs.first, area.pairs.second, area.pairs.distance)
         return {
             "sensor": self.sensor.name,
             "probe": self.probe.notation,
@@ -239,24 +237,30 @@ class Identification:
             "mirror_region": None if self.mirror is None else self.mirror.to_dict(),
             "limits_in_working_area": [limits.statistics() for limits in self.inner_maps],
             "limits_with_side_force": [limits.statistics() for limits in self.side_force],
-            "by_distance": {
-                "distance_mm": self.maps[0].rings.distance.tolist(),
-                **{
-                    f"{name}_position_mm_at_{limits.force:g}_N": statistic(limits.position, axis=1).tolist()
-                    for limits in self.maps
-                    for name, statistic in (("median", np.median), ("worst", np.max))
-                },
-            },
+            "by_distance": self._errors_by_distance(),
             "folds_mm": area.folds.round(3).tolist(),
-            "twins": [
-                {
-                    "first": dict(zip(CONTACT_KEYS, first.tolist(), strict=True)),
-                    "second": dict(zip(CONTACT_KEYS, second.tolist(), strict=True)),
-                    "sigmas_apart": float(distance),
-                }
-                for first, second, distance in zip(*(column[:MAX_LISTED_PAIRS] for column in pairs), strict=True)
-            ],
+            "twins": self._listed_pairs(),
         }
+
+    def _errors_by_distance(self) -> dict[str, list[float]]:
+        """Return the median and the largest position error on each ring for each force, for JSON."""
+        errors = {"distance_mm": self.maps[0].rings.distance.tolist()}
+        for limits in self.maps:
+            errors[f"median_position_mm_at_{limits.force:g}_N"] = np.median(limits.position, axis=1).tolist()
+            errors[f"worst_position_mm_at_{limits.force:g}_N"] = np.max(limits.position, axis=1).tolist()
+        return errors
+
+    def _listed_pairs(self) -> list[dict[str, Any]]:
+        """Return the first `MAX_LISTED_PAIRS` ambiguous pairs for JSON."""
+        pairs = self.area.pairs
+        return [
+            {
+                "first": dict(zip(CONTACT_KEYS, pairs.first[number].tolist(), strict=True)),
+                "second": dict(zip(CONTACT_KEYS, pairs.second[number].tolist(), strict=True)),
+                "sigmas_apart": float(pairs.distance[number]),
+            }
+            for number in range(min(len(pairs), MAX_LISTED_PAIRS))
+        ]
 
 
 def identify(
@@ -304,9 +308,10 @@ def identify(
 
 
 def search_radius(sensor: Sensor, probe: Probe) -> float:
-    """Return the radius of the search for the working area, mm: the distance of the outermost corner of an electrode.
+    """Return the radius of the search for the working area, mm.
 
-    Electrodes that surround the working area bound it, mostly by a fold near the electrodes.
+    The radius is the distance of the outermost corner of an electrode from the centre, but not more than
+    `MAX_SEARCH_RADIUS` allows. The working area is mostly bounded by a fold near the electrodes that surround it.
     """
     corners = [sensor.calibration.place(np.array(electrode.corners)) for electrode in sensor.electrodes]
     outermost = float(np.hypot(*np.concatenate(corners).T).max())
@@ -341,7 +346,7 @@ def map_to_search(
 
 
 def _limit_maps(charges: ChargeMap, noise: NoiseModel, forces: list[float], radius: float) -> tuple[LimitMap, ...]:
-    """Compute the lower limits of the errors for each force.
+    """Compute a map of the error limits for each force.
 
     Args:
         charges: Charges as a function of the contact.
@@ -361,5 +366,6 @@ def _limit_maps(charges: ChargeMap, noise: NoiseModel, forces: list[float], radi
 def _median(values: Array, weights: Array) -> float:
     """Compute the weighted median of values; both arguments have the shape (n,)."""
     order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
+    cumulative_weight = np.cumsum(weights[order])
+    middle = np.searchsorted(cumulative_weight, 0.5 * cumulative_weight[-1])
+    return float(values[order][middle])

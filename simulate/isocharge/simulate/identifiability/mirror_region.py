@@ -1,8 +1,9 @@
-"""The mirror region: places outside the working area where a press has the charges of a press inside it.
+"""The mirror region: positions outside the working area where a press has the charges of a press inside it.
 
-Electrodes on one circle of radius R cause a mirror region on almost the whole film. The influence of a point load on
-the points of this circle is nearly the same from the distance r as from R^2 / r, because inversion in the circle keeps
-the ratios of the distances to its points. A press in the mirror region cannot be noticed, whatever the method.
+If all electrodes lie on one circle of radius R, the mirror region covers almost the whole film. A point load at the
+distance r from the centre has nearly the same influence on the points of this circle as a point load at R^2 / r. The
+reason is that an inversion in the circle preserves the ratios of the distances to the points of the circle. No method
+can notice a press in the mirror region, because its charges are those of a press in the working area.
 """
 
 from concurrent.futures import Executor
@@ -20,11 +21,11 @@ from isocharge.simulate.sensor.probe import Circle, Probe
 from isocharge.simulate.sensor.sensor import Sensor
 
 DETECTABLE_SIGMAS = 5.0
-"""Difference of charges above which a press is noticed, in standard deviations of the noise. It is the smallest limit
-of the misfit in `isocharge.serve`."""
+"""Difference of charges above which a press can be noticed, in standard deviations of the noise. It is the smallest
+limit of the misfit in `isocharge.serve`."""
 
 FORCE_COUNT = 5
-"""Number of forces with which every place is pressed."""
+"""Number of forces of the presses at each position."""
 
 FORCE_RATIO = 10.0
 """Largest ratio of the largest to the smallest of these forces, dimensionless."""
@@ -39,20 +40,21 @@ N_CANDIDATES = 1024
 """Number of contacts from which the search for the nearest contact starts."""
 
 INTERIOR = 0.98
-"""Radius, in units of the working area, up to which a contact counts as inside. A contact on the edge is not an answer
-to the charges, but the end of the search."""
+"""Distance from the centre up to which a contact counts as inside the working area, in units of its radius. A contact
+on the edge does not explain the charges; the search only stopped there."""
 
 
 @dataclass(frozen=True)
 class MirrorRegion:
-    """How many presses outside the working area have the charges of a press inside it.
+    """Share of the presses outside the working area that have the charges of a press inside it, by position.
 
     Attributes:
         inner: Radius of the working area, mm.
         outer: Largest distance of the presses from the centre, mm.
         forces: Forces of the presses, shape (n_force,), N.
-        share: Share of the forces at which a press has the charges of a press inside, shape (n_ring, n_sector). The
-            rings have equal widths. The first sector begins at the x axis, and the others follow anticlockwise.
+        share: Share of the forces at which a press has the charges of a press in the working area, shape (n_ring,
+            n_sector), dimensionless. The rings have equal widths. The first sector begins at the x axis, and the others
+            follow anticlockwise.
     """
 
     inner: float
@@ -80,7 +82,7 @@ class MirrorRegion:
         ring_distance = 0.5 * (edges[1:] + edges[:-1])
         sector_angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
 
-        # presses with every combination of ring, sector and force
+        # Presses with every combination of ring, sector and force
         grids = np.meshgrid(ring_distance, sector_angle, forces, indexing="ij")
         distance, angle, force = (grid.ravel() for grid in grids)
         contact = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), force])
@@ -101,7 +103,7 @@ class MirrorRegion:
 
     @property
     def summary(self) -> str:
-        """Sentence about the mirror region."""
+        """Sentence that states how many presses outside the working area have the charges of a press inside it."""
         presses = (
             f"presses of {self.forces[0]:.2g} to {self.forces[-1]:.2g} N from {self.inner:.3g} to {self.outer:.3g} mm "
             "from the centre"
@@ -126,7 +128,7 @@ class MirrorRegion:
 
 
 def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
-    """Return which charges a press in a domain also has, within the noise.
+    """Return for which charges a press in a domain has the same charges, up to the noise.
 
     Args:
         inside: Charge map of the domain.

@@ -1,6 +1,7 @@
-"""Contact whose charges are nearest to given charges, in standard deviations of the noise:
+"""Search for the contact whose charges are nearest to given charges.
 
-min over contacts c of the domain of |(Q - Q(c)) / sigma|
+The distance of the charges Q(c) of a contact c from given charges Q is |(Q - Q(c)) / sigma|, where sigma is the
+standard deviation of the noise of each charge. The distance is minimised over the contacts of a domain.
 """
 
 from collections.abc import Callable
@@ -18,8 +19,8 @@ STEPS = 8
 """Number of steps from a start near the solution. Most charges need five."""
 
 CANDIDATES = 4096
-"""Number of contacts among which the starts are chosen. They are spread over the domain, with a quarter of them on the
-edge of the disk."""
+"""Number of contacts among which the starting points of a search are chosen. The contacts are distributed over the
+domain, and a quarter of them lie on the edge of the disk."""
 
 START_SEPARATION = 0.25
 """Smallest distance between the starts of one search in unit coordinates, in which the radius of the domain is one.
@@ -30,7 +31,7 @@ CHUNK = 2048
 
 
 def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, start: Array) -> tuple[Array, Array]:
-    """Find the contacts that explain charges best, by least squares from a start near the solution.
+    """Find the contacts that explain charges best by a least-squares descent from starting points near the solution.
 
     Args:
         charge_map: Charges as a function of the contact.
@@ -54,7 +55,10 @@ def nearest_contact(charge_map: ChargeMap, noise: NoiseModel, charge: Array, sta
 def explain(
     charge_map: ChargeMap, charge: Array, sigma: Array, start: Array, *, min_change: float = MIN_CHANGE
 ) -> tuple[Array, Array]:
-    """Find the contacts to which the least-squares descent from a start leads.
+    """Find the contacts that explain charges best by a least-squares descent from given starting points.
+
+    Unlike in `nearest_contact`, the standard deviations of the charges are given, and the starting points need not be
+    near the solution.
 
     Args:
         charge_map: Charges as a function of the contact.
@@ -102,7 +106,8 @@ def _descend(
     min_log, max_log = np.log(force_range)
     centre = charge_map.domain.centre  # (x, y, ln F)
     half_width = np.array([radius, radius, 0.5 * (max_log - min_log)])
-    divisor = np.where(half_width > 0.0, half_width, 1.0)  # the range of ln F is zero if the map has a single force
+    # The half width of ln F is zero if the map has a single force.
+    divisor = np.where(half_width > 0.0, half_width, 1.0)
 
     def to_contact(unit_coordinates: Array) -> Array:
         """Convert unit coordinates into contacts (x, y, F), both of shape (k, 3)."""
@@ -132,7 +137,7 @@ def search(
     candidates: int = CANDIDATES,
     min_change: float = MIN_CHANGE,
 ) -> tuple[Array, Array]:
-    """Find the nearest contacts by a descent from each of the best few of many candidates.
+    """Find the nearest contacts by descents from the best candidates among contacts distributed over the domain.
 
     Args:
         charge_map: Charges as a function of the contact.
@@ -143,7 +148,7 @@ def search(
         min_change: Change of the squared distance below which a descent ends, relative to 1 + its value.
 
     Returns:
-        Contacts and residuals, as of `explain`.
+        Contacts and residuals of the best descent; see `explain`.
     """
     unit_candidates = _unit_candidates(candidates)
     candidate_contacts = charge_map.domain.to_contact(INNER_RADIUS * unit_candidates)
@@ -155,11 +160,13 @@ def search(
     for first in range(0, max(len(charge), 1), CHUNK):
         chunk = slice(first, first + CHUNK)
         start_rows.append(_nearest_rows(charge[chunk], sigma[chunk], candidate_charges, is_neighbour, starts))
+
+    # One descent from the nearest candidate of each row of charges, one from the second nearest, and so on
     rows_of_starts = np.concatenate(start_rows).T  # shape (starts, n)
     solutions = [
         explain(charge_map, charge, sigma, candidate_contacts[rows], min_change=min_change) for rows in rows_of_starts
     ]
-    contacts = np.stack([contact for contact, _ in solutions])
+    contacts = np.stack([contact for contact, _ in solutions])  # shape (starts, n, 3)
     residuals = np.stack([residual for _, residual in solutions])  # shape (starts, n, n_electrode)
     best_start = (residuals**2).sum(axis=2).argmin(axis=0)
     row = np.arange(len(charge))
@@ -185,15 +192,25 @@ def _unit_candidates(count: int) -> Array:
 def _nearest_rows(
     charge: Array, sigma: Array, candidate_charges: Array, is_neighbour: Booleans, count: int
 ) -> Integers:
-    """Return the numbers of the nearest candidates that are not neighbours of each other, shape (n, count).
+    """Find the candidates whose charges are nearest to each row of charges, and which are not neighbours of each other.
 
-    The squared distance is expanded, so that it is a matrix product. The term that does not depend on the candidate is
-    omitted. A few searches for the smallest distance are ten times as fast as a partition of the distances.
+    A few searches for the smallest distance are faster than sorting all distances.
+
+    Args:
+        charge: Charges, shape (n, n_electrode), pC.
+        sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
+        candidate_charges: Charges of the candidates, shape (n_candidate, n_electrode), pC.
+        is_neighbour: Whether each pair of candidates lies close together, shape (n_candidate, n_candidate).
+        count: Number of candidates to find for each row of charges.
+
+    Returns:
+        Indices of the candidates in ascending order of the distance, shape (n, count).
     """
-    weight = sigma**-2.0
-    weights = np.hstack([weight, -2.0 * charge * weight])
+    # sum((Q - Q_c)^2 / sigma^2) = sum(Q_c^2 / sigma^2 - 2 Q Q_c / sigma^2) + const., as one matrix product
+    inverse_variance = sigma**-2.0
+    weights = np.hstack([inverse_variance, -2.0 * charge * inverse_variance])
     powers = np.hstack([candidate_charges**2, candidate_charges])
-    squared_distance = weights @ powers.T
+    squared_distance = weights @ powers.T  # shape (n, n_candidate), without the constant
     nearest = np.empty((len(charge), count), dtype=np.intp)
     for number in range(count):
         nearest[:, number] = squared_distance.argmin(axis=1)

@@ -1,8 +1,8 @@
 """Cramer-Rao limits of contacts with an unknown side force.
 
 Such a contact has five parameters: x, y, the force F, and the side force (Fx, Fy). The limits of the five parameters
-are computed for a side force of zero. They are computed for sensors with at least six electrodes, because a sensor with
-five electrodes has no charge left that could show a wrong model.
+are computed for a side force of zero. The sensor must have at least six electrodes, because five charges always fit
+five parameters, even if the model of the film is wrong.
 """
 
 from concurrent.futures import Executor
@@ -23,7 +23,8 @@ MIN_ELECTRODES = 6
 """Smallest number of electrodes for which the limits are computed."""
 
 MAX_SIDE_FORCE_ERROR = 0.1
-"""Largest median standard deviation of the side force, over the force, at which the side force counts as estimable."""
+"""Largest median error of the side force, divided by the force, at which the side force counts as estimable,
+dimensionless."""
 
 RING_COUNT = 10
 """Number of rings on which the limits are computed."""
@@ -63,10 +64,17 @@ class SideForceLimits:
         """
         contact = Rings.spread(radius, RING_COUNT, ANGLE_COUNT).contacts(force)
         charge, contact_jacobian = linearised(charge_map, contact)
-        share_jacobian = force * side_force_map.jacobian(contact)
-        limits = cramer_rao(charge, np.concatenate([contact_jacobian, share_jacobian], axis=2), noise)
-        side_force_variance = limits.covariance[:, 3, 3] + limits.covariance[:, 4, 4]
-        return cls(force, np.sqrt(side_force_variance), limits.position, limits.force)
+        relative_side_force_jacobian = force * side_force_map.jacobian(contact)  # with respect to Fx / F and Fy / F
+        jacobian = np.concatenate([contact_jacobian, relative_side_force_jacobian], axis=2)
+        limits = cramer_rao(charge, jacobian, noise)
+        variance = np.diagonal(limits.covariance, axis1=1, axis2=2)
+        *_, side_x_variance, side_y_variance = variance.T
+        return cls(
+            force=force,
+            side_force=np.sqrt(side_x_variance + side_y_variance),
+            position=limits.position,
+            relative_force=limits.force,
+        )
 
     @property
     def is_estimable(self) -> bool:
@@ -87,11 +95,12 @@ class SideForceLimits:
         }
 
     def _median(self, values: Array) -> float:
-        """Compute the median of values at the positions, weighted with the area of each position."""
-        area = np.repeat(np.arange(1, RING_COUNT + 1), ANGLE_COUNT)
+        """Compute the median of values at the positions, weighted with the area that each position represents."""
+        relative_area = np.repeat(np.arange(1, RING_COUNT + 1), ANGLE_COUNT)  # proportional to the radius of the ring
         order = np.argsort(values)
-        total_area = np.cumsum(area[order])
-        return float(values[order][np.searchsorted(total_area, 0.5 * total_area[-1])])
+        cumulative_area = np.cumsum(relative_area[order])
+        middle = np.searchsorted(cumulative_area, 0.5 * cumulative_area[-1])
+        return float(values[order][middle])
 
 
 def side_force_limits(
@@ -102,9 +111,10 @@ def side_force_limits(
     radius: float,
     executor: Executor | None = None,
 ) -> tuple[SideForceLimits, ...]:
-    """Compute the limits for each force, or return nothing if the sensor has too few electrodes or no working area.
+    """Compute the limits for each force.
 
-    Only circular probes have a side force map. For other probes the result is empty.
+    The result is empty if the sensor has fewer than `MIN_ELECTRODES` electrodes or no working area, or if the probe is
+    not circular, because only circular probes have a side force map.
 
     Args:
         forward_map: Forward map of the sensor.

@@ -21,12 +21,12 @@ RADIUS_STEP = 0.1
 """Step to which radii of working areas are rounded down, mm."""
 
 MAX_CONFIRMATIONS = 4
-"""Largest number of times that the error is evaluated again on finer rings within the area. Beside electrodes the error
-may exceed its limit between two rings."""
+"""Largest number of times that the error is evaluated again on finer rings within the area. Near an electrode, the
+error may exceed its limit between two of the first rings."""
 
 Bound = Literal["fold", "ambiguous pair", "error", "search"]
-"""Reason for the radius of a working area. "search" means that the radius of the search is the only bound. The error
-grows without limit towards a fold, so the bound before a fold is mostly "error"."""
+"""Reason for the radius of a working area. "search" means that only the radius of the search bounds the area. The error
+grows without limit towards a fold, so an area that ends before a fold mostly has the bound "error"."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class WorkingArea:
             sides = "the fold" if self.electrodes == 3 else "the points where it loses rank"
             parts.append(
                 f"The map folds {self.fold_radius:.1f} mm from the centre: contacts on both sides of {sides} give the "
-                "same charges, and no method can tell them apart by one reading."
+                "same charges, and no method can distinguish these contacts by one reading."
             )
         if len(self.pairs):
             parts.append(self.pairs.summary)
@@ -104,9 +104,10 @@ def working_area(
     charge_map = with_fast_derivatives(charge_map)
     searched = charge_map.domain.radius
     min_force, max_force = charge_map.domain.force_range
-    rings = Rings.spread(searched)
     middle_force = float(np.sqrt(min_force * max_force))
     forces = sorted({min_force, middle_force, max_force})
+    rings = Rings.spread(searched)
+
     searches = [find_folds(charge_map, rings, force, noise) for force in forces]
     folds = np.concatenate([search.points for search in searches])
     fold_radius = float(np.hypot(*folds.T).min(initial=np.inf))
@@ -125,7 +126,7 @@ def working_area(
         "ambiguous pair": pairs.radius,
         "error": error_radius if error_radius < searched else np.inf,
     }
-    bound = min(radii, key=lambda each: radii[each])
+    bound = min(radii, key=lambda reason: radii[reason])
     return WorkingArea(
         radius=_round_down(radii[bound]),
         bound=bound,
@@ -168,7 +169,10 @@ def _confirmed(charge_map: ChargeMap, radius: float, forces: list[float], noise:
 
 
 def _error_radius(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel, error: float) -> float:
-    """Return the distance at which the position error first exceeds its limit, mm; ln(error) is interpolated linearly.
+    """Return the distance from the centre at which the position error first exceeds its limit, mm.
+
+    The logarithm of the largest error on each ring is interpolated linearly between the rings. If no error exceeds the
+    limit, the distance of the outermost ring is returned.
 
     Args:
         charge_map: Charges as a function of the contact.
@@ -177,25 +181,34 @@ def _error_radius(charge_map: ChargeMap, rings: Rings, force: float, noise: Nois
         noise: Noise of the readings.
         error: Largest allowed position error, mm.
     """
-    largest = rings.per_ring(limits_at(charge_map, rings.contacts(force), noise).position).max(axis=1)
-    exceeding = np.flatnonzero(~(largest <= error))  # including NaN
+    position_error = rings.per_ring(limits_at(charge_map, rings.contacts(force), noise).position)
+    largest_error = position_error.max(axis=1)  # of each ring
+    exceeding = np.flatnonzero(~(largest_error <= error))  # including NaN
     if not exceeding.size:
         return float(rings.distance[-1])
-    first = int(exceeding[0])
-    if first == 0:
+    first_exceeding = int(exceeding[0])
+    if first_exceeding == 0:
         return 0.0
-    interval = slice(first - 1, first + 1)
-    return float(np.interp(np.log(error), np.log(largest[interval]), rings.distance[interval]))
+    two_rings = [first_exceeding - 1, first_exceeding]
+    return float(np.interp(np.log(error), np.log(largest_error[two_rings]), rings.distance[two_rings]))
 
 
 def _nearest_exceeding(charge_map: ChargeMap, position: Array, force: float, noise: NoiseModel, error: float) -> float:
-    """Return the distance of the nearest position, shape (n, 2), whose error exceeds its limit, mm; else infinity."""
+    """Return the distance from the centre of the nearest position whose error exceeds its limit, mm; or infinity.
+
+    Args:
+        charge_map: Charges as a function of the contact.
+        position: Positions (x, y), shape (n, 2), mm.
+        force: Force of the contacts, N.
+        noise: Noise of the readings.
+        error: Largest allowed position error, mm.
+    """
     contact = np.column_stack([position, np.full(len(position), force)])
     is_exceeding = ~(limits_at(charge_map, contact, noise).position <= error)  # including NaN
     return float(np.hypot(*position.T).min(initial=np.inf, where=is_exceeding))
 
 
 def _round_down(radius: float) -> float:
-    """Round a radius down to a multiple of `RADIUS_STEP`, mm, without the rounding error of the product."""
-    steps = np.floor(radius / RADIUS_STEP * (1.0 + 1e-9))
-    return float(f"{steps * RADIUS_STEP:.12g}")
+    """Round a radius (mm) down to a multiple of `RADIUS_STEP`."""
+    steps = np.floor(radius / RADIUS_STEP * (1.0 + 1e-9))  # the factor allows for rounding of the quotient
+    return float(f"{steps * RADIUS_STEP:.12g}")  # removes the rounding error of the product

@@ -1,1 +1,1 @@
-"""Design of a layout: design case, table of charges, position error, search of the electrode positions."""
+"""Design of electrode layouts: design case, table of charges, position error, and search of the positions."""

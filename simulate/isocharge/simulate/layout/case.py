@@ -28,7 +28,7 @@ DEFAULT_SIDE = 3.0
 """Side of new squares if the sensor has no square electrodes, mm."""
 
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-"""Names of new electrodes, of which the first unused ones are taken."""
+"""Names of new electrodes. The first names that the kept electrodes do not use are assigned."""
 
 MAX_SEARCH_PRESSES = 300
 """Largest number of presses in the exchange. The refinement uses a fine grid."""
@@ -45,9 +45,9 @@ class Nuisances:
     """Standard deviations of parameters that are not known exactly when a press is read.
 
     Attributes:
-        probe_radius: Standard deviation of the probe radius, mm. An unknown distribution of the pressure, between
-            uniform and that of a rigid flat punch, contributes 0.05 times the radius, because only the second moment of
-            the pressure matters beyond the footprint.
+        probe_radius: Standard deviation of the probe radius, mm. It includes an unknown distribution of the pressure.
+            Outside the footprint, only the second moment of the pressure matters. Distributions between a uniform
+            pressure and that of a rigid flat punch differ like probes whose radii differ by 5 %.
         pretension: Standard deviation of the pretension after a calibration, MPa.
         gain: Standard deviation of the relative gain of each electrode, dimensionless.
     """
@@ -63,7 +63,7 @@ class Nuisances:
 
 
 NO_NUISANCES = Nuisances(probe_radius=0.0, pretension=0.0, gain=0.0)
-"""Nuisances for the case that only the contact is unknown."""
+"""Nuisances of a press for which everything except the contact is known exactly."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,9 @@ class WeightMap:
     table: Array
 
     def weigh(self, presses: Array) -> Array:
-        """Compute the weights of presses by linear interpolation, and by the nearest neighbour outside the table.
+        """Compute the weights of presses by linear interpolation between the rows of the table.
+
+        A press outside the area that the table covers has the weight of the nearest row.
 
         Args:
             presses: Positions (x, y), shape (n, 2), mm.
@@ -89,12 +91,12 @@ class WeightMap:
         """
         positions = self.table[:, :2]
         values = self.table[:, 2]
-        weights = scipy.interpolate.NearestNDInterpolator(positions, values)(presses)
+        nearest_weights = scipy.interpolate.NearestNDInterpolator(positions, values)(presses)
         spans_plane = np.linalg.matrix_rank(positions - positions[0]) == 2
-        if spans_plane:
-            linear = scipy.interpolate.LinearNDInterpolator(positions, values)(presses)
-            weights = np.where(np.isnan(linear), weights, linear)
-        return np.asarray(weights)
+        if not spans_plane:  # linear interpolation needs a triangulation of the positions
+            return np.asarray(nearest_weights)
+        linear_weights = scipy.interpolate.LinearNDInterpolator(positions, values)(presses)  # NaN outside
+        return np.asarray(np.where(np.isnan(linear_weights), nearest_weights, linear_weights))
 
 
 NamedGoal = Literal["worst", "rms"]
@@ -213,8 +215,9 @@ class DesignCase:
         if self.sensor.readout != "edge":
             return
         for electrode in self.kept_electrodes:
-            (left, _), (right, _), *_ = electrode.corners
-            if electrode.square and abs(right - left - self.square_side) > 1e-6:
+            lower_left, lower_right, *_ = electrode.corners
+            side = lower_right[0] - lower_left[0]
+            if electrode.square and abs(side - self.square_side) > 1e-6:
                 raise InputError(
                     f"side: with the readout 'edge' all squares have one side, got {self.square_side:g} mm"
                 )
@@ -227,8 +230,8 @@ class DesignCase:
         squares = [electrode for electrode in self.sensor.electrodes if electrode.square]
         if not squares:
             return DEFAULT_SIDE
-        corners = squares[0].corners
-        return float(corners[1][0] - corners[0][0])
+        lower_left, lower_right, *_ = squares[0].corners
+        return float(lower_right[0] - lower_left[0])
 
     @property
     def kept_electrodes(self) -> tuple[Electrode, ...]:
@@ -262,7 +265,7 @@ class DesignCase:
         return self.goal.weigh(presses) if isinstance(self.goal, WeightMap) else np.ones(len(presses))
 
     def clearance(self, positions: Array) -> Array:
-        """Compute by how much single squares exceed the smallest distances from the rim and the kept electrodes.
+        """Compute how far single squares are beyond the smallest distances from the rim and the kept electrodes.
 
         Args:
             positions: Centres of the squares, shape (n, 2), mm.
@@ -280,7 +283,7 @@ class DesignCase:
         return np.asarray(np.min(clearances, axis=0))
 
     def pair_clearance(self, positions: Array, others: Array) -> Array:
-        """Compute by how much pairs of new squares exceed the smallest distance between electrodes.
+        """Compute how far pairs of new squares are beyond the smallest distance between electrodes.
 
         Args:
             positions: Centres of the first squares, shape (n, 2), mm.

@@ -1,15 +1,18 @@
 """Table of the charges of electrodes anywhere on the film, and of their derivatives with respect to the parameters.
 
-The parameters are the contact and the nuisances. The equilibrium of a round film under a press depends only on the
-distance of the press from the centre, not on the electrodes. In the coordinates of the conformal map that carries the
-circle of the probe onto |z| = rho (`mesh.placement`), its stress is smooth except for a kink on that circle.
+The parameters are the contact and the nuisances. The equilibrium of a round film under a press depends on the distance
+of the press from the centre, but not on the electrodes. A conformal map transforms the circle of the probe into the
+circle |z| = rho (`mesh.placement`). In the coordinates of this map, the stress is smooth except for a kink on the
+circle.
 
 The equilibrium is solved at Chebyshev nodes in `distance_coordinate`. The stress and its finite differences with
-respect to the parameters are sampled on a grid. The grid is uniform in |z| within the circle, in ln|z| from the circle
-to the rim, and in arg z. The table interpolates with polynomials in the distance coordinate and with local cubics on
-the grid. An electrode collects the mean over its area.
+respect to the parameters are sampled on a polar grid in z. The rows of the grid are equally spaced in |z| within the
+circle, and in ln|z| between the circle and the rim. The table is interpolated with polynomials in the distance
+coordinate, and with local cubic polynomials on the grid. The charge of an electrode is its area times the mean charge
+per area.
 """
 
+import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -50,8 +53,8 @@ ANGLES = 64
 """Number of columns of the grid, at equal angles."""
 
 MARGIN = 0.03
-"""Share of rho that the grid omits on both sides of the circle, dimensionless. Finite differences across the kink of
-the stress would be wrong there."""
+"""Width of the gap of the grid on either side of the circle, in units of rho, dimensionless. In the gap, the finite
+differences would be wrong because of the kink of the stress."""
 
 RELATIVE_STEP = 0.02
 """Step of the finite differences with respect to position and probe radius, in units of the probe radius."""
@@ -62,13 +65,16 @@ LOG_FORCE_STEP = 0.05
 PRETENSION_STEP = 0.1
 """Step of the finite differences with respect to the pretension, MPa."""
 
-DISTANCES = (5, 8)
-"""Number of distances that are solved if the radius is at most, or more than, a quarter of the film radius."""
+N_DISTANCES = 5
+"""Number of distances that are solved if the radius is at most a quarter of the film radius."""
+
+N_DISTANCES_WIDE = 8
+"""Number of distances that are solved if the radius is more than a quarter of the film radius."""
 
 GAUSS_RULES = ((1.4, 10), (2.5, 4), (np.inf, 2))
-"""Largest distance of a square from a press, in units of half the diagonal of the square plus the probe radius, and
-number of Gauss points per side for this distance. The kink of the stress crosses squares nearer than the first
-distance."""
+"""Integration rules of squares. Each pair consists of the largest distance of a square from a press and the number of
+Gauss points per side up to this distance. The unit of the distances is the sum of half the diagonal of the square and
+the probe radius. The kink of the stress crosses only squares within the first distance."""
 
 PRESS_CHUNK = 256
 """Number of presses that are evaluated at once, which limits the memory to about 100 MB."""
@@ -115,12 +121,17 @@ class ChargeTable:
         film = sensor.film
         settings = SolveSettings(theory=theory_for(sensor, probe, (force, force)), layer=layer_for(film, force))
         settings = replace(settings, resolution=needed_resolution(film, probe, (radius, 0.0), force, settings))
+
         is_wide = radius > 0.25 * film.radius
+        n_distance = N_DISTANCES_WIDE if is_wide else N_DISTANCES
         largest_coordinate = float(distance_coordinate(radius / film.radius))
-        distance = film.radius * np.tanh(chebyshev_nodes(DISTANCES[int(is_wide)], 0.0, largest_coordinate))
+        distance = film.radius * np.tanh(chebyshev_nodes(n_distance, 0.0, largest_coordinate))
         solve = partial(_stress_at, film, sensor.surface, probe, force, settings)
-        solved = list(track(in_order(executor, solve, distance.tolist()), "solving the film", len(distance)))
-        stress = np.stack(solved).transpose(0, 3, 2, 1).reshape(3 * len(distance), -1).astype(np.float32)
+        solved = list(track(in_order(executor, solve, distance.tolist()), "solving the film", n_distance))
+
+        # From (n_distance, 6, n_node, 3) to (n_distance * 3, n_node * 6)
+        component_first = np.stack(solved).transpose(0, 3, 2, 1)
+        stress = component_first.reshape(3 * n_distance, -1).astype(np.float32)
         return cls(film.radius, probe, (sensor.piezo.d31, sensor.piezo.d32), distance, stress)
 
     def rows(self, presses: Array, centres: Array, side: float, others: tuple[Electrode, ...] = ()) -> Array:
@@ -200,7 +211,9 @@ class _PressedFilm:
         return cls(table, position, direction, pole, rho, density)
 
     def squares(self, centres: Array, side: float) -> Array:
-        """Compute the rows of all presses and squares; the number of Gauss points depends on the distance.
+        """Compute the rows of all presses and squares.
+
+        Squares near a press are integrated with more Gauss points than distant squares; see `GAUSS_RULES`.
 
         Args:
             centres: Centres of the squares, shape (m, 2), mm.
@@ -213,13 +226,13 @@ class _PressedFilm:
         relative_distance = distance / (np.sqrt(0.5) * side + self.table.probe.radius)
         rule_number = np.searchsorted([largest for largest, _ in GAUSS_RULES], relative_distance)
         rows = np.empty((*distance.shape, len(COLUMNS)))
-        for number, (_, count) in enumerate(GAUSS_RULES):
-            unit_points, weights = gauss_square(count)
+        for number, (_, points_per_side) in enumerate(GAUSS_RULES):
+            unit_points, weights = gauss_square(points_per_side)
             press_index, square_index = np.nonzero(rule_number == number)
-            size = POINT_CHUNK // len(unit_points)
-            for start in range(0, len(square_index), size):
-                press_chunk = press_index[start : start + size]
-                square_chunk = square_index[start : start + size]
+            chunk_size = POINT_CHUNK // len(unit_points)
+            for start in range(0, len(square_index), chunk_size):
+                press_chunk = press_index[start : start + chunk_size]
+                square_chunk = square_index[start : start + chunk_size]
                 points = centres[square_chunk, None] + side * (unit_points - 0.5)
                 rows[press_chunk, square_chunk] = side**2 * self.means(press_chunk, points, weights)
         return rows
@@ -233,80 +246,90 @@ class _PressedFilm:
         Returns:
             Rows with the columns `COLUMNS`, shape (n, 1, 6).
         """
-        points, weights = electrode_rule(electrode, "area", GAUSS_RULES[0][1])
-        chunk_count = -(-len(self.presses) * len(points) // POINT_CHUNK)
+        _, points_per_side = GAUSS_RULES[0]  # the finest rule
+        points, weights = electrode_rule(electrode, "area", points_per_side)
+        n_chunk = math.ceil(len(self.presses) * len(points) / POINT_CHUNK)
         means = []
-        for chunk in np.array_split(np.arange(len(self.presses)), chunk_count):
+        for chunk in np.array_split(np.arange(len(self.presses)), n_chunk):
             chunk_points = np.broadcast_to(points, (len(chunk), *points.shape))
             means.append(self.means(chunk, chunk_points, weights[:, 0]))
         return electrode.area * np.concatenate(means)[:, None]
 
-    def means(self, which: Integers, points: Array, weights: Array) -> Array:
+    def means(self, press_index: Integers, points: Array, weights: Array) -> Array:
         """Compute weighted means of the charge per area and its derivatives.
 
         Args:
-            which: Numbers of the presses, shape (k,).
+            press_index: Indices of the presses, shape (k,).
             points: Points on the film for each press, shape (k, n_point, 2), mm.
             weights: Weights of the points, which add up to one, shape (n_point,).
 
         Returns:
             Means with the columns `COLUMNS` per area, shape (k, 6).
         """
-        direction = self.direction[which]
-        row, column = self._grid_coordinates(which, points @ np.array([1.0, 1j]) / direction[:, None])
+        n_mean = len(press_index)
+        direction = self.direction[press_index]
+        complex_points = points @ np.array([1.0, 1j])
+        points_in_press_frame = complex_points / direction[:, None]
+        row, column = self._grid_coordinates(press_index, points_in_press_frame)
         rows, row_weights = _row_weights(row)
         columns, column_weights = cubic_weights(column, ANGLES, periodic=True)
 
         # Nodes of the grid around each point and their weights, shape (k, n_point, n_row, n_column)
-        first_row = which[:, None, None, None] * (INNER_ROWS + OUTER_ROWS)
+        first_row = press_index[:, None, None, None] * (INNER_ROWS + OUTER_ROWS)
         nodes = (first_row + rows[..., None]) * ANGLES + columns[..., None, :]
         node_weights = weights[:, None, None] * row_weights[..., None] * column_weights[..., None, :]
-        flat_weights = node_weights.reshape(len(which), 1, -1).astype(np.float32)
-        node_density = self.density[nodes.reshape(len(which), -1)]
+        flat_weights = node_weights.reshape(n_mean, 1, -1).astype(np.float32)
+        node_density = self.density[nodes.reshape(n_mean, -1)]
         mean: Array = np.matmul(flat_weights, node_density)[:, 0].astype(float)
 
-        # Rotation of the derivatives with respect to x and y from the frame of the press
-        position_derivative = (mean[:, 1] + 1j * mean[:, 2]) * direction
-        mean[:, 1] = position_derivative.real
-        mean[:, 2] = position_derivative.imag
+        # The derivatives with respect to x and y are rotated from the frame of the press to the frame of the film.
+        x_column = COLUMNS.index("x")
+        y_column = COLUMNS.index("y")
+        position_derivative = (mean[:, x_column] + 1j * mean[:, y_column]) * direction
+        mean[:, x_column] = position_derivative.real
+        mean[:, y_column] = position_derivative.imag
         return mean
 
-    def _grid_coordinates(self, which: Integers, points: Complexes) -> tuple[Array, Array]:
+    def _grid_coordinates(self, press_index: Integers, points: Complexes) -> tuple[Array, Array]:
         """Compute row and column on the grid. Points beyond the rim are moved to the rim.
 
         Args:
-            which: Numbers of the presses, shape (k,).
+            press_index: Indices of the presses, shape (k,).
             points: Points x + iy in the frame of the press, shape (k, n_point), mm.
 
         Returns:
             Fractional rows and columns, each of shape (k, n_point).
         """
-        z = points / self.table.film_radius
-        z = z / np.maximum(np.abs(z), 1.0)
-        pole = self.pole[which, None]
-        rho = self.rho[which, None]
-        z = (z - pole) / (1.0 - pole * z)
+        pole = self.pole[press_index, None]
+        rho = self.rho[press_index, None]
+        unit_points = points / self.table.film_radius
+        unit_points = unit_points / np.maximum(np.abs(unit_points), 1.0)
+        z = (unit_points - pole) / (1.0 - pole * unit_points)
         radius = np.abs(z)
+
+        # Rows are equally spaced in |z| within the circle, and in ln|z| outside; see `_grid_points`.
         inner_row = radius / (rho * (1.0 - MARGIN)) * (INNER_ROWS - 1)
-        outer_share = 1.0 - np.log(np.maximum(radius, rho)) / np.log(rho * (1.0 + MARGIN))
-        outer_row = INNER_ROWS + outer_share * (OUTER_ROWS - 1)
+        outer_fraction = 1.0 - np.log(np.maximum(radius, rho)) / np.log(rho * (1.0 + MARGIN))
+        outer_row = INNER_ROWS + outer_fraction * (OUTER_ROWS - 1)
         row = np.where(radius <= rho, inner_row, outer_row)
         return row, np.angle(z) * ANGLES / (2.0 * np.pi)
 
 
 def _row_weights(row: Array) -> tuple[Integers, Array]:
-    """Compute the nodes and weights of cubic interpolation across the rows, separately on both sides of the circle.
+    """Compute the rows and weights of cubic interpolation, separately on both sides of the circle of the probe.
 
     Args:
         row: Fractional rows, any shape.
 
     Returns:
-        Numbers of the four rows and their weights, each of shape (..., 4).
+        Indices of the four rows and their weights, each of shape (..., 4).
     """
     is_inner = (row < INNER_ROWS - 0.5)[..., None]
     inner_rows, inner_weights = cubic_weights(row, INNER_ROWS)
     outer_rows, outer_weights = cubic_weights(row - INNER_ROWS, OUTER_ROWS)
-    return np.where(is_inner, inner_rows, outer_rows + INNER_ROWS), np.where(is_inner, inner_weights, outer_weights)
+    rows = np.where(is_inner, inner_rows, outer_rows + INNER_ROWS)
+    weights = np.where(is_inner, inner_weights, outer_weights)
+    return rows, weights
 
 
 def _stress_at(
@@ -362,8 +385,8 @@ def _stress_at(
 def _grid_points(film_radius: float, probe_radius: float, distance: float) -> Array:
     """Compute the points of the grid of a press on the positive x axis.
 
-    The grid is polar in the coordinates z of a conformal map, in which the footprint is a circle about the centre. Its
-    rows are equally spaced inside the footprint, and equally spaced in the logarithm of |z| outside.
+    The grid is polar in the coordinate z of a conformal map, which transforms the footprint into a circle about the
+    centre. The rows of the grid are equally spaced in |z| within the footprint, and in ln|z| outside.
 
     Args:
         film_radius: Radius of the film, mm.

@@ -2,9 +2,9 @@
 
 Let A = d(charge) / d(x, y, ln F, nuisances) for all electrodes, W the diagonal matrix of the Fisher information that
 one reading provides about its charge, and P the inverse of the prior covariance. The information about all parameters
-is B = A' W A + P, and the block of its inverse that belongs to x and y is the Cramer-Rao limit, in which the nuisances
-are marginalised. Each electrode adds a product of vectors to B. With the row a of sqrt(W) A that belongs to a further
-electrode, the limit changes according to Sherman and Morrison (1950):
+is B = A' W A + P. The Cramer-Rao limit of the position, with marginalised nuisances, is the block of the inverse of B
+that belongs to x and y. A further electrode adds a matrix a a' to B, where a is the row of sqrt(W) A that belongs to
+this electrode. The limit then changes according to Sherman and Morrison (1950):
 
     tr_xy (B + a a')^-1 = tr_xy B^-1 - |(B^-1 a)_xy|^2 / (1 + a' B^-1 a).
 """
@@ -38,7 +38,12 @@ class ErrorModel:
 
     @classmethod
     def of(cls, noise: NoiseModel, nuisances: Nuisances) -> "ErrorModel":
-        """Create the model for a noise model and the standard deviations of the nuisances."""
+        """Create the error model of readings with a noise and with nuisances.
+
+        Args:
+            noise: Noise of the readings.
+            nuisances: Standard deviations of the nuisances. The gain is combined with the gain of the noise.
+        """
         gain = float(np.hypot(noise.gain, nuisances.gain))
         prior_std = [
             POSITION_PRIOR_STD,
@@ -99,8 +104,10 @@ def with_one_more(sensitivity: Array, candidates: Array) -> Array:
     Returns:
         Squared position errors, shape (n_press, n_candidate), mm^2.
     """
+    # With the notation of the docstring of this module: `inverse` is B^-1, and each candidate is a vector a.
     inverse = inverse_information(sensitivity)
     inverse_times_candidate = inverse @ candidates
-    position_part = (inverse_times_candidate[:, :2] ** 2).sum(axis=1)
-    reduction = position_part / (1.0 + (inverse_times_candidate * candidates).sum(axis=1))
+    squared_position_part = (inverse_times_candidate[:, :2] ** 2).sum(axis=1)  # |(B^-1 a)_xy|^2
+    quadratic_form = (inverse_times_candidate * candidates).sum(axis=1)  # a' B^-1 a
+    reduction = squared_position_part / (1.0 + quadratic_form)
     return np.asarray(position_variance(inverse)[:, None] - POSITION_PRIOR_STD**2 * reduction)

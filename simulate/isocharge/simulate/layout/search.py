@@ -1,16 +1,17 @@
 """Search of the electrode positions: exchange on a grid, then minimisation of the largest error on a fine grid.
 
 The exchange (Fedorov 1972; Meyer and Nachtsheim 1995) starts from a random layout. Each square in turn is moved to the
-position that gives the smallest error together with the other electrodes, until no square moves. All positions of a
-grid are compared at once, because one further electrode changes the information by a product of vectors. If the goal is
-the largest error, the exchange minimises a power mean of the errors, which is close to the largest error.
+position at which the error of the whole layout is smallest, until the error no longer decreases. The formula of Sherman
+and Morrison compares all positions of a grid at once (`position_error`). If the goal is the largest error, the exchange
+minimises a power mean of the errors, which approximates the largest error.
 
-The largest error occurs mostly beside an electrode, where a coarse grid of presses misses it. The refinement therefore
-solves
+The largest error mostly occurs near the edge of an electrode, between the presses of a coarse grid. The refinement
+therefore solves
 
     minimise t   subject to   ln error(press) <= t   for the presses with the largest errors on a fine grid
 
-by sequential quadratic programming within a small step, and selects the presses again after every step.
+by sequential quadratic programming with a limited change of the positions. The presses are selected again in each
+round.
 """
 
 from collections.abc import Callable
@@ -63,7 +64,7 @@ MAX_ROUNDS = 8
 MAX_ITERATIONS = 25
 """Largest number of quadratic programs in a round."""
 
-ACTIVE_SHARE = 0.9
+ACTIVE_ERROR = 0.9
 """Error above which a press becomes a constraint, relative to the largest error, dimensionless."""
 
 MAX_ACTIVE = 60
@@ -96,24 +97,28 @@ def random_layouts(case: DesignCase) -> tuple[Array, list[Integers]]:
         case: Design case.
 
     Returns:
-        Positions of the grid, shape (n, 2), mm, and for each of `STARTS` layouts the numbers of its positions, shape
-        (n_new,).
+        Positions of the grid, shape (n, 2), mm, and `STARTS` layouts. A layout is an array of indices into the
+        positions of the grid, shape (n_new,).
 
     Raises:
         InputError: If the squares do not fit.
     """
     film_radius = case.sensor.film.radius
-    grid_radius = min(case.radius + GRID_EXTENT * film_radius, film_radius - case.rim - 0.5 * case.square_side)
+    useful_radius = case.radius + GRID_EXTENT * film_radius
+    allowed_radius = film_radius - case.rim - 0.5 * case.square_side
+    grid_radius = min(useful_radius, allowed_radius)
     grid = square_grid(grid_radius, grid_radius / GRID_STEPS)
-    grid = grid[case.clearance(grid) >= 0.0]
+    allowed_grid = grid[case.clearance(grid) >= 0.0]
+
     rng = np.random.default_rng(case.seed)
-    layouts = [_random_layout(case, grid, rng) for _ in range(STARTS)]
-    if min(map(len, layouts)) < case.new_count:
+    layouts = [_random_layout(case, allowed_grid, rng) for _ in range(STARTS)]
+    is_any_incomplete = any(len(layout) < case.new_count for layout in layouts)
+    if is_any_incomplete:
         raise InputError(
             f"{case.new_count} new squares of {case.square_side:g} mm do not fit within {grid_radius:.3g} mm of the "
             f"centre, with gaps of {case.gap:g} mm; ask for fewer, smaller or nearer electrodes"
         )
-    return grid, layouts
+    return allowed_grid, layouts
 
 
 def _random_layout(case: DesignCase, grid: Array, rng: np.random.Generator) -> Integers:
@@ -125,7 +130,7 @@ def _random_layout(case: DesignCase, grid: Array, rng: np.random.Generator) -> I
         rng: Random number generator.
 
     Returns:
-        Indices of the positions: as many as fit, and at most the number of new squares.
+        Indices of the positions. There are fewer than `case.new_count` positions if no further square fits.
     """
     chosen: list[int] = []
     for candidate in rng.permutation(len(grid)).tolist():
@@ -169,25 +174,25 @@ class Search:
         """Rows of the kept electrodes for all presses, shape (n, n_kept, 6)."""
         return self.table.rows(self.presses, np.empty((0, 2)), self.case.square_side, self.case.kept_electrodes)
 
-    def squared(self, positions: Array, which: Integers | slice) -> Array:
+    def squared_errors(self, positions: Array, selection: Integers | slice) -> Array:
         """Compute the squared position errors of a layout.
 
         Args:
             positions: Centres of the new squares, shape (n_new, 2), mm.
-            which: Selection of presses.
+            selection: Selection of presses.
 
         Returns:
             Squared errors, shape (n_press,), mm^2.
         """
-        rows = self.table.rows(self.presses[which], positions, self.case.square_side)
-        return self.model.squared(np.concatenate([rows, self.kept_rows[which]], axis=1))
+        rows = self.table.rows(self.presses[selection], positions, self.case.square_side)
+        return self.model.squared(np.concatenate([rows, self.kept_rows[selection]], axis=1))
 
     def optima(self, grid: Array, layouts: list[Integers]) -> list[Array]:
-        """Improve layouts by exchange and return the best ones that differ.
+        """Improve layouts by exchange, and return at most `MAX_FINALISTS` different layouts with the smallest errors.
 
         Args:
             grid: Positions of the grid, shape (n, 2), mm.
-            layouts: Numbers of the positions of each initial layout, each of shape (n_new,).
+            layouts: Indices of the positions of each initial layout, each of shape (n_new,).
 
         Returns:
             Centres of the new squares of each layout, each of shape (n_new, 2), mm, in ascending order of the error.
@@ -195,78 +200,82 @@ class Search:
         exchange = _Exchange.of(self, grid)
         results = [exchange.improve(layout) for layout in track(layouts, "exchanging")]
         results.sort(key=lambda result: result[0])
-        finalists = results[:1]
-        for value, chosen in results:
-            last_value = finalists[-1][0]
-            if len(finalists) < MAX_FINALISTS and value > last_value * (1.0 + MIN_DIFFERENCE):
-                finalists.append((value, chosen))
-        return [grid[chosen] for _, chosen in finalists]
+        finalists: list[Array] = []
+        last_value = 0.0
+        for value, indices in results:
+            is_different = value > last_value * (1.0 + MIN_DIFFERENCE)
+            if is_different and len(finalists) < MAX_FINALISTS:
+                finalists.append(grid[indices])
+                last_value = value
+        return finalists
 
     def value(self, positions: Array) -> float:
         """Compute the quantity that the search minimises, mm: the largest error, or the weighted root mean square."""
         return float(np.exp(self._log_errors(positions, ALL_PRESSES).max()))
 
-    def _log_errors(self, positions: Array, which: Integers | slice) -> Array:
-        """Compute the logarithms of the position errors, from which the goal of the search is computed.
+    def _log_errors(self, positions: Array, selection: Integers | slice) -> Array:
+        """Compute the logarithms of the errors whose maximum is minimised.
 
         Args:
             positions: Centres of the new squares, shape (n_new, 2), mm.
-            which: Selection of presses.
+            selection: Selection of presses.
 
         Returns:
-            ln of the error of each press if the goal is the worst error, shape (n_press,). For other goals ln of the
-            weighted root mean square, shape (1,).
+            Logarithm of the error (mm) of each press if the goal is the largest error, shape (n_press,). For other
+            goals, logarithm of the weighted root mean square of the errors (mm), shape (1,).
         """
-        rows = self.table.rows(self.presses[which], positions, self.case.square_side)
-        return self._goal_values(np.concatenate([rows, self.kept_rows[which]], axis=1), which)
+        rows = self.table.rows(self.presses[selection], positions, self.case.square_side)
+        return self._log_errors_of_rows(np.concatenate([rows, self.kept_rows[selection]], axis=1), selection)
 
-    def _goal_values(self, rows: Array, which: Integers | slice) -> Array:
+    def _log_errors_of_rows(self, rows: Array, selection: Integers | slice) -> Array:
         """Compute the result of `_log_errors` from the charges and derivatives of all electrodes.
 
         Args:
             rows: Rows of the charge table, shape (n_press, n_electrode, 6).
-            which: Selection of presses.
+            selection: Selection of the presses to which the rows belong.
         """
         squared_error = self.model.squared(rows)
         if self.case.goal != "worst":
-            squared_error = np.average(squared_error, weights=self.weights[which], keepdims=True)
+            squared_error = np.average(squared_error, weights=self.weights[selection], keepdims=True)
         return np.asarray(0.5 * np.log(squared_error))
 
-    def _log_error_jacobian(self, positions: Array, which: Integers | slice) -> Array:
-        """Compute the derivatives of `_log_errors` with respect to the coordinates by differences.
+    def _log_error_jacobian(self, positions: Array, selection: Integers | slice) -> Array:
+        """Compute the derivatives of `_log_errors` with respect to the coordinates by forward differences.
 
-        The electrodes that do not move keep their rows, so that only one square is integrated for each coordinate.
+        If one square moves, the rows of all other electrodes remain unchanged. Only the moved square is integrated
+        again.
 
         Args:
             positions: Centres of the new squares, shape (n_new, 2), mm.
-            which: Selection of presses.
+            selection: Selection of presses.
 
         Returns:
             Shape (n_error, 2 n_new), 1/mm.
         """
-        presses = self.presses[which]
-        kept_rows = self.kept_rows[which]
+        kept_rows = self.kept_rows[selection]
         n_new = len(positions)
 
-        # rows of the new squares, and of the same squares moved along x and along y
+        # Rows of the new squares, followed by the rows of each square after a step along x and after a step along y
         steps = DIFFERENCE_STEP * np.eye(2)
         moved_positions = (positions[:, None] + steps).reshape(-1, 2)
         all_positions = np.concatenate([positions, moved_positions])
-        all_rows = self.table.rows(presses, all_positions, self.case.square_side)
+        all_rows = self.table.rows(self.presses[selection], all_positions, self.case.square_side)
         new_rows = all_rows[:, :n_new]
         moved_rows = all_rows[:, n_new:]
 
-        log_error = self._goal_values(np.concatenate([new_rows, kept_rows], axis=1), which)
+        log_error = self._log_errors_of_rows(np.concatenate([new_rows, kept_rows], axis=1), selection)
         derivatives = []
         for coordinate in range(2 * n_new):
+            square = coordinate // 2
             changed_rows = new_rows.copy()
-            changed_rows[:, coordinate // 2] = moved_rows[:, coordinate]
-            changed_log_error = self._goal_values(np.concatenate([changed_rows, kept_rows], axis=1), which)
+            changed_rows[:, square] = moved_rows[:, coordinate]
+            all_changed_rows = np.concatenate([changed_rows, kept_rows], axis=1)
+            changed_log_error = self._log_errors_of_rows(all_changed_rows, selection)
             derivatives.append((changed_log_error - log_error) / DIFFERENCE_STEP)
         return np.stack(derivatives, axis=1)
 
     def _clearance_jacobian(self, positions: Array) -> Array:
-        """Compute the derivatives of all distance rules with respect to the coordinates by differences.
+        """Compute the derivatives of all distance rules with respect to the coordinates by forward differences.
 
         Args:
             positions: Centres of the new squares, shape (n_new, 2), mm.
@@ -315,13 +324,13 @@ class Search:
         """
         active: Integers | slice = ALL_PRESSES
         if self.case.goal == "worst":
-            squared = self.squared(positions, ALL_PRESSES)
-            largest = np.argsort(-squared)[:MAX_ACTIVE]
-            active = largest[squared[largest] >= ACTIVE_SHARE**2 * squared.max()]
+            squared_error = self.squared_errors(positions, ALL_PRESSES)
+            largest = np.argsort(-squared_error)[:MAX_ACTIVE]
+            active = largest[squared_error[largest] >= ACTIVE_ERROR**2 * squared_error.max()]
 
-        # The variables are the coordinates, followed by a bound of the log errors, which is minimised.
+        # The variables are the coordinates, followed by an upper bound of the logarithmic errors, which is minimised.
         def constraints(variables: Array) -> Array:
-            """Return the values that must not be negative, of the log errors and of the distance rules."""
+            """Return values that must not be negative: the bound minus the log errors, and the excess distances."""
             moved = variables[:-1].reshape(-1, 2)
             bound = variables[-1]
             return np.concatenate([bound - self._log_errors(moved, active), self.case.all_clearances(moved)])
@@ -356,8 +365,9 @@ class _Exchange:
     """Exchange of single squares on a grid of positions.
 
     Attributes:
-        mean_error: Function from a layout without one square, as numbers of positions, to the power mean of the errors
-            (before the root) with a further square at each position, shape (n,); infinite where it violates a rule.
+        mean_error: Function of the other squares of a layout, which are given as indices of positions. It returns the
+            mean of the errors to the given power, for a further square at each position of the grid, shape (n,). The
+            mean is infinite if the further square violates a distance rule.
         power: Power of the errors in the mean, dimensionless.
     """
 
@@ -384,10 +394,10 @@ class _Exchange:
         power = WORST_POWER if case.goal == "worst" else RMS_POWER
 
         def mean_error(other_squares: Integers) -> Array:
-            """Return the power mean of the errors for each position of one further square; see `_Exchange`."""
+            """Return the mean for each position of one further square; see `_Exchange`."""
             others_sensitivity = candidates[:, :, other_squares].swapaxes(1, 2)
-            present = np.concatenate([kept_sensitivity, others_sensitivity], axis=1)
-            squared_error = np.maximum(with_one_more(present, candidates), 1e-12)  # shape (n_press, n)
+            layout_sensitivity = np.concatenate([kept_sensitivity, others_sensitivity], axis=1)
+            squared_error = np.maximum(with_one_more(layout_sensitivity, candidates), 1e-12)  # shape (n_press, n)
             mean = np.average(squared_error ** (0.5 * power), axis=0, weights=weights)
             is_allowed = is_allowed_pair[other_squares].all(axis=0)
             mean[~is_allowed] = np.inf
@@ -399,19 +409,20 @@ class _Exchange:
         """Exchange squares until no exchange of a single square improves the layout.
 
         Args:
-            layout: Numbers of the positions, shape (n_new,).
+            layout: Indices of the positions, shape (n_new,).
 
         Returns:
-            Power mean of the errors, mm, and the numbers of the improved positions, shape (n_new,).
+            Power mean of the errors, mm, and the indices of the improved positions, shape (n_new,).
         """
-        chosen = layout.copy()
+        improved = layout.copy()
         best_value = np.inf
         for _ in range(MAX_SWEEPS):
-            for square in range(len(chosen)):
-                mean = self.mean_error(np.delete(chosen, square))
-                chosen[square] = np.argmin(mean)
-            value = float(mean.min() ** (1.0 / self.power))
+            for square in range(len(improved)):
+                other_squares = np.delete(improved, square)
+                mean_error = self.mean_error(other_squares)
+                improved[square] = np.argmin(mean_error)
+            value = float(mean_error.min() ** (1.0 / self.power))
             if value > best_value * (1.0 - MIN_SWEEP_GAIN):
                 break
             best_value = value
-        return value, chosen
+        return value, improved

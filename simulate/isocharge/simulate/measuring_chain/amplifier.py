@@ -6,18 +6,18 @@ factor of e within tau. The output of reading n is
     v[n] = exp(-dt / tau) v[n-1] + g (q[n] - q[n-1]) + b dt,
 
 where q is the charge of the film (touch charge and pyroelectric charge), g the gain and b the bias current. Offset,
-hum, white noise, clipping and the rounding of the converter follow. A film with creep responds to a unit step of the
-touch charge with
+hum, white noise, clipping and the rounding of the converter are then applied to the output. A film with creep responds
+to a unit step of the touch charge with
 
     h(t) = 1 - creep log10(t / 1 s) + thermoelastic exp(-t / film_time).
 
-The logarithm is valid from some milliseconds to days. It is approximated by a Prony series with two terms per decade,
-according to Boltzmann's superposition principle. The exponential describes the cooling of the stretched film, which
-lasts until the film has its initial temperature again.
+The logarithm is valid from some milliseconds to days. A Prony series with two terms per decade approximates the
+logarithm, and Boltzmann's superposition principle gives the response to any touch charge. The exponential describes the
+cooling of the film when it is stretched, and its return to the initial temperature.
 
-The values of hum, offset, bias and mismatch in the built-in levels are engineering choices for a tidy and for a noisy
-electric environment; they are not measurements. The memoryless noise is defined in `measuring_chain.noise`; the levels
-`clean` and `reference` contain only this noise.
+The values of hum, offset, bias and mismatch in the built-in levels are plausible for an electric environment with
+little or with strong interference. They were not measured. The levels `clean` and `reference` contain only the
+memoryless noise of `measuring_chain.noise`.
 """
 
 import math
@@ -36,14 +36,14 @@ from isocharge.simulate.measuring_chain.noise import NoiseModel
 PVDF_PYRO = -30.0 * 9.0
 """Pyroelectric charge of a PVDF electrode of 9 mm^2 per temperature change, pC/K, for -30 uC/(m^2 K).
 
-It is negative if a press gives positive charges (d31 > 0), because warming makes the film thicker and a press makes it
-thinner."""
+The sign is negative if a press results in positive charges (d31 > 0), because a warmer film is thicker, and a pressed
+film is thinner."""
 
 FILM_TIME = 1.78e-3 * 1.2 * 0.025 / (2.0 * 1e-5)
 """Time constant with which a PVDF film of 25 um follows the temperature of the air at both faces, s.
 
-It is density times specific heat times thickness divided by twice the heat transfer coefficient, for 1.78 g/cm^3,
-1.2 J/(g K) and 10 W/(m^2 K), which is typical of free convection and radiation."""
+The time constant is density * specific heat * thickness / (2 * heat transfer coefficient), with 1.78 g/cm^3,
+1.2 J/(g K) and 10 W/(m^2 K). This heat transfer coefficient is typical of free convection and radiation."""
 
 
 CREEP_TIMES = 10.0 ** np.arange(-3.0, 6.1, 0.5)
@@ -72,7 +72,8 @@ class Amplifier:
         pyro: Pyroelectric charge of each electrode per temperature change, pC/K; negative for PVDF with d31 > 0.
         pyro_mismatch: Standard deviation of the relative error of the pyroelectric charge of a channel, dimensionless.
         creep: Share of a touch charge that is lost in each decade of time, dimensionless.
-        thermoelastic: Share by which a touch charge is initially increased, dimensionless.
+        thermoelastic: Initial increase of a touch charge by the cooling of the film, relative to the touch charge,
+            dimensionless.
         temperature_rms: Root mean square of the temperature drift of the film, K.
         temperature_time: Time constant of the temperature drift of the air, s.
         step: Temperature step of the air, K.
@@ -137,7 +138,7 @@ class Amplifier:
 
 @dataclass
 class Measurement:
-    """Running measurement, which is called with successive blocks of touch charges.
+    """Running measurement. It is called with successive blocks of touch charges and returns their readings.
 
     Attributes:
         amplifier: Parameters of the measuring chain.
@@ -169,18 +170,21 @@ class Measurement:
     _touch_charge: Array = field(init=False)
 
     def __post_init__(self) -> None:
-        """Draw the temperatures at the beginning, and set the charges to their stationary values."""
-        first, second = self.amplifier.temperature_rms * self.rng.standard_normal(2)
+        """Draw the initial temperatures, and set all charges to their stationary values at these temperatures."""
+        # The temperature of the film has the standard deviation `temperature_rms`, and that of the air a larger one.
+        common, independent = self.amplifier.temperature_rms * self.rng.standard_normal(2)
         variance_ratio = self._variance_ratio
         correlation = math.sqrt(variance_ratio)  # between the stationary temperatures of the film and the air
-        self._air_temperature = first / correlation
-        self._film_temperature = correlation * first + math.sqrt(1.0 - variance_ratio) * second
+        self._air_temperature = common / correlation
+        self._film_temperature = correlation * common + math.sqrt(1.0 - variance_ratio) * independent
+
         self._film_charge = self.pyro * self._film_temperature
         self._touch_charge = np.zeros_like(self.gain)
         self._relaxation = np.zeros((CREEP_TIMES.size + 1, 1, self.gain.size))
         self._output = np.zeros_like(self.gain)
         if math.isfinite(self.amplifier.tau):
-            self._output = self.bias / (1.0 - np.exp(-1.0 / (self.rate * self.tau))) / self.rate
+            decay = np.exp(-1.0 / (self.rate * self.tau))
+            self._output = self.bias / (1.0 - decay) / self.rate  # the bias current balances the leak
 
     def __call__(self, charge: Array, charge_per_K: Array | None = None) -> Array:
         """Simulate the readings of the next block of touch charges.
@@ -201,14 +205,15 @@ class Measurement:
         film_charge = self._relaxed(charge) + self.pyro * temperature
         output = self._integrate(film_charge) + self.offset
         hum_angle = 2.0 * np.pi * self.amplifier.hum_frequency * time[:, np.newaxis] + self.phase
-        noisy = self.amplifier.noise.add(output + self.amplifier.hum * np.sin(hum_angle), self.rng)
-        return self._convert(noisy)
+        output_with_hum = output + self.amplifier.hum * np.sin(hum_angle)
+        noisy_output = self.amplifier.noise.add(output_with_hum, self.rng)
+        return self._convert(noisy_output)
 
     def _relaxed(self, charge: Array) -> Array:
         """Apply creep and the thermoelastic effect to touch charges.
 
-        Both effects are sums of exponentials. Each exponential is a recursive filter of the changes of the charge, and
-        the state of the filter is kept for the next call.
+        Both effects are sums of decaying exponentials. Each exponential is computed by a recursive filter of the
+        changes of the charge. The state of the filter is stored for the next call.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
@@ -223,14 +228,15 @@ class Measurement:
         self._touch_charge = charge[-1]
 
         time_constants = np.append(CREEP_TIMES, chain.film_time)
-        creep_shares = np.full(CREEP_TIMES.size, 0.5 * chain.creep)
-        shares = np.append(creep_shares, chain.thermoelastic)
-        # The factor makes the charge equal to the touch charge one second after the touch.
-        relaxed: Array = (1.0 - 0.5 * chain.creep * np.exp(-1.0 / CREEP_TIMES).sum()) * charge
-        for index, (time_constant, share) in enumerate(zip(time_constants, shares, strict=True)):
+        creep_amplitudes = np.full(CREEP_TIMES.size, 0.5 * chain.creep)
+        amplitudes = np.append(creep_amplitudes, chain.thermoelastic)
+        # With this factor, the charge is equal to the touch charge one second after the touch.
+        factor = 1.0 - 0.5 * chain.creep * np.exp(-1.0 / CREEP_TIMES).sum()
+        relaxed: Array = factor * charge
+        for index, (time_constant, amplitude) in enumerate(zip(time_constants, amplitudes, strict=True)):
             decay = math.exp(-1.0 / (self.rate * time_constant))
             exponential, self._relaxation[index] = scipy.signal.lfilter(
-                [share], [1.0, -decay], changes, axis=0, zi=self._relaxation[index]
+                [amplitude], [1.0, -decay], changes, axis=0, zi=self._relaxation[index]
             )
             relaxed = relaxed + exponential
         return relaxed
@@ -255,7 +261,8 @@ class Measurement:
         air_decay = math.exp(-1.0 / (self.rate * chain.temperature_time))
         film_decay = math.exp(-1.0 / (self.rate * chain.film_time))
 
-        # Drift of the air, with the innovations that give the film the rms value `temperature_rms`
+        # Drift of the air. The innovations are scaled so that the temperature of the film has the standard deviation
+        # `temperature_rms`.
         innovation_std = math.sqrt((1.0 - air_decay * air_decay) / self._variance_ratio) * chain.temperature_rms
         innovations = innovation_std * self.rng.standard_normal(time.size)
         air_start = [air_decay * self._air_temperature]
@@ -264,8 +271,8 @@ class Measurement:
         # Trapezoidal change of the temperature of the air: ramp up, constant value, ramp down
         time_since_step = time - chain.step_at
         time_until_end = chain.step_for - time_since_step
-        step_share = np.clip(np.minimum(time_since_step, time_until_end) / chain.step_time, 0.0, 1.0)
-        air = drift + chain.step * step_share
+        relative_step = np.clip(np.minimum(time_since_step, time_until_end) / chain.step_time, 0.0, 1.0)
+        air = drift + chain.step * relative_step
 
         film_start = [film_decay * self._film_temperature]
         film: Array = scipy.signal.lfilter([1.0 - film_decay], [1.0, -film_decay], air, zi=film_start)[0]

@@ -1,10 +1,10 @@
-"""Noise model of the measuring chain, used for training, for Cramer-Rao limits and for the virtual sensor.
+"""Noise model of the measuring chain. Training, Cramer-Rao limits and the virtual sensor use this model.
 
 The noise is independent between channels and readings, with the variance
 
     sigma^2 = white^2 + (gain * Q)^2.
 
-Leak, hum, drift, temperature, mismatch and clipping are modelled by `measuring_chain.amplifier`.
+The module `measuring_chain.amplifier` simulates leak, hum, drift, temperature, mismatch and clipping.
 """
 
 import math
@@ -41,7 +41,7 @@ class NoiseModel:
         return np.hypot(self.white, self.gain * np.asarray(charge))
 
     def variance(self, charge: Array) -> Array:
-        """Compute the variance (pC^2) for charges (pC) of any shape, which is faster than to square `sigma`."""
+        """Compute the variance (pC^2) for charges (pC) of any shape. This is faster than squaring `sigma`."""
         return self.white**2 + (self.gain * np.asarray(charge)) ** 2
 
     def information(self, charge: Array) -> Array:

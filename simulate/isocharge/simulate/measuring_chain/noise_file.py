@@ -31,7 +31,7 @@ BENCH = Amplifier(
     limit=1500.0,
     bits=16,
 )
-"""Amplifier of the level `bench`: a tidy electric environment."""
+"""Amplifier of the level `bench`, which is plausible for an electric environment with little interference."""
 
 AMPLIFIER_LEVELS = {
     "clean": Amplifier(noise=NOISE_LEVELS["clean"]),
@@ -57,7 +57,8 @@ KEY_NAMES = {
     "film_time": "film_time_s",
     "limit": "limit_pC",
 }
-"""Keys of the TOML file that differ from the names of the attributes of `Amplifier`, because they contain the unit."""
+"""Keys of the TOML file by the attributes of `Amplifier`. These keys differ from the attributes, because they contain
+the unit."""
 
 AmplifierFile = defstruct(
     "AmplifierFile",
@@ -75,8 +76,8 @@ AmplifierFile = defstruct(
     frozen=True,
     rename=KEY_NAMES,
 )
-"""Content of the TOML file: noise, and the attributes of `Amplifier` with their bounds. Keys that are absent have the
-value of the level `like`."""
+"""Content of the TOML file: the noise, and the attributes of `Amplifier` with their bounds. An absent key has the value
+of the level `like`."""
 
 
 def load_amplifier(level: str) -> Amplifier:
@@ -90,8 +91,8 @@ def load_amplifier(level: str) -> Amplifier:
         level: Name of a level, or path of a TOML file.
 
     Raises:
-        InputError: If the level or the file does not exist, if a key is unknown or its value out of range, or if a
-            resolution of the converter is given without a limit.
+        InputError: If the level or the file does not exist, if a key is unknown or its value is out of range, or if
+            the resolution of the converter is given without a limit.
     """
     if level in AMPLIFIER_LEVELS:
         return AMPLIFIER_LEVELS[level]

@@ -1,1 +1,1 @@
-"""The film's physics, dimensionless: membrane and bending energy, stress, and which theory a press needs."""
+"""Mechanics of the film in dimensionless form: energy, stress, scaling, temperature and the choice of the theory."""

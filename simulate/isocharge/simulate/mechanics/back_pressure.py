@@ -5,8 +5,9 @@ If the film displaces the volume V of a closed cavity with the volume V0, the pr
     p0 V0 / (V0 - V) - p0,
 
 where p0 is the pressure of the atmosphere (Boyle's law, at constant temperature). The energy of the air is
--p0 V0 (ln(1 - V / V0) + V / V0). Both pressures act along the direction of the push on the area of the undeformed film,
-as in the theory of plates. With S = integral(W), the units of `mechanics.scaling` give V / V0 = compression * S.
+-p0 V0 (ln(1 - V / V0) + V / V0). The static pressure and the pressure of the air act along the direction of the push on
+the area of the undeformed film, as in the theory of plates. In the units of `mechanics.scaling`, V / V0 is the product
+of `compression` and the integral of W over the film.
 """
 
 from functools import cached_property
@@ -18,7 +19,8 @@ from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.placed_mesh import Geometry
 
 SERIES_BELOW = 1e-3
-"""Compression below which the energy of the air is computed by a series, because the logarithm loses digits."""
+"""Compression below which the energy of the air is computed by a series, because the formula with the logarithm loses
+digits."""
 
 
 class BackPressure:
@@ -32,7 +34,7 @@ class BackPressure:
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
         self.geometry = geometry
         self.groups = groups
-        self._copies = 1.0 / float(geometry.load.sum())
+        self._copies = 1.0 / float(geometry.load.sum())  # number of copies of the mesh that cover the film
 
     @cached_property
     def weights(self) -> Array:
@@ -40,7 +42,10 @@ class BackPressure:
         return self.geometry.gather(self.geometry.mass)
 
     def energy(self, deflection: Array) -> float:
-        """Compute the energy of the meshed part for a deflection W, shape (n_node,); infinite if no air remains."""
+        """Compute the energy of the meshed part of the film for a deflection W, shape (n_node,).
+
+        The energy is infinite if the film displaces the whole volume of the air.
+        """
         volume = self._volume(deflection)
         static_work = self.groups.static_pressure * volume
         if self.groups.compression == 0.0:
@@ -49,7 +54,11 @@ class BackPressure:
         return (air_energy - static_work) / self._copies
 
     def forces(self, deflection: Array) -> Array:
-        """Compute the derivatives of the energy with respect to W, shape (n_node,), for W of the same shape."""
+        """Compute the derivatives of the energy with respect to W at the nodes, shape (n_node,).
+
+        Args:
+            deflection: W at the nodes, shape (n_node,).
+        """
         pressure = -self.groups.static_pressure
         compression = self.groups.compression * self._volume(deflection)
         if compression >= 1.0:
@@ -59,7 +68,11 @@ class BackPressure:
         return pressure * self.weights
 
     def stiffness(self, deflection: Array) -> float:
-        """Compute the factor c of the second derivatives of the energy, which are c times weights times weights."""
+        """Compute the factor c of the second derivatives c * weights[i] * weights[j] of the energy.
+
+        Args:
+            deflection: W at the nodes, shape (n_node,).
+        """
         compression = self.groups.compression * self._volume(deflection)
         slope = self.groups.ambient_pressure * self.groups.compression / (1.0 - compression) ** 2
         return float(self._copies * slope)
@@ -73,7 +86,7 @@ class BackPressure:
         return self._copies * float(self.weights @ deflection)
 
     def _air_energy(self, deflection: Array) -> float:
-        """Compute the energy of the air over p0 V0, which is -ln(1 - x) - x for the compression x.
+        """Compute the energy of the air over p0 V0, which is -ln(1 - x) - x for the relative compression x = V / V0.
 
         Args:
             deflection: W at the nodes, shape (n_node,).
@@ -84,10 +97,11 @@ class BackPressure:
         x = self.groups.compression * self._volume(deflection)
         if x >= 1.0:
             return np.inf
-        if abs(x) < SERIES_BELOW:
-            # Taylor series x^2 / 2 + x^3 / 3 + ..., evaluated by Horner's scheme
-            series = 1.0 / 6.0
-            for exponent in (5.0, 4.0, 3.0, 2.0):
-                series = 1.0 / exponent + x * series
-            return x**2 * series
-        return float(-np.log1p(-x) - x)
+        if abs(x) >= SERIES_BELOW:
+            return float(-np.log1p(-x) - x)
+
+        # Taylor series x^2 / 2 + x^3 / 3 + ... + x^6 / 6, evaluated by Horner's scheme
+        series = 1.0 / 6.0
+        for exponent in (5.0, 4.0, 3.0, 2.0):
+            series = 1.0 / exponent + x * series
+        return x**2 * series

@@ -14,8 +14,8 @@ Green-Lagrange strain are
 
 The expression in brackets is the scaled strain E', which is of order one for every force. The stress is that of St.
 Venant-Kirchhoff elasticity in plane stress, S = E_young A^2 (C : E' + tau I). Energies are in units of
-E_young h a^2 A^4. An anisotropic film adds a matrix to C and a deviator to tau I (`scaling.Anisotropy`). Its bending
-stiffness is that of the isotropic film.
+E_young h a^2 A^4. If the film is anisotropic, a matrix is added to C and a deviator to tau I (`scaling.Anisotropy`).
+The bending stiffness of an anisotropic film is that of the isotropic film.
 """
 
 from dataclasses import replace
@@ -34,11 +34,12 @@ COMPONENT_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Pairs of displacement components whose blocks of the tangent are computed. The other blocks follow by symmetry."""
 
 SHIFT = 5.0
-"""Shift s of the linear solves with bending, between 0 and 11.56, twice the lowest eigenvalue of the film."""
+"""Shift s of the linear solves with bending; see `Bending`. It must lie between 0 and 11.56, which is twice the lowest
+eigenvalue of the film."""
 
 
 class ElasticFilm:
-    """The discrete film for one mesh and one set of dimensionless groups.
+    """The film as a discrete elastic system, for one mesh and one set of dimensionless groups.
 
     Attributes:
         geometry: Elements of the mesh.
@@ -62,7 +63,7 @@ class ElasticFilm:
 
     @property
     def has_side_load(self) -> bool:
-        """Whether the probe also pulls the film along its plane."""
+        """Whether the force of the probe has a component in the plane of the film."""
         return self.groups.side_load != (0.0, 0.0)
 
     def energy(self, field: Array) -> float:
@@ -99,25 +100,33 @@ class ElasticFilm:
 
     @property
     def load_scale(self) -> float:
-        """Norm of the forces at the nodes by the probe or, without a probe, by the static pressure."""
+        """Norm of the nodal forces of the probe, or of the static pressure if there is no probe."""
         if self.groups.load == 0.0 and self.back is not None:
             return abs(self.groups.static_pressure) * float(np.linalg.norm(self.back.weights))
         return self.groups.load * float(np.linalg.norm(self.geometry.load))
 
     def work(self, field: Array) -> float:
-        """Compute the size of the work of the probe or, without a probe, of the static pressure on a field."""
+        """Compute the magnitude of the work of the probe, or of the static pressure if there is no probe.
+
+        Args:
+            field: Scaled displacements, shape (n_node, 3).
+        """
         if self.groups.load == 0.0 and self.back is not None:
             return abs(self.back.static_work(field[:, 2]))
         return self.groups.load * abs(float(self.geometry.load @ field[:, 2]))
 
     def in_plane_scale(self, field: Array) -> float:
-        """Compute the norm of the in-plane forces of the elements, to which the in-plane residual is relative."""
+        """Compute the norm of the in-plane forces of the elements. The in-plane residual is divided by this norm.
+
+        Args:
+            field: Scaled displacements, shape (n_node, 3).
+        """
         return float(np.linalg.norm(self.membrane.forces(field)[..., :2]))
 
     def tangent(self, field: Array, guard: float = 0.0) -> Array:
         """Compute the element matrices of the linear solve, without the stiffness of trapped air.
 
-        This stiffness couples all nodes; see `solver.tangent_factor`.
+        The stiffness of trapped air couples all nodes, so `solver.tangent_factor` adds it separately.
 
         Args:
             field: Scaled displacements, shape (n_node, 3).
@@ -136,9 +145,10 @@ class Membrane:
     """Stretching energy of the geometrically nonlinear membrane.
 
     The energy is integral( E' : C : E' / 2 + tau (tr E' - div U) ). The integral of div U over a clamped film is zero.
-    It is subtracted because its round-off would dominate the other terms if the pretension is large. With
-    F_ia = d_ia + A^2 U_i,a for i = 1, 2 and F_3a = W,a, the variation of E' is sym(F_ia v_i,b) for all three
-    components. (Strain and stress: Bonet and Wood 2008, ch. 3 and 6; scaling: Schwerin 1929.)
+    The term div U is subtracted because its rounding errors would dominate the other terms if the pretension is large.
+    With F_ia = d_ia + A^2 U_i,a for i = 1, 2 and F_3a = W,a, the variation of E' is sym(F_ia v_i,b) for all three
+    components of a test displacement v. The strain and the stress are derived by Bonet and Wood (2008, ch. 3 and 6),
+    and the scaling by Schwerin (1929).
     """
 
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
@@ -157,20 +167,20 @@ class Membrane:
         """Difference between the pretension and its mean, over E_young A^2, shape (2, 2); None if isotropic."""
         return None if self.groups.anisotropy is None else _tensor(self.groups.anisotropy.tension)
 
-    def _stress(self, elastic: Array) -> Array:
-        """Compute the stress C : E' of the film and its coat at the quadrature points.
+    def _stress(self, elastic_strain: Array) -> Array:
+        """Compute the stress C : E' of the film and its coat at the quadrature points, without the pretension.
 
         Args:
-            elastic: Scaled strain (E11, E22, 2 E12), shape (n_element, n_point, 3).
+            elastic_strain: Scaled strain E' as (E11, E22, 2 E12), shape (n_element, n_point, 3).
 
         Returns:
             (S11, S22, S12), same shape.
         """
-        total = scaled_stress(elastic, self.groups)
+        elastic_stress = scaled_stress(elastic_strain, self.groups)
         if self.geometry.coat is not None:
-            coated, moduli = self.geometry.coat
-            total[coated] += (moduli @ elastic[coated][..., None])[..., 0]
-        return total
+            coated_elements, moduli = self.geometry.coat
+            elastic_stress[coated_elements] += (moduli @ elastic_strain[coated_elements][..., None])[..., 0]
+        return elastic_stress
 
     def _slope(self, field: Array) -> Array:
         """Compute d(U1, U2, W)/d(X1, X2) at the quadrature points.
@@ -211,7 +221,7 @@ class Membrane:
         elastic_strain = strain(slope, self.groups.amplitude2)
         energy_density = 0.5 * np.sum(elastic_strain * self._stress(elastic_strain), axis=-1)
 
-        # The part of the pretension, from which the integral of div U is subtracted, is quadratic in the slopes.
+        # Without div U, the term of the pretension is quadratic in the slopes.
         energy_density += 0.5 * self.groups.tension * np.sum(slope**2 @ self._scale, axis=-1)
         if self._deviator is not None:
             energy_density += 0.5 * np.sum(slope * (self._deviator @ slope) @ self._scale, axis=-1)
@@ -274,15 +284,15 @@ class Membrane:
         return matrix.transpose(0, 2, 1, 4, 3)
 
     def _moduli(self, stretch: Array, i: int, j: int) -> Array:
-        """Compute the material part of d(traction_ia)/d(slope_jb) for a pair of components.
+        """Compute the material part of d(traction_ia)/d(slope_jb) for a pair of displacement components.
 
-        It is the product of the derivatives of the strain with respect to both slopes with the elasticity matrix. For
-        the isotropic elasticity matrix, the product is written out.
+        With the derivative B_i of the strain (E11, E22, 2 E12) with respect to the slopes of component i, the result is
+        B_i C B_j'. For the isotropic elasticity matrix C, the product is written out.
 
         Args:
             stretch: F, shape (n_element, n_point, 2, 3).
-            i: Component of the traction.
-            j: Component of the slope.
+            i: Displacement component of the traction, from 0 to 2.
+            j: Displacement component of the slope, from 0 to 2.
 
         Returns:
             Shape (n_element, n_point, 2, 2), with the indices a and b.
@@ -290,24 +300,24 @@ class Membrane:
         poisson = self.groups.poisson
         plane_modulus = 1.0 / (1.0 - poisson**2)
         shear_modulus = 0.5 / (1.0 + poisson)
-        i1 = stretch[..., 0, i]  # F_i1 and so on
-        i2 = stretch[..., 1, i]
-        j1 = stretch[..., 0, j]
-        j2 = stretch[..., 1, j]
-        block = np.empty((*i1.shape, 2, 2))
-        block[..., 0, 0] = plane_modulus * i1 * j1 + shear_modulus * i2 * j2
-        block[..., 1, 1] = plane_modulus * i2 * j2 + shear_modulus * i1 * j1
-        block[..., 0, 1] = plane_modulus * poisson * i1 * j2 + shear_modulus * i2 * j1
-        block[..., 1, 0] = plane_modulus * poisson * i2 * j1 + shear_modulus * i1 * j2
+        f_i1 = stretch[..., 0, i]
+        f_i2 = stretch[..., 1, i]
+        f_j1 = stretch[..., 0, j]
+        f_j2 = stretch[..., 1, j]
+        block = np.empty((*f_i1.shape, 2, 2))
+        block[..., 0, 0] = plane_modulus * f_i1 * f_j1 + shear_modulus * f_i2 * f_j2
+        block[..., 1, 1] = plane_modulus * f_i2 * f_j2 + shear_modulus * f_i1 * f_j1
+        block[..., 0, 1] = plane_modulus * poisson * f_i1 * f_j2 + shear_modulus * f_i2 * f_j1
+        block[..., 1, 0] = plane_modulus * poisson * f_i2 * f_j1 + shear_modulus * f_i1 * f_j2
         if self.groups.anisotropy is not None:
-            i_derivative = _strain_by_slope(i1, i2)
-            j_derivative = _strain_by_slope(j1, j2)
+            i_derivative = _strain_derivative(f_i1, f_i2)
+            j_derivative = _strain_derivative(f_j1, f_j2)
             block += i_derivative @ self.groups.anisotropy.moduli @ j_derivative.swapaxes(-1, -2)
         if self.geometry.coat is not None:
-            coated, moduli = self.geometry.coat
-            i_derivative = _strain_by_slope(i1[coated], i2[coated])
-            j_derivative = _strain_by_slope(j1[coated], j2[coated])
-            block[coated] += i_derivative @ moduli @ j_derivative.swapaxes(-1, -2)
+            coated_elements, moduli = self.geometry.coat
+            i_derivative = _strain_derivative(f_i1[coated_elements], f_i2[coated_elements])
+            j_derivative = _strain_derivative(f_j1[coated_elements], f_j2[coated_elements])
+            block[coated_elements] += i_derivative @ moduli @ j_derivative.swapaxes(-1, -2)
         return block
 
 
@@ -318,9 +328,9 @@ class Bending:
 
         integral( m phi ) = -integral( grad W . grad phi )   for every basis function phi.
 
-    Since this includes the basis functions on the rim, it also clamps the slope at the rim (Ciarlet and Raviart 1974).
-    The integral on the left is lumped on the Gauss-Lobatto nodes, so m = -M^-1 L W with a diagonal matrix M, and the
-    energy is beta / 2 W L^T M^-1 L W.
+    Since the basis functions on the rim are included, this definition also clamps the slope at the rim (Ciarlet and
+    Raviart 1974). The integral on the left is lumped on the Gauss-Lobatto nodes, so m = -M^-1 L W with a diagonal
+    matrix M. The energy is then beta / 2 W L^T M^-1 L W.
 
     The matrix of this energy couples elements that do not touch. The linear solves therefore have an additional unknown
     mu = sqrt(beta) M^-1 (L - s M) W, where s is a shift:
@@ -328,10 +338,10 @@ class Bending:
         [ K + beta (2 s L - s^2 M)    sqrt(beta) (L - s M)^T ] [W ]   [r]
         [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0]
 
-    The solution W does not depend on s, because the Schur complement is K + beta L^T M^-1 L for every s. If s lies
-    between 0 and twice the lowest eigenvalue of the film (5.78), the first block is positive definite even if K
-    vanishes, as in a thick film without tension. The matrix is then quasi-definite and needs no pivoting (Vanderbei
-    1995).
+    The solution W does not depend on s, because the Schur complement is K + beta L^T M^-1 L for every s. The lowest
+    eigenvalue of the film is 5.78. If s lies between 0 and twice this eigenvalue, the first block is positive definite
+    even if K vanishes, as in a thick film without tension. The matrix is then quasi-definite and needs no pivoting
+    (Vanderbei 1995).
     """
 
     def __init__(self, geometry: Geometry, stiffness: float) -> None:
@@ -362,10 +372,12 @@ class Bending:
         constraint = self.geometry.constraint
         if constraint is None:
             return np.asarray(-weak_laplacian / self._mass)
-        if self._factor is None:  # the constraint makes the mass matrix non-diagonal
+
+        # With hanging nodes, the mass matrix is not diagonal. It is factorised once.
+        if self._factor is None:
             constrained_mass = constraint.T @ diags_array(self._mass) @ constraint
             is_hanging = constraint.diagonal() == 0.0
-            unit_diagonal = diags_array(is_hanging.astype(float))  # keeps the matrix regular
+            unit_diagonal = diags_array(is_hanging.astype(float))  # the rows of hanging nodes would be zero otherwise
             self._factor = splu((constrained_mass + unit_diagonal).tocsc())
         return np.asarray(-(constraint @ self._factor.solve(weak_laplacian)))
 
@@ -386,7 +398,7 @@ class Bending:
         return np.asarray(-self.stiffness * (self._laplace @ laplacian[..., None])[..., 0])
 
     def extend(self, tangent: Array) -> Array:
-        """Add bending to the element matrices of the membrane.
+        """Add bending to the element matrices of the membrane; see the matrix in the docstring of this class.
 
         Args:
             tangent: Matrices for (U1, U2, W), shape (n_element, n_local, 3, n_local, 3).
@@ -406,24 +418,24 @@ class Bending:
         return matrix
 
 
-def _strain_by_slope(first: Array, second: Array) -> Array:
-    """Compute d(E11, E22, 2 E12) / d(slope) for one displacement component.
+def _strain_derivative(f_i1: Array, f_i2: Array) -> Array:
+    """Compute the derivatives of the strain with respect to the slopes U_i,1 and U_i,2 of one displacement component.
 
     Args:
-        first: F_i1 of the component, shape (...).
-        second: F_i2 of the component, shape (...).
+        f_i1: Element F_i1 of the deformation gradient, shape (...).
+        f_i2: Element F_i2 of the deformation gradient, shape (...).
 
     Returns:
-        Shape (..., 2, 3): the derivative of the component, then the strain.
+        Derivatives of (E11, E22, 2 E12), shape (..., 2, 3), with one row for each slope.
     """
-    derivative = np.zeros((*first.shape, 2, 3))
-    derivative[..., 0, 0] = first
-    derivative[..., 1, 2] = first
-    derivative[..., 1, 1] = second
-    derivative[..., 0, 2] = second
+    derivative = np.zeros((*f_i1.shape, 2, 3))
+    derivative[..., 0, 0] = f_i1  # d E11 / d U_i,1
+    derivative[..., 1, 1] = f_i2  # d E22 / d U_i,2
+    derivative[..., 0, 2] = f_i2  # d 2 E12 / d U_i,1
+    derivative[..., 1, 2] = f_i1  # d 2 E12 / d U_i,2
     return derivative
 
 
-def _tensor(total: Array) -> Array:
+def _tensor(stress: Array) -> Array:
     """Convert stresses (S11, S22, S12), shape (..., 3), into symmetric matrices, shape (..., 2, 2)."""
-    return total[..., [0, 2, 2, 1]].reshape(*total.shape[:-1], 2, 2)
+    return stress[..., [0, 2, 2, 1]].reshape(*stress.shape[:-1], 2, 2)

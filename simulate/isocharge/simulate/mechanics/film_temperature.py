@@ -5,9 +5,9 @@ along each axis of the film changes by
 
     strain_i = ring_expansion * dR - expansion_i * dT,
 
-and the pretension by the stress of this strain, with the plane-stress stiffness of the film. A drawn film expands more
-across the drawn direction than along it, and its tension changes accordingly. A thin film follows the temperature of
-the air within seconds, and a ring within many minutes.
+and the pretension changes by the stress of this strain, with the plane-stress stiffness of the film. A drawn film
+expands more across the drawn direction than along this direction, so its tension becomes uneven. The temperature of a
+thin film follows that of the air within seconds, and the temperature of a ring within many minutes.
 """
 
 from dataclasses import replace
@@ -22,7 +22,7 @@ from isocharge.simulate.sensor.sensor import Sensor
 
 
 def tension_change(film: Film, film_K: float, ring_K: float) -> Array:
-    """Compute the change of the pretension by changes of the temperatures.
+    """Compute the change of the pretension that changes of the temperatures of film and ring cause.
 
     Args:
         film: The film. If it has no expansion coefficients, the result is zero.
@@ -37,17 +37,17 @@ def tension_change(film: Film, film_K: float, ring_K: float) -> Array:
     expansion_1, expansion_2 = film.expansion
     ring_strain = film.ring_expansion * ring_K
     strain = np.array([ring_strain - expansion_1 * film_K, ring_strain - expansion_2 * film_K, 0.0])
-    in_film_axes = film.young * stress(strain, film.poisson, orthotropic_moduli(film))
-    return rotate_stress(in_film_axes, film.axis)
+    change_in_film_axes = film.young * stress(strain, film.poisson, orthotropic_moduli(film))
+    return rotate_stress(change_in_film_axes, film.axis)
 
 
 def warmed(sensor: Sensor, film_K: float, ring_K: float = 0.0) -> Sensor:
-    """Return the sensor with the pretension at other temperatures of the film and of its ring.
+    """Return the sensor with the pretension that it has at other temperatures of the film and of its ring.
 
     Args:
-        sensor: The sensor as described.
-        film_K: Temperature of the film less that for which the sensor is described, K.
-        ring_K: Temperature of the ring less that for which the sensor is described, K.
+        sensor: The sensor at the temperatures for which it is described.
+        film_K: Difference between the temperature of the film and the temperature for which it is described, K.
+        ring_K: Difference between the temperature of the ring and the temperature for which it is described, K.
 
     Raises:
         SensorError: If the film becomes so slack that it is outside the range of the simulator.
@@ -59,6 +59,9 @@ def warmed(sensor: Sensor, film_K: float, ring_K: float = 0.0) -> Sensor:
     pretension = film.pretension + 0.5 * (tension_11 + tension_22)
     if film.expands_evenly:
         return replace(sensor, film=replace(film, pretension=pretension))
-    difference, shear = film.deviator
-    deviator = (difference + 0.5 * (tension_11 - tension_22), shear + tension_12)
-    return replace(sensor, film=replace(film, pretension=pretension, deviator=deviator))
+
+    # The deviator of the tension consists of half of its difference along x and y, and of its shear.
+    half_difference, shear = film.deviator
+    warm_half_difference = half_difference + 0.5 * (tension_11 - tension_22)
+    warm_shear = shear + tension_12
+    return replace(sensor, film=replace(film, pretension=pretension, deviator=(warm_half_difference, warm_shear)))

@@ -6,9 +6,10 @@ Under a central force F, the deflection of the centre is w = a A. The force F / 
     (pretension / E) A      for a membrane with a large pretension,
     16 pi b A               for a plate, with b = (h / a)^2 / (12 (1 - poisson^2))
 
-(Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). The sum of the three terms is a cubic equation for A,
-which is a good approximation also between the limiting cases. The in-plane displacement is proportional to A^2. After
-this scaling, only the ratios of the terms remain as parameters of the press.
+(Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). The amplitude A is the solution of the cubic equation
+in which the sum of the three terms is equal to F / (E h a). This is a good approximation also between the limiting
+cases. The in-plane displacement is proportional to A^2. After this scaling, only the ratios of the terms remain as
+parameters of the press.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from isocharge.simulate.mechanics.stress import rotate_stress, stress, stress_ro
 from isocharge.simulate.sensor.film import Film
 
 MEMBRANE_STIFFNESS = 1.6
-"""Force over deflection of a membrane with a large pretension, in units of pretension times thickness.
+"""Ratio of force to deflection of a membrane with a large pretension, in units of pretension times thickness.
 
 The value is 2 pi / ln(a / R) for a probe radius R = 0.02 a."""
 
@@ -29,10 +30,12 @@ AMBIENT_PRESSURE = 0.101325
 """Pressure of the atmosphere, MPa."""
 
 AIR_SHAPE = 0.6
-"""Square of the volume under the first iterate of Newton's method, over its height, in units of a^2."""
+"""Square of the ratio of the volume under the film to the deflection of the centre, for the first iterate of Newton's
+method, in units of a^4."""
 
 PLATE_STIFFNESS = 16.0 * np.pi
-"""Force over deflection of a clamped plate under a central point load, in units of the plate stiffness over a^2."""
+"""Ratio of force to deflection of a clamped plate under a central point load, in units of the plate stiffness over
+a^2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +68,8 @@ class DimensionlessGroups:
         side_load: Side force (Fx, Fy) over E h a A^2, in axes that are rotated with the press.
         static_pressure: Static pressure over E h A^3 / a, positive in the direction of the push.
         ambient_pressure: Pressure of the atmosphere over E h A^3 / a. Zero if the back is vented.
-        compression: Relative compression of the air behind the film, per integral of the scaled deflection W over the
-            film. Zero if the back is vented.
+        compression: Relative compression of the air behind the film, divided by the integral of the scaled deflection W
+            over the film. Zero if the back is vented.
     """
 
     amplitude2: float
@@ -103,20 +106,23 @@ class DimensionlessGroups:
             The groups, which describe the press completely.
         """
         amplitude2 = float(amplitude_squared(film, force))
+        force_unit = film.young * film.thickness * film.radius * amplitude2**1.5
+        pressure_unit = film.young * film.thickness * amplitude2**1.5 / film.radius
+
         side_load = (0.0, 0.0)
-        if any(side_force):
+        if any(side_force):  # rotated into the axes of the press
             side_x, side_y = side_force
             along_press = side_x * np.cos(angle) + side_y * np.sin(angle)
             across_press = side_y * np.cos(angle) - side_x * np.sin(angle)
             side_unit = side_force_unit(film, amplitude2)
             side_load = (float(along_press / side_unit), float(across_press / side_unit))
-        pressure_unit = film.young * film.thickness * amplitude2**1.5 / film.radius
+
         compression = 0.0
         if film.back_volume is not None:
             compression = film.radius**3 * amplitude2**0.5 / film.back_volume
         return cls(
             amplitude2=amplitude2,
-            load=force / (film.young * film.thickness * film.radius * amplitude2**1.5),
+            load=force / force_unit,
             tension=film.pretension / (film.young * amplitude2),
             bending=slenderness(film) / amplitude2 if bending else 0.0,
             poisson=film.poisson,
@@ -139,13 +145,15 @@ class DimensionlessGroups:
 
     @property
     def total_load(self) -> float:
-        """Force of the probe plus the size of the force of the static pressure, over E h a A^3."""
+        """Sum of the force of the probe and the magnitude of the force of the static pressure, over E h a A^3."""
         return self.load + np.pi * abs(self.static_pressure)
 
     @property
     def height(self) -> float:
-        """Approximate deflection of the centre in units of a A, which is one for groups of a film with a vented back
-        that `of` computes."""
+        """Approximate deflection of the centre in units of a A.
+
+        It is one for the groups that `of` computes with bending for a film with a vented back.
+        """
         linear = MEMBRANE_STIFFNESS * max(self.tension, 0.0) + PLATE_STIFFNESS * self.bending
         air = AIR_SHAPE * self.ambient_pressure * self.compression
         return float(_root(linear + air, self.load))
@@ -154,8 +162,9 @@ class DimensionlessGroups:
     def static_height(self) -> float:
         """Approximate deflection of the centre by the static pressure, in units of a A.
 
-        The deflection is (0.662)^3 p of a membrane without pretension (Hencky 1915), p / 4 over the pretension, and
-        p / 64 over the bending stiffness.
+        The deflection H is the root of a cubic equation that has the correct limits for a scaled pressure p:
+        H^3 = (0.662)^3 p for a membrane without pretension (Hencky 1915), H = p / (4 tension) for a large pretension,
+        and H = p / (64 bending) for a plate.
         """
         air = 0.5 * np.pi * self.ambient_pressure * self.compression
         linear = 4.0 * max(self.tension, 0.0) + 64.0 * self.bending + air
@@ -165,7 +174,7 @@ class DimensionlessGroups:
 
     @property
     def induced(self) -> float:
-        """Approximate share of the load that the induced stress carries: 0 in a linear theory, 1 without pretension."""
+        """Approximate share of the load that the induced stress carries, from 0 (linear film) to 1 (no pretension)."""
         return self.height**3 / self.load
 
     def stiffened(self, tension: float) -> "DimensionlessGroups":
@@ -173,18 +182,18 @@ class DimensionlessGroups:
         return replace(self, tension=self.tension + tension)
 
 
-def scaled_stress(strained: Array, groups: DimensionlessGroups) -> Array:
+def scaled_stress(scaled_strain: Array, groups: DimensionlessGroups) -> Array:
     """Compute the scaled stress C : E' of a scaled strain.
 
     Args:
-        strained: Scaled strain (E11, E22, 2 E12), shape (..., 3), in units of A^2.
+        scaled_strain: Scaled strain (E11, E22, 2 E12), shape (..., 3), in units of A^2.
         groups: Dimensionless groups of the press.
 
     Returns:
         (S11, S22, S12), shape (..., 3), in units of E_young A^2.
     """
     moduli = None if groups.anisotropy is None else groups.anisotropy.moduli
-    return stress(strained, groups.poisson, moduli)
+    return stress(scaled_strain, groups.poisson, moduli)
 
 
 def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:
@@ -208,20 +217,23 @@ def _anisotropy(film: Film, amplitude2: float, angle: float) -> Anisotropy:
 
 
 def orthotropic_moduli(film: Film) -> Array:
-    """Compute the difference of the elasticity matrix C over E from that of the isotropic film, in the film's axes.
+    """Compute the difference between the elasticity matrix C over E of a film and that of an isotropic film.
 
-    The moduli along the axes are E1 = E root and E2 = E / root.
+    The axes are those of the film. The moduli along the axes are E1 = E r and E2 = E / r, with r^2 = E1 / E2.
+
+    Args:
+        film: The film.
 
     Returns:
-        Shape (3, 3).
+        Difference for the strain components (E11, E22, 2 E12), shape (3, 3), dimensionless.
     """
     plane_modulus = 1.0 / (1.0 - film.poisson**2)
-    root = np.sqrt(film.young_ratio)
-    change_11 = plane_modulus * (root - 1.0)
-    change_22 = plane_modulus * (1.0 / root - 1.0)
+    r = np.sqrt(film.young_ratio)
+    difference_11 = plane_modulus * (r - 1.0)
+    difference_22 = plane_modulus * (1.0 / r - 1.0)
     isotropic_shear = 0.5 / (1.0 + film.poisson)
-    change_shear = 0.0 if film.shear is None else film.shear / film.young - isotropic_shear
-    return np.diag([change_11, change_22, change_shear])
+    difference_12 = 0.0 if film.shear is None else film.shear / film.young - isotropic_shear
+    return np.diag([difference_11, difference_22, difference_12])
 
 
 def side_force_unit(film: Film, amplitude2: Array | float) -> Any:
@@ -243,7 +255,7 @@ def slenderness(film: Film) -> float:
 
 
 def amplitude_squared(film: Film, force: Array | float) -> Any:
-    """Compute the square A^2 of the amplitude of a press; see the module.
+    """Compute the square A^2 of the amplitude of a press; see the docstring of this module.
 
     Args:
         film: The film.
@@ -256,9 +268,10 @@ def amplitude_squared(film: Film, force: Array | float) -> Any:
     return _root(linear, force / (film.young * film.thickness * film.radius)) ** 2
 
 
-def _root(linear: float, right: Array | float) -> Any:
-    """Return the real root x of x^3 + linear * x = right, where `linear` and `right` are not negative."""
-    scale = np.sqrt(linear / 3.0)
+def _root(linear: float, right_side: Array | float) -> Any:
+    """Return the real root x of x^3 + linear * x = right_side. Both parameters must not be negative."""
     if linear == 0.0:
-        return np.cbrt(right)
-    return 2.0 * scale * np.sinh(np.arcsinh(right / (2.0 * scale**3)) / 3.0)
+        return np.cbrt(right_side)
+    scale = np.sqrt(linear / 3.0)
+    # Hyperbolic form of Cardano's formula, from x = 2 scale sinh(t) and 4 sinh(t)^3 + 3 sinh(t) = sinh(3 t)
+    return 2.0 * scale * np.sinh(np.arcsinh(right_side / (2.0 * scale**3)) / 3.0)

@@ -1,14 +1,24 @@
-"""Strain, stress, principal stresses, and the rotation of stresses."""
+"""Strain and stress of a film, principal stresses, and rotation of stresses."""
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 
 
-def principal_stresses(total: Array) -> tuple[float, float]:
-    """Compute the smallest and the largest principal stress of an array of stresses (S11, S22, S12), shape (..., 3)."""
-    mean = 0.5 * (total[..., 0] + total[..., 1])
-    radius = np.hypot(0.5 * (total[..., 0] - total[..., 1]), total[..., 2])
+def principal_stresses(stresses: Array) -> tuple[float, float]:
+    """Compute the smallest and the largest of the principal stresses of many stresses.
+
+    Args:
+        stresses: Stresses (S11, S22, S12), shape (..., 3).
+
+    Returns:
+        Smallest and largest principal stress, in the unit of the stresses.
+    """
+    s11 = stresses[..., 0]
+    s22 = stresses[..., 1]
+    s12 = stresses[..., 2]
+    mean = 0.5 * (s11 + s22)
+    radius = np.hypot(0.5 * (s11 - s22), s12)  # of Mohr's circle
     return float((mean - radius).min()), float((mean + radius).max())
 
 
@@ -59,8 +69,10 @@ def stress(strain: Array, poisson: float, moduli: Array | None = None) -> Array:
 
 
 def stress_rotation(angle: float) -> Array:
-    """Return the matrix T of `rotate_stress` for an angle (rad), shape (3, 3). T C T^T rotates an elasticity matrix
-    C."""
+    """Return the matrix T of `rotate_stress` for an angle (rad), shape (3, 3).
+
+    T C T^T is the elasticity matrix C of a rotated material in the unrotated frame.
+    """
     return rotate_stress(np.eye(3), angle).T
 
 

@@ -1,8 +1,9 @@
 """The choice between the theories of the film, and the error of the terms that a theory omits.
 
-One formulation has two optional terms. *Bending* matters within the bending length l = sqrt(D / N) of the rim and of
-the probe, where N is the tension force per length, and for stress at the surface of the film. If the pretension and the
-induced tension are small, bending carries the load. *Stretching* is the effect of the induced stress on the deflection.
+All theories are special cases of one formulation with two optional terms. The first term is *bending*. It matters
+within the bending length l = sqrt(D / N) of the rim and of the probe, where D is the bending stiffness and N is the
+tension force per length, and for the stress at the surface of the film. If the pretension and the induced tension are
+small, bending carries the load. The second term is *stretching*, the effect of the induced stress on the deflection.
 Without stretching the film is linear, and the charges are computed from the linear deflection in a second step. The
 pretension is always included.
 
@@ -27,22 +28,23 @@ ACCURACY = 1e-3
 """Default target of the relative error of a charge, dimensionless."""
 
 LINEAR_WEIGHT = 4.0
-"""Relative error of a charge by a linear theory, per share of the load that the induced stress carries."""
+"""Ratio of the relative error of a charge by a linear theory to the share of the load that the induced stress
+carries."""
 
 LOCAL_WEIGHT = 0.4
-"""Relative error of a charge by a linear theory of a taut film, per ratio of the strain that the footprint induces to
-the strain of the pretension."""
+"""Factor of the relative error of a charge by a linear theory of a film with a large pretension. It multiplies the
+ratio of the strain that the footprint induces to the strain of the pretension."""
 
 BENDING_WEIGHT = 1.5
-"""Largest relative error of a charge without bending, per ratio of the bending length to the film radius. The largest
-value in the reference cases of tests/data is 1.41."""
+"""Factor of the largest relative error of a charge without bending. It multiplies the ratio of the bending length to
+the film radius. The largest factor in the reference cases of tests/data is 1.41."""
 
 MAX_MEMBRANE_BENDING_LENGTH = 0.3
 """Bending length, in film radii, above which a membrane does not describe the film. The error is then infinite."""
 
 PROBE_WEIGHT = 4.0
-"""Relative error of a charge of a taut film without bending, per squared ratio of the bending length at the probe to
-the reach of the probe."""
+"""Factor of the relative error of a charge without bending, for a film with a large pretension. It multiplies the
+squared ratio of the bending length at the probe to the reach of the probe."""
 
 INDUCED_STRAIN = 0.44
 """Radial strain at the rim of a membrane without pretension, in units of the squared amplitude A^2."""
@@ -87,9 +89,9 @@ def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
     """Estimate the relative change of a charge by bending at the footprint, for a film with pretension.
 
     The change is proportional to the squared ratio of the bending length to the reach of the footprint. The tension at
-    the footprint is the sum of the pretension and of the stress S = E W'^2 / 2 of a membrane without pretension. The
-    equilibrium of S W' with the load gives W'^3 = F / (pi R h E). If the induced stress dominates, the charges hardly
-    change.
+    the footprint is the sum of the pretension and of the stress S = E W'^2 / 2 of a membrane without pretension, whose
+    slope at the footprint is W'. The slope follows from the equilibrium 2 pi R h S W' = F of the stress with the load,
+    which means W'^3 = F / (pi R h E). If the induced stress dominates, bending hardly changes the charges.
 
     Args:
         film: The film.
@@ -109,10 +111,10 @@ def bending_at_probe(film: Film, probe: Probe, force: float) -> float:
 
 
 def induced_at_probe(film: Film, probe: Probe, force: float) -> float:
-    """Estimate the strain that the footprint induces in a taut film, relative to the strain of the pretension T.
+    """Estimate the ratio of the strain that the footprint induces in a film to the strain of the pretension T.
 
-    The slope at the footprint is F / (2 pi R h T). If the bending length exceeds the footprint, bending reduces the
-    slope.
+    The slope of a film with a large pretension at the footprint is F / (2 pi R h T). If the bending length exceeds the
+    footprint, bending reduces the slope.
 
     Args:
         film: The film.
@@ -184,8 +186,9 @@ def choose_theory(film: Film, probe: Probe, force: float, accuracy: float) -> Th
 
 
 def theory_for(sensor: Sensor, probe: Probe, force_range: tuple[float, float], accuracy: float = ACCURACY) -> Theory:
-    """Return the theory with the fewest terms that suffice for all forces of a range and for the surface of the
-    readout.
+    """Return the theory with the fewest terms that is sufficient for all forces of a range.
+
+    If the stress is read at an outer surface of the film, the theory includes bending.
 
     Args:
         sensor: The sensor.
@@ -207,7 +210,7 @@ def theory_by_name(name: str, film: Film) -> Theory:
     Args:
         name: "linear plate", "linear membrane", "nonlinear membrane" or "nonlinear membrane + bending". The prefix
             "pre-tensioned " of a linear theory is optional.
-        film: The film, whose pretension decides whether the theory has one.
+        film: The film. The theory includes a pretension if the film has one.
 
     Raises:
         SceneError: If no theory has this name, or the film has no stiffness in this theory.

@@ -1,1 +1,1 @@
-"""The mesh that follows the probe: its topology, the conformal map that places it, its elements."""
+"""Mesh of a press: its elements, the conformal map that places them on the film, and its refinement along coats."""

@@ -1,4 +1,4 @@
-"""The elements of the mesh and their adjacency, which do not depend on the position of the probe or the film.
+"""The elements of the mesh and their adjacency, which depend neither on the position of the probe nor on the film.
 
 The innermost circle of the mesh encloses the footprint. The mesh consists of three parts:
 
@@ -8,11 +8,12 @@ The innermost circle of the mesh encloses the footprint. The mesh consists of th
        film resists bending.
 
 A polygonal footprint is its own core polygon. A circular footprint has a virtual square as its core polygon, and its
-boundary is the innermost circle. Any other curved footprint has a core polygon, one layer of blocks up to its boundary
+boundary is the innermost circle. Any other curved footprint has a core polygon, one layer of blocks up to its boundary,
 and a second layer up to the innermost circle. Each block can be subdivided.
 
-A press by a circular probe is symmetric about the line through the centre of the film, so only the upper half is meshed
-if the film is symmetric too. `Placement` computes the positions of the elements, and `Template` numbers their nodes.
+A press by a circular probe is symmetric about the line from the centre of the film to the probe. If the film is
+symmetric as well, only the upper half is meshed. `Placement` computes the positions of the elements, and `Template`
+numbers their nodes.
 """
 
 from dataclasses import asdict, dataclass
@@ -45,7 +46,7 @@ class Resolution:
 
     @property
     def description(self) -> str:
-        """The four numbers as in the manifest of a dataset: "order 4, around 8, rings 5, rim 0"."""
+        """The four numbers as a text, such as "order 4, around 8, rings 5, rim 0"."""
         return ", ".join(f"{name} {value}" for name, value in asdict(self).items())
 
     def __post_init__(self) -> None:
@@ -59,9 +60,9 @@ class Resolution:
 class Blocks:
     """The elements of the mesh for one resolution and one topology of the footprint.
 
-    An element has (order + 1)^2 nodes in tensor order: the local coordinate xi, which points outwards, changes fastest;
-    the local coordinate eta points anticlockwise. Both lie in [-1, 1]. The elements are ordered from the inside out:
-    the quadrilaterals of the core polygon, the layers up to the innermost circle, the rings.
+    An element has the local coordinates xi, which points outwards, and eta, which points anticlockwise. Both lie in
+    [-1, 1]. The (order + 1)^2 nodes of an element are ordered by eta and then by xi. The elements are ordered from the
+    inside out: the quadrilaterals of the core polygon, the layers up to the innermost circle, the rings.
 
     Attributes:
         resolution: Fineness of the mesh.
@@ -136,17 +137,18 @@ class Blocks:
     def boundary(self) -> Array:
         """Points along the edges of the core polygon as weights of its corners and its centroid.
 
-        Shape (n_sector + 1, n_corner + 1). The points go anticlockwise from the middle of the edge before the first
-        corner.
+        The shape is (n_sector + 1, n_corner + 1). The points follow anticlockwise from the middle of the edge before
+        the first corner.
         """
-        corners = np.eye(self.n_corner + 1)[:-1]
-        middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
+        corners = np.eye(self.n_corner + 1)[:-1]  # the weights of a corner are zero except for its own
+        middles = 0.5 * (corners + np.roll(corners, -1, axis=0))  # of the edges after the corners
         stops = [middles[-1]]
         for corner, middle in zip(corners[: self.n_meshed], middles[: self.n_meshed], strict=True):
             stops += [corner, middle]
 
-        share = np.arange(self.split)[:, None] / self.split  # divides the line between two stops into equal parts
-        points = [start + share * (end - start) for start, end in pairwise(stops)]
+        # Divide the line between two stops into equal parts.
+        fraction = np.arange(self.split)[:, None] / self.split
+        points = [start + fraction * (end - start) for start, end in pairwise(stops)]
         points.append(stops[-1][None])
         return np.concatenate(points)
 
@@ -154,9 +156,9 @@ class Blocks:
     def straight(self) -> Array:
         """Corners (a, b, c, d) of the elements inside the innermost circle, shape (n_inner, 4, n_corner + 1).
 
-        The corners are weights of the corners of the core polygon and its centroid. An element with straight sides is
-        (1 - v) (a + t (b - a)) + v (c + t (d - c)) with v and t from 0 to 1. The weights of corners on a curved side
-        are zero, and `Placement` adds the curved side.
+        Each corner is described by weights of the corners of the core polygon and its centroid. The points of an
+        element with straight sides are (1 - v) (a + t (b - a)) + v (c + t (d - c)) with v and t from 0 to 1. The
+        weights of a corner on a curved side are zero, and `Placement` adds the curved side.
         """
         core_elements = [
             self._quad(corner, v_index, t_index)
@@ -173,8 +175,8 @@ class Blocks:
     def _quad(self, corner: int, v_index: int, t_index: int) -> list[Array]:
         """Return the corners (a, b, c, d) of one element of the core polygon, each of shape (n_corner + 1,).
 
-        The quadrilateral of a corner lies between the centroid, the middles of both adjacent edges, and the corner. It
-        consists of `split` times `split` elements.
+        The quadrilateral of a corner lies between the centroid, the middles of both adjacent edges, and the corner.
+        Each quadrilateral consists of `split` times `split` elements.
 
         Args:
             corner: Index of the corner of the core polygon whose quadrilateral contains the element.
@@ -195,17 +197,17 @@ class Blocks:
             for v, t in ((v_inner, t_first), (v_inner, t_last), (v_outer, t_first), (v_outer, t_last))
         ]
 
-    def rotated(self, fold: int, folds: int) -> Integers:
-        """Return the numbers of the elements after a rotation of the probe by a part of a full turn.
+    def rotated(self, steps: int, steps_per_turn: int) -> Integers:
+        """Return the indices of the elements after a rotation of the probe that maps the mesh onto itself.
 
         Args:
-            fold: Number of parts by which the probe is rotated.
-            folds: Number of parts of a full turn.
+            steps: Number of steps by which the probe is rotated.
+            steps_per_turn: Number of steps in a full turn.
 
         Returns:
-            Number of the element that takes the place of each element, shape (n_element,).
+            Index of the element that takes the place of each element, shape (n_element,).
         """
-        shift = fold * self.n_corner // folds
+        shift = steps * self.n_corner // steps_per_turn
         quads = np.arange(self.n_quad).reshape(self.n_meshed, -1)
         sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)
         rotated_quads = np.roll(quads, -shift, axis=0)
@@ -213,7 +215,7 @@ class Blocks:
         return np.concatenate([rotated_quads.ravel(), rotated_sectors.ravel()])
 
     def into_meshed_half(self, points: Complexes) -> tuple[Complexes, Booleans]:
-        """Reflect film points into the meshed part of the film.
+        """Reflect film points into the upper half if only this half is meshed.
 
         Args:
             points: Film points x + iy, any shape.
@@ -221,12 +223,13 @@ class Blocks:
         Returns:
             The points in the meshed part, and whether each of them was reflected. Both have the shape of `points`.
         """
-        mirrored = (points.imag < 0.0) & self.half
-        return np.where(self.half, points.real + 1j * np.abs(points.imag), points), mirrored
+        is_reflected = (points.imag < 0.0) & self.half
+        meshed_points = points.real + 1j * np.abs(points.imag) if self.half else points
+        return meshed_points, is_reflected
 
 
 def _bilinear(a: Array, b: Array, c: Array, d: Array, v: float, t: float) -> Array:
-    """Return the point with the local coordinates (v, t) of a quadrilateral.
+    """Return the point of a quadrilateral with the corners a, b, c, d that has the local coordinates (v, t).
 
     Args:
         a: Corner at v = 0 and t = 0, as weights of the corners of the core polygon, shape (n_corner + 1,).

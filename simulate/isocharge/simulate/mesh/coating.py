@@ -1,14 +1,14 @@
-"""Stiffness of a film with a coat on parts of it, whose edges do not follow the elements.
+"""Stiffness of a film with a coat on some of its parts. The edges of the coat need not follow the elements.
 
-The strain jumps by sym(a x n) = N a across an edge of the coat with the normal n. Displacement and traction are
-continuous. Within a band along the edge, the bare film and the coated film are treated as a laminate with this normal.
-The phases i of the laminate have the stiffness C_i and the volume share f_i (composite voxels: Kabel, Merkert and
-Schneider 2015). If E is the mean strain, the strain of a phase is
+Displacement and traction are continuous across an edge of the coat with the normal n, but the strain jumps by
+sym(a x n) = N a. Within a band along the edge, the bare film and the coated film are treated as a laminate with this
+normal, which is the method of composite voxels (Kabel, Merkert and Schneider 2015). The phase i of the laminate has the
+stiffness C_i and the volume share f_i. If E is the mean strain, the strain of a phase is
 
     E_i = E + N M_i^-1 (T E - N^T C_i E),   M_i = N^T C_i N,   T = (sum f_i M_i^-1)^-1 sum f_i M_i^-1 N^T C_i,
 
-and the mean stress is sum f_i C_i E_i. The energy and the charges therefore include the jump, although the elements
-have no edge there. The remaining error is of second order in the ratio of the width of the band to that of the coat.
+and the mean stress is sum f_i C_i E_i. The energy and the charges therefore include the jump of the strain, although it
+lies within elements. The remaining error is of second order in the ratio of the width of the band to that of the coat.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.numerics.polygon import area_in_disk, min_edge_cross_product
 
 NORMAL_STEP = 0.1
-"""Step of the finite differences that determine the normal of an edge, in widths of the band."""
+"""Step of the finite differences that determine the normal of an edge, in units of the width of the band."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,8 @@ class Coating:
 
     Attributes:
         layers: Areas with at least one layer of the coat, with at least two layers, and so on. Each area consists of
-            convex polygons that do not overlap, with anticlockwise corners x + iy, in film radii.
+            convex polygons that do not overlap. The corners x + iy of a polygon are ordered anticlockwise, in film
+            radii.
         band_width: Width of the band along the edges, in film radii.
         bare: Elasticity matrix C over E of the film, shape (3, 3).
         added: Addition of one layer of the coat to this matrix, shape (3, 3).
@@ -41,7 +42,10 @@ class Coating:
     added: Array
 
     def near(self, points: Complexes) -> Booleans:
-        """Return whether points lie on the coat or near it. Distant points are always excluded.
+        """Return which points may lie on the coat or near the coat. The result is only a fast estimate.
+
+        It is true for all points on the coat and in the band, for some points near the coat, and false for distant
+        points.
 
         Args:
             points: Film points x + iy, any shape, in film radii.
@@ -78,14 +82,14 @@ class Coating:
         return np.asarray((strain_of_phase @ mean_strain[:, :, None])[:, :, 0])
 
     def _is_near(self, part: Complexes, points: Complexes) -> Booleans:
-        """Return whether points lie in the circle round a polygon that is enlarged by the width of the band."""
+        """Return which points lie in the circumscribed circle of a polygon, enlarged by the width of the band."""
         middle = part.mean()
         return np.asarray(np.abs(points - middle) < np.abs(part - middle).max() + self.band_width)
 
     def _shares(self, points: Complexes) -> Array:
-        """Compute the share of a disk about each point that each layer covers.
+        """Compute the share of a small disk about each point that each layer covers.
 
-        The diameter of the disk is the width of the band.
+        The diameter of the disk is the width of the band along the edges.
 
         Args:
             points: Film points x + iy, shape (...), in film radii.
@@ -139,7 +143,8 @@ class Coating:
             Volume share and stiffness of each phase, and its strain for a unit mean strain. Phase i has i layers of the
             coat.
         """
-        # `_shares` counts the area under at least so many layers; the differences are the areas under exactly so many.
+        # `_shares` returns the shares with at least 1, 2, ... layers. Their differences are the shares with exactly
+        # 0, 1, 2, ... layers.
         shares = -np.diff(self._shares(points), prepend=1.0, append=0.0)
 
         # The matrix N converts the jump of the displacement derivative across the edge into a jump of the strain.

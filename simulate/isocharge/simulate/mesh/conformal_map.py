@@ -1,6 +1,6 @@
-"""Parameters of the disk automorphism of `placement`, and the grading of sectors and rings.
+"""Parameters of the conformal map of `placement`, which is a disk automorphism, and the grading of sectors and rings.
 
-All lengths are in film radii. Angles are in radians.
+All lengths are in film radii. All angles are in radians.
 """
 
 from typing import Any
@@ -11,27 +11,29 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
 
 CLEARANCE = 0.4
-"""Gap between the farthest point of a footprint and the circle that encloses it, in units of that point's distance."""
+"""Gap between the farthest point of a footprint and the enclosing circle, in units of the distance of this point from
+the centre of the circle."""
 
 MAX_TURN = 0.2
 """Largest angle between the side of a sector and the ray through its corner, rad. With larger angles, elements at
 corners that lie close together would fold."""
 
 INNER_GAP_SHARE = 0.25
-"""Largest gap between the footprint and the enclosing circle, over the gap between the footprint and the rim."""
+"""Largest gap between the footprint and the enclosing circle, in units of the gap between the footprint and the rim."""
 
 OUTER_GAP_SHARE = 0.35
-"""Smallest gap between the enclosing circle and the rim, over the gap between the footprint and the rim."""
+"""Smallest gap between the enclosing circle and the rim, in units of the gap between the footprint and the rim."""
 
 GRADING = 0.65
-"""Share of the stretching of the conformal map along the rim that the sectors compensate: 0 none, 1 all."""
+"""Share of the stretching of the conformal map along the rim that the sectors compensate, from 0 (nothing) to 1
+(everything)."""
 
 BISECTION_STEPS = 40
 """Number of bisection steps for the centre of the enclosing circle."""
 
 
 def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
-    """Compute the disk automorphism that maps the circle |z| = rho onto a given circle; see `placement`.
+    """Compute the parameters of the conformal map that maps a circle |z| = rho onto a given circle; see `placement`.
 
     Args:
         centre: Centre of the circle on the x axis, any shape, in film radii.
@@ -42,14 +44,16 @@ def automorphism_onto(centre: Array, radius: Array) -> tuple[Array, Array]:
     """
     outer = np.arctanh(centre + radius)
     inner = np.arctanh(centre - radius)
-    return np.tanh(0.5 * (outer + inner)), np.tanh(0.5 * (outer - inner))
+    c = np.tanh(0.5 * (outer + inner))
+    rho = np.tanh(0.5 * (outer - inner))
+    return c, rho
 
 
 def distance_coordinate(distance: Array | float) -> Any:
     """Return the coordinate in which fields are interpolated by polynomials between presses at different distances.
 
-    Near the clamp, the fields change over the distance from the press to the clamp, which this coordinate stretches.
-    The disk automorphism of `placement` is a translation along this coordinate.
+    If a press is near the clamp, the fields change over the short distance from the press to the clamp. The coordinate
+    stretches this distance. The conformal map of `placement` is a translation along this coordinate.
 
     Args:
         distance: Distances from the centre of the film, in film radii.
@@ -61,10 +65,10 @@ def distance_coordinate(distance: Array | float) -> Any:
 
 
 def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]:
-    """Compute a circle on the film that encloses each footprint at a distance.
+    """Compute a circle on the film that encloses each footprint with a gap.
 
-    The centre is the centroid if that circle keeps its distance from the rim. Otherwise the centre moves towards the
-    centre of the film. Its position is found by bisection.
+    The centre of the circle is the centroid of the footprint, unless the circle would be too close to the rim. In this
+    case, the centre is shifted towards the centre of the film as far as necessary. The shift is found by bisection.
 
     Args:
         outline: Points along the boundary of each footprint, shape (..., n), in film radii.
@@ -92,7 +96,7 @@ def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]
 
 
 def _enclosing_radius(outline: Complexes, centre: Array) -> Array:
-    """Return the radius of the circle about a centre on the x axis that encloses a footprint at a distance.
+    """Return the radius of the circle about a centre on the x axis that encloses a footprint with a gap.
 
     Args:
         outline: Points along the boundary of each footprint, shape (..., n), in film radii.
@@ -112,9 +116,9 @@ def sector_angles(
 ) -> Array:
     """Compute the angles of the sides of the sectors on the innermost circle.
 
-    Rays from the centroid of the footprint meet the circle at these angles. The directions of the rays lie between the
-    directions of the stops and an even distribution. The narrower the gap between the footprint and the circle, the
-    closer the rays are to the stops, because elements would fold otherwise.
+    The sides begin where rays from the centroid of the footprint meet the circle. The directions of the rays are a
+    compromise between the directions of the stops and equal angles. If the gap between the footprint and the circle is
+    narrow, the rays pass close to the stops, because elements would fold otherwise.
 
     Args:
         blocks: The elements.
@@ -134,12 +138,13 @@ def sector_angles(
     ray_angle = _ray_angles(blocks, stops - origin, radius / reach)
     ray = np.exp(1j * ray_angle)
 
-    # The intersections of the rays with the circle, relative to the centre of the circle.
+    # Intersections of the rays with the circle, relative to the centre of the circle
     offset = origin - centre[..., None]
     projection = (offset * np.conj(ray)).real
     length = np.sqrt(projection**2 + radius[..., None] ** 2 - np.abs(offset) ** 2) - projection
     intersection = offset + ray * length
 
+    # Angles on the circle, which increase from one ray to the next
     first_angle = np.angle(intersection[..., :1])
     step = np.mod(np.angle(intersection[..., 1:] / intersection[..., :-1]), 2.0 * np.pi)
     film_angle = np.concatenate([first_angle, first_angle + np.cumsum(step, axis=-1)], axis=-1)
@@ -167,18 +172,19 @@ def _ray_angles(blocks: Blocks, stops: Complexes, radius_ratio: Array) -> Array:
     mixed_angle = stop_angle + turn
 
     # Divide each interval between two stops into `blocks.split` equal parts.
-    share = np.arange(blocks.split) / blocks.split
+    fraction = np.arange(blocks.split) / blocks.split
     interval = np.diff(mixed_angle, axis=-1)[..., None]
-    divided = mixed_angle[..., :-1, None] + share * interval  # shape (..., n_stop - 1, split)
-    divided = divided.reshape(*mixed_angle.shape[:-1], -1)
-    return np.concatenate([divided, mixed_angle[..., -1:]], axis=-1)
+    angles_in_intervals = mixed_angle[..., :-1, None] + fraction * interval  # shape (..., n_stop - 1, split)
+    angles = angles_in_intervals.reshape(*mixed_angle.shape[:-1], -1)
+    return np.concatenate([angles, mixed_angle[..., -1:]], axis=-1)
 
 
 def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
     """Compute the angles of the sides of the sectors on the rim.
 
-    The sides move towards the angle pi, where the conformal map compresses the far side of the film. Even spacing on
-    the innermost circle already moves them part of the way.
+    The conformal map compresses the far side of the film, which lies at the angle pi. The sides of the sectors are
+    therefore shifted towards this angle. The equal spacing on the innermost circle already contains a part of the
+    shift.
 
     Args:
         angle: Angles on the innermost circle, in the template plane, shape (..., n_sector + 1).
@@ -195,9 +201,10 @@ def rim_angles(angle: Array, c: Array, rho: Array) -> Array:
 
 
 def stretch_angles(angle: Array, factor: Array) -> Array:
-    """Multiply the tangent of half of each angle by a factor, as the conformal map does on a circle about its centre.
+    """Multiply the tangent of half of each angle by a factor, which is the effect of the conformal map on a circle.
 
-    The map carries |z| = rho onto its image with the factor (1 - c rho) / (1 + c rho), and the rim is the case rho = 1.
+    The conformal map changes the angles on the circle |z| = rho with the factor (1 - c rho) / (1 + c rho). For the rim,
+    rho is 1.
 
     Args:
         angle: Angles, shape (..., n).
@@ -213,7 +220,8 @@ def stretch_angles(angle: Array, factor: Array) -> Array:
 def ring_edges(resolution: Resolution, rho: Array, layer: Array) -> Array:
     """Compute the depths of the edges of the rings: 0 on the innermost circle, 1 on the rim.
 
-    The edges follow in even steps, then at the thin rings, each of which is a third as wide as the one before.
+    The rings have equal depths, except for the thin rings at the rim. Each thin ring is a third as wide as the previous
+    thin ring.
 
     Args:
         resolution: Fineness of the mesh.
@@ -250,5 +258,8 @@ def widest_layer(resolution: Resolution, c: Array, rho: Array) -> Array:
 
 
 def _max_thin_depth(resolution: Resolution) -> float:
-    """Return the largest depth of all thin rings together, which is that of one even ring if they had equal depths."""
+    """Return the largest depth of all thin rings together.
+
+    It is the depth that each ring would have if the thin rings together counted as one ring, and all had equal depths.
+    """
     return 1.0 / (resolution.rings + 1)

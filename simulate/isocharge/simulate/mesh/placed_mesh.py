@@ -34,7 +34,8 @@ Pressure = Callable[[Complexes], Array]
 """Function that returns the pressure at film points."""
 
 INVERSE_STEPS = 8
-"""Number of Newton steps of `from_oval`, which suffice for round-off up to e = 0.05."""
+"""Number of Newton steps of `from_oval`. With these steps, the error is of the order of rounding errors up to
+e = 0.05."""
 
 
 @dataclass(frozen=True)
@@ -84,20 +85,20 @@ class Geometry:
         footprint = template.footprint
         if pressure is None:
             footprint_weights = weights[footprint]  # shape (n_footprint_element, n_point)
-            node_load = footprint_weights @ rule.values  # shape (n_footprint_element, n_local)
+            element_load = footprint_weights @ rule.values  # shape (n_footprint_element, n_local)
             total_load = footprint_weights.sum()
         else:
-            node_load = _integrated_pressure(template.resolution.order, points[footprint], pressure)
-            total_load = node_load.sum()
-        load = np.bincount(template.nodes[footprint].ravel(), node_load.ravel(), template.n_node)
-        load = load / (template.copies * total_load)
+            element_load = _integrated_pressure(template.resolution.order, points[footprint], pressure)
+            total_load = element_load.sum()
+        node_load = np.bincount(template.nodes[footprint].ravel(), element_load.ravel(), template.n_node)
+        load = node_load / (template.copies * total_load)
         if template.constraint is not None:
             load = template.constraint.T @ load
         return cls(template.nodes, gradient, weights, load, mass, template.constraint)
 
     @property
     def stacked(self) -> Array:
-        """The gradient with quadrature points and derivatives on one axis, shape (n_element, n_point * 2, n_local)."""
+        """The gradient with a common axis for points and derivatives, shape (n_element, n_point * 2, n_local)."""
         return self.gradient.reshape(len(self.gradient), -1, self.gradient.shape[-1])
 
     def gather(self, local: Array) -> Array:
@@ -172,8 +173,8 @@ class PlacedMesh:
             points: Film points rotated with the press, in film radii.
         """
         centroid = self.placement.corners[-1]
-        from_centroid = (from_oval(points, self.oval) - centroid) / self.placement.rotation_and_scale
-        return self.placement.probe.pressure(from_centroid)
+        points_of_probe = (from_oval(points, self.oval) - centroid) / self.placement.rotation_and_scale
+        return self.placement.probe.pressure(points_of_probe)
 
     def locate(self, points: Complexes) -> tuple[Integers, Array, Array, Booleans]:
         """Find the elements that contain film points.
@@ -255,7 +256,7 @@ def place(
 
 
 def to_oval(points: Complexes, oval: complex) -> Complexes:
-    """Map points of a circular film to an oval film. Points within `UNDEFORMED_RADIUS` do not move.
+    """Map points of a circular film to an oval film. Points within `UNDEFORMED_RADIUS` remain unchanged.
 
     Args:
         points: Points x + iy, any shape, in film radii.
@@ -268,13 +269,13 @@ def to_oval(points: Complexes, oval: complex) -> Complexes:
         return points
     radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
     rim_displacement = (np.conj(oval) * (points / radius) ** 2).real
-    return np.asarray(points * (1.0 + _displacement_share(radius) * rim_displacement))
+    return np.asarray(points * (1.0 + _relative_displacement(radius) * rim_displacement))
 
 
 def from_oval(points: Complexes, oval: complex) -> Complexes:
     """Map points of an oval film to a circular film. This is the inverse of `to_oval`.
 
-    The radius is found by Newton's method with a fixed slope.
+    The radius is found by Newton's method with an approximate slope.
 
     Args:
         points: Points x + iy, any shape, in film radii.
@@ -289,15 +290,15 @@ def from_oval(points: Complexes, oval: complex) -> Complexes:
     rim_displacement = (np.conj(oval) * (points / oval_radius) ** 2).real
     radius = oval_radius
     for _ in range(INVERSE_STEPS):
-        share = _displacement_share(radius)
-        residual = radius * (1.0 + share * rim_displacement) - oval_radius
-        slope = 1.0 + 7.0 * rim_displacement * share  # the derivative at the rim, where the share is 1
+        relative_displacement = _relative_displacement(radius)
+        residual = radius * (1.0 + relative_displacement * rim_displacement) - oval_radius
+        slope = 1.0 + 7.0 * rim_displacement * relative_displacement  # exact at the rim, approximate elsewhere
         radius = radius - residual / slope
     return np.asarray(points * (radius / oval_radius))
 
 
-def _displacement_share(radius: Array) -> Array:
-    """Return the displacement at a radius over that of the rim: 0 at `UNDEFORMED_RADIUS`, 1 at the rim."""
+def _relative_displacement(radius: Array) -> Array:
+    """Return the ratio of the displacement at a radius to that of the rim: 0 at `UNDEFORMED_RADIUS`, 1 at the rim."""
     return np.asarray(((radius - UNDEFORMED_RADIUS) / (1.0 - UNDEFORMED_RADIUS)) ** 3)
 
 

@@ -4,15 +4,15 @@ The disk automorphism
 
     Z = (z + c) / (1 + c z),   0 <= c < 1,
 
-maps rings about the origin of the template plane (z) onto the film (Z, in film radii, with the probe on the positive x
-axis). It maps circles to circles. With
+is a conformal map of the unit disk onto itself. It maps rings about the origin of the template plane (z) onto the film
+(Z, in film radii, with the probe on the positive x axis), and circles onto circles. With
 
     al = (atanh(p + R) + atanh(p - R)) / 2,   be = (atanh(p + R) - atanh(p - R)) / 2,   c = tanh al,   rho = tanh be
 
-the circle |z| = rho becomes exactly the circle of radius R about p. Inside this circle, the blocks are linear blends
-between the edges of the core polygon, the boundary of the footprint and the circle. The edges of a polygon stay
-straight, so the load is integrated over exactly the footprint. Nodal fields are smooth functions of the position of the
-probe. The module `point_location` finds the element that contains a film point.
+the circle |z| = rho is mapped exactly onto the circle of radius R about p. Inside this circle, the blocks are linear
+blends between the edges of the core polygon, the boundary of the footprint and the circle. The edges of a polygonal
+footprint remain straight, so the load is integrated over exactly the footprint. The values of fields at the nodes are
+smooth functions of the position of the probe. The module `point_location` finds the element that contains a film point.
 """
 
 from collections.abc import Callable
@@ -50,8 +50,8 @@ class Placement:
         rim_angles: Angles of the sides of the sectors on the rim, shape (..., n_sector + 1), rad.
         ring_depths: Depths of the edges of the rings, 0 on the innermost circle and 1 on the rim, shape
             (..., n_ring + 1).
-        rotation_and_scale: Complex factor that converts points relative to the centroid from mm before the further
-            rotation to film radii, shape (...).
+        rotation_and_scale: Complex factor that rotates points of the footprint by the further rotation and converts
+            them from mm to film radii, shape (...). The points are relative to the centroid.
         probe: The probe.
     """
 
@@ -78,7 +78,7 @@ class Placement:
 
         Args:
             blocks: The elements, whose topology must be the topology of the probe.
-            probe: The probe, rotated as it is when the press lies on the x axis.
+            probe: The probe in the frame in which the press lies on the positive x axis.
             distance: Distance of the centroid of the footprint from the centre of the film, any shape, mm.
             film_radius: Radius of the film, mm.
             layer: Width of the thin rings at the rim, in film radii.
@@ -166,8 +166,8 @@ class Placement:
     def _inner_element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of the elements inside the innermost circle.
 
-        A point is a linear blend between the inner and the outer side of its element. `Blocks.straight` contributes the
-        straight sides; this function adds the curved ones.
+        A point is a linear blend between the inner and the outer side of its element. The straight sides follow from
+        `Blocks.straight`, and the curved sides are added here.
 
         Returns:
             Shape (n_inner, (order + 1)^2), in film radii.
@@ -201,6 +201,7 @@ class Placement:
         node_depth = inner_depth + radial * np.diff(self.ring_depths)[:, None]  # shape (n_ring, n_local)
         depth = node_depth[:, None]  # shape (n_ring, 1, n_local)
 
+        # The angle is interpolated over the depth between the innermost circle and the rim.
         circle_angle = self._node_circle_angles(blocks)  # shape (n_sector, n_local)
         rim_angle = self.rim_angles[:-1, None] + angular * np.diff(self.rim_angles)[:, None]
         angle = (1.0 - depth) * circle_angle + depth * rim_angle
@@ -222,17 +223,19 @@ def _unit_coordinates(blocks: Blocks) -> tuple[Array, Array]:
 
 
 def widest_smooth_layer(mesh: Blocks, probe: Probe, distance: float, film_radius: float) -> float:
-    """Return the largest width of the thin rings, in film radii, with which the mesh is a smooth function of the
-    position up to a distance.
+    """Return the largest width of the thin rings for which the mesh is a smooth function of the position of the press.
 
-    `ring_edges` limits the depth of wider rings near the rim. The nodes of such a mesh would move with a kink, which
-    polynomials in the distance do not interpolate.
+    `ring_edges` limits the depth of wider thin rings if the press is near the rim. The positions of the nodes would
+    then have a kink as functions of the distance, and polynomials in the distance would interpolate the fields badly.
 
     Args:
         mesh: Template of the mesh.
         probe: The probe.
         distance: Largest distance of a press from the centre, mm.
         film_radius: Radius of the film, mm.
+
+    Returns:
+        Width of all thin rings together, in film radii.
     """
     rotation = 2.0 * np.pi * np.arange(CHECKED_ORIENTATIONS) / CHECKED_ORIENTATIONS
     placement = Placement.of(mesh, probe, np.full(CHECKED_ORIENTATIONS, distance), film_radius, 0.0, rotation)

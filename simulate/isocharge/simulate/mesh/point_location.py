@@ -1,8 +1,8 @@
 """Search for the elements that contain film points.
 
-Points outside the innermost circle are located by closed formulas. Points inside are located by Newton's method. The
-module `placement` describes the positions of the elements. In an element, the radial coordinate goes from the inner to
-the outer side, and the angular coordinate goes anticlockwise along the sector. Both go from 0 to 1.
+Points outside the innermost circle are located by closed formulas, and points inside by Newton's method. The module
+`placement` describes the positions of the elements. Each element has two local coordinates from 0 to 1. The radial
+coordinate increases from the inner to the outer side, and the angular coordinate anticlockwise along the sector.
 """
 
 from typing import NamedTuple
@@ -17,10 +17,10 @@ NEWTON_STEPS = 20
 """Number of Newton steps to locate a point inside the innermost circle. Six suffice in well-shaped blocks."""
 
 OVERSHOOT = 0.1
-"""Largest distance outside its element at which Newton's method evaluates a point, in local coordinates from 0 to 1."""
+"""Largest amount by which the local coordinates of a point may leave the range from 0 to 1 in Newton's method."""
 
 SECTOR_TOLERANCE = 1e-9
-"""Distance outside its element, in local coordinates from 0 to 1, from which a neighbouring sector is tried."""
+"""Amount by which a local coordinate must leave the range from 0 to 1 before a neighbouring sector is tried."""
 
 PARAMETER_STEP = 1e-5
 """Step of the boundary parameter for the derivative of a curved boundary by central differences."""
@@ -81,6 +81,7 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
     Returns:
         Index of the element, xi and eta, each of shape (k, n).
     """
+    # All points are first located as if they were in the rings. The points inside the circle are then located again.
     template_points = placement.to_template(points)
     element, radial, angular = _locate_in_rings(placement, blocks, template_points)
     is_inside = np.abs(template_points) <= placement.rho[:, None]
@@ -104,28 +105,30 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
     Returns:
         Index of the element and its radial and angular coordinate from 0 to 1, each of shape (k, n).
     """
+    # Ring of each point, from the number of ring edges that the point has passed
     with np.errstate(divide="ignore"):
         log_ratio = np.log(np.abs(template_points)) / np.log(placement.rho)[:, None]
     depth = np.clip(1.0 - log_ratio, 0.0, 1.0)
-    inner_ring_edges = placement.ring_depths[:, None, 1:-1]  # shape (k, 1, n_ring - 1)
-    ring = np.sum(inner_ring_edges <= depth[..., None], axis=-1)
+    edges_between_rings = placement.ring_depths[:, None, 1:-1]  # shape (k, 1, n_ring - 1)
+    ring = np.sum(edges_between_rings <= depth[..., None], axis=-1)
     inner_edge = np.take_along_axis(placement.ring_depths, ring, axis=1)
     outer_edge = np.take_along_axis(placement.ring_depths, ring + 1, axis=1)
+    radial = (depth - inner_edge) / (outer_edge - inner_edge)
 
+    # Sector of each point, from the number of sides that the angle of the point has passed
     angle = np.angle(template_points)
     if not blocks.half:  # count the angle from the first side, up to a full turn
-        first_side = _side_angles(placement, np.zeros_like(ring), depth)
-        angle = first_side + np.mod(angle - first_side, 2.0 * np.pi)
-    inner_circle_angles = placement.circle_angles[:, None, 1:-1]  # shape (k, 1, n_sector - 1)
-    inner_rim_angles = placement.rim_angles[:, None, 1:-1]
-    all_side_angles = inner_circle_angles + depth[..., None] * (inner_rim_angles - inner_circle_angles)
-    sector = np.sum(all_side_angles <= angle[..., None], axis=-1)
-    angle_of_first_side = _side_angles(placement, sector, depth)
-    angle_of_last_side = _side_angles(placement, sector + 1, depth)
+        angle_of_side_0 = _side_angles(placement, np.zeros_like(ring), depth)
+        angle = angle_of_side_0 + np.mod(angle - angle_of_side_0, 2.0 * np.pi)
+    circle_angles = placement.circle_angles[:, None, 1:-1]  # of the sides between sectors, shape (k, 1, n_sector - 1)
+    rim_angles = placement.rim_angles[:, None, 1:-1]
+    side_angles = circle_angles + depth[..., None] * (rim_angles - circle_angles)
+    sector = np.sum(side_angles <= angle[..., None], axis=-1)
+    first_side_angle = _side_angles(placement, sector, depth)
+    last_side_angle = _side_angles(placement, sector + 1, depth)
+    angular = (angle - first_side_angle) / (last_side_angle - first_side_angle)
 
     element = blocks.n_inner + ring * blocks.n_sector + sector
-    radial = (depth - inner_edge) / (outer_edge - inner_edge)
-    angular = (angle - angle_of_first_side) / (angle_of_last_side - angle_of_first_side)
     return element, radial, angular
 
 
@@ -148,9 +151,10 @@ def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
 def _locate_inside(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
     """Locate points inside the innermost circle, one point for each placement.
 
-    Each point is assigned to the element in which its smallest distance from a side is largest. The distance is
-    positive on the inner side of the line through two corners. Curved sides are excluded (infinite distance), and
-    elements that cannot contain the point are ruled out (negative infinite distance).
+    The signed distance of a point from a side of an element is positive if the point lies on the side of the element.
+    Each point is assigned to the element for which the smallest of its distances from the four sides is largest. Curved
+    sides have an infinite distance, so that they are ignored. Elements that cannot contain the point get a negative
+    infinite distance.
 
     Args:
         placement: One placement for each point.
@@ -198,11 +202,11 @@ def _correct_sectors(
     radial: Array,
     angular: Array,
 ) -> None:
-    """Move points whose coordinates lie outside of their element to a neighbouring sector that contains them.
+    """Assign points that lie outside of the found element to another sector of the same layer.
 
-    The straight sides of two sectors may cross outside of the elements, so that a point lies between the sides of
-    a sector that does not contain it. This occurs for elongated probes near the rim. Sectors at increasing
-    distances on both sides are tried.
+    The straight sides of two sectors may cross outside of the elements, so that a point may lie between the extended
+    sides of a sector that does not contain the point. This occurs for elongated probes near the rim. The neighbouring
+    sectors on both sides are tried, then the next neighbours, and so on.
 
     Args:
         placement: One placement for each point.
@@ -267,7 +271,7 @@ def _inner_corners(placement: Placement, blocks: Blocks) -> QuadCorners:
 def _invert_blend(
     placement: Placement, blocks: Blocks, points: Complexes, element: Integers, corners: QuadCorners
 ) -> tuple[Array, Array]:
-    """Compute the coordinates of points in given elements inside the innermost circle, by Newton's method.
+    """Compute the local coordinates of points in given elements inside the innermost circle, by Newton's method.
 
     Args:
         placement: One placement for each point.
@@ -381,12 +385,19 @@ def _boundary_in_sector(
 
 
 def _overshoot(radial: Array, angular: Array) -> Array:
-    """Return how far local coordinates lie outside of the range from 0 to 1; negative inside, shape (n,)."""
+    """Return how far local coordinates lie outside of the range from 0 to 1, shape (n,). Inside, it is negative."""
     distance_from_middle = np.maximum(np.abs(radial - 0.5), np.abs(angular - 0.5))
     return np.asarray(distance_from_middle - 0.5)
 
 
 def _distance_to_left(start: Complexes, end: Complexes, points: Complexes) -> Array:
-    """Return the distances of points to the left of directed lines from `start` to `end`."""
+    """Return the signed distances of points from directed lines, positive to the left of a line.
+
+    Args:
+        start: Points x + iy at which the lines start, any shape.
+        end: Points x + iy at which the lines end, same shape.
+        points: Points x + iy, of a shape that broadcasts with that of the lines.
+    """
     direction = end - start
-    return np.asarray(((points - start) * np.conj(direction)).imag / np.maximum(np.abs(direction), 1e-300))
+    length = np.maximum(np.abs(direction), 1e-300)
+    return np.asarray(((points - start) * np.conj(direction)).imag / length)

@@ -1,9 +1,9 @@
 """Local refinement of the mesh along the edges of a coat.
 
 An element is split into halves or quarters of equal size in its local coordinates, so the refined mesh can represent
-every field of the original mesh. If a small element is adjacent to a larger one, its nodes on their common side are
-hanging nodes. Their values are those of the polynomial of the larger element (Ainsworth and Senior 1997), so fields are
-continuous.
+every field of the original mesh. If a small element is adjacent to a larger element, the nodes of the small element on
+the common side are hanging nodes. The polynomial of the larger element determines the values at the hanging nodes
+(Ainsworth and Senior 1997), so fields are continuous.
 """
 
 from dataclasses import replace
@@ -21,12 +21,12 @@ from isocharge.simulate.numerics.interpolation import lagrange_values, lobatto_n
 from isocharge.simulate.numerics.polygon import area_of, min_edge_cross_product, to_corners
 
 GRADING = 1.0
-"""Distance of an edge of the coat from the middle of an element below which the element is split, in units of the
-longest side of the element."""
+"""Largest distance between an edge of the coat and the middle of an element at which the element is split, in units of
+the longest side of the element."""
 
 MIN_SIDE_RATIO = 0.5
-"""Ratio of a side to the longest side of its element above which the side is halved. Thin elements at the rim are
-therefore split along their length only."""
+"""Smallest ratio of a side to the longest side of its element at which the side is halved. Thin elements at the rim are
+therefore halved only along their length."""
 
 MAX_SPLITS = 12
 """Largest number of successive splits of an element."""
@@ -36,7 +36,7 @@ NODE_TOLERANCE = 1e-8
 
 
 EDGE_ELEMENT_SIZE = 0.35
-"""Longest side of an element at an edge of the coat, over the square root of the area of the largest part of the
+"""Longest side of an element at an edge of the coat, in units of the square root of the area of the largest part of the
 coat."""
 
 BAND = 0.6
@@ -107,8 +107,8 @@ class RefinedTemplate(Template):
     def within(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
         """Convert positions in the original elements into positions in the elements; see `Template.within`.
 
-        For each size of elements, an original element is a grid of cells. A cell has a unique code, and the element of
-        this size that fills the cell is found by its code.
+        All elements of one size are cells of a regular grid in their original element. Each cell has a unique code. The
+        code of the cell that contains a point is looked up among the codes of the elements of this size.
 
         Args:
             element: Index of the original element of each point, shape (n,).
@@ -168,7 +168,9 @@ class RefinedTemplate(Template):
         return low + 0.5 * size * (local + 1.0)
 
     def _hanging_node_matrix(self, points: Complexes) -> csr_array:
-        """Compute the matrix from the values at the nodes that do not hang to the values at all nodes.
+        """Compute the matrix that converts the values at the regular nodes into the values at all nodes.
+
+        All nodes that are not hanging nodes are regular.
 
         Args:
             points: Film points of the nodes of all elements under the sample press, shape (n_element * n_local,).
@@ -196,8 +198,8 @@ class RefinedTemplate(Template):
         """Find the hanging nodes, and the nodes that determine their values.
 
         A side of an element may be adjacent to 2, 4, 8, ... smaller elements. For each of these numbers, the positions
-        that the nodes of the smaller elements have on the side are computed. A node at such a position hangs, unless it
-        is a node of the side.
+        that the nodes of the smaller elements have on the side are computed. A node at such a position is a hanging
+        node, unless it is a node of the larger element.
 
         Args:
             points: Film points of the nodes of all elements under the sample press, shape (n_element * n_local,).
@@ -240,13 +242,13 @@ def _tree(points: Complexes) -> cKDTree:
 
 
 def _merge_coinciding(points: Complexes) -> tuple[int, Integers]:
-    """Number points so that points within `NODE_TOLERANCE` of each other have the same number.
+    """Assign the same number to all points that lie within `NODE_TOLERANCE` of each other.
 
     Args:
         points: Points x + iy, shape (n,), in film radii.
 
     Returns:
-        Count of different numbers, and the number of each point, shape (n,).
+        Number of distinct points, and the number that is assigned to each point, shape (n,).
     """
     pairs = _tree(points).query_pairs(NODE_TOLERANCE, output_type="ndarray")
     is_same = csr_array((np.ones(len(pairs)), pairs.T), shape=(points.size, points.size))
@@ -255,7 +257,7 @@ def _merge_coinciding(points: Complexes) -> tuple[int, Integers]:
 
 
 def refine(mesh: PlacedMesh, lines: Complexes, finest: float) -> PlacedMesh:
-    """Split the elements of a mesh along lines.
+    """Split the elements of a mesh along lines, until the elements on the lines are small enough.
 
     Args:
         mesh: Mesh of a whole film.
@@ -330,9 +332,10 @@ def coated(mesh: PlacedMesh, layers: tuple[tuple[Complexes, ...], ...], bare: Ar
 
 
 def _edges(parts: tuple[Complexes, ...], finest: float) -> Complexes:
-    """Return points on the edges of the area that parts cover together.
+    """Return points on the edges of the union of several polygons.
 
-    Points on an edge between two adjacent parts are left out, because another part covers their outer side.
+    An edge between two adjacent polygons is not an edge of the union. Its points are recognised because another polygon
+    covers the points just outside of the edge.
 
     Args:
         parts: Convex polygons with anticlockwise corners x + iy.
@@ -347,8 +350,8 @@ def _edges(parts: tuple[Complexes, ...], finest: float) -> Complexes:
         for start, end in zip(part, np.roll(part, -1), strict=True):
             length = abs(end - start)
             n_point = 2 + int(3.0 * length / finest)
-            share_of_length = (np.arange(n_point) + 0.5) / n_point
-            edge_points = start + share_of_length * (end - start)
+            fraction_of_length = (np.arange(n_point) + 0.5) / n_point
+            edge_points = start + fraction_of_length * (end - start)
             outward_normal = -1j * (end - start) / length
             points.append(edge_points)
             points_just_outside.append(edge_points + 1e-3 * finest * outward_normal)

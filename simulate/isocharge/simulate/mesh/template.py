@@ -1,4 +1,4 @@
-"""The mesh template: the elements and the numbers of their nodes, for all positions of a probe."""
+"""Mesh templates: elements with numbered nodes, which are the same for all positions of a probe."""
 
 from functools import lru_cache
 from typing import Self
@@ -31,10 +31,10 @@ class Template(Blocks):
         first_seen: Index of the first occurrence of each node among the nodes of all elements, shape (n_node,).
         on_rim: Whether a node lies on the rim, shape (n_node,).
         on_axis: Whether a node lies on the line of symmetry of a half template, shape (n_node,).
-        splits: Parent and position of each element in the original elements, one row per element. Empty if no element
-            is split.
-        constraint: Matrix that computes the values at all nodes from the values at the nodes that do not hang, shape
-            (n_node, n_node). None if no node hangs.
+        splits: Index of the original element and position in this element, with one row for each element. Empty if no
+            element is split.
+        constraint: Matrix that computes the values at all nodes from the values at the nodes that are not hanging
+            nodes, shape (n_node, n_node). None if there are no hanging nodes.
     """
 
     splits: Array = np.empty(0)
@@ -43,7 +43,7 @@ class Template(Blocks):
     def __init__(self, resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> None:
         """Count the elements and number their nodes.
 
-        Nodes of different elements with equal film points under a sample press are the same node.
+        If nodes of different elements have the same position under a sample press, they are the same node.
 
         Args:
             resolution: Fineness of the mesh.
@@ -53,7 +53,7 @@ class Template(Blocks):
         super().__init__(resolution, topology, whole)
         element_points = sample_points(self)
         all_points = element_points.ravel()
-        rounded_points = np.round(all_points, 9)  # so that round-off does not separate equal points
+        rounded_points = np.round(all_points, 9)  # equal points may differ by rounding errors
         _, self.first_seen, node_number = np.unique(rounded_points, return_index=True, return_inverse=True)
         self.nodes: Integers = node_number.reshape(element_points.shape)
         self.n_node = self.first_seen.size
@@ -63,6 +63,8 @@ class Template(Blocks):
 
     def from_base(self, values: np.ndarray) -> np.ndarray:
         """Return values at the nodes of the elements, from values at the nodes of the original (unsplit) elements.
+
+        In this class no element is split, so the values do not change. `RefinedTemplate` interpolates.
 
         Args:
             values: Shape (n_original_element, n_local, ...).
@@ -74,6 +76,8 @@ class Template(Blocks):
 
     def within(self, element: Integers, xi: Array, eta: Array) -> tuple[Integers, Array, Array]:
         """Convert positions in the original (unsplit) elements into positions in the elements.
+
+        In this class no element is split, so the positions do not change. `RefinedTemplate` finds the split elements.
 
         Args:
             element: Index of the original element, shape (n,).
@@ -87,7 +91,7 @@ class Template(Blocks):
 
 
 class SampleCurve(CurvedProbe):
-    """A circular footprint with the topology of another curved footprint, used to number the nodes of a template."""
+    """A circular footprint with the topology of another curved footprint, for the numbering of the nodes."""
 
     angle = 0.0
     notation = "sample"
@@ -120,7 +124,10 @@ class SampleCurve(CurvedProbe):
 def sample_points(blocks: Blocks) -> Complexes:
     """Return the film points of the nodes of every element under a sample press.
 
-    No element is folded under the sample press, so nodes coincide only if they are the same node.
+    No element is folded under the sample press, so nodes have the same position only if they are the same node.
+
+    Args:
+        blocks: The elements.
 
     Returns:
         Shape (n_element, (order + 1)^2), in film radii.
@@ -131,7 +138,7 @@ def sample_points(blocks: Blocks) -> Complexes:
 
 
 def _sample_probe(topology: FootprintTopology) -> Probe:
-    """Return a probe of the sample size (film radius 1 mm) with this topology."""
+    """Return the probe of the sample press, which has the given topology, on a film with a radius of 1 mm."""
     if topology.fills_circle:
         return Circle(SAMPLE_REACH)
     if topology.is_curved:

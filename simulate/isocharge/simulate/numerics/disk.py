@@ -1,4 +1,4 @@
-"""Points on a disk: square lattices, a sunflower pattern, rings, and the projection of points onto the disk."""
+"""Points on a disk: square lattices, the sunflower pattern, rings, and the projection of points onto the disk."""
 
 from dataclasses import dataclass
 
@@ -7,8 +7,8 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes
 
 INNER_RADIUS = 1.0 - 1e-9
-"""Radius within which contacts are searched, in units of the radius of the charge map, dimensionless. It is smaller
-than one so that rounding errors do not move a contact out of the disk."""
+"""Radius within which contacts are searched, in units of the radius of the charge map, dimensionless. The value is
+smaller than one, so that rounding errors do not move a contact out of the disk."""
 
 ROUNDING = 1e-9
 """Relative tolerance for points on the edge of a disk, dimensionless."""
@@ -42,7 +42,9 @@ class Rings:
 
     @classmethod
     def spread(cls, radius: float, rings: int = 100, angles: int = 180) -> "Rings":
-        """Create rings at equal distances, of which the last has the given radius. The centre is not included.
+        """Create rings with equal distances between them. The outermost ring has the given radius.
+
+        The centre of the rings is not one of the positions.
 
         Args:
             radius: Radius of the outermost ring.
@@ -70,8 +72,8 @@ class Rings:
 def lattice(max_count: int) -> Complexes:
     """Return the points x + iy of a square lattice in the unit disk.
 
-    The lattice is the largest one with at most `max_count` points. The centre of the disk is one of the points, and
-    the outermost points lie on the unit circle.
+    The number of points is as large as possible, but at most `max_count`. The centre of the disk is one of the points,
+    and the outermost points lie on the unit circle.
 
     Args:
         max_count: Largest number of points.
@@ -85,10 +87,10 @@ def lattice(max_count: int) -> Complexes:
     x_grid, y_grid = np.meshgrid(line, line)
     squared_distance = x_grid**2 + y_grid**2
 
-    # The largest radius within which the lattice has at most `max_count` points.
-    squared_radii, counts = np.unique(squared_distance, return_counts=True)
-    number_of_radii = np.searchsorted(np.cumsum(counts), max_count, side="right")
-    squared_radius = squared_radii[number_of_radii - 1]
+    # Find the largest radius within which the lattice has at most `max_count` points.
+    squared_radii, point_counts = np.unique(squared_distance, return_counts=True)
+    n_radii = np.searchsorted(np.cumsum(point_counts), max_count, side="right")
+    squared_radius = squared_radii[n_radii - 1]
 
     is_inside = squared_distance <= squared_radius
     x = x_grid[is_inside]
@@ -117,9 +119,10 @@ def square_grid(radius: float, spacing: float) -> Array:
 
 
 def sunflower(count: int) -> Complexes:
-    """Return `count` points x + iy that are spread evenly over the unit disk, ordered by distance from the centre.
+    """Return `count` points x + iy that are distributed evenly over the unit disk, shape (count,).
 
-    The pattern is that of the seeds of a sunflower (Vogel 1979).
+    The points form the pattern of the seeds of a sunflower (Vogel 1979). They are ordered by the distance from the
+    centre.
     """
     number = np.arange(count)
     golden_angle = np.pi * (3.0 - np.sqrt(5.0))

@@ -6,9 +6,9 @@ Each problem is
 
 where r has a few components and the derivatives J. A damped Gauss-Newton step solves
 (J'J + damping trace(J'J) / 3) du = -J'r (Levenberg 1944). The bounds of D are treated by an active set: if u lies on an
-edge and the negative gradient points out of D, the step follows the edge. On the circle, the curvature of the circle is
-added to the second derivatives, so that the search along the circle also converges within a few steps, regardless of
-how far outside D the unbounded minimum lies.
+edge and the negative gradient points out of D, the step follows the edge. On the edge of the disk, the curvature of the
+circle is added to the second derivatives. A search along the circle therefore also converges within a few steps, even
+if the minimum without bounds lies far outside of D.
 """
 
 from collections.abc import Callable
@@ -53,14 +53,14 @@ EDGE_TOLERANCE = 1e-9
 """Distance from an edge of D below which a point counts as lying on the edge."""
 
 MEAN_OF_DIAGONAL = np.eye(3) / 3.0
-"""Matrix that, multiplied by the trace of a 3 x 3 matrix, has the mean of the diagonal of that matrix as its diagonal
-elements."""
+"""Matrix whose product with the trace of a 3 x 3 matrix is a diagonal matrix. All diagonal elements of the product are
+the mean of the diagonal of the 3 x 3 matrix."""
 
 
 def minimise(
     residuals: Residuals, start: Array, steps: int = MAX_STEPS, min_change: float = MIN_CHANGE
 ) -> tuple[Array, Array]:
-    """Find the local minimum that is reached from the starting point of every problem.
+    """Find the local minimum of every problem to which the iteration from its starting point leads.
 
     Args:
         residuals: Function that evaluates the residuals of some of the problems.
@@ -151,7 +151,7 @@ def _restrict_to_edges(
     is_on_circle: np.ndarray,
     is_at_end: np.ndarray,
 ) -> tuple[Array, Array]:
-    """Modify the normal equations so that steps follow the edges across which the negative gradient points.
+    """Modify the normal equations so that steps do not leave D across an edge, but follow the edge.
 
     Args:
         unit: Points of D, shape (..., 3).
@@ -173,11 +173,11 @@ def _restrict_to_edges(
     end_normal = np.zeros_like(unit)
     end_normal[..., 2] = np.sign(unit[..., 2])
 
-    # Outward components of the negative gradient, which are the Lagrange multipliers of the active edges
-    circle_pressure = -(gradient * circle_normal).sum(axis=-1)
-    end_pressure = -(gradient * end_normal).sum(axis=-1)
-    circle_multiplier = np.where(is_on_circle, np.maximum(circle_pressure, 0.0), 0.0)
-    end_multiplier = np.where(is_at_end, np.maximum(end_pressure, 0.0), 0.0)
+    # An edge is active if the negative gradient has an outward component, which is then the Lagrange multiplier.
+    circle_outward = -(gradient * circle_normal).sum(axis=-1)
+    end_outward = -(gradient * end_normal).sum(axis=-1)
+    circle_multiplier = np.where(is_on_circle, np.maximum(circle_outward, 0.0), 0.0)
+    end_multiplier = np.where(is_at_end, np.maximum(end_outward, 0.0), 0.0)
 
     # The curvature of the circle acts along its tangent. The stiffness keeps the point on the active edges.
     curvature = _outer_product(circle_tangent, circle_multiplier)

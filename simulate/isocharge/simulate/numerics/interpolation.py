@@ -11,12 +11,15 @@ from scipy.special import eval_legendre, roots_jacobi
 from isocharge.common.arrays import Array, Integers
 
 MIN_DIFFERENCE = 1e-200
-"""Distance from a node below which a point is treated as the node, because the barycentric quotient would overflow."""
+"""Distance below which a point is treated as equal to a node, because the barycentric formula would overflow."""
 
 
 @lru_cache(maxsize=32)
 def lobatto_nodes(order: int) -> Array:
     """Return the Gauss-Lobatto-Legendre nodes: the extrema of the Legendre polynomial P_order, and -1 and 1.
+
+    Args:
+        order: Order of the polynomials that the nodes determine.
 
     Returns:
         Nodes in ascending order, shape (order + 1,).
@@ -29,8 +32,9 @@ def lobatto_nodes(order: int) -> Array:
 def lobatto_weights(order: int) -> Array:
     """Return the barycentric weights of `lobatto_nodes`, shape (order + 1,).
 
-    They are proportional to 1 / P_order(x_j) with the Legendre polynomial P_order. Up to the alternating
-    sign they are the square roots of the quadrature weights (Wang, Huybrechs and Vandewalle 2014).
+    The weight of the node x_j is proportional to 1 / P_order(x_j) with the Legendre polynomial P_order. Except for
+    alternating signs, the weights are proportional to the square roots of the quadrature weights (Wang, Huybrechs and
+    Vandewalle 2014).
     """
     weights: Array = 1.0 / eval_legendre(order, lobatto_nodes(order))
     return _read_only(weights / np.abs(weights).max())
@@ -66,7 +70,7 @@ def chebyshev_nodes(count: int, low: float, high: float) -> Array:
         high: Upper end of the interval.
 
     Returns:
-        Nodes, ascending, shape (count,). Both ends of the interval lie outside of them.
+        Nodes, ascending, shape (count,). The ends of the interval are not among the nodes.
     """
     number = np.arange(count, 0, -1)
     angle = (2.0 * number - 1.0) * np.pi / (2.0 * count)
@@ -116,7 +120,10 @@ def lagrange_values(nodes: Array, weights: Array, points: Array) -> Array:
 
 @lru_cache(maxsize=32)
 def derivative_matrix(order: int) -> Array:
-    """Return the matrix D for which (D f)_i is the derivative at node i of the interpolant of the nodal values f.
+    """Return the matrix that converts the values of a polynomial at the nodes into its derivatives at the nodes.
+
+    Args:
+        order: Order of the polynomials.
 
     Returns:
         Matrix for `lobatto_nodes`, shape (order + 1, order + 1).
@@ -206,7 +213,7 @@ def cubic_weights(points: Array, count: int, periodic: bool = False) -> tuple[In
         periodic: Whether the grid is periodic, so that node `count` is the same as node 0.
 
     Returns:
-        Numbers of the four nodes, and their weights, each of shape (..., 4).
+        Indices of the four nodes, and their weights, each of shape (..., 4).
     """
     first_node = np.floor(points).astype(np.intp) - 1
     if not periodic:
@@ -230,7 +237,14 @@ def cubic_weights(points: Array, count: int, periodic: bool = False) -> tuple[In
 
 
 def gauss_line(count: int) -> tuple[Array, Array]:
-    """Return the Gauss rule on [0, 1]: points and weights, which add up to one, each of shape (count,)."""
+    """Return the Gauss rule on [0, 1].
+
+    Args:
+        count: Number of points.
+
+    Returns:
+        Points, and weights, which add up to one, each of shape (count,).
+    """
     points, weights = np.polynomial.legendre.leggauss(count)
     return 0.5 * (points + 1.0), 0.5 * weights
 

@@ -1,7 +1,7 @@
 """Polygons and disks in the plane: areas, centroid, convexity, overlap, and Gauss rules.
 
-Centroids, overlaps and intersections of polygons come from shapely (GEOS). The area within a disk is computed here,
-because shapely replaces a disk by a polygon.
+The library shapely (GEOS) computes centroids, overlaps and intersections of polygons. The area of a polygon within a
+disk is computed here, because shapely would replace the disk by a polygon.
 """
 
 from itertools import pairwise
@@ -68,12 +68,12 @@ def _cross(first: Array, second: Array) -> Array:
 
 
 def overlap(first: Array, second: Array, within: float = 0.0) -> bool:
-    """Return whether two polygons have common area, or are nearer to each other than a distance.
+    """Return whether two polygons overlap, or are closer to each other than a given distance.
 
     Args:
         first: Corners (x, y), shape (n, 2).
         second: Corners (x, y), shape (m, 2).
-        within: Distance, in the unit of the corners. If it is 0, polygons that only touch do not overlap.
+        within: The distance, in the unit of the corners. If it is 0, polygons that only touch do not overlap.
     """
     first_polygon = shapely.Polygon(first)
     second_polygon = shapely.Polygon(second)
@@ -95,8 +95,9 @@ def to_corners(z: Complexes) -> Array:
 def min_edge_cross_product(corners: Complexes, points: Complexes) -> Array:
     """Compute the smallest cross product of an edge of a convex polygon with the vector from the edge to a point.
 
-    The cross product is the length of the edge times the distance of the point from the line through the edge. It is
-    positive on the left of the edge, so the smallest one is positive for points within the polygon.
+    The cross product is the length of the edge times the signed distance of the point from the line through the edge.
+    The sign is positive if the point lies on the left of the edge. The smallest cross product is therefore positive for
+    points within the polygon.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
@@ -125,8 +126,9 @@ def shared_area(first: Complexes, second: Complexes) -> float:
 def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float) -> Array:
     """Compute the area that a polygon has in common with disks.
 
-    The area is the sum over the edges of the area that the disk has in common with the triangle of the edge and the
-    centre. The part of an edge inside the circle contributes a triangle; the parts outside contribute sectors.
+    For each edge, the area that the disk has in common with the triangle of the edge and the centre is computed, and
+    these signed areas are added. The part of an edge inside the circle contributes a triangle, and the parts outside
+    contribute sectors.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
@@ -136,16 +138,15 @@ def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float)
     Returns:
         Common area for each disk, in the shape of `centre`.
     """
-    # Ends of each edge relative to the centre, and their coordinates along and across the edge, shape (..., n).
-    # The product of one complex number with the conjugate of another has the dot product as its real part.
+    # Ends of each edge relative to the centre, and their coordinates along and across the edge, shape (..., n)
     start = corners - np.asarray(centre)[..., None]
     end = np.roll(start, -1, axis=-1)
     direction = (end - start) / np.abs(end - start)
     start_along = (start * np.conj(direction)).real
     end_along = (end * np.conj(direction)).real
-    across = (start * np.conj(direction)).imag  # negative if the centre is on the left of the edge, as inside
+    across = (start * np.conj(direction)).imag  # negative if the centre lies on the left of the edge
 
-    # The part of the edge within the circle; both ends coincide if the edge does not meet the circle.
+    # Ends of the part of the edge within the circle. They coincide if the edge does not meet the circle.
     half_chord = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
     chord_start_along = np.clip(start_along, -half_chord, half_chord)
     chord_end_along = np.clip(end_along, -half_chord, half_chord)
@@ -162,8 +163,8 @@ def area_in_disk(corners: Complexes, centre: Complexes | complex, radius: float)
 def gauss_polygon(corners: Array, count: int) -> tuple[Array, Array]:
     """Compute a Gauss rule for a convex polygon.
 
-    The polygon is divided into triangles that share its first corner. The rule of a triangle is that of a square, of
-    which one side is contracted to a point (Duffy 1982).
+    The polygon is divided into triangles that share its first corner. The rule of a triangle is the rule of a square
+    one of whose sides is contracted to a point (Duffy 1982).
 
     Args:
         corners: Corners (x, y), anticlockwise, shape (n, 2).
@@ -209,9 +210,9 @@ def gauss_quadrilateral(corners: Array, count: int, length: float) -> tuple[Arra
 
     Args:
         corners: Corners (x, y), anticlockwise, shape (4, 2) or (3, 2).
-        count: Number of points along a side of `length` or longer. Shorter sides have proportionally fewer, but at
-            least two.
-        length: Length of a side that has `count` points, in the unit of the corners.
+        count: Number of points along a side of the length `length` or more. Shorter sides have proportionally fewer
+            points, but at least two.
+        length: Length of a side from which on it has `count` points, in the unit of the corners.
 
     Returns:
         Points (x, y), shape (n, 2), and weights, shape (n,), which add up to the area of the polygon.
@@ -234,11 +235,17 @@ def gauss_quadrilateral(corners: Array, count: int, length: float) -> tuple[Arra
 
 
 def _four_corners(corners: Complexes) -> Complexes:
-    """Return the corners of a quadrilateral, or those of a triangle with the last one repeated."""
+    """Return the four corners of a quadrilateral, or the three corners of a triangle with the last corner repeated."""
     return corners if corners.size == 4 else np.append(corners, corners[-1:])
 
 
 def _gauss_line_for(side: float, count: int, length: float) -> tuple[Array, Array]:
-    """Return the Gauss rule on [0, 1] with as many points as a side needs."""
-    needed = max(2, int(np.ceil(count * side / length)))
-    return gauss_line(min(count, needed))
+    """Return the Gauss rule on [0, 1] with as many points as a side needs.
+
+    Args:
+        side: Length of the side.
+        count: Largest number of points.
+        length: Length of a side from which on it has `count` points, in the unit of `side`.
+    """
+    proportional_count = max(2, int(np.ceil(count * side / length)))
+    return gauss_line(min(count, proportional_count))

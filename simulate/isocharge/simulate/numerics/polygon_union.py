@@ -1,8 +1,8 @@
 """Unions of polygons, divided into trapezoids for integration. Polygons are arrays of corners x + iy, anticlockwise.
 
-Unions, intersections and validity come from shapely (GEOS). Two functions are written here, because shapely has no
-equivalent: the division into trapezoids, and the outline of a trace. The `buffer` of shapely cuts a sharp bend off
-without notice and joins a trace that crosses itself into a ring, while `trace_outline` makes both detectable.
+The library shapely (GEOS) computes unions and intersections. It has no equivalent for two functions of this module: the
+division into trapezoids, and the outline of a trace. The function `buffer` of shapely silently cuts off sharp bends,
+and converts a trace that crosses itself into a ring. With `trace_outline`, both errors can be detected.
 """
 
 from collections.abc import Sequence
@@ -18,15 +18,16 @@ MERGE_DISTANCE = 1e-9
 """Distance below which two corners, or the y coordinates of two corners, are merged, mm."""
 
 MIN_BEND = 0.1
-"""Smallest 1 + cos(angle) for the angle by which a trace bends, dimensionless. It corresponds to a bend of 154 degrees.
-The length of a mitre grows with 1 / (1 + cos(angle))."""
+"""Smallest allowed value of 1 + cos(angle) for the angle by which a trace bends, dimensionless. The length of a mitre
+is proportional to 1 / (1 + cos(angle)). The largest allowed bend is 154 degrees."""
 
 
 def is_simple(corners: Complexes) -> bool:
     """Return whether a polygon is anticlockwise and does not cross itself.
 
-    The signed area of a polygon equals the area that it covers only if it covers no point twice or with the opposite
-    orientation. A polygon that touches itself in a point or along an edge is simple in this sense.
+    The signed area of a polygon is compared with the area that the polygon covers. The two areas are different if the
+    polygon covers some points twice, or some points clockwise. A polygon that touches itself at a point or along an
+    edge counts as simple.
 
     Args:
         corners: Corners x + iy, shape (n,), mm.
@@ -40,8 +41,8 @@ def is_simple(corners: Complexes) -> bool:
 def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> list[Complexes]:
     """Divide the union of simple polygons into trapezoids without common area.
 
-    The plane is cut into horizontal strips at every corner and at every crossing of two edges. Within a strip the union
-    consists of trapezoids (or triangles, as trapezoids with two equal corners).
+    The plane is cut into horizontal strips at every corner and at every crossing of two edges. The part of the union
+    within a strip consists of trapezoids. A triangle is represented as a trapezoid with two equal corners.
 
     Args:
         front: Simple polygons, each of shape (n,), mm.
@@ -60,15 +61,17 @@ def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> l
     start, end = _edges(region)
     trapezoids = []
     for bottom, top in pairwise(_strip_ends([*front, *back])):
+        # Edges that cross the strip, in the order from left to right
         middle = 0.5 * (bottom + top)
         crosses_strip = (start.imag < middle) != (end.imag < middle)
-        crossing_start = start[crosses_strip]
-        crossing_end = end[crosses_strip]
-        x_middle = _x_at_height(crossing_start, crossing_end, middle)
-        from_left = np.argsort(x_middle)
-        x_bottom = _x_at_height(crossing_start, crossing_end, bottom)[from_left]
-        x_top = _x_at_height(crossing_start, crossing_end, top)[from_left]
-        for left in range(0, x_middle.size, 2):  # the region lies between an edge with an even number and the next one
+        edge_start = start[crosses_strip]
+        edge_end = end[crosses_strip]
+        order = np.argsort(_x_at_height(edge_start, edge_end, middle))
+        x_bottom = _x_at_height(edge_start, edge_end, bottom)[order]
+        x_top = _x_at_height(edge_start, edge_end, top)[order]
+
+        # The region begins at the first edge, ends at the second edge, begins again at the third edge, and so on.
+        for left in range(0, order.size, 2):
             right = left + 1
             lower_left = x_bottom[left] + 1j * bottom
             lower_right = x_bottom[right] + 1j * bottom
@@ -79,7 +82,13 @@ def union_parts(front: Sequence[Complexes], back: Sequence[Complexes] = ()) -> l
 
 
 def _x_at_height(start: Complexes, end: Complexes, y: float) -> Array:
-    """Return the x coordinates at which lines from `start` to `end`, shape (n,), have the height y, shape (n,)."""
+    """Return the x coordinates at which lines have the height y, shape (n,).
+
+    Args:
+        start: Points x + iy at which the lines start, shape (n,).
+        end: Points x + iy at which the lines end, shape (n,).
+        y: The height.
+    """
     slope = (end - start).real / (end - start).imag
     return np.asarray(start.real + slope * (y - start.imag))
 
@@ -93,8 +102,8 @@ def _region(polygons: Sequence[Complexes]) -> shapely.Geometry:
 def _strip_ends(polygons: Sequence[Complexes]) -> Array:
     """Return the y coordinates of all corners and of all crossings of edges, ascending and without repetition, mm."""
     outlines = [shapely.LinearRing(to_corners(corners)) for corners in polygons]
-    noded = shapely.union_all(outlines)
-    y = np.unique(shapely.get_coordinates(noded)[:, 1])
+    lines = shapely.union_all(outlines)  # has a point at each crossing
+    y = np.unique(shapely.get_coordinates(lines)[:, 1])
     return np.asarray(y[np.diff(y, prepend=-np.inf) > MERGE_DISTANCE])
 
 
@@ -118,26 +127,21 @@ def subdivide(part: Complexes, max_side: float) -> list[Complexes]:
     Returns:
         Polygons of shape (4,) or (3,), mm.
     """
-    # Divide the unit square (s, t), of which the quadrilateral is the bilinear image, into a grid of cells.
-    side_length = np.abs(np.roll(part, -1) - part)
-    s_count = int(np.ceil(max(side_length[0], side_length[2]) / max_side))
-    t_count = int(np.ceil(max(side_length[1], side_length[3]) / max_side))
-    s = np.linspace(0.0, 1.0, s_count + 1)
-    t = np.linspace(0.0, 1.0, t_count + 1)
-    grid = bilinear(part, s[:, None], t)  # shape (s_count + 1, t_count + 1)
+    # The quadrilateral is the bilinear image of the unit square (s, t), which is divided into a grid of cells.
+    first_s_side, first_t_side, second_s_side, second_t_side = np.abs(np.roll(part, -1) - part)
+    n_s = int(np.ceil(max(first_s_side, second_s_side) / max_side))
+    n_t = int(np.ceil(max(first_t_side, second_t_side) / max_side))
+    s = np.linspace(0.0, 1.0, n_s + 1)
+    t = np.linspace(0.0, 1.0, n_t + 1)
+    grid = bilinear(part, s[:, None], t)  # shape (n_s + 1, n_t + 1)
     cells = []
-    for row in range(s_count):
-        for column in range(t_count):
-            corners = np.array(
-                [
-                    grid[row, column],
-                    grid[row + 1, column],
-                    grid[row + 1, column + 1],
-                    grid[row, column + 1],
-                ]
-            )
-            is_distinct = np.abs(corners - np.roll(corners, 1)) > MERGE_DISTANCE
-            if np.count_nonzero(is_distinct) > 2:  # cells without area are omitted
+    for i in range(n_s):
+        for j in range(n_t):
+            corners = np.array([grid[i, j], grid[i + 1, j], grid[i + 1, j + 1], grid[i, j + 1]])
+            previous_corners = np.roll(corners, 1)
+            is_distinct = np.abs(corners - previous_corners) > MERGE_DISTANCE
+            has_area = np.count_nonzero(is_distinct) > 2
+            if has_area:
                 cells.append(corners[is_distinct])
     return cells
 

@@ -1,4 +1,4 @@
-"""Maps of the lower limit of the position error over the film, for an identification and for a design."""
+"""Pictures of the lower limit of the position error over the film, for an identification and for a design."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ MARGIN = 1.0
 """Margin around the electrodes, mm."""
 
 FORCE_COLOURS = ("#8fb8de", "#3a7ca5", INK)
-"""Colours of the curves, of which the last is that of the largest force."""
+"""Colours of the curves for ascending forces. The last colour is that of the largest force."""
 
 
 def identification_picture(identification: Identification) -> Figure:
@@ -133,13 +133,16 @@ def error_maps_picture(design: Design) -> Figure:
     layouts = [(design.sensor, design.after)]
     if design.before:
         layouts.insert(0, (case.sensor, design.before))
-    figure = new_figure(6.4 * len(layouts) + 1.0, 6.0)
+
+    # All maps have the same range of colours, and the same axes that show all electrodes.
     smallest = min(float(errors.with_nuisances.min()) for _, errors in layouts)
     norm = LogNorm(smallest, MAX_ERROR_RATIO * smallest)
     electrodes = [electrode for sensor, _ in layouts for electrode in sensor.electrodes]
     corners = np.concatenate([polygon for electrode in electrodes for polygon in electrode.front])
     half_width = float(max(case.radius, np.abs(corners).max())) + MARGIN
     limits = (-half_width, half_width)
+
+    figure = new_figure(6.4 * len(layouts) + 1.0, 6.0)
     all_axes = figure.subplots(1, len(layouts), squeeze=False)[0]
     for axes, (sensor, errors) in zip(all_axes, layouts, strict=True):
         shades = _draw_errors(axes, sensor, errors, norm)

@@ -1,6 +1,6 @@
-"""Matplotlib figures without a window: creation, colours, and output files. All pictures of isocharge use this module.
+"""Creation, colours and output files of matplotlib figures. All pictures of isocharge use this module.
 
-The module needs matplotlib, so it is imported only where a picture is drawn.
+The figures have no window. The module needs matplotlib, so it is imported only where a picture is drawn.
 """
 
 from io import BytesIO
@@ -81,7 +81,7 @@ def shades(count: int) -> Array:
 
 
 def check_picture(path: Path) -> None:
-    """Check the file name of a picture, which is done before the computation.
+    """Check the file name of a picture before the picture is computed.
 
     Raises:
         InputError: If the suffix is not one of `FORMATS`.
@@ -95,7 +95,7 @@ def check_picture(path: Path) -> None:
 def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
     """Convert a figure into the bytes of an image file.
 
-    The file contains neither a date nor random identifiers, so that equal figures give equal bytes.
+    The file contains neither a date nor random identifiers, so equal figures have equal bytes.
 
     Args:
         figure: The figure.

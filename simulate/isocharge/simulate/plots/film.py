@@ -22,7 +22,9 @@ rim may lie outside the film."""
 
 
 def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool = True, ink: str = INK) -> None:
-    """Draw the outlines of the electrodes at their calibrated positions, with solid lines for the front.
+    """Draw the outlines of the electrodes at their calibrated positions.
+
+    The outlines of the front are solid lines, and those of the back are dashed lines.
 
     Args:
         axes: Matplotlib axes.
@@ -158,7 +160,16 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
 
 
 def _polar_grid(radius: float, rings: int, angles: int) -> tuple[Array, Array]:
-    """Return coordinates x and y (mm) on a disk, each of shape (rings, angles), on rings of equal area."""
+    """Return the points of a polar grid on a disk, with equal areas between neighbouring rings.
+
+    Args:
+        radius: Radius of the disk, mm.
+        rings: Number of rings, including the centre.
+        angles: Number of points on each ring.
+
+    Returns:
+        Coordinates x and y, each of shape (rings, angles), mm.
+    """
     distance = radius * np.sqrt(np.linspace(0.0, 1.0, rings))
     angle = np.linspace(0.0, 2.0 * np.pi, angles)
     return np.outer(distance, np.cos(angle)), np.outer(distance, np.sin(angle))

@@ -26,9 +26,10 @@ def mirror_picture(identification: Identification, mirror: MirrorRegion) -> Figu
     shades = _draw_region(film_axes, identification, mirror)
     figure.colorbar(shades, ax=film_axes, label="share of the forces that cannot be noticed", shrink=0.85)
     _draw_distance(distance_axes, mirror)
-    lightest, hardest = mirror.forces[0], mirror.forces[-1]
+    min_force = mirror.forces[0]
+    max_force = mirror.forces[-1]
     figure.suptitle(
-        f"{identification.sensor.name}: presses of {lightest:.2g} to {hardest:.2g} N with the charges of a press in "
+        f"{identification.sensor.name}: presses of {min_force:.2g} to {max_force:.2g} N with the charges of a press in "
         "the working area",
         fontsize=13,
     )
@@ -46,8 +47,8 @@ def _draw_region(axes: Any, identification: Identification, mirror: MirrorRegion
     Returns:
         The coloured cells, for which a colour bar can be drawn.
     """
+    # Corners of the cells, shape (n_ring + 1, n_sector + 1)
     n_ring, n_sector = mirror.share.shape
-    # corners of the cells, shape (n_ring + 1, n_sector + 1)
     edge_radius = np.linspace(mirror.inner, mirror.outer, n_ring + 1)
     edge_angle = 2.0 * np.pi * np.arange(n_sector + 1) / n_sector
     corner_x = np.outer(edge_radius, np.cos(edge_angle))

@@ -1,1 +1,1 @@
-"""What the sensor is and what presses it: film, electrodes, probe, and their TOML file."""
+"""Description of a sensor and of probes: film, electrodes, probe shapes, and the reader of sensor files."""

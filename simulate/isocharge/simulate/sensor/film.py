@@ -17,8 +17,8 @@ MIN_THICKNESS = 1e-4
 """Smallest thickness of a film, mm. Smaller values are probably in metres."""
 
 MAX_PIEZO = 1e5
-"""Largest piezoelectric or pyroelectric coefficient, pC/N or pC/(mm^2 K): thirty times that of the strongest
-crystals."""
+"""Largest piezoelectric or pyroelectric coefficient, pC/N or pC/(mm^2 K). It is thirty times the coefficient of the
+strongest crystals."""
 
 MIN_PIEZO = 1e-3
 """Smallest coefficient d31, d32, d33 or d12 other than zero, pC/N. Smaller values are probably in C/N."""
@@ -54,12 +54,14 @@ MAX_STATIC_PRESSURE = 0.01
 """Largest size of a static pressure, MPa. A film of 25 um bulges by several millimetres under such a pressure."""
 
 MAX_COAT_STIFFNESS = 5.0
-"""Largest stiffness of a coat over the stiffness of the film. The bending of a stiffer coat cannot be neglected."""
+"""Largest ratio of the stiffness of a coat to that of the film. The bending of a stiffer coat cannot be neglected."""
 
 
 @dataclass(frozen=True)
 class Coat:
-    """Metal or ink that stiffens parts of a film. It is isotropic, has Poisson's ratio of the film, and no pretension.
+    """Metal or ink that stiffens parts of a film.
+
+    The coat is isotropic, has the same Poisson's ratio as the film, and has no pretension.
 
     Attributes:
         stiffness: Young's modulus times thickness of one layer, N/mm.
@@ -71,7 +73,7 @@ class Coat:
     layers: tuple[tuple[tuple[tuple[float, float], ...], ...], ...]
 
     def __repr__(self) -> str:
-        """Return a short text with the stiffness and the number of parts; the corners would fill pages."""
+        """Return a short text with the stiffness and the number of polygons, without their many corners."""
         return f"Coat({self.stiffness:.4g} N/mm, {len(self.layers[0])} parts)"
 
 
@@ -204,8 +206,8 @@ class Film:
 class Piezo:
     """Piezoelectric strain coefficients and pyroelectric coefficient of a film.
 
-    The sign of the charge is that of a tension along x if d31 > 0. In PVDF, a decrease of the thickness increases the
-    charge, and an increase of the thickness decreases it. With d31 = 20 pC/N, PVDF therefore has d33 = -33 pC/N and
+    With d31 > 0, a tension along x causes a positive charge. In PVDF, a decrease of the thickness increases the charge,
+    and an increase of the thickness decreases the charge. With d31 = 20 pC/N, PVDF therefore has d33 = -33 pC/N and
     pyro = -30 pC/(mm^2 K), because warming increases the thickness (Kepler and Anderson 1978). Data sheets often omit
     these signs. If the wires of a film are exchanged, all signs change.
 
@@ -228,7 +230,7 @@ class Piezo:
         """Check the coefficients.
 
         Raises:
-            SensorError: If a coefficient is too large or too small to be meant in pC/N, or if the film gives no charge.
+            SensorError: If a coefficient is too large or too small for the unit pC/N, or if the film has no charge.
         """
         for name, coefficient in vars(self).items():
             if not abs(coefficient) <= MAX_PIEZO:

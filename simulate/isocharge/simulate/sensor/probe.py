@@ -1,10 +1,16 @@
-"""The probe shapes, and the notation for them on the command line and in files.
+"""The probe shapes, and their notation on the command line and in files.
 
-Examples of the notation are `circle:1.0` (radius), `ellipse:4.0x2.0` (axes along x and y), `rectangle:4.0x2.0` (sides
-along x and y), `triangle:4.0` (side of an equilateral triangle with one corner towards +y), `polygon:x,y;x,y;x,y`
-(corners of a convex polygon, anticlockwise) and `finger:6.0` (radius of the contact area of a fingertip). Lengths are
-in mm. `@30` at the end rotates the footprint by 30 degrees anticlockwise. The position of a probe is the centroid of
-its footprint.
+Examples of the notation:
+
+    circle:1.0             radius
+    ellipse:4.0x2.0        axes along x and y
+    rectangle:4.0x2.0      sides along x and y
+    triangle:4.0           side of an equilateral triangle with one corner towards +y
+    polygon:x,y;x,y;x,y    corners of a convex polygon, anticlockwise
+    finger:6.0             radius of the contact area of a fingertip
+
+All lengths are in mm. The suffix `@30` rotates the footprint by 30 degrees anticlockwise. The position of a probe is
+the centroid of its footprint.
 """
 
 from isocharge.common.errors import SceneError, cut
@@ -29,7 +35,7 @@ NOTATIONS: tuple[ProbeNotation, ...] = tuple(notation for shape in PROBE_SHAPES 
 
 
 def _listed(forms: list[str]) -> str:
-    """Return the forms as an enumeration: "a, b or c"."""
+    """Join the forms of several notations in a text such as "a, b or c"."""
     return f"{', '.join(forms[:-1])} or {forms[-1]}"
 
 
@@ -44,7 +50,7 @@ def parse_probe(text: str) -> Probe:
     """Convert the notation of a probe into the probe.
 
     Args:
-        text: Notation such as "rectangle:4.0x2.0@30"; the module's docstring lists the others.
+        text: Notation such as "rectangle:4.0x2.0@30"; see the docstring of this module.
 
     Returns:
         The probe.

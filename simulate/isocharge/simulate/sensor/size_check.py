@@ -1,4 +1,4 @@
-"""Checks of lengths and stresses, which also detect values in metres and pascals, and rounding for files."""
+"""Checks of lengths and stresses, which also detect values in metres and pascals; rounding of numbers for files."""
 
 import math
 
@@ -6,12 +6,12 @@ from isocharge.common.errors import InputError
 
 
 def tidy(value: float) -> float:
-    """Round a number to twelve digits, which removes the round-off of unit conversions."""
+    """Round a number to twelve digits, which removes the rounding errors of unit conversions."""
     return float(f"{value:.12g}")
 
 
 def check_length(what: str, value: float, minimum: float, error: type[InputError]) -> None:
-    """Raise an error if a length is infinite or too small to be meant in millimetres.
+    """Raise an error if a length is infinite, or so small that it is probably in metres instead of millimetres.
 
     Args:
         what: Name of the length in the error message.

@@ -1,1 +1,1 @@
-"""From a press to its equilibrium: choice of mesh, assembly, Newton's method, estimates of the error."""
+"""Solver of presses: choice of the mesh, assembly, Newton's method, and estimates of the error."""

@@ -1,9 +1,9 @@
-"""Solution of the linear system of a mesh: static condensation of the elements, then a sparse direct solver.
+"""Solution of the linear system of a mesh by static condensation of the elements and a sparse direct solver.
 
-A node in the interior of an element belongs to no other element. Its unknowns are eliminated element by element with
-dense matrices, so only the unknowns of the skeleton (the sides of the elements) are factorised together. At order 4
-this reduces the number of unknowns by a factor of 2.3. The numbering and the sparsity pattern depend on the template
-only and are computed once.
+A node in the interior of an element belongs to no other element. The unknowns of such nodes are eliminated element by
+element with dense matrices, so only the unknowns of the skeleton (the sides of the elements) are factorised together.
+At order 4 this reduces the number of unknowns by a factor of 2.3. The numbering and the sparsity pattern depend on the
+template only and are computed once.
 
 The unknowns of a node are U1, U2, W and, with bending, the auxiliary unknown of `mechanics.energy`. The first three are
 zero on the rim. On the line of symmetry of a half template, U2 is zero for even fields, and all other unknowns are zero
@@ -27,10 +27,11 @@ class Assembly:
         components: Number of unknowns per node.
         odd: Whether the fields are odd about the line of symmetry.
         free: Whether each unknown is free, shape (n_node, components).
-        inner_global: Numbers of the interior unknowns of each element, shape (n_element, n_inner).
-        outer_global: Numbers of the unknowns on the sides of each element, shape (n_element, n_outer).
-        skeleton: Numbers of the free unknowns on sides, in the order of elimination, shape (n_skeleton,).
-        follow: Matrix from the skeleton unknowns that do not hang to all skeleton unknowns; None if no node hangs.
+        inner_global: Indices of the interior unknowns of each element, shape (n_element, n_inner).
+        outer_global: Indices of the unknowns on the sides of each element, shape (n_element, n_outer).
+        skeleton: Indices of the free unknowns on sides, in the order of elimination, shape (n_skeleton,).
+        constraint: Matrix that computes all skeleton unknowns from those of nodes that are not hanging nodes; None if
+            there are no hanging nodes.
     """
 
     def __init__(self, mesh: Template, components: int, odd: bool = False) -> None:
@@ -45,7 +46,7 @@ class Assembly:
         self.odd = odd
         self.free = _free(mesh, components, odd)
 
-        # Local numbers of the unknowns on the sides of an element and in its interior, component by component
+        # Local indices of the unknowns on the sides of an element and in its interior, component by component
         line = np.arange(mesh.resolution.order + 1)
         is_end = (line == line[0]) | (line == line[-1])
         is_on_side = (is_end[:, None] | is_end[None, :]).ravel()
@@ -64,12 +65,12 @@ class Assembly:
         skeleton_number = np.full(self.free.size, -1, dtype=np.intp)
         skeleton_number[self.skeleton] = np.arange(self.skeleton.size)
         self._set_pattern(skeleton_number[self.outer_global])
-        self.follow = None
+        self.constraint = None
         if mesh.constraint is not None:
-            node_constraint = kron(mesh.constraint, eye_array(components)).tocsr()
-            skeleton_constraint = node_constraint[self.skeleton][:, self.skeleton]
-            does_not_hang = skeleton_constraint.diagonal() > 0.0
-            self.follow = skeleton_constraint[:, does_not_hang].tocsc()
+            unknown_constraint = kron(mesh.constraint, eye_array(components)).tocsr()
+            skeleton_constraint = unknown_constraint[self.skeleton][:, self.skeleton]
+            is_regular = skeleton_constraint.diagonal() > 0.0  # the columns of hanging nodes are zero
+            self.constraint = skeleton_constraint[:, is_regular].tocsc()
         self._reorder()
 
     def _set_pattern(self, skeleton_numbers: Integers) -> None:
@@ -90,7 +91,7 @@ class Assembly:
         entry, position = np.unique(column[is_free] * size + row[is_free], return_inverse=True)
         positions = np.full(shape, entry.size, dtype=np.intp)
         positions[is_free] = position
-        self._place = positions.ravel()
+        self._entry_positions = positions.ravel()
         self._indices = (entry % size).astype(np.int32)
         entries_per_column = np.bincount(entry // size, minlength=size)
         self._indptr = np.concatenate([[0], np.cumsum(entries_per_column)]).astype(np.int32)
@@ -101,16 +102,16 @@ class Assembly:
         pattern = self._skeleton(np.ones(self._indices.size))
         dominant = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
         order = np.argsort(_factorise(dominant, "MMD_AT_PLUS_A").perm_c)
-        if self.follow is not None:
-            self.follow = self.follow[:, order]
+        if self.constraint is not None:
+            self.constraint = self.constraint[:, order]
             return
 
-        # Permute a matrix whose entries are their own positions, which shows the new position of each entry.
+        # Permute a matrix whose entries are their own positions, and read the new position of each entry from it.
         pattern.data = np.arange(pattern.nnz)
         permuted = pattern[:, order][order]
         permuted.sort_indices()
         new_position = np.append(np.argsort(permuted.data), permuted.nnz)
-        self._place = new_position[self._place]
+        self._entry_positions = new_position[self._entry_positions]
         self._indices = permuted.indices
         self._indptr = permuted.indptr
         self.skeleton = self.skeleton[order]
@@ -126,26 +127,32 @@ class Assembly:
         """
         inner = self._inner
         outer = self._outer
-        size = matrix.shape[1] * self.components
-        matrix = matrix.transpose(0, 2, 1, 4, 3).reshape(-1, size, size)  # unknowns component by component
+        n_unknown = matrix.shape[1] * self.components
+        element_matrix = matrix.transpose(0, 2, 1, 4, 3).reshape(-1, n_unknown, n_unknown)  # component by component
 
         # Static condensation: eliminate the interior unknowns of each element.
-        coupling = matrix[:, inner[:, None], outer]
-        inverse = np.linalg.inv(matrix[:, inner[:, None], inner]).astype(float, copy=False)
+        coupling = element_matrix[:, inner[:, None], outer]
+        inverse = np.linalg.inv(element_matrix[:, inner[:, None], inner]).astype(float, copy=False)
         reduced = inverse @ coupling
-        schur_complement = matrix[:, outer[:, None], outer] - coupling.transpose(0, 2, 1) @ reduced
+        schur_complement = element_matrix[:, outer[:, None], outer] - coupling.transpose(0, 2, 1) @ reduced
 
-        # Sum the Schur complements of the elements; the last position collects the entries of fixed unknowns.
-        skeleton_entries = np.bincount(self._place, schur_complement.ravel(), self._indices.size + 1)[:-1]
+        # Sum the Schur complements of the elements. The last position, which collects the entries of fixed unknowns,
+        # is dropped.
+        entry_count = self._indices.size + 1
+        skeleton_entries = np.bincount(self._entry_positions, schur_complement.ravel(), entry_count)[:-1]
         skeleton_factor = _factorise(self._skeleton(skeleton_entries), "NATURAL")
         return Factor(self, inverse, coupling, reduced, skeleton_factor)
 
     def _skeleton(self, data: np.ndarray) -> csc_matrix:
-        """Return the matrix of the skeleton unknowns that do not hang, from the entries of its sparsity pattern."""
+        """Return the matrix of the skeleton unknowns, without those of hanging nodes.
+
+        Args:
+            data: Entries of the sparsity pattern, in the order of the compressed sparse column format.
+        """
         matrix = csc_matrix((data, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
-        if self.follow is None:
+        if self.constraint is None:
             return matrix
-        return csc_matrix(self.follow.T @ matrix @ self.follow)
+        return csc_matrix(self.constraint.T @ matrix @ self.constraint)
 
 
 class Factor:
@@ -189,26 +196,27 @@ class Factor:
 
         # Solve for the unknowns of the skeleton.
         skeleton_right = reduced_right[assembly.skeleton]
-        if assembly.follow is None:
+        if assembly.constraint is None:
             skeleton_solution = self._skeleton.solve(skeleton_right)
         else:
-            skeleton_solution = assembly.follow @ self._skeleton.solve(assembly.follow.T @ skeleton_right)
+            regular_solution = self._skeleton.solve(assembly.constraint.T @ skeleton_right)
+            skeleton_solution = assembly.constraint @ regular_solution
         solution = np.zeros(flat_right.size)
         solution[assembly.skeleton] = skeleton_solution
 
-        # Substitute them back into the equations of the interior unknowns.
+        # Compute the interior unknowns from those of the skeleton.
         correction = self._reduced @ solution[assembly.outer_global][..., None]
         solution[assembly.inner_global] = (inner_solution - correction)[..., 0]
         return solution.reshape(assembly.free.shape)[:, :3]
 
 
 def _factorise(matrix: csc_matrix, order: str) -> SuperLU:
-    """Factorise a symmetric matrix without pivoting, with a column ordering of SuperLU."""
+    """Factorise a symmetric matrix without pivoting. `order` is the name of a column ordering of SuperLU."""
     return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def _free(mesh: Template, components: int, odd: bool) -> np.ndarray:
-    """Return whether each unknown is free, which is not fixed by the clamp or by symmetry.
+    """Return which unknowns are free. The other unknowns are fixed by the clamp or by symmetry.
 
     Args:
         mesh: Template of the mesh.

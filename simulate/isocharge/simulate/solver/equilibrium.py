@@ -43,13 +43,13 @@ class Equilibrium:
         status: "converged" or "failed".
         message: Description of the outcome in one sentence.
         iterations: Number of Newton steps with a new tangent. For a linear theory, the number of linear solves.
-        residual: Out-of-balance force relative to the load. For a linear theory, the size of the last correction in the
-            energy norm.
+        residual: Out-of-balance force relative to the load. For a linear theory, the energy norm of the last
+            correction.
         seconds: Process CPU time for meshing and solving, s.
         proven_error: Relative difference of the charges between this mesh and a mesh of one order less; None if only
             one mesh was solved.
-        rest: Equilibrium of the same mesh before the contact, under the static pressure alone; None if there is no
-            static pressure. Its stress is not part of the touch stress.
+        rest: Equilibrium on the same mesh before the contact, under the static pressure alone; None if there is no
+            static pressure. The touch stress does not include the stress of this equilibrium.
     """
 
     film: Film
@@ -70,7 +70,7 @@ class Equilibrium:
     rest: "Equilibrium | None" = None
 
     def __repr__(self) -> str:
-        """Return a summary: the press, the deflection, the largest stress, and a warning if PVDF would yield."""
+        """Return a summary of the press, the deflection and the largest stress, with a warning if PVDF would yield."""
         (depth,) = deflection(self, np.array([self.at]))
         _, largest_stress = principal_stress(self)
         exceeds_limit = largest_stress > DEFAULT_STRESS_LIMIT
@@ -83,7 +83,9 @@ class Equilibrium:
 
 
 def deflection(equilibrium: Equilibrium, points: Array) -> Array:
-    """Compute the deflection at points of the film, from the flat film. It includes that of a static pressure.
+    """Compute the deflection at points of the film, relative to the flat film.
+
+    The deflection includes that of a static pressure.
 
     Args:
         equilibrium: The solved press.
@@ -121,19 +123,26 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     """
     mesh = equilibrium.mesh
     groups = equilibrium.groups
-    element, xi, eta, mirrored = _locate(equilibrium, points)
+    element, xi, eta, is_reflected = _locate(equilibrium, points)
+
+    # Strain of the mid-surface, then the strain of bending, and the jump of the strain at the edges of a coat
     gradient = mesh.gradient(element, xi, eta)
-    strained = strain(gradient @ equilibrium.field[mesh.template.nodes[element]], groups.amplitude2)
+    nodal_displacement = equilibrium.field[mesh.template.nodes[element]]
+    total_strain = strain(gradient @ nodal_displacement, groups.amplitude2)
     if surface != "middle":
-        strained += _bending_strain(equilibrium, surface, gradient @ node_slope(equilibrium)[element, :, :, 2])
+        nodal_slope_of_deflection = node_slope(equilibrium)[element, :, :, 2]
+        total_strain += _bending_strain(equilibrium, surface, gradient @ nodal_slope_of_deflection)
     if mesh.coat is not None:
-        strained = mesh.coat.film_strain(_rotated(equilibrium, points), strained)
-    local = equilibrium.film.young * groups.amplitude2 * scaled_stress(strained, groups)
-    local[mirrored, 2] *= -1.0
-    total = rotate_stress(local, np.arctan2(equilibrium.at[1], equilibrium.at[0]))
+        total_strain = mesh.coat.film_strain(_rotated(equilibrium, points), total_strain)
+
+    # Stress in the frame of the press, with s12 reversed in the reflected half, and then in the axes of the film
+    press_stress = equilibrium.film.young * groups.amplitude2 * scaled_stress(total_strain, groups)
+    press_stress[is_reflected, 2] *= -1.0
+    x, y = equilibrium.at
+    film_stress = rotate_stress(press_stress, np.arctan2(y, x))
     if equilibrium.rest is None:
-        return total
-    return np.asarray(total - touch_stress(equilibrium.rest, points, surface))
+        return film_stress
+    return np.asarray(film_stress - touch_stress(equilibrium.rest, points, surface))
 
 
 def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array:
@@ -162,17 +171,19 @@ def _induced_stress(equilibrium: Equilibrium, surface: Surface) -> Array:
         (S11, S22, S12) at the nodes in units of E_young A^2, shape (n_element, n_local, 3).
     """
     slope = node_slope(equilibrium)
-    strained = strain(slope, equilibrium.groups.amplitude2)
+    total_strain = strain(slope, equilibrium.groups.amplitude2)
     if surface != "middle":
-        strained += _bending_strain(equilibrium, surface, equilibrium.mesh.node_derivatives(slope[..., 2]))
-    return scaled_stress(strained, equilibrium.groups)
+        slope_of_deflection = slope[..., 2]
+        hessian = equilibrium.mesh.node_derivatives(slope_of_deflection)
+        total_strain += _bending_strain(equilibrium, surface, hessian)
+    return scaled_stress(total_strain, equilibrium.groups)
 
 
 def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     """Compute the smallest and the largest principal stress in the film, including the pretension.
 
-    The smallest stress is that of the mid-surface. If the theory includes bending, the largest stress is that of the
-    mid-surface and of both outer surfaces.
+    The smallest stress is computed for the mid-surface only. If the theory includes bending, the largest stress is
+    computed for the mid-surface and for both outer surfaces.
 
     Args:
         equilibrium: The solved press.
@@ -193,6 +204,9 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
 
 def node_slope(equilibrium: Equilibrium) -> Array:
     """Compute the derivatives of (U1, U2, W) with respect to (X1, X2) at the nodes of every element.
+
+    Args:
+        equilibrium: The solved press.
 
     Returns:
         Shape (n_element, n_local, 2, 3): the derivative, then the component.
@@ -249,6 +263,11 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
 
 
 def _rotated(equilibrium: Equilibrium, points: Array) -> Complexes:
-    """Convert points (x, y), mm, into x + iy in film radii, with the press rotated onto the x axis."""
+    """Convert points (x, y), shape (n, 2), mm, into points x + iy in the frame with the press on the positive x axis.
+
+    Returns:
+        Points, shape (n,), in film radii.
+    """
     z = (points[:, 0] + 1j * points[:, 1]) / equilibrium.film.radius
-    return np.asarray(z * np.exp(-1j * np.arctan2(equilibrium.at[1], equilibrium.at[0])))
+    press_x, press_y = equilibrium.at
+    return np.asarray(z * np.exp(-1j * np.arctan2(press_y, press_x)))

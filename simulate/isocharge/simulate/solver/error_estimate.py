@@ -2,9 +2,10 @@
 
 In the inner part of the film, the error of the mesh is estimated from the shapes of the elements and the decay of their
 polynomial modes. This estimate is not reliable near the rim and for large footprints that are not circular, because the
-coarse elements can be far from the stressed ones. In these cases, and for accuracies below the default, the press is
-solved on meshes of increasing order until two meshes agree. Each order reduces the error by a factor of three to ten,
-so the difference of two meshes is an upper bound of the error of the finer one.
+coarse elements may be far from the elements with the largest stress. In these cases, and if the required accuracy is
+better than the default, the press is solved on meshes of increasing order until two meshes agree. Each order reduces
+the error by a factor of three to ten, so the difference between two meshes is an upper bound of the error of the finer
+mesh.
 """
 
 from typing import Any
@@ -28,14 +29,14 @@ from isocharge.simulate.solver.equilibrium import (
 SAFETY = 2.0
 """Safety factor of the error that is predicted from element shapes and modal decay, dimensionless.
 
-It is too small at distances above 0.6 film radii.
+The factor is too small for presses at distances above 0.6 film radii.
 """
 
 MIN_ERROR = 5e-5
 """Smallest reported relative error of a charge, which the thin rings and the integration over electrodes cause."""
 
 DECAY_WEIGHT = 0.1
-"""Relative error of a charge, per share of the slopes in the highest modes of the elements, dimensionless."""
+"""Ratio of the relative error of a charge to the share of the slopes in the highest modes, dimensionless."""
 
 PATCH_RINGS = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8)
 """Radii of the rings of square patches on which the charges of two meshes are compared, in film radii."""
@@ -60,9 +61,12 @@ GROUPS = ("amplitude2", "load", "tension", "bending", "poisson")
 def shape_error(mesh: PlacedMesh) -> float:
     """Predict the relative error of a charge from the shapes of the elements.
 
-    The elements approximate the conformal map by polynomials. The error of this approximation is measured by the error
-    of the film's area. The largest error of a charge is about a third of the square root of the relative error of the
-    area (`tests/benchmarks/bench_hard_cases.py`).
+    The elements approximate the conformal map by polynomials. Because of this approximation, the area of the mesh
+    differs from the area of the film. The prediction is the square root of the relative error of the area. The largest
+    error of a charge is about a third of the prediction (`tests/benchmarks/bench_hard_cases.py`).
+
+    Args:
+        mesh: Mesh of the press.
 
     Returns:
         The error, which is infinite if an element is folded.
@@ -101,7 +105,10 @@ def decay(mesh: PlacedMesh, slope: Array) -> float:
 
 
 def mesh_error(equilibrium: Equilibrium) -> float:
-    """Estimate the relative error of a charge by the mesh, from a second mesh or from element shapes and modes.
+    """Estimate the relative error of a charge that the mesh causes.
+
+    The estimate is the difference from a second mesh if there is one. Otherwise it is predicted from the shapes of the
+    elements and the decay of their modes.
 
     Args:
         equilibrium: The solved press.
@@ -112,12 +119,15 @@ def mesh_error(equilibrium: Equilibrium) -> float:
     if equilibrium.proven_error is not None:
         return max(MIN_ERROR, equilibrium.proven_error)
     mesh = equilibrium.mesh
-    modes = DECAY_WEIGHT * decay(mesh, node_slope(equilibrium)[..., 2])
-    return max(MIN_ERROR, SAFETY * shape_error(mesh), SAFETY * modes)
+    decay_error = DECAY_WEIGHT * decay(mesh, node_slope(equilibrium)[..., 2])
+    return max(MIN_ERROR, SAFETY * shape_error(mesh), SAFETY * decay_error)
 
 
 def estimated_error(equilibrium: Equilibrium) -> float:
-    """Estimate the relative error of a charge by the mesh and by the terms that the theory omits.
+    """Estimate the relative error of a charge that the mesh and the omitted terms of the theory cause.
+
+    Args:
+        equilibrium: The solved press.
 
     Returns:
         The error, which is infinite if the theory cannot describe the film.
@@ -131,9 +141,9 @@ def estimated_error(equilibrium: Equilibrium) -> float:
 def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     """Compute the largest relative difference between two equilibria of the same press.
 
-    The charges of square patches, for biaxial and uniaxial films, and the deflection are compared. The patches lie on
-    rings about the centre of the film and round the footprint. The difference of the charges of a patch is relative to
-    the largest charge on its ring.
+    The deflections, and the charges of square patches on a biaxial and on a uniaxial film, are compared. The patches
+    lie on rings about the centre of the film and around the footprint. The difference of the charges of a patch is
+    relative to the largest charge on its ring.
 
     Args:
         one: First equilibrium.
@@ -158,23 +168,24 @@ def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     return max(charge_difference, depth_difference)
 
 
-def _patch_charges(solved: Equilibrium, centres: Array) -> Array:
+def _patch_charges(equilibrium: Equilibrium, centres: Array) -> Array:
     """Compute the charges per area of square patches, for a biaxial and a uniaxial film.
 
     Args:
-        solved: The solved press.
+        equilibrium: The solved press.
         centres: Centres x + iy of the patches, shape (n_ring, n_patch), mm.
 
     Returns:
         Charges in arbitrary units, shape (n_ring, n_patch, 2). Points outside the film do not contribute.
     """
-    film_radius = solved.film.radius
+    film_radius = equilibrium.film.radius
     xi, eta, weights = gauss_reference_square(PATCH_POINTS)
     half_side = 0.5 * PATCH_SIDE * film_radius
-    points = (centres[:, :, None] + half_side * (xi + 1j * eta)).ravel()
-    is_on_film = np.abs(points) < film_radius
-    stress = np.zeros((points.size, 3))
-    stress[is_on_film] = touch_stress(solved, np.stack([points.real, points.imag], axis=1)[is_on_film])
+    complex_points = (centres[:, :, None] + half_side * (xi + 1j * eta)).ravel()
+    points = np.stack([complex_points.real, complex_points.imag], axis=1)
+    is_on_film = np.abs(complex_points) < film_radius
+    stress = np.zeros((len(points), 3))
+    stress[is_on_film] = touch_stress(equilibrium, points[is_on_film])
 
     # Mean over the integration points p of each patch; the weights of the reference square add up to 4.
     patch_stress = stress.reshape(*centres.shape, -1, 3)
@@ -199,8 +210,9 @@ def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
 
 def summary(equilibrium: Equilibrium) -> dict[str, Any]:
     """Return the deflection, the theory, the estimated error and the outcome of the solve, for JSON output."""
+    (centre_deflection,) = deflection(equilibrium, np.array([equilibrium.at]))
     return {
-        "deflection_mm": float(deflection(equilibrium, np.array([equilibrium.at]))[0]),
+        "deflection_mm": float(centre_deflection),
         "theory": equilibrium.theory.name,
         "status": equilibrium.status,
         "iterations": equilibrium.iterations,

@@ -1,15 +1,16 @@
 """Friction between a probe on a vertical stage and the film.
 
-When the film sinks under a probe that presses beside the centre, the material point under the probe moves along the
-film: the steeper part of the film, towards the near rim, would otherwise stretch more than the rest. A stage that moves
-exactly vertically does not follow this displacement, so the film slips outwards under the probe, and friction pulls the
-film inwards. (Under a probe that hangs freely, the probe follows, and there is no side force.)
+If a probe presses beside the centre, the film between the probe and the near rim is steeper than the rest of the film.
+The steeper part would stretch more than the rest if the material point under the probe did not move outwards. A stage
+that moves exactly vertically does not follow this displacement, so the film slips outwards under the probe, and
+friction pulls the film inwards. A probe that hangs freely follows the displacement and has no side force.
 
-The model is Coulomb friction during one monotonic press (Johnson 1985, sec. 7.1). If the side force that holds the
-material point in place is smaller than the coefficient of friction times the force, the film sticks to the probe, and
-this is the side force. Otherwise the film slips, and the side force is the coefficient times the force, against the
-slip. The side force is spread over the footprint like the pressure. When the probe is lifted again, the slip and the
-side force change their sign, which this model does not describe.
+The model is Coulomb friction during one monotonic press (Johnson 1985, sec. 7.1). The holding force is the side force
+that keeps the material point in place. If the holding force is smaller than the coefficient of friction times the
+force, the film sticks to the probe, and the side force is the holding force. Otherwise the film slips, and the side
+force is the coefficient times the force, in the direction opposite to the slip. The side force is distributed over the
+footprint like the pressure. When the probe is lifted again, the slip and the side force change their sign, which this
+model does not describe.
 """
 
 import numpy as np
@@ -28,7 +29,7 @@ MAX_FRICTION = 1.0
 
 
 def holding_force(solved: Equilibrium) -> tuple[float, float]:
-    """Compute the side force that prevents the mean displacement of the footprint along the film, to first order.
+    """Compute the side force that prevents the mean in-plane displacement of the footprint, to first order.
 
     Args:
         solved: Press without a side force, solved with a theory that includes stretching.
@@ -40,25 +41,30 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
     geometry = mesh.geometry
     groups = solved.groups
     components = 3 if groups.bending == 0.0 else 4
+    n_direction = 1 if mesh.template.half else 2  # a half template has no displacement across its symmetry line
+    field_before_contact = np.zeros_like(solved.field) if solved.rest is None else solved.rest.field
+    slip = geometry.load @ (solved.field - field_before_contact)[:, :n_direction]
+
+    # Mean displacement of the footprint by a unit side load in each direction
+    compliance = np.empty((n_direction, n_direction))
     with single_threaded_blas():
         factor = factor_tangent(ElasticFilm(geometry, groups), assembly(mesh.template, components), solved.field)
-        n_direction = 1 if mesh.template.half else 2  # a half template has no displacement across its symmetry line
-        before_contact = np.zeros_like(solved.field) if solved.rest is None else solved.rest.field
-        slip = geometry.load @ (solved.field - before_contact)[:, :n_direction]
-        compliance = np.empty((n_direction, n_direction))
         for direction in range(n_direction):
             unit_load = np.zeros_like(solved.field)
             unit_load[:, direction] = geometry.load
             compliance[:, direction] = geometry.load @ factor.solve(unit_load)[:, :n_direction]
+
+    # The side load that reverses the slip, converted to N and rotated from the frame of the press
     scaled_force = np.zeros(2)
     scaled_force[:n_direction] = -np.linalg.solve(compliance, slip)
-    angle = np.arctan2(solved.at[1], solved.at[0])
-    force = complex(*scaled_force) * side_force_unit(solved.film, groups.amplitude2) * np.exp(1j * angle)
+    x, y = solved.at
+    rotation = np.exp(1j * np.arctan2(y, x))
+    force = complex(*scaled_force) * side_force_unit(solved.film, groups.amplitude2) * rotation
     return float(force.real), float(force.imag)
 
 
 def friction_force(solved: Equilibrium, coefficient: float) -> tuple[float, float]:
-    """Compute the side force of a probe on a vertical stage; see the module.
+    """Compute the side force of a probe on a vertical stage; see the docstring of this module.
 
     Args:
         solved: Press without a side force, solved with a theory that includes stretching.
@@ -71,7 +77,9 @@ def friction_force(solved: Equilibrium, coefficient: float) -> tuple[float, floa
         SceneError: If the coefficient is not between 0 and `MAX_FRICTION`.
     """
     check_friction(coefficient)
-    side_x, side_y = limited(np.array([holding_force(solved)]), np.array([coefficient * solved.force]))[0].tolist()
+    holding = np.array([holding_force(solved)])
+    largest_friction = np.array([coefficient * solved.force])
+    ((side_x, side_y),) = limited(holding, largest_friction).tolist()
     return side_x, side_y
 
 
@@ -82,7 +90,7 @@ def check_friction(coefficient: float) -> None:
 
 
 def limited(holding: Array, largest: Array) -> Array:
-    """Reduce holding forces to the largest friction.
+    """Reduce holding forces that exceed the largest friction to this friction, without a change of their direction.
 
     Args:
         holding: Forces (Fx, Fy) that prevent the slip, shape (n, 2), N.

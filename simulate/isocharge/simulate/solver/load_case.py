@@ -1,4 +1,4 @@
-"""Decisions about a press before it is solved: checks, theory, and the coarsest mesh that the accuracy allows."""
+"""Decisions about a press before the solve: checks, the theory, and the coarsest mesh that the accuracy allows."""
 
 import math
 from collections.abc import Iterator
@@ -23,8 +23,8 @@ from isocharge.simulate.sensor.probe import Probe
 from isocharge.simulate.solver.error_estimate import shape_error
 
 TOLERANCE = 1e-7
-"""Out-of-balance force over load at which a solve has converged. It is far below the error of the mesh and well above
-round-off."""
+"""Ratio of the out-of-balance force to the load at which a solve has converged, dimensionless. The ratio is far below
+the error of the mesh and well above rounding errors."""
 
 Auto = Literal["auto"]
 """Value of a setting that is chosen automatically for a press, or for all presses of a forward map."""
@@ -43,20 +43,22 @@ MAX_AMPLITUDE2 = 0.1
 valid."""
 
 MAX_SIDE_SHARE = 1.0
-"""Largest side force over the force of the press. It corresponds to a coefficient of friction of one."""
+"""Largest ratio of the side force to the force of the press. It corresponds to a coefficient of friction of one."""
 
 MIN_PROBE_REACH = 1e-5
 """Smallest reach of a probe, in film radii. The grading of the mesh for smaller probes exceeds the resolution of
 float64."""
 
 REFINEMENTS = ((0, 1), (1, 1), (0, 2), (2, 1), (1, 2), (0, 3), (2, 2), (1, 3), (2, 3), (3, 3))
-"""Meshes that are tried in turn: (increase of the order, factor of the number of elements round the circle)."""
+"""Meshes that are tried one after the other. Each pair consists of the increase of the order and the factor of the
+number of elements around the circle."""
 
 THIN_RINGS_PER_FACTOR = 0.8
 """Number of thin rings at the rim per factor of three between their largest and smallest width."""
 
 MAX_SHAPE_ERROR = 0.05
-"""Predicted relative error of a charge on the finest mesh above which a press is rejected as too near the rim."""
+"""Largest predicted relative error of a charge on the finest mesh. A press with a larger error is rejected, because it
+is too close to the rim."""
 
 RELIABLE_RADIUS = 0.6
 """Distance from the centre within which the shapes of the elements predict the error reliably, in film radii."""
@@ -64,7 +66,8 @@ RELIABLE_RADIUS = 0.6
 MIN_RIM_DISTANCE = 0.2
 """Smallest distance from the rim of a curved footprint that is not circular, relative to its reach.
 
-Nearer to the rim, the mesh between the footprint and the innermost circle is so thin that points cannot be located.
+If the footprint is closer to the rim, the mesh between the footprint and the innermost circle is so thin that points
+cannot be located.
 """
 
 RELIABLE_REACH = 0.08
@@ -103,8 +106,7 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
 
     Raises:
         SceneError: If the footprint is too small or not completely on the film, if the force is not positive and
-        finite,
-            or if the strains are not small.
+            finite, or if the strains are not small.
     """
     if not (np.isfinite(force) and force > 0.0):
         raise SceneError(f"force: expected a positive number of newtons (F > 0 pushes), got {force}")
@@ -170,7 +172,7 @@ class LoadCase:
         layer: Width of the thin rings at the rim, in film radii.
         accuracy: Target of the relative error of a charge.
         tolerance: Out-of-balance force over load at which the solve has converged.
-        began: Process CPU time at the beginning of the work on the press, s.
+        began: Reading of the CPU clock of the process at the beginning of the work on the press, s.
         side_force: Force (Fx, Fy) of the probe on the film along the film, N.
     """
 
@@ -265,7 +267,7 @@ def place_coated(
         tuple(to_complex(np.array(part)) * rotation_and_scale for part in coat_layer) for coat_layer in film.coat.layers
     )
 
-    # The stresses of the three unit strains are the columns of an elasticity matrix, here over E of the film.
+    # The stresses of the three unit strains form an elasticity matrix over E of the film.
     unit_strains = np.eye(3)
     film_moduli = scaled_stress(unit_strains, DimensionlessGroups.of(film, 1.0, bending=False, angle=angle))
     stiffness_ratio = film.coat.stiffness / (film.young * film.thickness)
@@ -313,7 +315,7 @@ def choose_mesh(case: LoadCase) -> PlacedMesh:
 
 
 def needs_second_mesh(case: LoadCase) -> bool:
-    """Return whether a press must be solved on two meshes to estimate its error; see `error_estimate`."""
+    """Return whether a press must be solved on two meshes, so that its error can be estimated; see `error_estimate`."""
     radius = case.film.radius
     is_large = not case.probe.topology.fills_circle and case.probe.reach > RELIABLE_REACH * radius
     is_near_rim = case.probe.farthest_distance(case.at) > RELIABLE_RADIUS * radius
@@ -330,10 +332,14 @@ def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
 
 
 def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
-    """Generate the resolutions of a press from coarse to fine.
+    """Yield the resolutions of a press from coarse to fine.
 
-    A small probe needs more rings. Near the rim, where the conformal map stretches the template, the mesh needs more
-    rings and more elements round the circle. In the inner half of the film the first resolution suffices.
+    A small probe needs more rings. If the press is close to the rim, the conformal map stretches the template, and the
+    mesh needs more rings and more elements around the circle. In the inner half of the film, the first resolution is
+    sufficient.
+
+    Args:
+        case: The press and its accuracy.
     """
     film = case.film
     probe = case.probe
@@ -350,25 +356,26 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
         rings=max(3, rings) + extra_order // 2,
         rim=_thin_rings(placement, case.layer) if case.theory.bending else 0,
     )
-    for order, around in REFINEMENTS:
-        yield replace(base, order=base.order + order, around=base.around * around)
+    for order_increase, around_factor in REFINEMENTS:
+        yield replace(base, order=base.order + order_increase, around=base.around * around_factor)
 
 
 def _thin_rings(placement: Placement, layer: float) -> int:
     """Return the number of thin rings at the rim.
 
-    Each ring is a third as wide as the one before. The rings cover the widths from that of the layer next to the probe
-    to that on the far side of the film, where the conformal map compresses the layer.
+    Each ring is a third as wide as the previous ring. In the template plane, the boundary layer of bending has its
+    largest width next to the probe, and its smallest width on the far side of the film, where the conformal map
+    compresses the layer. The widths of the rings cover the range between both.
 
     Args:
         placement: Placement of the mesh under the press.
         layer: Width of the thin rings, in film radii.
     """
     stretch = _stretch(placement)
-    depth = -float(np.log(placement.rho))
-    near = min(layer * stretch / depth, 1.0 / 8.0)
-    far = min(min(layer, 0.2) / stretch / depth, 1.0 / 8.0)
-    return 1 + math.floor(THIN_RINGS_PER_FACTOR * math.log(near / far, 3.0))
+    total_depth = -float(np.log(placement.rho))
+    largest_width = min(layer * stretch / total_depth, 1.0 / 8.0)
+    smallest_width = min(min(layer, 0.2) / stretch / total_depth, 1.0 / 8.0)
+    return 1 + math.floor(THIN_RINGS_PER_FACTOR * math.log(largest_width / smallest_width, 3.0))
 
 
 def _stretch(placement: Placement) -> float:

@@ -1,10 +1,10 @@
 """Newton's method for the equilibrium of the film, and the direct solution of the linear theories.
 
-A flat film without pretension has no transverse stiffness, so the plain Newton method fails. The following measures
-make it reliable: the first iterate has the shape of Schwerin's solution, the step length is found by a line search on
-the energy, and a tension proportional to the residual is added to the tangent matrix only. With this tension the step
-is a descent direction, and the convergence near the equilibrium remains quadratic. The iteration stops after
-`MAX_ITERATIONS` steps, or if the steps no longer become smaller (`PATIENCE`).
+A flat film without pretension has no transverse stiffness, so the plain Newton method fails. Three measures make the
+method reliable. The first iterate has the shape of Schwerin's solution. A line search on the energy determines the
+length of each step. A tension proportional to the residual is added to the tangent matrix, but not to the residual.
+With this tension, each step is a descent direction, and the convergence near the equilibrium remains quadratic. The
+iteration stops after `MAX_ITERATIONS` steps, or if the steps no longer become smaller (`PATIENCE`).
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from isocharge.simulate.solver.assembly import Assembly
 from isocharge.simulate.solver.tangent_factor import TangentFactor, factor_tangent
 
 GUARD_TENSION = 0.4
-"""Tension that is added to the tangent at a relative residual of one, over the induced tension of a film without
+"""Tension that is added to the tangent at a relative residual of one, in units of the induced tension of a film without
 pretension."""
 
 GUARD_BELOW = 1e-2
@@ -38,28 +38,31 @@ MAX_REFINEMENTS = 5
 """Largest number of corrections of a linear solve."""
 
 REFINEMENT_TOLERANCE = 1e-5
-"""Size of a correction of a linear solve, in the energy norm, at which the solve has converged."""
+"""Energy norm of a correction of a linear solve at which the solve has converged."""
 
 CHORD_START = 0.15
-"""Ratio of the residuals after and before a Newton step below which the factorised tangent is used again."""
+"""Largest ratio of the residual after a Newton step to the residual before it at which the factorised tangent is used
+again."""
 
 CHORD_CONTINUE = 0.3
-"""Ratio of the residuals after and before a step with a reused tangent below which it is used once more."""
+"""Largest ratio of the residual after a step with a reused tangent to the residual before it at which the tangent is
+used once more."""
 
 ROUND_OFF = 1e-9
-"""Size of a Newton step, in the energy norm relative to the work of the load, that is caused by round-off only."""
+"""Size of a Newton step that is caused by rounding errors only. The size is the energy norm relative to the work of the
+load."""
 
 FIRST_DESCENT_TENSION = 0.05
-"""Smallest tension that is added to the tangent to obtain a descent direction, over the guard tension."""
+"""Smallest tension that is added to the tangent to obtain a descent direction, in units of the guard tension."""
 
 MAX_DESCENT_TRIALS = 12
-"""Largest number of tensions that are tried to obtain a descent direction. Each is twice the one before."""
+"""Largest number of tensions that are tried to obtain a descent direction. Each tension is twice the previous one."""
 
 MAX_HALVINGS = 30
 """Largest number of step lengths that the line search tries."""
 
 ARMIJO_SHARE = 1e-4
-"""Smallest accepted decrease of the energy, as a share of the decrease that the slope predicts, dimensionless."""
+"""Smallest accepted ratio of the decrease of the energy to the decrease that the slope predicts, dimensionless."""
 
 ENERGY_ROUND_OFF = 1e-12
 """Relative change of the energy that is caused by round-off only."""
@@ -71,10 +74,10 @@ class NewtonResult:
 
     Attributes:
         field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
-        converged: Whether the residual is below the tolerance or at the level of round-off.
+        converged: Whether the residual is below the tolerance or at the level of rounding errors.
         iterations: Number of Newton steps. For a linear theory, the number of linear solves.
-        residual: Relative residual: the larger one of the transverse residual over the load, and the in-plane residual
-            over the in-plane forces. For a linear theory, the size of the last correction in the energy norm.
+        residual: Relative residual, which is the larger one of two ratios: the transverse residual to the load, and the
+            in-plane residual to the in-plane forces. For a linear theory, the energy norm of the last correction.
         message: Description of the outcome in one sentence.
     """
 
@@ -88,9 +91,9 @@ class NewtonResult:
 def schwerin_start(z: np.ndarray, rho: float, groups: DimensionlessGroups) -> Array:
     """Compute the first iterate of Newton's method: Schwerin's deflection, and no in-plane displacement.
 
-    W = (3 / pi)^(1/3) (1 - r^(2/3)) is the exact deflection of a membrane without pretension under a point load if
-    Poisson's ratio is 1/3 (Schwerin 1929). The radius r is measured in the template plane. Pretension and bending
-    reduce the deflection.
+    Schwerin's deflection is W = (3 / pi)^(1/3) (1 - r^(2/3)). It is exact for a membrane without pretension under a
+    point load if Poisson's ratio is 1/3 (Schwerin 1929). The radius r is measured in the template plane. For a film
+    with pretension or bending, the deflection is reduced.
 
     Args:
         z: Nodes in the template plane, shape (n_node,).
@@ -126,9 +129,9 @@ def parabolic_start(radius: np.ndarray, groups: DimensionlessGroups) -> Array:
 def solve_linear(elastic: ElasticFilm, assembly: Assembly) -> NewtonResult:
     """Solve a linear theory: the deflection W under the load, and the in-plane displacement U that W causes.
 
-    The induced stress does not affect the deflection. The tangent of the flat film does not couple W and U, so one
-    solve computes both U and a correction of W (iterative refinement). The size of the correction in the energy norm
-    measures the error of W.
+    The induced stress does not affect the deflection. The tangent of the flat film does not couple W and U, so each
+    further solve computes U and also a correction of W (iterative refinement). The energy norm of the correction is a
+    measure of the error of W.
 
     Args:
         elastic: The discrete film.
@@ -170,10 +173,10 @@ def _linear_residual(elastic: ElasticFilm, field: Array) -> Array:
         Residual, shape (n_node, 3).
     """
     amplitude = 0.01
-    flat = elastic.residual(np.zeros_like(field))
-    once = elastic.residual(amplitude * field) - flat
-    twice = elastic.residual(2.0 * amplitude * field) - flat
-    return flat + (8.0 * once - twice) / (6.0 * amplitude)
+    flat_residual = elastic.residual(np.zeros_like(field))
+    single_change = elastic.residual(amplitude * field) - flat_residual
+    double_change = elastic.residual(2.0 * amplitude * field) - flat_residual
+    return flat_residual + (8.0 * single_change - double_change) / (6.0 * amplitude)
 
 
 def solve_newton(
@@ -193,26 +196,31 @@ def solve_newton(
         The result, which may not have converged.
     """
     iterate = _Iterate.at(elastic, assembly.free[:, :3], start)
-    sizes: list[float] = []
+    step_sizes: list[float] = []
     for iteration in range(MAX_ITERATIONS + 1):
-        relative = iterate.relative
-        if not np.isfinite(relative):
+        relative_residual = iterate.relative_residual
+        if not np.isfinite(relative_residual):
             return iterate.result(False, iteration, "the residual is not a finite number")
-        if relative <= tolerance:
+        if relative_residual <= tolerance:
             return iterate.result(True, iteration, f"converged in {iteration} steps")
-        if iteration == MAX_ITERATIONS or _stalled(sizes):
+        if iteration == MAX_ITERATIONS or _stalled(step_sizes):
             return iterate.result(False, iteration, f"no progress any more after {iteration} steps")
-        factor = factor_tangent(elastic, assembly, iterate.field, _regularisation(elastic, relative))
+
+        guard_tension = _guard_tension(elastic, relative_residual)
+        factor = factor_tangent(elastic, assembly, iterate.field, guard_tension)
         step = factor.solve(-iterate.residual)
-        sizes.append(_energy_norm(elastic, iterate.field, step, iterate.residual))
-        if sizes[-1] <= ROUND_OFF:
+        step_size = _energy_norm(elastic, iterate.field, step, iterate.residual)
+        step_sizes.append(step_size)
+        if step_size <= ROUND_OFF:
             return iterate.result(True, iteration, f"converged to round-off in {iteration} steps")
-        following = _local_step(iterate, step) if relative <= local_below else None
-        if following is None:
-            following = _line_search(iterate, _descent_step(iterate, assembly, step))
-        if following is None:
+
+        # Take the full step if it is close to the equilibrium, and search the step length otherwise.
+        next_iterate = _local_step(iterate, step) if relative_residual <= local_below else None
+        if next_iterate is None:
+            next_iterate = _line_search(iterate, _descent_step(iterate, assembly, step))
+        if next_iterate is None:
             return iterate.result(False, iteration, "no step lowers the energy any more")
-        iterate = _chord_steps(following, factor, relative, tolerance)
+        iterate = _chord_steps(next_iterate, factor, relative_residual, tolerance)
     raise AssertionError("the loop returns")
 
 
@@ -242,7 +250,7 @@ class _Iterate:
         return type(self).at(self.elastic, self.free, self.field + step)
 
     @cached_property
-    def relative(self) -> float:
+    def relative_residual(self) -> float:
         """Larger one of the relative transverse residual and the relative in-plane residual."""
         residual = self.residual * self.free
         load = self.elastic.load_scale
@@ -253,32 +261,44 @@ class _Iterate:
 
     def result(self, converged: bool, iterations: int, message: str) -> NewtonResult:
         """Return the result of a solve that ends with this iterate."""
-        return NewtonResult(self.field, converged, iterations, self.relative, message)
+        return NewtonResult(self.field, converged, iterations, self.relative_residual, message)
 
 
-def _stalled(sizes: list[float]) -> bool:
-    """Return whether the sizes of the steps no longer decrease, as along a direction without stiffness."""
-    if len(sizes) <= 2 * PATIENCE:
+def _stalled(step_sizes: list[float]) -> bool:
+    """Return whether the sizes of the steps no longer decrease, as along a direction without stiffness.
+
+    Args:
+        step_sizes: Sizes of all steps so far, from the first to the last.
+    """
+    if len(step_sizes) <= 2 * PATIENCE:
         return False
-    recent = sizes[-PATIENCE:]
-    earlier = sizes[:-PATIENCE]
+    recent = step_sizes[-PATIENCE:]
+    earlier = step_sizes[:-PATIENCE]
     return min(recent) > 0.5 * min(earlier)
 
 
 def _energy_norm(elastic: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
-    """Compute the size of a step: the square root of its energy over the work of the load."""
-    return float(np.sqrt(abs(float(np.sum(step * residual))) / max(elastic.work(field), 1e-300)))
+    """Compute the size of a step: the square root of the ratio of its energy to the work of the load.
 
-
-def _regularisation(elastic: ElasticFilm, relative: float) -> float:
-    """Return the tension that is added to the tangent, in proportion to the relative residual.
-
-    It is zero below `GUARD_BELOW`.
+    Args:
+        elastic: The discrete film.
+        field: Scaled displacements before the step, shape (n_node, 3).
+        step: The step, shape (n_node, 3).
+        residual: Out-of-balance forces before the step, shape (n_node, 3).
     """
-    if relative <= GUARD_BELOW:
+    step_energy = abs(float(np.sum(step * residual)))
+    return float(np.sqrt(step_energy / max(elastic.work(field), 1e-300)))
+
+
+def _guard_tension(elastic: ElasticFilm, relative_residual: float) -> float:
+    """Return the tension that is added to the tangent. It is proportional to the relative residual.
+
+    The tension is zero if the relative residual is at most `GUARD_BELOW`.
+    """
+    if relative_residual <= GUARD_BELOW:
         return 0.0
     induced_tension = float(np.cbrt(elastic.groups.total_load)) ** 2
-    return GUARD_TENSION * induced_tension * min(1.0, relative)
+    return GUARD_TENSION * induced_tension * min(1.0, relative_residual)
 
 
 def _local_step(iterate: _Iterate, step: Array) -> _Iterate | None:
@@ -290,29 +310,30 @@ def _local_step(iterate: _Iterate, step: Array) -> _Iterate | None:
     if not np.isfinite(step).all():
         return None
     trial = iterate.moved(step)
-    return trial if trial.relative < 0.5 * iterate.relative else None
+    halves_residual = trial.relative_residual < 0.5 * iterate.relative_residual
+    return trial if halves_residual else None
 
 
-def _chord_steps(iterate: _Iterate, factor: TangentFactor, before: float, tolerance: float) -> _Iterate:
-    """Continue with the factorised tangent of the last step as long as it reduces the residual well (chord method).
+def _chord_steps(iterate: _Iterate, factor: TangentFactor, residual_before: float, tolerance: float) -> _Iterate:
+    """Continue with the factorised tangent of the last Newton step as long as it reduces the residual (chord method).
 
-    Such a step costs a seventh of a Newton step. If the last step reduced the residual by the factor s, the next step
-    with the same tangent reduces it by about 2 s (Kelley 1995).
+    A step with a reused tangent costs a seventh of a Newton step. If the last step multiplied the residual by s, the
+    next step with the same tangent multiplies it by about 2 s (Kelley 1995).
 
     Args:
         iterate: Iterate after the Newton step.
         factor: Factorised tangent of this step.
-        before: Relative residual before this step.
+        residual_before: Relative residual before this step.
         tolerance: Relative residual at which the solve has converged.
 
     Returns:
-        The last iterate that reduced the residual well.
+        The last iterate whose step reduced the residual sufficiently.
     """
-    if iterate.relative > CHORD_START * before:
+    if iterate.relative_residual > CHORD_START * residual_before:
         return iterate
-    while iterate.relative > tolerance:
+    while iterate.relative_residual > tolerance:
         trial = iterate.moved(factor.solve(-iterate.residual))
-        if not trial.relative < CHORD_CONTINUE * iterate.relative:
+        if not trial.relative_residual < CHORD_CONTINUE * iterate.relative_residual:
             break
         iterate = trial
     return iterate
@@ -321,7 +342,8 @@ def _chord_steps(iterate: _Iterate, factor: TangentFactor, before: float, tolera
 def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
     """Return a step that is a descent direction of the energy.
 
-    If the given step is not a descent direction, a tension is added to the tangent and doubled until the step is one.
+    If the given step is not a descent direction, a tension is added to the tangent, and the tension is doubled until
+    the new step is a descent direction.
 
     Args:
         iterate: Present iterate.
@@ -345,7 +367,7 @@ def _descent_step(iterate: _Iterate, assembly: Assembly, step: Array) -> Array:
 def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
     """Halve a step until it lowers the energy sufficiently (condition of Armijo).
 
-    If the change of the energy is within round-off, the step must lower the residual instead.
+    If the change of the energy is not larger than its rounding errors, the step must lower the residual instead.
 
     Args:
         iterate: Present iterate.

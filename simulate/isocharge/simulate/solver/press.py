@@ -1,4 +1,4 @@
-"""Solve the film under a press."""
+"""Solver of a press: the choice of the mesh, the solve with the selected theory, and load steps if a solve fails."""
 
 from dataclasses import replace
 from time import process_time
@@ -39,7 +39,8 @@ MAX_EXTRA_ORDERS = 3
 """Largest number of increases of the order after the first mesh."""
 
 DIFFERENT_EQUILIBRIUM = 0.1
-"""Relative difference of the charges above which two meshes have different equilibria. A wrinkling film has many."""
+"""Relative difference of the charges above which the solutions on two meshes count as different equilibria. A film that
+wrinkles has many equilibria."""
 
 FIRST_LOAD_SHARE = 0.0625
 """Share of the load with which the load steps begin if the solve with the full load fails."""
@@ -96,7 +97,7 @@ def press(
 def needed_resolution(
     film: Film, probe: Probe, at: tuple[float, float], force: float, settings: SolveSettings = SolveSettings()
 ) -> Resolution:
-    """Return the resolution that `press` would choose. The film is solved only if two meshes must be compared.
+    """Return the resolution that `press` would choose. The press is solved only if two meshes must be compared.
 
     Args:
         film: The clamped film.
@@ -120,9 +121,9 @@ def needed_resolution(
 def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equilibrium:
     """Solve on meshes of increasing order until the charges of two meshes agree within half of the accuracy.
 
-    The order is increased at most `MAX_EXTRA_ORDERS` times. If a finer mesh has no equilibrium, return the equilibrium
-    of the finer one of the two previous meshes, with the difference of these meshes as its error. If two meshes have
-    different equilibria, the status of the result is "failed".
+    The order is increased at most `MAX_EXTRA_ORDERS` times. If no equilibrium is found on a further mesh, the result is
+    the equilibrium on the finer one of the two previous meshes, and its error is the difference between these two
+    meshes. If two meshes have different equilibria, the status of the result is "failed".
 
     Args:
         case: The press and its accuracy.
@@ -198,7 +199,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 
 
 def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
-    """Add the film before the contact, under the static pressure alone, to the equilibrium of a press.
+    """Solve the film under the static pressure alone, and add this solution to the equilibrium of a press as `rest`.
 
     Args:
         equilibrium: Equilibrium of the press.
@@ -225,22 +226,22 @@ def _static_start(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
 
 
 def _elastic(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
-    """Return the discrete film for a press with another force. The side force changes in proportion.
+    """Return the discrete film for a press with another force. The side force is scaled by the same factor.
 
     Args:
         case: The press.
         geometry: Integration rules of the elements.
         force: The other force, N.
     """
-    angle = float(np.arctan2(case.at[1], case.at[0]))
-    share = force / case.force
+    x, y = case.at
+    force_factor = force / case.force
     side_x, side_y = case.side_force
     groups = DimensionlessGroups.of(
         case.film,
         force,
         bending=case.theory.bending,
-        angle=angle,
-        side_force=(share * side_x, share * side_y),
+        angle=float(np.arctan2(y, x)),
+        side_force=(force_factor * side_x, force_factor * side_y),
     )
     return ElasticFilm(geometry, groups)
 
@@ -250,8 +251,8 @@ def _solve_nonlinear(
 ) -> NewtonResult:
     """Solve with Newton's method.
 
-    The first iterate is the field of the starting equilibrium if it has the same mesh, or else the field of Schwerin.
-    If Newton's method fails, the load is applied in steps.
+    The first iterate is the field of the starting equilibrium if this equilibrium has the same mesh. Otherwise it is
+    the field of `schwerin_start`. If Newton's method fails, the load is applied in steps.
 
     Args:
         case: The press and its tolerance.
@@ -276,7 +277,9 @@ def _solve_nonlinear(
 def _solve_by_load_steps(
     case: LoadCase, failed: NewtonResult, geometry: Geometry, solver: Assembly, first_field: Array
 ) -> NewtonResult:
-    """Solve with increasing forces, each from the field before, if the solve with the full force has failed.
+    """Solve with increasing forces, after the solve with the full force has failed.
+
+    Each solve starts from the field of the previous force. If a solve fails, the next force is reduced.
 
     Args:
         case: The press.
@@ -288,8 +291,8 @@ def _solve_by_load_steps(
     Returns:
         The result with the full force, or `failed` with the total number of iterations.
     """
-    solved_force = 0.0
-    force_ratio = 2.0
+    solved_force = 0.0  # largest force with an equilibrium
+    force_ratio = 2.0  # of the next force to `solved_force`
     iterations = failed.iterations
     field = first_field
     force = FIRST_LOAD_SHARE * case.force
@@ -321,15 +324,16 @@ def _start_field(start: Equilibrium | None, template: Template, default: Array) 
     """
     if start is None:
         return default
-    before = start.mesh.template
-    if (before.topology, before.half) != (template.topology, template.half):
+    start_template = start.mesh.template
+    if (start_template.topology, start_template.half) != (template.topology, template.half):
         return default
-    with_same_order = replace(before.resolution, order=template.resolution.order)
-    if with_same_order != template.resolution or not np.array_equal(before.splits, template.splits):
+    resolution_with_same_order = replace(start_template.resolution, order=template.resolution.order)
+    has_same_elements = resolution_with_same_order == template.resolution
+    if not has_same_elements or not np.array_equal(start_template.splits, template.splits):
         return default
-    if before.resolution == template.resolution:
+    if start_template.resolution == template.resolution:
         return start.field
-    return resampled(start.field, before, template)
+    return resampled(start.field, start_template, template)
 
 
 def resampled(field: Array, before: Template, after: Template) -> Array:

@@ -5,11 +5,11 @@ displacement by
 
     du/dm = -K^-1 dR/dm,
 
-which costs one additional back substitution. An imperfection with two axes, at the angle alpha to the direction of the
-press, is the sum of cos(2 alpha) times a field that is even about this direction and sin(2 alpha) times a field that is
-odd. Both fields are solved on the meshed half of the film. They differ in the displacement components that are fixed on
-the line of symmetry. dR/dm and the change of the stress are central differences of the residual and the stress of a
-press.
+which costs one additional back substitution. Let alpha be the angle between an axis of the imperfection and the
+direction of the press. For an imperfection with two axes, the change is the sum of cos(2 alpha) times a field that is
+even with respect to a reflection in this direction, and sin(2 alpha) times a field that is odd. Both fields are solved
+on the meshed half of the film, with different fixed displacement components on the line of symmetry. The derivative
+dR/dm and the change of the stress are central differences of the residual and of the stress of a press.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ Change = Callable[[Equilibrium, float], Equilibrium]
 
 @dataclass(frozen=True)
 class StressField:
-    """A field of stress changes by one imperfection.
+    """A field of stress changes that one imperfection causes.
 
     Attributes:
         change: Function that adds the imperfection.
@@ -48,14 +48,16 @@ class StressField:
 
 
 def _tension(direction: tuple[float, float, float]) -> Change:
-    """Return the function for an uneven pretension, in units of E A^2 (1 + mean pretension over E A^2).
+    """Return the function that adds a tension to the pretension of a film.
+
+    The unit of the tension is the sum of E A^2 and the mean pretension.
 
     Args:
         direction: Components (T11, T22, T12) of one unit.
     """
 
     def with_tension(solved: Equilibrium, value: float) -> Equilibrium:
-        """Return the equilibrium with an uneven pretension of this size."""
+        """Return the equilibrium with `value` units of the additional tension."""
         unit = 1.0 + solved.groups.tension
         anisotropy = Anisotropy(moduli=np.zeros((3, 3)), tension=value * unit * np.array(direction))
         return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
@@ -125,7 +127,7 @@ FIELDS = {
 
 
 def _side_load(direction: tuple[float, float]) -> Change:
-    """Return the function that adds a side load to a press. Its value is the load in units of E h a A^2.
+    """Return the function that adds a side load to a press. The unit of the side load is E h a A^2.
 
     Args:
         direction: Unit vector (x, y) of the side load.
@@ -160,7 +162,8 @@ IS_ODD = np.array([field.odd for fields in FIELDS.values() for field in fields])
 def stress_changes(solved: Equilibrium, surface: Surface = "middle") -> Array:
     """Compute the change of the scaled stress at the nodes by each of `FIELDS`, with the press on the x axis.
 
-    The derivative is taken at fixed points of the film, although the mesh moves with an oval rim.
+    The change is computed at fixed points of the film. If the rim becomes oval, the nodes move, so the effect of their
+    displacement is subtracted.
 
     Args:
         solved: Press with a circular probe on an axisymmetric film, solved with a theory that includes stretching.
@@ -240,11 +243,15 @@ def _stress_change(solved: Equilibrium, field: StressField, solve: Callable[[Arr
     force_above = ElasticFilm(above.mesh.geometry, above.groups).residual(above.field)
     force_below = ElasticFilm(below.mesh.geometry, below.groups).residual(below.field)
     displacement = -0.5 * solve(force_above - force_below)  # for one step of the imperfection
+
     stress_above = nodal_stress(replace(above, field=above.field + displacement), surface)
     stress_below = nodal_stress(replace(below, field=below.field - displacement), surface)
     change = (stress_above - stress_below) / (2.0 * STEP)
     if above.mesh.oval != 0.0:
-        shift = (above.mesh.points - below.mesh.points) / (2.0 * STEP)
-        slope = solved.mesh.node_derivatives(nodal_stress(solved, surface))
-        change -= shift.real[..., None] * slope[..., 0, :] + shift.imag[..., None] * slope[..., 1, :]
+        # The nodes move with the rim. Subtract the change of the stress by this displacement of the nodes.
+        node_shift = (above.mesh.points - below.mesh.points) / (2.0 * STEP)
+        stress_slope = solved.mesh.node_derivatives(nodal_stress(solved, surface))
+        x_contribution = node_shift.real[..., None] * stress_slope[..., 0, :]
+        y_contribution = node_shift.imag[..., None] * stress_slope[..., 1, :]
+        change -= x_contribution + y_contribution
     return np.asarray(change)

@@ -1,9 +1,9 @@
 """The largest stress of a film under a press, and the force that keeps this stress below a limit.
 
-The largest principal stress occurs under the probe, at the surface of the film. It hardly depends on the position of
-the press within 0.7 of the film radius, so it is computed for a press at the centre. Nearer the rim it is larger: 1.4
-times at 0.8 and 3.7 times at 0.93 of the radius. Under a small probe it grows slightly slower than F^(2/3), as in a
-membrane.
+The largest principal stress occurs under the probe, at the surface of the film. Within 0.7 film radii, it hardly
+depends on the position of the press, so it is computed for a press at the centre. Closer to the rim the stress is
+larger: 1.4 times at 0.8 film radii, and 3.7 times at 0.93 film radii. Under a small probe, the stress increases
+slightly less than F^(2/3), which holds for a membrane.
 """
 
 from functools import lru_cache

@@ -1,12 +1,13 @@
 """Factorisation of the tangent of an equilibrium, with the stiffness of trapped air.
 
-The air behind the film resists the volume under the deflection W. Its stiffness c v v' couples all nodes and has the
-rank one, where v are the integration weights of the volume. The system (K + c v v') x = b is solved with the
-factorisation of the sparse matrix K (Sherman and Morrison 1950):
+The air behind the film resists a deflection W that compresses it. The stiffness of the air is c v v', where v are the
+weights with which the deflections of the nodes contribute to the volume. This matrix couples all nodes and has the rank
+one. The system (K + c v v') x = b is therefore solved with the factorisation of the sparse matrix K (Sherman and
+Morrison 1950):
 
     x = K^-1 b - y c (v . K^-1 b) / (1 + c v . y),   y = K^-1 v.
 
-Fields that are odd about the line of symmetry have no volume, so their matrix is K.
+Fields that are odd about the line of symmetry do not change the volume, so their matrix is K.
 """
 
 from dataclasses import dataclass
@@ -34,19 +35,19 @@ class _AirFactor:
         film: Factorisation of K.
         weights: Integration weights v of the volume, shape (n_node,).
         response: Displacements y = K^-1 v by a uniform pressure, shape (n_node, 3).
-        share: c / (1 + c v . y).
+        pressure_per_volume: c / (1 + c v . y), the pressure of the air for a unit volume without the air.
     """
 
     film: Factor
     weights: Array
     response: Array
-    share: float
+    pressure_per_volume: float
 
     def solve(self, right: Array) -> Array:
         """See `TangentFactor`."""
         field = self.film.solve(right)
         volume = float(self.weights @ field[:, 2])
-        return np.asarray(field - self.share * volume * self.response)
+        return np.asarray(field - self.pressure_per_volume * volume * self.response)
 
 
 def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, guard: float = 0.0) -> TangentFactor:
@@ -66,11 +67,11 @@ def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, guard
     if elastic.back is None or not has_air or assembly.odd:
         return film_factor
 
-    # The stiffness of the air is c v v', so that the formula of Sherman and Morrison gives the inverse.
+    # Terms of the formula of Sherman and Morrison in the docstring of this module
     weights = elastic.back.weights
     uniform_pressure = np.zeros_like(field)
     uniform_pressure[:, 2] = weights
     response = film_factor.solve(uniform_pressure)
     air_stiffness = elastic.back.stiffness(field[:, 2])
-    share = air_stiffness / (1.0 + air_stiffness * float(weights @ response[:, 2]))
-    return _AirFactor(film_factor, weights, response, share)
+    pressure_per_volume = air_stiffness / (1.0 + air_stiffness * float(weights @ response[:, 2]))
+    return _AirFactor(film_factor, weights, response, pressure_per_volume)

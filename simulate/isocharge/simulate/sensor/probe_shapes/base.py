@@ -1,11 +1,11 @@
-"""Base classes of the probe shapes: the methods that meshing, loading, reading out and drawing call.
+"""Base classes of the probe shapes. They declare the methods that the mesh, the load, the readout and drawings need.
 
 A footprint is the area on which a probe presses. Points of a footprint are complex numbers x + iy in mm, relative to
 the centroid of the footprint.
 
-A polygonal footprint is filled with straight mesh blocks. A footprint with a smooth boundary derives from
-`CurvedProbe`: the mesh has straight blocks in a core polygon inside the footprint, and blocks with one curved side
-between the core polygon and the boundary.
+The mesh of a polygonal footprint consists of blocks with straight sides. A footprint with a smooth boundary is a
+subclass of `CurvedProbe`. Its mesh consists of blocks with straight sides in a core polygon inside the footprint, and
+of blocks with one curved side between the core polygon and the boundary.
 """
 
 import math
@@ -65,8 +65,11 @@ class ProbeNotation:
     def parse(self, text: str) -> "Probe | None":
         """Return the probe that `text` describes, or None if the text has another notation.
 
+        Args:
+            text: Notation of a probe, such as "rectangle:4.0x2.0@30".
+
         Raises:
-            SceneError: If the notation is correct but no such footprint can exist.
+            SceneError: If the notation is correct, but no such footprint can exist.
         """
         pattern = self.pattern or re.sub("[A-Z]+", lambda _: NUMBER, self.parameters)
         match = re.fullmatch(rf"{self.name}:(?P<parameters>{pattern})(?:@(?P<degrees>{NUMBER}))?", text)
@@ -78,14 +81,14 @@ class ProbeNotation:
 
 @dataclass(frozen=True)
 class FootprintTopology:
-    """Number and kind of the mesh blocks that a footprint needs. Probes with equal topologies share a mesh template.
+    """Number and kind of the mesh blocks that a footprint needs. Probes with the same topology share a mesh template.
 
     Attributes:
         n_corner: Number of corners of the core polygon. The core polygon of a polygonal footprint is the footprint.
         is_curved: Whether a layer of blocks with a curved outer side lies between the core polygon and the boundary of
             the footprint.
-        fills_circle: Whether the boundary of the footprint is the innermost circle of the mesh. Otherwise that circle
-            encloses the footprint at a distance.
+        fills_circle: Whether the boundary of the footprint is the innermost circle of the mesh. Otherwise there is a
+            gap between the footprint and the innermost circle.
     """
 
     n_corner: int
@@ -126,7 +129,8 @@ class Probe(ABC):
     @property
     @abstractmethod
     def period(self) -> float:
-        """Smallest rotation that maps the footprint onto itself, rad; zero if every rotation does."""
+        """Smallest rotation that maps the footprint onto itself, rad. Zero for a circle, which has no smallest
+        rotation."""
 
     @property
     @abstractmethod
@@ -222,15 +226,15 @@ class Probe(ABC):
 class CurvedProbe(Probe):
     """A convex footprint with a smooth boundary that is described by a parameter from 0 to 2 pi.
 
-    A subclass implements `boundary`, `contains`, `notation`, `area`, `reach` and `period`, and has a field `angle`. The
-    other methods follow from these; a subclass may override them with closed formulas.
+    A subclass implements `boundary`, `contains`, `notation`, `area`, `reach` and `period`, and has a field `angle`. All
+    other methods are computed from these. A subclass may override them with closed formulas.
     """
 
     @property
     def topology(self) -> FootprintTopology:
         """A core polygon with the rotational symmetry of the footprint, and a layer up to its boundary."""
-        folds = round(math.tau / self.period)
-        n_corner = 4 if folds in (1, 2) else folds
+        symmetry_order = round(math.tau / self.period)  # number of rotations that map the footprint onto itself
+        n_corner = 4 if symmetry_order in (1, 2) else symmetry_order
         return FootprintTopology(n_corner, is_curved=True, fills_circle=False)
 
     @property
@@ -271,7 +275,7 @@ def check_angle(angle: float) -> None:
 
 
 def check_reach(reach: float, what: str = "probe reach") -> None:
-    """Raise an error if a footprint is too small to be meant in millimetres.
+    """Raise an error if a footprint is so small that its size is probably in metres instead of millimetres.
 
     Args:
         reach: Distance of the farthest point of the footprint from its centroid, mm.

@@ -69,10 +69,11 @@ class Ellipse(CurvedProbe):
 
     def covered_area(self, corners: Array, at: complex) -> float:
         """Return the area of a polygon that lies in the ellipse, mm^2."""
-        share = area_in_disk(self._on_unit_disk(to_complex(corners) - at), 0.0, 1.0)
-        return float(share) * 0.25 * self.width * self.height
+        # The map onto the unit disk divides areas by the product of the semi-axes.
+        area_on_unit_disk = area_in_disk(self._on_unit_disk(to_complex(corners) - at), 0.0, 1.0)
+        return float(area_on_unit_disk) * 0.25 * self.width * self.height
 
     def _on_unit_disk(self, points: Complexes) -> Complexes:
-        """Map points (relative to the centre, mm) by the affine map that takes the ellipse to the unit disk."""
+        """Map points (relative to the centre, mm) by the affine map that maps the ellipse onto the unit disk."""
         unrotated = points * np.exp(-1j * self.angle)
         return np.asarray(2.0 * unrotated.real / self.width + 2.0j * unrotated.imag / self.height)

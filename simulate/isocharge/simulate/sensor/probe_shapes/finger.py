@@ -25,7 +25,7 @@ PRESSURE_LEVELS = 48
 
 @dataclass(frozen=True)
 class Finger(RoundProbe):
-    """A circular contact area whose pressure falls from its centre to zero at its edge.
+    """A circular contact area whose pressure decreases from a maximum at the centre to zero at the edge.
 
     Attributes:
         radius: Radius of the contact area, mm; 4 to 8 mm for a fingertip. It does not depend on the force.
@@ -40,19 +40,20 @@ class Finger(RoundProbe):
 
     @property
     def has_uniform_pressure(self) -> bool:
-        """False."""
+        """Whether the pressure is uniform, which is false."""
         return False
 
     def pressure(self, points: Complexes) -> Array:
         """Return the Hertzian pressure relative to its mean, zero outside of the contact area."""
-        depth = np.clip(1.0 - np.abs(points) ** 2 / self.radius**2, 0.0, None)
-        return np.asarray(PEAK_PRESSURE * np.sqrt(depth))
+        squared_relative_pressure = np.clip(1.0 - np.abs(points) ** 2 / self.radius**2, 0.0, None)
+        return np.asarray(PEAK_PRESSURE * np.sqrt(squared_relative_pressure))
 
     def force_share(self, corners: Array, at: complex) -> float:
         """Return the share of the force that acts on a convex polygon.
 
-        The pressure exceeds the share t of its peak within a disk of radius a sqrt(1 - t^2). The force on the polygon
-        is the integral over t of the area that the polygon has in common with this disk.
+        The pressure exceeds the fraction t of its peak within a disk of radius a sqrt(1 - t^2). The force on the
+        polygon is the peak pressure times the integral over t of the area that the polygon has in common with this
+        disk.
 
         Args:
             corners: Corners (x, y) of the polygon, anticlockwise, shape (n, 2), mm.
