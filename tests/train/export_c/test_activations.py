@@ -17,9 +17,9 @@ from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, T
 from isocharge.train.films.conditional_network import ConditionalPerceptron
 from isocharge.train.films.films_model import ConditionalWeights
 from isocharge.train.model_release.onnx_graph import read_graph, write_graph
-from isocharge.train.training.fit import Split
 from isocharge.train.training.folded_network import MISFIT_UNIT
 from isocharge.train.training.network import TrainablePerceptron
+from isocharge.train.training.split import Split
 
 CLOSED_FORMS = {
     "tanh": lambda x: (np.exp(x) - np.exp(-x)) / (np.exp(x) + np.exp(-x)),

@@ -14,7 +14,7 @@ from isocharge.simulate import Dataset, Domain, NoiseModel, Samples
 from isocharge.train import FitConfig, NetworkConfig, Teacher, TrainingConfig, TrainingData, fit, load_config
 from isocharge.train.training import descent
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.fit import Split, fit_identity, train_network
+from isocharge.train.training.fit import fit_identity, train_network
 from isocharge.train.training.losses import (
     STD_EXPONENT,
     distillation_loss,
@@ -24,6 +24,7 @@ from isocharge.train.training.losses import (
     weighted_likelihood_loss,
 )
 from isocharge.train.training.network import FIRST_LAYER_SLOPES, LARGEST_INT8, TrainablePerceptron
+from isocharge.train.training.split import Split
 
 REPORT_EVERY = 20
 
@@ -290,7 +291,7 @@ def test_a_killed_training_continues_only_with_its_own_presses_and_settings(data
             pass
     whole = weights(dataset, LONGER)
     calls = []
-    monkeypatch.setattr("isocharge.train.training.fit.draw_misfit_examples", pytest.fail)
+    monkeypatch.setattr("isocharge.train.training.misfit_training.draw_misfit_examples", pytest.fail)
     with listening(lambda *call: calls.append(call)), resume_parts(tmp_path / "it", identity) as run:
         assert torch.equal(weights(dataset, LONGER, run=run), whole)
     assert {title for title, *_ in calls} - {"solving the film"} == {"training the misfit network"}

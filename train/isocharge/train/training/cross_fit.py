@@ -39,9 +39,10 @@ from isocharge.train.data.presses import (
 from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.features import WhitenedFeatures
-from isocharge.train.training.fit import contact_stage, misfit_stage, threads_and_seed, train_perceptron
+from isocharge.train.training.fit import contact_stage, threads_and_seed, train_perceptron
 from isocharge.train.training.fitted import Answers, Fitted, Provenance
 from isocharge.train.training.losses import distillation_loss
+from isocharge.train.training.misfit_training import misfit_stage
 from isocharge.train.training.network import InverseNetwork, as_tensor, fold_network
 
 _log = logging.getLogger(__name__)

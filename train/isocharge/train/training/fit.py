@@ -7,10 +7,9 @@ from the nearest contact of the domain is computed beforehand.
 """
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib import metadata
 
 import numpy as np
@@ -18,42 +17,36 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from isocharge.common.arrays import Array
 from isocharge.common.errors import ConfigError
 from isocharge.common.progress import second_thread
 from isocharge.common.resumable_run import ResumableRun
 from isocharge.serve.model.charge_series import FILE as CHARGES_FILE
-from isocharge.serve.model.charge_series import ChargeSeries
-from isocharge.simulate import ChargeMap, Dataset, Domain, NoiseModel
-from isocharge.simulate.forward.charge_map import within
-from isocharge.train.data.channel_noise import ChannelNoise, Noise
-from isocharge.train.data.charge_field import ChargeField, invertible_domain
-from isocharge.train.data.misfit_charges import draw_misfit_examples, draw_outside_examples, misfit_noise
+from isocharge.simulate import Dataset
+from isocharge.train.data.channel_noise import Noise
+from isocharge.train.data.misfit_charges import misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
-from isocharge.train.data.presses import LabelledPresses, held_out, split_by_position
-from isocharge.train.training.config import FEW_ELECTRODES, FitConfig, TrainingConfig
+from isocharge.train.data.presses import LabelledPresses
+from isocharge.train.training.config import FitConfig, TrainingConfig
 from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.descent import Descent, TrainingStage
-from isocharge.train.training.features import WhitenedFeatures
 from isocharge.train.training.fitted import Fitted
-from isocharge.train.training.folded_network import MISFIT_UNIT
 from isocharge.train.training.losses import (
     distillation_loss,
-    focused_squared_distance,
     validation_score,
     warm_up_loss,
     weighted_likelihood_loss,
     with_fresh_noise,
 )
+from isocharge.train.training.misfit_training import MisfitExamples, misfit_stage
 from isocharge.train.training.network import (
     InverseNetwork,
     TrainablePerceptron,
     as_tensor,
-    compress_length,
     fold_network,
 )
 from isocharge.train.training.output_regression import fit_std
 from isocharge.train.training.source import Teacher, TrainingData
+from isocharge.train.training.split import Split
 
 _log = logging.getLogger(__name__)
 
@@ -63,40 +56,8 @@ WARM_UP_FRACTION = 0.15
 ROUNDED_FRACTION = 0.25
 """Number of steps after the hidden weights are rounded, relative to the number of steps before, dimensionless."""
 
-VALIDATION_FRACTION = 0.5
-"""Number of validation positions relative to the number of test positions, dimensionless."""
-
-MISFIT_RATE_FACTOR = 1.5
-"""Learning rate of the misfit network, whose targets have no noise, relative to that of the contact network."""
-
 N_STD_PRESSES = 60_000
 """Number of presses with noise to which the standard deviations of a trained network are fitted."""
-
-N_OUTSIDE_PRESSES = 6_000
-"""Number of presses outside the working area from which charges for the misfit network are drawn."""
-
-OUTSIDE_SHARE = 0.15
-"""Share of the examples of the misfit network that are presses outside the working area, if those are simulated,
-dimensionless."""
-
-MANY_OUTSIDE_SHARE = 0.3
-"""The same share with more than `FEW_ELECTRODES` electrodes, dimensionless. They can notice nearly all presses outside
-the working area."""
-
-SEARCH_STARTS = 2
-"""Number of starts of a search for the nearest contact."""
-
-MANY_SEARCH_STARTS = 4
-"""The same number with more than `FEW_ELECTRODES` electrodes, whose charges have more local minima of the misfit."""
-
-FOCUS_MISFIT = 10.0
-"""Misfit at which the weight of an example of the misfit network is half of the largest weight, in standard deviations.
-It is twice the smallest limit of the flag `misfit`."""
-
-SIGNED_FEATURE_SCALE = 0.1
-"""Charge above which features of charges of both signs are logarithmic, relative to the charge above which the noise is
-proportional to the charge. On a taut uniaxial film the position error is 1.05 of the Bayes limit with 0.1, and 1.08
-with 1."""
 
 
 def fit(source: Dataset | TrainingData, config: FitConfig | None = None, *, run: ResumableRun | None = None) -> Fitted:
@@ -167,71 +128,6 @@ def fit_identity(data: TrainingData, config: FitConfig) -> dict[str, object]:
     if data.teacher is not None:
         identity["teacher_sha256"] = data.teacher.sha256
     return identity
-
-
-@dataclass(frozen=True)
-class Split:
-    """The presses of a training, split by position, in the domain where the map can be inverted.
-
-    Attributes:
-        domain: Contacts for which the network is trained.
-        train: Presses for training.
-        validation: Presses for early stopping.
-        test: Presses for measuring errors.
-        field: Map from contacts to charges, fitted to the presses of the domain, or to all presses if that fits better.
-        cautions: Sentences about folds of the map and about contacts with the same charges.
-        folded_charges: Charges of all presses, including the region where the map folds; None if it does not fold.
-    """
-
-    domain: Domain
-    train: LabelledPresses
-    validation: LabelledPresses
-    test: LabelledPresses
-    field: ChargeMap
-    cautions: tuple[str, ...]
-    folded_charges: ChargeSeries | None
-
-    @classmethod
-    def of(cls, data: TrainingData, training: TrainingConfig) -> "Split":
-        """Split presses into those for training, validation and test, and fit a charge field to them.
-
-        Only presses within the largest disk in which the map certainly does not fold are used.
-
-        Args:
-            data: Presses of the sensor.
-            training: Fractions of the presses, noise and seed.
-        """
-        presses = data.presses
-        names = data.sensor.electrode_names
-        whole_field = ChargeField.fit(data.domain, names, *split_by_position(presses, training.hold_out, training.seed))
-        domain, cautions = invertible_domain(whole_field, presses, misfit_noise(training.noise_model))
-        is_folded = domain != data.domain
-        inside = presses.within(domain.radius) if is_folded else presses
-        if presses.measured:
-            is_test = held_out(inside.contact)
-            remaining = inside[~is_test]
-            test = inside[is_test]
-        else:
-            remaining, test = split_by_position(inside, training.hold_out, training.seed)
-        validation_share = VALIDATION_FRACTION * training.hold_out
-        train, validation = split_by_position(remaining, validation_share, training.seed + 1)
-
-        field: ChargeMap = whole_field
-        if is_folded or presses.measured:  # the first field was fitted to presses beyond the fold, or to test presses
-            field = ChargeField.fit(domain, names, train, validation)
-            if is_folded and whole_field.error < field.error:
-                field = within(whole_field, domain.radius)
-        folded_charges = whole_field.of_positive if is_folded else None
-        return cls(domain, train, validation, test, field, cautions, folded_charges)
-
-    def features(self, noise: NoiseModel) -> WhitenedFeatures:
-        """Fit the input features: logarithms if all charges are positive, otherwise inverse hyperbolic sines."""
-        charge = self.train.charge
-        if not (self.train.signed or self.validation.signed or self.test.signed):
-            return WhitenedFeatures.fit_logarithms(charge)
-        channels = ChannelNoise.alike(noise, charge.shape[1])
-        scaled = replace(channels, white=SIGNED_FEATURE_SCALE * channels.white)
-        return WhitenedFeatures.fit_signed(charge, scaled.bend(charge))
 
 
 @dataclass(frozen=True)
@@ -395,116 +291,4 @@ def contact_stage(
         config.steps,
         warm_up_steps,
         slow_parameters=(network.contact.skip.weight,),
-    )
-
-
-@dataclass(frozen=True)
-class MisfitExamples:
-    """Draws the examples for the misfit network. The run saves them, because the search takes long.
-
-    Attributes:
-        split: Presses for training, and the charge field in which the nearest contacts are searched for.
-        features: Features of the network, which limit the charges.
-        config: Noise, number of examples and seed.
-        run: Run that saves the examples; None if they are not saved.
-    """
-
-    split: Split
-    features: WhitenedFeatures
-    config: TrainingConfig
-    run: ResumableRun | None
-
-    def inner(self) -> Array:
-        """Return charges, pC, and residuals of examples made from presses in the working area.
-
-        The shape is (2, n, n_electrode); see `draw_misfit_examples`.
-        """
-        draw = partial(
-            draw_misfit_examples, self.split.train, self.split.field, self._noise(), starts=self._search_starts
-        )
-        return self._kept("misfit-charges", partial(draw, self.config.misfit_charges, self.config.seed))
-
-    def with_outside(self, inner_examples: Array, outside: OutsidePresses | None) -> Array:
-        """Replace a share of the examples by presses outside the working area.
-
-        Args:
-            inner_examples: Result of `inner`.
-            outside: The film outside the working area; None if it is not simulated.
-
-        Returns:
-            Charges, pC, and residuals, same shape, in random order.
-        """
-        if outside is None:
-            return inner_examples
-        seed = self.config.seed
-        outside_share = MANY_OUTSIDE_SHARE if self._has_many_electrodes else OUTSIDE_SHARE
-        n_outside = round(outside_share * self.config.misfit_charges)
-        charge = outside.draw(N_OUTSIDE_PRESSES, seed).charge
-        draw = partial(draw_outside_examples, charge, self.split.field, self._noise(), starts=self._search_starts)
-        outside_examples = self._kept("misfit-outside", partial(draw, n_outside, seed))
-        examples = np.concatenate([inner_examples[:, n_outside:], outside_examples], axis=1)
-        return np.random.default_rng(seed).permutation(examples, axis=1)
-
-    @property
-    def _has_many_electrodes(self) -> bool:
-        return self.features.charge_features.n_electrode > FEW_ELECTRODES
-
-    @property
-    def _search_starts(self) -> int:
-        """Number of starts of a search for the nearest contact."""
-        return MANY_SEARCH_STARTS if self._has_many_electrodes else SEARCH_STARTS
-
-    def _noise(self) -> Noise:
-        """Return the noise of good presses; for charges of any sign, the noise of each channel."""
-        noise = misfit_noise(self.config.noise_model)
-        charge_features = self.features.charge_features
-        if charge_features.mean is None:
-            return noise
-        return ChannelNoise.alike(noise, charge_features.n_electrode)
-
-    def _kept(self, name: str, draw: Callable[..., Array]) -> Array:
-        """Return the examples that a function draws, or that the run has saved under a name."""
-        charge_features = self.features.charge_features
-        limited_draw = draw
-        if charge_features.mean is not None:
-            limited_draw = partial(draw, limits=(charge_features.low_pC, charge_features.high_pC))
-        if self.run is None:
-            return limited_draw()
-        saved: Array = self.run.storing_executor(name).submit(limited_draw).result()
-        return saved
-
-
-def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:
-    """Return the training of the misfit perceptron.
-
-    Args:
-        network: The network, whose misfit perceptron is trained.
-        examples: Charges, pC, and residuals (Q - Q(c)) / sigma at the nearest contact c, shape (2, n, n_electrode).
-            The last of them are used for validation.
-        config: Number of steps and batch size.
-    """
-    charges, residuals = examples
-    inputs = network.inputs(as_tensor(charges))
-    targets = compress_length(torch.tensor(residuals)).float()
-    n_validation = max(1, round(VALIDATION_FRACTION * config.hold_out * len(inputs)))
-    n_train = len(inputs) - n_validation
-
-    focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_UNIT))
-
-    def distance(rows: Tensor | slice) -> Tensor:
-        """Return the weighted mean squared distance between outputs and targets, for some rows of the examples."""
-        return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows], focus)
-
-    def loss(_: int, random: torch.Generator) -> Tensor:
-        """Return the weighted mean squared distance for a random batch."""
-        batch_rows = torch.randint(n_train, (config.batch,), generator=random)
-        return distance(batch_rows)
-
-    def score() -> tuple[float, str]:
-        """Return the weighted mean squared distance for the validation examples, and a text with it."""
-        validation_loss = distance(slice(n_train, None)).item()
-        return validation_loss, f"{validation_loss:.4f} on watched charges"
-
-    return TrainingStage(
-        "misfit", network.misfit_vector, loss, score, config.misfit_steps, rate_factor=MISFIT_RATE_FACTOR
     )

@@ -1,0 +1,164 @@
+"""Training of the misfit perceptron: its examples, which a search makes, and its loss."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from isocharge.common.arrays import Array
+from isocharge.common.resumable_run import ResumableRun
+from isocharge.train.data.channel_noise import ChannelNoise, Noise
+from isocharge.train.data.misfit_charges import draw_misfit_examples, draw_outside_examples, misfit_noise
+from isocharge.train.data.outside_presses import OutsidePresses
+from isocharge.train.training.config import FEW_ELECTRODES, TrainingConfig
+from isocharge.train.training.descent import TrainingStage
+from isocharge.train.training.features import WhitenedFeatures
+from isocharge.train.training.folded_network import MISFIT_UNIT
+from isocharge.train.training.losses import (
+    focused_squared_distance,
+)
+from isocharge.train.training.network import (
+    InverseNetwork,
+    as_tensor,
+    compress_length,
+)
+from isocharge.train.training.split import VALIDATION_FRACTION, Split
+
+MISFIT_RATE_FACTOR = 1.5
+"""Learning rate of the misfit network, whose targets have no noise, relative to that of the contact network."""
+
+N_OUTSIDE_PRESSES = 6_000
+"""Number of presses outside the working area from which charges for the misfit network are drawn."""
+
+OUTSIDE_SHARE = 0.15
+"""Share of the examples of the misfit network that are presses outside the working area, if those are simulated,
+dimensionless."""
+
+MANY_OUTSIDE_SHARE = 0.3
+"""The same share with more than `FEW_ELECTRODES` electrodes, dimensionless. They can notice nearly all presses outside
+the working area."""
+
+SEARCH_STARTS = 2
+"""Number of starts of a search for the nearest contact."""
+
+MANY_SEARCH_STARTS = 4
+"""The same number with more than `FEW_ELECTRODES` electrodes, whose charges have more local minima of the misfit."""
+
+FOCUS_MISFIT = 10.0
+"""Misfit at which the weight of an example of the misfit network is half of the largest weight, in standard deviations.
+It is twice the smallest limit of the flag `misfit`."""
+
+
+@dataclass(frozen=True)
+class MisfitExamples:
+    """Draws the examples for the misfit network. The run saves them, because the search takes long.
+
+    Attributes:
+        split: Presses for training, and the charge field in which the nearest contacts are searched for.
+        features: Features of the network, which limit the charges.
+        config: Noise, number of examples and seed.
+        run: Run that saves the examples; None if they are not saved.
+    """
+
+    split: Split
+    features: WhitenedFeatures
+    config: TrainingConfig
+    run: ResumableRun | None
+
+    def inner(self) -> Array:
+        """Return charges, pC, and residuals of examples made from presses in the working area.
+
+        The shape is (2, n, n_electrode); see `draw_misfit_examples`.
+        """
+        draw = partial(
+            draw_misfit_examples, self.split.train, self.split.field, self._noise(), starts=self._search_starts
+        )
+        return self._kept("misfit-charges", partial(draw, self.config.misfit_charges, self.config.seed))
+
+    def with_outside(self, inner_examples: Array, outside: OutsidePresses | None) -> Array:
+        """Replace a share of the examples by presses outside the working area.
+
+        Args:
+            inner_examples: Result of `inner`.
+            outside: The film outside the working area; None if it is not simulated.
+
+        Returns:
+            Charges, pC, and residuals, same shape, in random order.
+        """
+        if outside is None:
+            return inner_examples
+        seed = self.config.seed
+        outside_share = MANY_OUTSIDE_SHARE if self._has_many_electrodes else OUTSIDE_SHARE
+        n_outside = round(outside_share * self.config.misfit_charges)
+        charge = outside.draw(N_OUTSIDE_PRESSES, seed).charge
+        draw = partial(draw_outside_examples, charge, self.split.field, self._noise(), starts=self._search_starts)
+        outside_examples = self._kept("misfit-outside", partial(draw, n_outside, seed))
+        examples = np.concatenate([inner_examples[:, n_outside:], outside_examples], axis=1)
+        return np.random.default_rng(seed).permutation(examples, axis=1)
+
+    @property
+    def _has_many_electrodes(self) -> bool:
+        return self.features.charge_features.n_electrode > FEW_ELECTRODES
+
+    @property
+    def _search_starts(self) -> int:
+        """Number of starts of a search for the nearest contact."""
+        return MANY_SEARCH_STARTS if self._has_many_electrodes else SEARCH_STARTS
+
+    def _noise(self) -> Noise:
+        """Return the noise of good presses; for charges of any sign, the noise of each channel."""
+        noise = misfit_noise(self.config.noise_model)
+        charge_features = self.features.charge_features
+        if charge_features.mean is None:
+            return noise
+        return ChannelNoise.alike(noise, charge_features.n_electrode)
+
+    def _kept(self, name: str, draw: Callable[..., Array]) -> Array:
+        """Return the examples that a function draws, or that the run has saved under a name."""
+        charge_features = self.features.charge_features
+        limited_draw = draw
+        if charge_features.mean is not None:
+            limited_draw = partial(draw, limits=(charge_features.low_pC, charge_features.high_pC))
+        if self.run is None:
+            return limited_draw()
+        saved: Array = self.run.storing_executor(name).submit(limited_draw).result()
+        return saved
+
+
+def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:
+    """Return the training of the misfit perceptron.
+
+    Args:
+        network: The network, whose misfit perceptron is trained.
+        examples: Charges, pC, and residuals (Q - Q(c)) / sigma at the nearest contact c, shape (2, n, n_electrode).
+            The last of them are used for validation.
+        config: Number of steps and batch size.
+    """
+    charges, residuals = examples
+    inputs = network.inputs(as_tensor(charges))
+    targets = compress_length(torch.tensor(residuals)).float()
+    n_validation = max(1, round(VALIDATION_FRACTION * config.hold_out * len(inputs)))
+    n_train = len(inputs) - n_validation
+
+    focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_UNIT))
+
+    def distance(rows: Tensor | slice) -> Tensor:
+        """Return the weighted mean squared distance between outputs and targets, for some rows of the examples."""
+        return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows], focus)
+
+    def loss(_: int, random: torch.Generator) -> Tensor:
+        """Return the weighted mean squared distance for a random batch."""
+        batch_rows = torch.randint(n_train, (config.batch,), generator=random)
+        return distance(batch_rows)
+
+    def score() -> tuple[float, str]:
+        """Return the weighted mean squared distance for the validation examples, and a text with it."""
+        validation_loss = distance(slice(n_train, None)).item()
+        return validation_loss, f"{validation_loss:.4f} on watched charges"
+
+    return TrainingStage(
+        "misfit", network.misfit_vector, loss, score, config.misfit_steps, rate_factor=MISFIT_RATE_FACTOR
+    )
