@@ -2,8 +2,9 @@
 
     python tests/benchmarks/bench_model.py [--models NAME,...] [--presses 6000] [--draws 40000] [--seed 1] [--json]
 
-Presses of a circle of 1 mm from solves of their own, none of them in the training data; `reference` noise, forces of
-the model. A minute for a thousand presses against the limit, kept in the cache folder afterwards.
+The presses of a circle of 1 mm are simulated separately and were not in the training data. They have `reference` noise
+and the forces of the model. Computing the Bayes limit takes a minute for a thousand presses; the result is stored in
+the cache folder.
 """
 
 from typing import Any
@@ -22,97 +23,145 @@ from isocharge.train.report.measures import interval_coverage
 RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
 MARGIN_mm = 0.01
 """Distance beyond the working area up to which charges are computed, so that rounding leaves no press out, mm."""
-APART = 8.0
-"""Distance of two presses at once, mm."""
+
+PAIR_DISTANCE_mm = 8.0
+"""Distance of two presses at the same time, mm."""
+
+MAX_PRESSES = 40_000
+"""Largest number of presses."""
+
 NOISE = noise_model("reference")
 LEVELS = np.array([0.68, 0.95])
+"""Levels of the intervals whose coverage is measured."""
+
+FAULTY_GAINS = {"one gain 20 % low": 0.8, "one gain 20 % high": 1.2, "one electrode dead": 0.0}
+"""Gain of one electrode, by the name of the fault."""
 
 
-class Bench:
-    """One model, the simulator's charges over its working area, and a seed."""
+class ModelCase:
+    """A model, the forward map of its sensor, and presses over its working area.
+
+    Attributes:
+        predictor: The model.
+        radius: Radius of the working area, mm.
+        film: Forward map of the sensor.
+        presses: Contacts (x, y, F), shape (MAX_PRESSES, 3), mm and N.
+        rng: Random number generator of noise and further contacts.
+    """
 
     def __init__(self, model: str, seed: int) -> None:
-        self.model, self.rng = Predictor(model), np.random.default_rng([seed, 1])
-        about = self.model.metadata
-        corners = np.array(about.working_area_mm) @ [1.0, 1j]
+        self.predictor = Predictor(model)
+        self.rng = np.random.default_rng([seed, 1])
+        metadata = self.predictor.metadata
+        corners = np.array(metadata.working_area_mm) @ [1.0, 1j]
         self.radius = float(np.abs(0.5 * (corners + np.roll(corners, 1))).min())
-        self.presses = Sweep(self.radius, about.force_range_N, 40_000, seed, sampling="random").contacts()
-        reach = self.radius + MARGIN_mm
-        self.film = ForwardMap.build(sensor_from_dict(about.sensor), Circle(1.0), reach, about.force_range_N)
+        sweep = Sweep(self.radius, metadata.force_range_N, MAX_PRESSES, seed, sampling="random")
+        self.presses = sweep.contacts()
+        sensor = sensor_from_dict(metadata.sensor)
+        self.film = ForwardMap.build(sensor, Circle(1.0), self.radius + MARGIN_mm, metadata.force_range_N)
 
-    def ring(self, count: int, force: float, least: float, most: float) -> np.ndarray:
-        """Contacts uniform between two radii, shape (count, 3)."""
-        z = np.sqrt(self.rng.uniform(least**2, most**2, count)) * np.exp(2j * np.pi * self.rng.random(count))
-        return np.stack([z.real, z.imag, np.full(count, force)], axis=1)
+    def noisy_charge(self, contact: np.ndarray) -> np.ndarray:
+        """Return the charges of contacts with noise, shape (n, n_electrode), pC."""
+        return NOISE.add(self.film.charges(contact), self.rng)
 
-    def answers(self, charge: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Contacts, their standard deviations, and misfits of the model, for charges with noise."""
-        found = np.stack(self.model.predict_batch(charge), axis=1).astype(float)
-        return found[:, :3], found[:, 3:6], found[:, 6]
+    def draw_in_ring(self, count: int, inner_mm: float, outer_mm: float) -> np.ndarray:
+        """Draw positions uniformly between two radii, shape (count, 2), mm."""
+        distance = np.sqrt(self.rng.uniform(inner_mm**2, outer_mm**2, count))
+        angle = 2.0 * np.pi * self.rng.random(count)
+        return np.column_stack([distance * np.cos(angle), distance * np.sin(angle)])
+
+    def estimate(self, charge: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return contacts, shape (n, 3), their standard deviations, shape (n, 3), and misfits, shape (n,)."""
+        outputs = np.stack(self.predictor.predict_batch(charge), axis=1).astype(float)
+        contact, std, misfit, _ = np.split(outputs, [3, 6, 7], axis=1)
+        return contact, std, misfit[:, 0]
 
 
-def against_limit(bench: Bench, count: int) -> dict[str, Any]:
-    """Errors of model and posterior mean on the same noisy charges."""
-    truth = bench.presses[:count]
-    charge = NOISE.add(bench.film.charges(truth), bench.rng)
-    problem = BayesProblem(bench.film.sensor, bench.film.probe, bench.radius, bench.film.domain.force_range, NOISE)
-    least = ContactErrorStatistics.of(bayes_estimate(problem, charge, charge_map=bench.film)[0], truth)
-    mine = ContactErrorStatistics.of(bench.answers(charge)[0], truth)
+def errors_over_limit(case: ModelCase, count: int) -> dict[str, Any]:
+    """Compare the errors of the model with those of the posterior mean on the same charges."""
+    truth = case.presses[:count]
+    charge = case.noisy_charge(truth)
+    problem = BayesProblem(case.film.sensor, case.film.probe, case.radius, case.film.domain.force_range, NOISE)
+    bayes_contact, _ = bayes_estimate(problem, charge, charge_map=case.film)
+    contact, _, _ = case.estimate(charge)
+    limit = ContactErrorStatistics.of(bayes_contact, truth)
+    errors = ContactErrorStatistics.of(contact, truth)
     return {
         "presses": count,
-        "position_rms_mm": mine.position_rms_mm,
-        "position_over_bayes": mine.position_rms_mm / least.position_rms_mm,
-        "force_rms_percent": mine.force_rms_percent,
-        "force_over_bayes": mine.force_rms_percent / least.force_rms_percent,
+        "position_rms_mm": errors.position_rms_mm,
+        "position_over_bayes": errors.position_rms_mm / limit.position_rms_mm,
+        "force_rms_percent": errors.force_rms_percent,
+        "force_over_bayes": errors.force_rms_percent / limit.force_rms_percent,
     }
 
 
-def intervals(bench: Bench, count: int) -> dict[str, Any]:
-    """Least and largest share of presses in the 68 and 95 % intervals: of all, and of thirds by radius and force."""
-    truth = bench.presses[:count]
-    contact, std, _ = bench.answers(NOISE.add(bench.film.charges(truth), bench.rng))
-    orders = (np.argsort(np.hypot(truth[:, 0], truth[:, 1])), np.argsort(truth[:, 2]))
-    thirds = [rows for order in orders for rows in np.array_split(order, 3)]
-    shares = np.stack([interval_coverage(contact[rows], std[rows], truth[rows], LEVELS) for rows in thirds])
-    of_all = interval_coverage(contact, std, truth, LEVELS)
-    found: dict[str, Any] = {"draws": count}
-    for k, level in enumerate(LEVELS):
-        found[f"{level:.0%} of all"] = [float(of_all[k].min()), float(of_all[k].max())]
-        found[f"{level:.0%} of a third"] = [float(shares[:, k].min()), float(shares[:, k].max())]
-    return found
+def coverage(case: ModelCase, count: int) -> dict[str, Any]:
+    """Measure how often the 68 and 95 % intervals contain the true coordinates.
+
+    Returns:
+        Smallest and largest coverage of x, y and the force: over all presses, and over thirds of the presses by radius
+        and by force.
+    """
+    truth = case.presses[:count]
+    contact, std, _ = case.estimate(case.noisy_charge(truth))
+    by_radius = np.argsort(np.hypot(truth[:, 0], truth[:, 1]))
+    by_force = np.argsort(truth[:, 2])
+    thirds = [*np.array_split(by_radius, 3), *np.array_split(by_force, 3)]
+    total_coverage = interval_coverage(contact, std, truth, LEVELS)
+    third_coverage = np.stack([interval_coverage(contact[rows], std[rows], truth[rows], LEVELS) for rows in thirds])
+    results: dict[str, Any] = {"draws": count}
+    for index, level in enumerate(LEVELS):
+        of_all = total_coverage[index]
+        of_thirds = third_coverage[:, index]
+        results[f"{level:.0%} of all"] = [float(of_all.min()), float(of_all.max())]
+        results[f"{level:.0%} of a third"] = [float(of_thirds.min()), float(of_thirds.max())]
+    return results
 
 
-def faults(bench: Bench, count: int) -> dict[str, Any]:
-    """Shares of presses flagged, with the limit that one good press in a hundred exceeds."""
+def flagged_faults(case: ModelCase, count: int) -> dict[str, Any]:
+    """Measure the share of faulty presses whose misfit exceeds the limit that 1 % of good presses exceed."""
 
     def misfits(charge: np.ndarray) -> np.ndarray:
-        return bench.answers(NOISE.add(charge, bench.rng))[2]
+        """Return the misfits of charges after adding noise."""
+        _, _, misfit = case.estimate(NOISE.add(charge, case.rng))
+        return misfit
 
-    limit = alarm_threshold(misfits(bench.film.charges(bench.presses[:count])))
+    limit = alarm_threshold(misfits(case.film.charges(case.presses[:count])))
 
-    def flagged(charge: np.ndarray) -> float:
+    def flagged_share(charge: np.ndarray) -> float:
         return float(np.mean(misfits(charge) > limit))
 
-    inside = bench.ring(count, 1.0, 0.0, bench.radius)
-    one = bench.film.charges(inside)
-    found = {"limit": limit, "good presses of 1 N": flagged(one)}
-    channels = np.eye(one.shape[1])
-    for name, gain in (("one gain 20 % low", 0.8), ("one gain 20 % high", 1.2), ("one electrode dead", 0.0)):
-        found[name] = min(flagged(one * (1.0 + (gain - 1.0) * channel)) for channel in channels)
-    beside = inside + bench.ring(count, 0.0, APART, APART)
-    both = np.hypot(beside[:, 0], beside[:, 1]) <= bench.radius
-    for force in (0.5, 1.0):
-        pair = sum(bench.film.charges(contact[both] * [1.0, 1.0, force]) for contact in (inside, beside))
-        found[f"two presses of {force:g} N, {APART:g} mm apart"] = flagged(pair)
-    return found
+    # Presses of 1 N, and presses with one faulty electrode: the smallest share over the electrodes
+    position = case.draw_in_ring(count, 0.0, case.radius)
+    charge = case.film.charges(np.column_stack([position, np.ones(count)]))
+    results = {"limit": limit, "good presses of 1 N": flagged_share(charge)}
+    for name, gain in FAULTY_GAINS.items():
+        shares = []
+        for electrode in range(charge.shape[1]):
+            gains = np.ones(charge.shape[1])
+            gains[electrode] = gain
+            shares.append(flagged_share(charge * gains))
+        results[name] = min(shares)
+
+    # Two presses at the same time, whose charges add up
+    second_position = position + case.draw_in_ring(count, PAIR_DISTANCE_mm, PAIR_DISTANCE_mm)
+    is_inside = np.hypot(second_position[:, 0], second_position[:, 1]) <= case.radius
+    for force_N in (0.5, 1.0):
+        force = np.full(np.count_nonzero(is_inside), force_N)
+        first_charge = case.film.charges(np.column_stack([position[is_inside], force]))
+        second_charge = case.film.charges(np.column_stack([second_position[is_inside], force]))
+        name = f"two presses of {force_N:g} N, {PAIR_DISTANCE_mm:g} mm apart"
+        results[name] = flagged_share(first_charge + second_charge)
+    return results
 
 
 def main() -> None:
-    asked, results = arguments(__doc__, models=RELEASED, presses=6000, draws=40000, seed=1, json=False), {}
+    asked = arguments(__doc__, models=RELEASED, presses=6000, draws=MAX_PRESSES, seed=1, json=False)
+    results = {}
     for model in asked.models.split(","):
-        bench = Bench(model, asked.seed)
-        results[f"{model}, within {bench.radius:.2f} mm"] = (
-            against_limit(bench, asked.presses) | intervals(bench, asked.draws) | faults(bench, asked.draws)
+        case = ModelCase(model, asked.seed)
+        results[f"{model}, within {case.radius:.2f} mm"] = (
+            errors_over_limit(case, asked.presses) | coverage(case, asked.draws) | flagged_faults(case, asked.draws)
         )
     print_results("model", asked, results)
 

@@ -1,4 +1,4 @@
-"""What the benchmarks share: options, calls that take turns, percentiles, and how results are printed."""
+"""Functions of all benchmarks: options, timing of calls in turns, percentiles, and printing of results."""
 
 import argparse
 import json
@@ -12,48 +12,83 @@ from isocharge.serve.benchmark import Contender, machine, take_turns
 
 
 def options(page: str, model: str = "three-25um-biaxial", **more: Any) -> argparse.Namespace:
-    """What was asked of a benchmark of a model, see `arguments`."""
+    """Parse the options of a benchmark of a model.
+
+    Args:
+        page: Description of the benchmark for `--help`.
+        model: Default of the option `--model`.
+        more: Defaults of further options; see `arguments`.
+    """
     return arguments(page, model=model, seed=0, json=False, **more)
 
 
 def arguments(page: str, **defaults: Any) -> argparse.Namespace:
-    """The command's options by name; a default says the type: False is a switch, None the path of a file."""
+    """Parse the options of a benchmark.
+
+    Args:
+        page: Description of the benchmark for `--help`.
+        defaults: Default of each option by its name, which also determines the type of the option. An option with the
+            default False is a switch, and an option with the default None is a path.
+    """
     parser = argparse.ArgumentParser(description=page, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name, default in defaults.items():
-        kind = {"action": "store_true"} if default is False else {"type": Path if default is None else type(default)}
-        parser.add_argument(
-            "--" + name.replace("_", "-").lower(), dest=name, default=default, help="%(default)s", **kind
-        )
+        option = "--" + name.replace("_", "-").lower()
+        if default is False:
+            parser.add_argument(option, dest=name, action="store_true")
+        else:
+            option_type = Path if default is None else type(default)
+            parser.add_argument(option, dest=name, default=default, type=option_type, help="%(default)s")
     return parser.parse_args()
 
 
 def print_results(name: str, asked: argparse.Namespace, results: dict[str, Any]) -> None:
-    """Results by title, a value, rows or values by name, with the machine: for people, or as one JSON object."""
+    """Print results as text, or as one JSON object with the option `--json`.
+
+    Args:
+        name: Name of the benchmark.
+        asked: Options of the benchmark.
+        results: Results by title: a value, a list of rows, or a dictionary of values.
+    """
     if asked.json:
         about = {"benchmark": name, **vars(asked), "machine": machine()}
         print(json.dumps(about | {"results": results}, default=str))
         return
     print(", ".join(f"{key} {value}" for key, value in machine().items()))
-    for title, value in results.items():
-        lines = [f"{name}: {item}" for name, item in value.items()] if isinstance(value, dict) else value
-        print(*([title, *lines] if isinstance(lines, list) else [f"{title}: {lines}"]), sep="\n    ")
+    for title, result in results.items():
+        rows = result
+        if isinstance(result, dict):
+            rows = [f"{key}: {value}" for key, value in result.items()]
+        if isinstance(rows, list):
+            print(title, *rows, sep="\n    ")
+        else:
+            print(f"{title}: {rows}")
 
 
 def percentiles(values: Any, shares: tuple[float, ...], digits: int = 1) -> dict[str, float]:
-    """By name; empty for no values."""
-    return {f"p{share:g}": round(float(np.percentile(values, share)), digits) for share in shares if len(values)}
+    """Return rounded percentiles of values by name, such as "p50"; nothing if there are no values."""
+    if not len(values):
+        return {}
+    return {f"p{share:g}": round(float(np.percentile(values, share)), digits) for share in shares}
 
 
 def in_turns(contenders: Sequence[Contender], seconds: float) -> list[dict[str, Any]]:
-    """A row for each: percentiles of the time for a press, and its median over that of the first."""
+    """Call functions in turns, and measure the time of each for one press.
+
+    Args:
+        contenders: The functions.
+        seconds: Duration of the measurement, s.
+
+    Returns:
+        For each function the percentiles of its time, and the ratio of its median to that of the first function.
+    """
     timings = take_turns(contenders, seconds)
-    first = timings[0].p50_us / timings[0].presses
+    medians_us = [timing.p50_us / timing.presses for timing in timings]
     return [
         {
             "call": timing.name,
-            "p50_us": round(timing.p50_us / timing.presses, 3),
+            "p50_us": round(median_us, 3),
             "p99_us": round(timing.p99_us / timing.presses, 3),
-            "ratio_p50": round(timing.p50_us / timing.presses / first, 3),
+            "ratio_p50": round(median_us / medians_us[0], 3),
         }
-        for timing in timings
+        for timing, median_us in zip(timings, medians_us, strict=True)
     ]

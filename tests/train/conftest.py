@@ -1,4 +1,4 @@
-"""One small dataset and one short fit, shared by the tests of this folder."""
+"""Fixtures for the tests of this folder: a small dataset, a network after a short training, and a film."""
 
 from functools import partial
 
@@ -34,7 +34,7 @@ def sensor():
 
 @pytest.fixture(scope="session")
 def film(sensor):
-    """The forward map: the simulator's own word on every charge."""
+    """The simulated map from contacts to charges of the sensor."""
     return kept(ForwardMap.build, sensor, Circle(1.0))
 
 
@@ -51,13 +51,13 @@ def dataset(film, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def trained(dataset):
-    """The network in torch, with the presses that it learned from and those that it did not."""
+    """The trained network in PyTorch, with its training presses and test presses."""
     return kept(train_network, TrainingData.of(dataset), QUICK)
 
 
 @pytest.fixture(scope="session")
 def fitted(dataset, trained):
-    """The same network, folded."""
+    """The same network after folding, with everything that a release needs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "train_network", lambda *_, **__: trained)
         return fit(dataset, QUICK)
@@ -65,5 +65,5 @@ def fitted(dataset, trained):
 
 @pytest.fixture(scope="session")
 def problem():
-    """What a calibration of the four-electrode sensor knows before its presses."""
+    """The calibration problem of a sensor with four electrodes."""
     return CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))

@@ -1,4 +1,4 @@
-"""Calibrations with the released networks for all films, and presses of films drawn from their priors."""
+"""Fixtures for calibrations with the released networks for all films, and presses on films drawn from their priors."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,10 @@ from isocharge.train.training import correlation
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse():
-    """Errors over fewer contacts, fewer places to press, correlations from fewer examples: a fourth of the time."""
+    """Average errors over fewer contacts, plan with fewer positions, and fit correlations to fewer examples.
+
+    A calibration then takes a fourth of the time.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contact_error, "N_CONTACTS", 50)
         patch.setattr(contact_error, "N_CANDIDATE_POSITIONS", 30)
@@ -23,11 +26,16 @@ def coarse():
 
 @pytest.fixture(scope="session", params=["four-25um-biaxial", "three-25um-biaxial"])
 def layout(request) -> CalibrationProblem:
+    """The calibration problem of a sensor with four electrodes, and that of a sensor with three."""
     return CalibrationProblem.of(load_sensor(request.param), Circle(1.0))
 
 
 def rig(problem, count, seed, position_std_mm=0.1, force_std=0.01) -> tuple[np.ndarray, MeasuredPresses]:
-    """A film drawn from the prior, and presses on it: noisy charges, and places and forces as a rig reads them."""
+    """Draw a film from the prior, and measure presses on it with a simulated rig.
+
+    Returns:
+        Parameters of the film, and presses with noisy charges and with errors of position and force.
+    """
     rng = np.random.default_rng(seed)
     parameters = problem.prior.draw(rng, 1)[0]
     contact = draw_contacts(rng, problem.domain, count)
@@ -38,7 +46,13 @@ def rig(problem, count, seed, position_std_mm=0.1, force_std=0.01) -> tuple[np.n
 
 
 def presses_of(problem, contact, charge, position_std_mm=0.1, force_std=0.01) -> MeasuredPresses:
-    """Presses on the lines 2, 3, ... of a file."""
+    """Return measured presses, which are on the lines 2, 3, ... of a file."""
     count = len(contact)
-    std = np.full(count, position_std_mm), np.full(count, force_std)
-    return MeasuredPresses(contact, charge, *std, problem.electrodes, tuple(range(2, count + 2)))
+    return MeasuredPresses(
+        contact=contact,
+        charge_pC=charge,
+        position_std_mm=np.full(count, position_std_mm),
+        force_std=np.full(count, force_std),
+        electrodes=problem.electrodes,
+        lines=tuple(range(2, count + 2)),
+    )

@@ -1,4 +1,4 @@
-"""calibration.json: unknowns without deviation, the next calibration with --from, and files that are wrong."""
+"""Tests of calibration.json: round trips, a further calibration with --from, and faulty files."""
 
 import json
 from dataclasses import replace
@@ -20,27 +20,31 @@ from isocharge.train.calibration.problem import Warming
 
 
 @pytest.fixture(scope="module")
-def bent(problem):
-    """A calibration with an active discrepancy and no traces: charges with 3 % that no parameter describes."""
+def imperfect(problem):
+    """A calibration by presses whose charges have errors of 3 % that no parameter describes.
+
+    The result has a discrepancy and no traces, so that some unknowns have no variance.
+    """
     _, presses = rig(problem, 20, seed=41)
     x, y, _ = presses.contact.T
-    share = np.column_stack([np.sin(x / 4 + k) * np.cos(y / 5) for k in range(4)])
-    result = calibrate(presses_of(problem, presses.contact, presses.charge_pC * np.exp(0.03 * share)), problem)
+    log_error = 0.03 * np.column_stack([np.sin(x / 4 + k) * np.cos(y / 5) for k in range(4)])
+    charge = presses.charge_pC * np.exp(log_error)
+    result = calibrate(presses_of(problem, presses.contact, charge), problem)
     assert result.posterior.imperfect
     assert (np.diag(result.posterior.joint) == 0.0).any()
     return result
 
 
 @pytest.fixture(scope="module")
-def table(bent):
-    """What its calibration.json holds, with a change of temperature besides."""
-    return json.loads(json.dumps(plain_values(result_table(bent)), allow_nan=False)) | {
-        "temperature": {
-            "at_C": 21.5,
-            "pretension_per_K": {"value": -3e5, "std": 1e5},
-            "correlations": [0.0] * len(bent.posterior.joint),
-        }
+def table(imperfect):
+    """The content of calibration.json of this calibration, with an added change with temperature."""
+    temperature = {
+        "at_C": 21.5,
+        "pretension_per_K": {"value": -3e5, "std": 1e5},
+        "correlations": [0.0] * len(imperfect.posterior.joint),
     }
+    table = json.loads(json.dumps(plain_values(result_table(imperfect)), allow_nan=False))
+    return table | {"temperature": temperature}
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +54,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def read(folder, problem):
-    """Read a table as the calibration.json of an earlier calibration."""
+    """A function that reads a table as the calibration.json of an earlier calibration."""
 
     def read_table(table):
         path = folder / "calibration.json"
@@ -60,73 +64,84 @@ def read(folder, problem):
     return read_table
 
 
-def test_deviations_of_zero_survive_the_round_trip(bent, table, read):
-    joint = bent.posterior.joint
+def test_standard_deviations_of_zero_are_read_back(imperfect, table, read):
+    joint = imperfect.posterior.joint
     film = read(table)
     assert np.array_equal(np.diag(film.joint) == 0.0, np.diag(joint) == 0.0)
     np.testing.assert_allclose(film.joint, joint, atol=1e-5)  # correlations have six digits
-    np.testing.assert_array_equal(film.coefficients, bent.posterior.coefficients)
+    np.testing.assert_array_equal(film.coefficients, imperfect.posterior.coefficients)
     assert np.linalg.eigvalsh(film.joint)[0] > -1e-12
 
 
-def test_null_beside_a_deviation_of_zero_is_read_as_older_versions_wrote_it(bent, table, read):
-    without_variance = np.diag(bent.posterior.joint) == 0.0
+def test_null_as_correlation_of_an_unknown_without_variance_is_read(imperfect, table, read):
+    """Earlier versions wrote null there."""
+    has_no_variance = np.diag(imperfect.posterior.joint) == 0.0
     correlations = np.array(table["discrepancy"]["correlations"])
-    correlations[np.add.outer(without_variance, without_variance)] = np.nan
+    correlations[has_no_variance[:, None] | has_no_variance] = np.nan
     older = table | {"discrepancy": table["discrepancy"] | {"correlations": plain_values(correlations)}}
     np.testing.assert_array_equal(read(older).joint, read(table).joint)
 
 
-def test_calibrate_from_a_film_with_a_discrepancy_and_no_traces(bent, problem, tmp_path, command):
-    """The next presses begin where the last calibration ended."""
+def test_calibrate_continues_from_a_film_with_a_discrepancy(imperfect, problem, tmp_path, command):
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "calibration.json").write_text(json.dumps(plain_values(result_table(bent))))
-    write_presses(tmp_path / "presses.csv", bent.presses[:4])
+    (tmp_path / "mine" / "calibration.json").write_text(json.dumps(plain_values(result_table(imperfect))))
+    write_presses(tmp_path / "presses.csv", imperfect.presses[:4])
     code, out, err = command(
         *("train", "calibrate", tmp_path / "presses.csv", "--sensor", "four-25um-biaxial"),
         *("--from", tmp_path / "mine", "--json"),
     )
     assert code == 0, err
     later = json.loads(out)
-    expected = bent.posterior.drifted(problem.prior)
-    expected_error = bent.sensitivity.contact_error(expected.joint)
+    expected = imperfect.posterior.drifted(problem.prior)
+    expected_error = imperfect.sensitivity.contact_error(expected.joint)
     assert later["error_left_before"]["position_mm"] == pytest.approx(expected_error.position_mm, rel=0.02)
     assert later["error_left"]["position_mm"] < later["error_left_before"]["position_mm"]
     earlier = read_earlier(tmp_path / "mine", problem)
     np.testing.assert_allclose(earlier.joint, expected.joint, atol=1e-5)
 
 
-def test_the_summary_plans_further_presses_once(bent, monkeypatch):
-    """A plan of thirty presses takes seconds; the command, the card and the file all take the summary."""
-    result = replace(bent)  # nothing is remembered yet
-    plans = []
-    monkeypatch.setattr(result_module, "next_presses", lambda *plan: plans.append(plan) or next_presses(*plan))
+def test_summary_plans_further_presses_only_once(imperfect, monkeypatch):
+    """Planning thirty presses takes seconds, and the summary is used by the command, the card and the file."""
+    result = replace(imperfect)  # a copy without cached values
+    planned = []
+
+    def count_plans(*arguments):
+        planned.append(arguments)
+        return next_presses(*arguments)
+
+    monkeypatch.setattr(result_module, "next_presses", count_plans)
     assert result.summary == result.summary
-    assert len(plans) == 1
+    assert len(planned) == 1
 
 
 @st.composite
 def covariances(draw, count):
-    """A covariance of the parameters and the change with temperature, singular or with unknowns without variance."""
+    """Draw a covariance of `count` unknowns, which may be singular, and in which unknowns may have no variance."""
     rank = draw(st.integers(1, count))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     root = rng.standard_normal((count, rank)) * np.geomspace(1e-3, 5.0, count)[:, None]
-    root[rng.random(count) < draw(st.sampled_from([0.0, 0.3, 1.0]))] = 0.0
+    share_without_variance = draw(st.sampled_from([0.0, 0.3, 1.0]))
+    root[rng.random(count) < share_without_variance] = 0.0
     return root @ root.T
 
 
 @settings(deadline=None)
 @given(data=st.data())
-def test_any_covariance_survives_the_round_trip(data, bent, problem, read):
+def test_any_covariance_is_read_back(data, imperfect, problem, read):
+    """The last unknown of the covariance is the change of the pretension with temperature."""
     prior = problem.prior
-    covariance = data.draw(covariances(len(prior.names) + 1))
-    warming = Warming(-0.3, float(np.sqrt(covariance[-1, -1])), 21.5, covariance[-1, :-1])
-    posterior = replace(bent.posterior, covariance=covariance[:-1, :-1], probabilities={}, warming=warming)
+    n_parameter = len(prior.names)
+    joint = data.draw(covariances(n_parameter + 1))
+    covariance = joint[:n_parameter, :n_parameter]
+    warming_covariance = joint[n_parameter, :n_parameter]
+    warming_std = float(np.sqrt(joint[n_parameter, n_parameter]))
+    warming = Warming(-0.3, warming_std, 21.5, warming_covariance)
+    posterior = replace(imperfect.posterior, covariance=covariance, probabilities={}, warming=warming)
     film = read(film_table(prior, posterior))
     std = np.sqrt(np.diag(covariance))
-    tolerance = 1e-5 * np.outer(std, std)  # correlations have six digits
-    assert (np.abs(film.covariance - covariance[:-1, :-1]) <= tolerance[:-1, :-1]).all()
-    assert (np.abs(film.warming.covariance - covariance[-1, :-1]) <= tolerance[-1, :-1]).all()
+    relative_tolerance = 1e-5  # correlations have six digits
+    assert (np.abs(film.covariance - covariance) <= relative_tolerance * np.outer(std, std)).all()
+    assert (np.abs(film.warming.covariance - warming_covariance) <= relative_tolerance * warming_std * std).all()
     np.testing.assert_allclose(film.parameters, posterior.parameters, rtol=1e-12)
 
 
@@ -152,42 +167,53 @@ WRONG_FILES = {
 }
 
 
+"""Path of keys to a value in the file, the faulty value, and the message that names the fault."""
+
+
 @pytest.mark.parametrize("name", WRONG_FILES)
-def test_a_wrong_calibration_file_is_refused_with_the_place_and_the_value(name, table, read):
-    place, value, message = WRONG_FILES[name]
+def test_faulty_calibration_file_is_refused_with_the_key_and_the_value(name, table, read):
+    keys, value, message = WRONG_FILES[name]
     with pytest.raises(PressError, match=message):
-        read(changed(table, place, value))
+        read(with_value(table, keys, value))
 
 
-def test_correlations_that_no_unknowns_have_together_are_refused(table, read):
-    """A is as B, B as C, and A the opposite of C; each number alone is a correlation."""
+def test_correlations_that_contradict_each_other_are_refused(table, read):
+    """The first unknown is correlated with the second, and the second with the third, but not the first with the third.
+
+    Each number alone is a valid correlation.
+    """
     plain = table | {"discrepancy": None, "temperature": None}
     correlations = np.eye(len(plain["correlations"]))
     correlations[:3, :3] = [[1.0, 0.9, -0.9], [0.9, 1.0, 0.9], [-0.9, 0.9, 1.0]]
     with pytest.raises(PressError, match=r"expected a positive semidefinite matrix, got one with the eigenvalue -0\.8"):
         read(plain | {"correlations": correlations.tolist()})
-    with_itself = [1.0, 1.0, *[0.0] * (len(correlations) - 2)]
-    uncorrelated = plain | {"correlations": np.eye(len(correlations)).tolist()}
+
+
+def test_change_with_temperature_cannot_equal_two_uncorrelated_parameters(table, read):
+    count = len(table["correlations"])
+    uncorrelated = table | {"discrepancy": None, "correlations": np.eye(count).tolist()}
+    warming_correlations = [1.0, 1.0, *[0.0] * (count - 2)]
     with pytest.raises(PressError, match="expected a positive semidefinite matrix"):
-        read(uncorrelated | {"temperature": table["temperature"] | {"correlations": with_itself}})
+        read(uncorrelated | {"temperature": table["temperature"] | {"correlations": warming_correlations}})
 
 
-def changed(table, place, value):
-    """A copy of a table with another value in one place."""
-    key, *rest = place
-    inner = changed(table[key], rest, value) if rest else value
+def with_value(table, keys, value):
+    """Return a copy of nested dictionaries and lists with another value at a path of keys."""
+    key, *inner_keys = keys
     copy = dict(table) if isinstance(table, dict) else list(table)
-    copy[key] = inner
+    copy[key] = with_value(table[key], inner_keys, value) if inner_keys else value
     return copy
 
 
-def draw_place(data, table, place=()):
-    """The place of a number, a list or a table within a table."""
-    if place and not (isinstance(table, dict | list) and table and data.draw(st.integers(0, 9))):
-        return place
-    keys = sorted(table) if isinstance(table, dict) else range(len(table))
-    key = data.draw(st.sampled_from(keys))
-    return draw_place(data, table[key], (*place, key))
+def draw_keys(data, table, keys=()):
+    """Draw the path of keys to a value, a list or a dictionary within nested dictionaries and lists."""
+    is_container = isinstance(table, dict | list) and len(table) > 0
+    goes_deeper = not keys or (is_container and data.draw(st.integers(0, 9)) > 0)
+    if not goes_deeper:
+        return keys
+    choices = sorted(table) if isinstance(table, dict) else range(len(table))
+    key = data.draw(st.sampled_from(choices))
+    return draw_keys(data, table[key], (*keys, key))
 
 
 JUNK = st.one_of(
@@ -204,22 +230,24 @@ JUNK = st.one_of(
 
 @settings(deadline=None, max_examples=60)
 @given(data=st.data())
-def test_any_change_of_a_calibration_file_is_refused_or_gives_a_film(data, table, read, problem):
-    """A film that is accepted is finite, and has a covariance that can be one."""
-    used = {key: table[key] for key in ("format_version", "sensor", "parameters", "correlations", "temperature")}
-    plain = used | {"temperature": used["temperature"] | {"correlations": [0.0] * len(used["parameters"])}}
-    base = data.draw(st.sampled_from([plain, used | {"discrepancy": table["discrepancy"]}]))
+def test_any_change_of_a_calibration_file_is_refused_or_gives_a_valid_film(data, table, read, problem):
+    """A valid film has finite parameters and a positive definite covariance after a drift."""
+    read_keys = ("format_version", "sensor", "parameters", "correlations", "temperature")
+    with_temperature = {key: table[key] for key in read_keys}
+    no_correlations = [0.0] * len(table["parameters"])
+    plain = with_temperature | {"temperature": table["temperature"] | {"correlations": no_correlations}}
+    with_discrepancy = with_temperature | {"discrepancy": table["discrepancy"]}
+    changed = data.draw(st.sampled_from([plain, with_discrepancy]))
     for _ in range(data.draw(st.integers(1, 2))):
-        base = changed(base, draw_place(data, base), data.draw(JUNK))
+        changed = with_value(changed, draw_keys(data, changed), data.draw(JUNK))
+    refusal = None
     try:
-        film = read(base)
-    except PressError as refusal:
-        message = str(refusal)
-    else:
-        message = ""
-    if message:
-        assert "calibration.json: " in message
-        assert len(message) < 2000
+        film = read(changed)
+    except PressError as error:
+        refusal = str(error)
+    if refusal is not None:
+        assert "calibration.json: " in refusal
+        assert len(refusal) < 2000
         return
     assert np.isfinite(film.unknowns).all()
     assert np.isfinite(film.unknown_covariance).all()

@@ -1,4 +1,4 @@
-"""A closed back behind the film, recognised by presses of direct solves."""
+"""Tests of the recognition of a closed back behind the film, with directly solved presses."""
 
 from dataclasses import replace
 
@@ -24,10 +24,12 @@ def presses_with(problem: CalibrationProblem, back_volume: float | None, pretens
     contact = draw_contacts(rng, problem.domain.within(7.5), 8)
     film = replace(problem.sensor.film, pretension=pretension, back_volume=back_volume)
     sensor = replace(problem.sensor, film=film)
-    return presses_of(problem, contact, problem.noise.add(kept(charges_of, sensor, contact.tolist()), rng))
+    exact_charge = kept(solved_charges, sensor, contact.tolist())
+    return presses_of(problem, contact, problem.noise.add(exact_charge, rng))
 
 
-def charges_of(sensor, contacts):
+def solved_charges(sensor, contacts):
+    """Solve each press (x, y, F), mm and N, and return the charges, shape (n, n_electrode), pC."""
     return np.array([touch_charge(sensor, press(sensor.film, Circle(1.0), (x, y), force)) for x, y, force in contacts])
 
 

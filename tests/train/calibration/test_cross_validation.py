@@ -1,4 +1,4 @@
-"""Errors of a calibration on presses that were held out, against calibrations that never had these presses."""
+"""Tests of the held-out errors of a calibration, against calibrations without the held-out presses."""
 
 import json
 
@@ -13,13 +13,13 @@ from isocharge.train.calibration.cross_validation import FOLD_COUNT
 from isocharge.train.data.presses import folds_by_place
 from isocharge.train.model_release.evaluate import evaluate
 
-COUNT = 60
+PRESS_COUNT = 60
 
 
 @pytest.fixture(scope="module")
 def session(problem):
-    """Sixty presses on a film that a seed draws, one of them with a wrong place."""
-    truth, presses = rig(problem, COUNT, seed=31)
+    """A film, and sixty presses on it, one of them with a wrong place."""
+    truth, presses = rig(problem, PRESS_COUNT, seed=31)
     presses.contact[7, :2] += 3.0
     return truth, presses
 
@@ -30,31 +30,31 @@ def result(problem, session):
 
 
 def test_held_out_answers_are_those_of_a_calibration_without_the_fold(problem, session, result):
-    """One fold is calibrated from the beginning, with the search for bad presses, by the public function."""
+    """The film is calibrated by the public function to all presses that are not in the first fold."""
     _, presses = session
     good = presses[~result.posterior.bad]
     assert result.bad_lines == (presses.lines[7],)
     held_out = result.held_out
-    judged = np.hypot(good.contact[:, 0], good.contact[:, 1]) <= problem.domain.radius
+    is_judged = np.hypot(good.contact[:, 0], good.contact[:, 1]) <= problem.domain.radius
     low, high = problem.domain.force_range
-    judged &= (good.contact[:, 2] >= low) & (good.contact[:, 2] <= high)
-    np.testing.assert_array_equal(held_out.presses.contact, good.contact[judged])
+    is_judged &= (good.contact[:, 2] >= low) & (good.contact[:, 2] <= high)
+    np.testing.assert_array_equal(held_out.presses.contact, good.contact[is_judged])
 
-    first_fold = np.zeros(len(good), dtype=bool)
-    first_fold[judged] = folds_by_place(good.contact[judged], FOLD_COUNT) == 0
-    independent = calibrate(good[~first_fold], problem)
+    in_first_fold = np.zeros(len(good), dtype=bool)
+    in_first_fold[is_judged] = folds_by_place(good.contact[is_judged], FOLD_COUNT) == 0
+    independent = calibrate(good[~in_first_fold], problem)
     network = independent.fitted_film(independent.posterior.parameters)
-    contact, std, _ = network.predict(good.charge_pC[first_fold])
-    answered = held_out.answers.contact[first_fold[judged]]
-    np.testing.assert_array_less(np.abs(answered - contact), 0.2 * std + 1e-3)
+    expected_contact, std, _ = network.predict(good.charge_pC[in_first_fold])
+    contact = held_out.answers.contact[in_first_fold[is_judged]]
+    np.testing.assert_array_less(np.abs(contact - expected_contact), 0.2 * std + 1e-3)
 
 
 def test_held_out_errors_are_about_those_on_new_presses(problem, session, result):
-    """New presses on the true film, measured with the same errors, which no calibration has seen."""
+    """The new presses are made on the same film and measured with the same errors."""
     truth, _ = session
-    _, fresh = rig(problem, 1000, seed=31)
+    same_film, fresh = rig(problem, 1000, seed=31)
+    assert np.array_equal(same_film, truth)
     contact, _, _ = result.fitted_film(result.posterior.parameters).predict(fresh.charge_pC)
-    assert np.array_equal(problem.prior.draw(np.random.default_rng(31), 1)[0], truth)
     fresh_rms_mm = np.sqrt(np.mean(position_error(contact, fresh.contact) ** 2))
     errors = result.held_out.errors
     assert errors["position_rms_mm"] == pytest.approx(fresh_rms_mm, rel=0.4)

@@ -1,4 +1,4 @@
-"""The folder of a calibrated film: read back by the predictor, the sensor reader and the next calibration."""
+"""Tests of the folder of a calibrated film, which predictor, sensor reader and further calibrations read."""
 
 import json
 import shutil
@@ -8,6 +8,7 @@ import pytest
 from tests.train.calibration.conftest import rig
 
 from isocharge.common.errors import ModelError, PressError
+from isocharge.common.statistics import rms
 from isocharge.serve import Predictor, load_model, read_presses, write_presses
 from isocharge.simulate import Circle, Domain, ForwardMap, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, read_earlier, write_calibration
@@ -20,7 +21,7 @@ CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial")
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory, problem):
-    """A film, presses on it, and the folder of its calibration."""
+    """The true parameters of a film, its calibration by ten presses, and the folder of the calibration."""
     truth, presses = rig(problem, 10, seed=31)
     result = calibrate(presses, problem)
     folder = tmp_path_factory.mktemp("films") / "mine"
@@ -29,25 +30,25 @@ def film(tmp_path_factory, problem):
     return truth, result, folder
 
 
-def test_the_model_is_right_about_the_film(film, problem):
-    """On fresh charges, solved for this film and not by the family, with the model that a user opens."""
+def test_calibrated_model_has_the_expected_errors_on_the_film(film, problem):
+    """The charges come from a forward map that is solved for the true film."""
     truth, result, folder = film
     domain = Domain(5.0, (0.3, 1.0))
     rng = np.random.default_rng(1)
     forward_map = kept(ForwardMap.build, *problem.prior.film(truth), domain.radius, domain.force_range)
-    at = draw_contacts(rng, domain, 400)
-    charge = problem.noise.add(forward_map.charges(at), rng)
+    contact = draw_contacts(rng, domain, 400)
+    charge = problem.noise.add(forward_map.charges(contact), rng)
 
-    def error_mm(model) -> float:
+    def rms_error_mm(model) -> float:
         answer = Predictor(model).predict_batch(charge)
-        return float(np.sqrt(np.mean((answer.x_mm - at[:, 0]) ** 2 + (answer.y_mm - at[:, 1]) ** 2)))
+        return rms(np.hypot(answer.x_mm - contact[:, 0], answer.y_mm - contact[:, 1]))
 
-    expected = np.hypot(result.error_left.position_mm, result.sensitivity.noise_error.position_mm)
-    assert error_mm(folder) < 1.5 * expected
-    assert error_mm("four-25um-biaxial") > 3.0 * error_mm(folder)
+    expected_mm = np.hypot(result.error_left.position_mm, result.sensitivity.noise_error.position_mm)
+    assert rms_error_mm(folder) < 1.5 * expected_mm
+    assert rms_error_mm("four-25um-biaxial") > 3.0 * rms_error_mm(folder)
 
 
-def test_every_file_is_there_and_reads_back(film, problem):
+def test_all_files_are_written_and_read_back(film, problem):
     _, result, folder = film
     table = json.loads((folder / "calibration.json").read_text("utf-8"))
     assert table["error_left"]["position_mm"] == pytest.approx(result.error_left.position_mm)
@@ -63,7 +64,7 @@ def test_every_file_is_there_and_reads_back(film, problem):
     load_model(folder / "1")
 
 
-def test_what_is_read_is_what_was_written_but_for_drift(film, problem):
+def test_earlier_calibration_is_read_with_the_uncertainty_of_a_drift(film, problem):
     _, result, folder = film
     earlier = read_earlier(folder, problem)
     expected = result.posterior.drifted(problem.prior)
@@ -71,22 +72,24 @@ def test_what_is_read_is_what_was_written_but_for_drift(film, problem):
     np.testing.assert_allclose(earlier.covariance, expected.covariance, atol=2e-6)  # correlations have six digits
 
 
-def test_deviations_cover_what_is_left_of_the_film(film, problem):
-    """At each contact that which is left there, beside the noise; the network follows that within some percent."""
+def test_standard_deviations_include_the_uncertainty_of_the_film(film, problem):
+    """The variance of x is the sum of the variance by noise and of the variance by the uncertainty of the film."""
     _, result, folder = film
     contact = result.sensitivity.contact
-    left = result.sensitivity.contact_covariance(result.posterior.joint)
     charge = problem.charges.charges(result.posterior.unknowns, contact)
-    plain = problem.films.fold(result.posterior.parameters).predict(charge)[1]
-    ratio = Predictor(folder).predict_batch(charge).x_std_mm / np.hypot(plain[:, 0], np.sqrt(left[:, 0, 0]))
-    assert np.median(np.abs(np.log(ratio))) < 0.03
-    assert np.abs(np.log(ratio)).max() < 0.5
+    _, noise_std, _ = problem.films.fold(result.posterior.parameters).predict(charge)
+    film_covariance = result.sensitivity.contact_covariance(result.posterior.joint)
+    expected_std = np.sqrt(noise_std[:, 0] ** 2 + film_covariance[:, 0, 0])
+    log_ratio = np.log(Predictor(folder).predict_batch(charge).x_std_mm / expected_std)
+    assert np.median(np.abs(log_ratio)) < 0.03
+    assert np.abs(log_ratio).max() < 0.5
 
 
-def test_a_folder_of_something_else_is_left_alone(film, tmp_path):
+def test_folder_with_other_files_is_refused_and_not_changed(film, tmp_path):
+    _, result, _ = film
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(ModelError, match="expected a new folder or one of an earlier calibration"):
-        write_calibration(film[1], tmp_path)
+        write_calibration(result, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
@@ -98,54 +101,64 @@ def test_a_damaged_earlier_calibration_is_refused(problem, tmp_path, text):
 
 
 def test_an_earlier_calibration_of_another_sensor_is_refused(film):
+    _, _, folder = film
     other = CalibrationProblem.of(load_sensor("three-25um-biaxial"), Circle(1.0))
     with pytest.raises(PressError, match="expected 'three-25um-biaxial'"):
-        read_earlier(film[-1], other)
+        read_earlier(folder, other)
 
 
-def test_the_command_says_what_is_known_and_where_to_press(film, command):
-    folder = film[-1]
+def test_command_prints_the_remaining_error_and_the_next_presses(film, command):
+    _, _, folder = film
     code, out, err = command(*CALIBRATE, folder.parent / "presses.csv", "--next", 2)
     assert code == 0, err
     assert "The uncertainty of the film causes errors of" in out
     assert out.count("\npress ") == 2
     table = json.loads(command(*CALIBRATE, folder.parent / "presses.csv", "--json", "--from", folder)[1])
-    assert (table["presses"], table["next"]) == (10, [])
+    assert table["presses"] == 10
+    assert table["next"] == []
 
 
-def test_the_next_calibration_is_the_next_version_and_what_lies_above_is_repaired(
-    film, problem, tmp_path, command, refused
-):
-    """Killed between the version and the files above it: nothing above, a draft, or the files of an older version."""
+@pytest.fixture
+def interrupted(film, tmp_path):
+    """A folder as a killed process leaves it: a whole version, an unfinished draft, and old copies of its files."""
+    _, _, folder = film
+    interrupted = tmp_path / "mine"
+    shutil.copytree(folder / "1", interrupted / "1")
+    (interrupted / ".0a1b2c3d.draft").mkdir()
+    (interrupted / "calibration.json").write_text("of an older version")
+    return interrupted
+
+
+def test_folder_of_a_killed_process_is_repaired_and_locked(film, problem, interrupted, refused):
     _, result, folder = film
-    presses = folder.parent / "presses.csv"
-    killed = tmp_path / "mine"
-    shutil.copytree(folder / "1", killed / "1")
-    (killed / ".0a1b2c3d.draft").mkdir()
-    (killed / "calibration.json").write_text("of an older version")
-    assert read_earlier(killed, problem).parameters == pytest.approx(result.posterior.parameters)
-    with calibration_folder(killed, problem):
-        assert (killed / "sensor.toml").read_bytes() == (killed / "1" / "sensor.toml").read_bytes()
-        assert (killed / "calibration.json").read_bytes() == (killed / "1" / "calibration.json").read_bytes()
-        refused(*CALIBRATE, presses, "-o", killed, message="another process is at work", code=1)
-    assert not list(killed.glob(".*"))
-    assert command(*CALIBRATE, presses, "-o", killed)[0] == 0
-    assert (killed / "calibration.json").read_bytes() == (killed / "2" / "calibration.json").read_bytes()
-    assert (killed / "1" / "model.onnx").read_bytes() == (folder / "1" / "model.onnx").read_bytes()
-    assert Predictor(killed).metadata.version == 2
+    assert read_earlier(interrupted, problem).parameters == pytest.approx(result.posterior.parameters)
+    with calibration_folder(interrupted, problem):
+        for name in ("sensor.toml", "calibration.json"):
+            assert (interrupted / name).read_bytes() == (interrupted / "1" / name).read_bytes()
+        presses = folder.parent / "presses.csv"
+        refused(*CALIBRATE, presses, "-o", interrupted, message="another process is at work", code=1)
+    assert not list(interrupted.glob(".*"))
 
 
-def test_a_folder_is_checked_before_anything_is_read(film, tmp_path, refused):
-    """Presses that are not there are not asked for, if the calibration could not be written."""
-    shutil.copytree(film[-1], tmp_path / "copy")
-    for name, message in (
-        ("my film", "model name 'my film'"),
-        ("copy", "names the model 'mine', its folder is 'copy'"),
-    ):
-        refused(*CALIBRATE, tmp_path / "none.csv", "-o", tmp_path / name, message=message)
+def test_next_calibration_is_the_next_version(film, interrupted, command):
+    _, _, folder = film
+    assert command(*CALIBRATE, folder.parent / "presses.csv", "-o", interrupted)[0] == 0
+    assert (interrupted / "calibration.json").read_bytes() == (interrupted / "2" / "calibration.json").read_bytes()
+    assert (interrupted / "1" / "model.onnx").read_bytes() == (folder / "1" / "model.onnx").read_bytes()
+    assert Predictor(interrupted).metadata.version == 2
 
 
-def test_presses_are_proposed_before_the_first(command):
-    proposed = json.loads(command(*CALIBRATE, "--next", 3, "--json")[1])["next"]
+def test_output_folder_is_checked_before_the_presses_are_read(film, tmp_path, refused):
+    """The file of presses does not exist, and the error is about the output folder."""
+    _, _, folder = film
+    shutil.copytree(folder, tmp_path / "copy")
+    missing = tmp_path / "none.csv"
+    refused(*CALIBRATE, missing, "-o", tmp_path / "my film", message="model name 'my film'")
+    refused(*CALIBRATE, missing, "-o", tmp_path / "copy", message="names the model 'mine', its folder is 'copy'")
+
+
+def test_presses_are_proposed_without_a_first_press(command):
+    _, out, _ = command(*CALIBRATE, "--next", 3, "--json")
+    proposed = json.loads(out)["next"]
     assert [*proposed[0]] == ["x_mm", "y_mm", "force_N", "position_mm", "force_percent"]
     assert proposed[2]["position_mm"] < proposed[0]["position_mm"]

@@ -1,4 +1,4 @@
-"""The forward map as a series, against the simulator; its folds; the nearest contact, against SciPy."""
+"""Tests of the charge series against the simulator, of its folds, and of the nearest contact against SciPy."""
 
 import re
 from dataclasses import replace
@@ -8,6 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from isocharge.common.errors import DatasetError, TrainingError
+from isocharge.common.statistics import rms
 from isocharge.serve.model.charge_series import read_charges
 from isocharge.simulate import Domain, Electrode, Sweep, noise_model, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
@@ -23,23 +24,33 @@ from isocharge.train.training.source import TrainingData
 DOMAIN = Domain(8.0, (0.05, 2.0))
 
 
-def test_charges_agree_with_the_simulator(trained, film):
-    field = trained.split.field
+@pytest.fixture(scope="module")
+def field(trained):
+    """The charge series of a training."""
+    return trained.split.field
+
+
+@pytest.fixture(scope="module")
+def held_out_presses(trained):
+    """The presses on which the errors of the training are measured."""
+    return trained.split.test
+
+
+def test_charges_agree_with_the_simulator(field, film):
     contact = draw_contacts(np.random.default_rng(8), DOMAIN, 500)
-    error = np.abs(field.charges(contact) / film.charges(contact) - 1.0)
-    assert np.median(error) < 2e-4
-    assert np.sqrt(np.mean(error**2)) < 2.0 * field.error
+    relative_error = np.abs(field.charges(contact) / film.charges(contact) - 1.0)
+    assert np.median(relative_error) < 2e-4
+    assert np.sqrt(np.mean(relative_error**2)) < 2.0 * field.error
 
 
-def test_the_derivatives_are_those_of_the_charges(trained):
-    field = trained.split.field  # the series ends at its domain's ends
-    inner = Domain(7.0, (0.06, 1.9))
+def test_derivatives_are_finite_differences_of_the_charges(field):
+    inner = Domain(7.0, (0.06, 1.9))  # differences need charges on both sides of a contact
     contact = draw_contacts(np.random.default_rng(3), inner, 200)
     expected = differences(field.charges, contact, steps=(1e-3, 1e-3, 1e-4))
     assert np.allclose(field.derivatives(contact), expected, rtol=1e-4, atol=1e-2)
 
 
-def test_too_few_presses():
+def test_too_few_presses_are_refused():
     few = LabelledPresses(draw_contacts(np.random.default_rng(0), DOMAIN, 50), np.ones((50, 3)))
     with pytest.raises(TrainingError, match="expected at least 448 presses"):
         ChargeField.fit(DOMAIN, ("A", "B", "C"), few, few)
@@ -52,21 +63,35 @@ TINY = FitConfig(
 REFERENCE = noise_model("reference")
 
 
-def field_of(charges, noise=0.0):
+def fit_field(charges, relative_noise=0.0):
+    """Fit a charge series to 3,000 presses.
+
+    Args:
+        charges: Function from x, y and F, shape (n,) each, to charges, shape (n, n_electrode).
+        relative_noise: Standard deviation of the logarithms of the charges.
+
+    Returns:
+        The series and the presses.
+    """
     rng = np.random.default_rng(0)
-    domain = Domain(8.0, (0.05, 2.0))
-    contact = draw_contacts(rng, domain, 3000)
-    charge = charges(*contact.T)
-    presses = LabelledPresses(contact, charge * np.exp(noise * rng.standard_normal(charge.shape)))
-    held = np.arange(3000) % 6 == 0
-    return ChargeField.fit(domain, ("A", "B", "C"), presses[~held], presses[held]), presses
+    contact = draw_contacts(rng, DOMAIN, 3000)
+    x, y, force = contact.T
+    exact_charge = charges(x, y, force)
+    charge = exact_charge * np.exp(relative_noise * rng.standard_normal(exact_charge.shape))
+    presses = LabelledPresses(contact, charge)
+    is_validation = np.arange(3000) % 6 == 0
+    return ChargeField.fit(DOMAIN, ("A", "B", "C"), presses[~is_validation], presses[is_validation]), presses
 
 
-def folded_at(fold):
-    """ln Q_1 - ln Q_0 = 0.1 (x - x^2 / (2 fold)): its slope changes sign at x = fold."""
+def charges_folded_at(fold_x):
+    """Return a function from contacts to charges whose map folds at x = `fold_x`.
+
+    The logarithm of the second charge is 0.1 (x - x^2 / (2 fold_x)), whose slope changes its sign there.
+    """
 
     def charges(x, y, force):
-        return force[:, None] ** 0.7 * np.exp(np.stack([0 * x, 0.1 * (x - x**2 / (2 * fold)), 0.1 * y], axis=1))
+        log_ratios = np.stack([0.0 * x, 0.1 * (x - x**2 / (2.0 * fold_x)), 0.1 * y], axis=1)
+        return force[:, None] ** 0.7 * np.exp(log_ratios)
 
     return charges
 
@@ -78,143 +103,144 @@ def test_field_of_a_taut_film_follows_the_change_of_the_exponent_of_the_force():
         growth = force / np.cbrt(1.0 + force / 0.3)
         return 500.0 * growth[:, None] * np.exp(0.05 * np.stack([x + y, x - y, -x], axis=1))
 
-    field, presses = field_of(charges)
-    error = field.charges(presses.contact) / presses.charge - 1.0
-    assert np.sqrt(np.mean(error**2)) < 1e-3
+    field, presses = fit_field(charges)
+    relative_error = field.charges(presses.contact) / presses.charge - 1.0
+    assert rms(relative_error) < 1e-3
     assert field.error < 1e-3
 
 
-@pytest.mark.parametrize("fold", [2.0, 5.0])
-def test_a_fold_at_a_known_place_ends_the_domain(fold):
-    field, presses = field_of(folded_at(fold))
+@pytest.mark.parametrize("fold_x", [2.0, 5.0])
+def test_domain_is_reduced_to_a_fold(fold_x):
+    field, presses = fit_field(charges_folded_at(fold_x))
     domain, (caution,) = invertible_domain(field, presses, REFERENCE)
-    assert domain.radius == pytest.approx(fold, abs=0.11)
+    assert domain.radius == pytest.approx(fold_x, abs=0.11)
     assert domain.force_range == field.domain.force_range
     assert f"folds beyond {domain.radius:g} mm" in caution
     assert f"on {len(presses.within(domain.radius))} of 3000 presses" in caution
 
 
-def test_a_fold_outside_the_domain_is_none_of_its_concern():
-    field, presses = field_of(folded_at(9.0))
+def test_domain_is_not_reduced_by_a_fold_outside():
+    field, presses = fit_field(charges_folded_at(9.0))
     assert invertible_domain(field, presses, REFERENCE) == (field.domain, ())
 
 
-def test_where_hardly_anything_is_left_it_is_refused():
+def test_fold_near_the_centre_is_refused():
+    field, presses = fit_field(charges_folded_at(1.2))
     with pytest.raises(DatasetError, match=r"folds 1\.\d+ mm from the centre, of 8 mm asked for"):
-        invertible_domain(*field_of(folded_at(1.2)), REFERENCE)
+        invertible_domain(field, presses, REFERENCE)
 
 
-@pytest.mark.parametrize(("fold", "seen"), [(2.0, ["2"]), (30.0, [])])
-def test_noisy_charges_show_a_fold_but_not_for_certain(fold, seen):
-    """Measured charges, 0.3 % of noise: the same map, whose fold is reported and not cut off."""
-    field, presses = field_of(folded_at(fold), noise=3e-3)
+@pytest.mark.parametrize(("fold_x", "reported_mm"), [(2.0, [2.0]), (30.0, [])])
+def test_fold_of_noisy_charges_is_reported_without_reducing_the_domain(fold_x, reported_mm):
+    field, presses = fit_field(charges_folded_at(fold_x), relative_noise=3e-3)
     domain, cautions = invertible_domain(field, presses, REFERENCE)
     assert domain.radius == 8.0
-    assert [f"{float(caution.split()[10]):.0f}" for caution in cautions] == seen
+    distances_mm = [float(re.search(r"seems to fold about (\S+) mm", caution)[1]) for caution in cautions]
+    assert distances_mm == pytest.approx(reported_mm, abs=0.5)
 
 
-def crossing(x, y, force):
-    """ln Q along a nodal cubic (u^2, u^3 - a^2 u): x = 3 mm and x = -3 mm have the same charges, and nothing folds."""
+def charges_along_a_nodal_cubic(x, y, force):
+    """Return charges, of which those at x = 3 mm and x = -3 mm are equal although the map has no fold.
+
+    The logarithms of two charges are the coordinates (u^2, u^3 - a^2 u) of a nodal cubic, which crosses itself.
+    """
     u = 0.1 * x
-    v = 0.1 * y
-    return 1e4 * force[:, None] ** 0.7 * np.exp(np.stack([0 * u, u**2, u * (u**2 - 0.09), v], axis=1))
+    log_ratios = np.stack([0.0 * u, u**2, u * (u**2 - 0.09), 0.1 * y], axis=1)
+    return 1e4 * force[:, None] ** 0.7 * np.exp(log_ratios)
 
 
 def test_contacts_far_apart_with_the_same_charges_are_a_caution():
-    field, presses = field_of(crossing)
+    field, presses = fit_field(charges_along_a_nodal_cubic)
     domain, (caution,) = invertible_domain(field, presses, REFERENCE)
     assert domain.radius == 8.0
     assert caution.startswith("contacts far apart can have the same charges: 0.05 N at (")
-    places = np.array([float(x) for x in re.findall(r"at \((\S+),", caution)])
-    assert np.sort(places) == pytest.approx([-3.0, 3.0], abs=0.5)
-    assert not invertible_domain(replace(field, error=1e-2), presses, REFERENCE)[1]  # too poor to decide
+    x_mm = [float(x) for x in re.findall(r"at \((\S+),", caution)]
+    assert sorted(x_mm) == pytest.approx([-3.0, 3.0], abs=0.5)
 
 
-def swept(folder, film, samples, sensor, radius=8.0):
-    """A dataset of another sensor on the same film, whose equilibria serve all layouts and readouts."""
-    sweep = Sweep(samples=samples, radius=radius)
-    return read_dataset(write_sweep(folder / "presses", (replace(film, sensor=sensor),), sweep))
+def test_a_poor_fit_reports_no_contacts_with_the_same_charges():
+    field, presses = fit_field(charges_along_a_nodal_cubic)
+    _, cautions = invertible_domain(replace(field, error=1e-2), presses, REFERENCE)
+    assert cautions == ()
 
 
-def layout(sensor, *centres):
-    squares = (Electrode.of_square(name, centre, 3.0) for name, centre in zip("ABCDE", centres, strict=False))
-    return replace(sensor, electrodes=tuple(squares))
-
-
-def test_a_fit_across_a_fold_is_in_log_card_and_metadata(film, sensor, tmp_path, caplog):
-    """One of three electrodes at the centre, where the map folds at once (0.2 mm by `identify`)."""
-    central = layout(sensor, (0.0, 0.0), (8.66, 5.0), (-8.66, 5.0))
-    model = release(fit(swept(tmp_path, film, 2_000, central), TINY), tmp_path / "models" / "centre")
-    caution, *_ = caplog.messages  # a network that learned so little may say so
+def test_caution_about_a_fold_is_in_log_card_and_metadata(film, sensor, tmp_path, caplog):
+    """One of the three electrodes is at the centre, where the map folds at a distance of about 0.2 mm."""
+    centres = {"A": (0.0, 0.0), "B": (8.66, 5.0), "C": (-8.66, 5.0)}
+    electrodes = tuple(Electrode.of_square(name, centre, 3.0) for name, centre in centres.items())
+    forward_map = replace(film, sensor=replace(sensor, electrodes=electrodes))
+    dataset = read_dataset(write_sweep(tmp_path / "presses", (forward_map,), Sweep(samples=2_000, radius=8.0)))
+    model = release(fit(dataset, TINY), tmp_path / "models" / "centre")
+    caution, *_ = caplog.messages  # further messages may be about the short training
     assert "seems to fold about 0." in caution or "seems to fold about 1." in caution
     assert model.metadata.made_with["cautions"] == [caution]
     assert f"- {caution}." in (model.folder / "card.md").read_text("utf-8")
 
 
-def test_where_the_map_folds_for_certain_the_charges_of_all_contacts_go_beside_the_model(sensor, trained, tmp_path):
+def test_charge_series_of_the_whole_domain_is_released_if_the_domain_is_reduced(sensor, trained, tmp_path):
     contact = draw_contacts(np.random.default_rng(0), DOMAIN, 3000)
-    presses = LabelledPresses(contact, 1000.0 * folded_at(5.0)(*contact.T))
+    presses = LabelledPresses(contact, 1000.0 * charges_folded_at(5.0)(*contact.T))
     data = TrainingData(sensor=sensor, probes=("circle:1.0",), domain=DOMAIN, presses=presses, sha256="0" * 64)
     fitted = fit(data, TINY)
     (tmp_path / "charges.npz").write_bytes(fitted.provenance.files["charges.npz"])
-    known = read_charges(tmp_path, 3)
-    charge, _ = known.linearised(np.column_stack([contact[:, :2], np.log(contact[:, 2])]))
+    series = read_charges(tmp_path, 3)
+    charge, _ = series.linearised(np.column_stack([contact[:, :2], np.log(contact[:, 2])]))
     assert np.allclose(charge, presses.charge, rtol=2e-3)
-    assert fitted.domain.radius < 5.2 < known.radius_mm
+    assert fitted.domain.radius < 5.2 < series.radius_mm
     assert "'serve stream --track' follows contacts to 8 mm" in fitted.cautions[0]
     assert trained.split.folded_charges is None
 
 
-NOISE = noise_model("reference")
 FAULTS = {
-    "noisy": lambda charge, rng: NOISE.add(charge, rng),
+    "noisy": lambda charge, rng: REFERENCE.add(charge, rng),
     "wrong gain": lambda charge, _: charge * [1.0, 1.3, 1.0],
     "far too hard": lambda charge, _: 4.0 * charge,
     "dead electrode": lambda charge, _: np.maximum(charge * [1.0, 0.0, 1.0], 1.0),
     "anything": lambda charge, rng: 10.0 ** rng.uniform(0.0, 4.0, charge.shape),
 }
+"""Functions that give charges a fault, by the name of the fault."""
 
 
-@pytest.fixture(scope="module")
-def field(trained):
-    return trained.split.field
+def scipy_distance(field, charge, start):
+    """Minimise the distance |(Q - Q(c)) / sigma| of a charge from those of the contacts in the domain with SciPy.
 
+    Args:
+        field: Charge series.
+        charge: The charge Q, shape (n_electrode,), pC.
+        start: Contact at which the search starts, in unit coordinates, shape (3,).
+    """
+    sigma = REFERENCE.sigma(charge)
 
-@pytest.fixture(scope="module")
-def held(trained):
-    return trained.split.test
+    def squared_distance(unit):
+        contact = field.domain.to_contact(unit[None])
+        residual = (charge - field.charges(contact)[0]) / sigma
+        return float((residual**2).sum())
 
-
-def by_scipy(field, charge, start):
-    """min over the domain of |(Q - Q(c)) / sigma|, the disk and the range of forces as constraints."""
-    sigma = np.hypot(1.0, 0.002 * charge)
-
-    def square(unit):
-        return float((((charge - field.charges(field.domain.to_contact(unit[None]))[0]) / sigma) ** 2).sum())
-
-    inside = {"type": "ineq", "fun": lambda unit: 1.0 - unit[0] ** 2 - unit[1] ** 2}
+    in_disk = {"type": "ineq", "fun": lambda unit: 1.0 - unit[0] ** 2 - unit[1] ** 2}
     bounds = [(-1, 1), (-1, 1), (-1, 1)]
-    found = minimize(square, start, bounds=bounds, constraints=inside, options={"ftol": 1e-12})
-    return np.sqrt(square(into_domain(found.x[None])[0]))  # it may end a little outside
+    result = minimize(squared_distance, start, bounds=bounds, constraints=in_disk, options={"ftol": 1e-12})
+    [solution] = into_domain(result.x[None])  # SciPy may return a point slightly outside the disk
+    return np.sqrt(squared_distance(solution))
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_nobody_finds_a_nearer_one(field, held, fault):
+def test_scipy_finds_no_nearer_contact(field, held_out_presses, fault):
     rng = np.random.default_rng(1)
-    charge = FAULTS[fault](held.charge[:12], rng)
-    contact, residual = search(field, charge, NOISE.sigma(charge), starts=3)
-    assert np.allclose(residual, (charge - field.charges(contact)) / np.hypot(1.0, 0.002 * charge), atol=1e-8)
-    assert ((np.hypot(contact[:, 0], contact[:, 1]) <= 8.0) & (contact[:, 2] >= 0.05) & (contact[:, 2] <= 2.0)).all()
-    for row, found in enumerate(np.linalg.norm(residual, axis=1)):
+    charge = FAULTS[fault](held_out_presses.charge[:12], rng)
+    contact, residual = search(field, charge, REFERENCE.sigma(charge), starts=3)
+    assert np.allclose(residual, (charge - field.charges(contact)) / REFERENCE.sigma(charge), atol=1e-8)
+    assert DOMAIN.contains(contact).all()
+    for row, distance in enumerate(np.linalg.norm(residual, axis=1)):
         starts = [field.domain.to_unit(contact)[row], *into_domain(rng.uniform(-0.7, 0.7, (3, 3)))]
-        best = min(by_scipy(field, charge[row], start) for start in starts)
-        assert found <= best + 0.01 + 1e-3 * best
+        smallest = min(scipy_distance(field, charge[row], start) for start in starts)
+        assert distance <= smallest + 0.01 + 1e-3 * smallest
 
 
-def test_examples_are_of_all_kinds_and_good_ones_are_near(field, trained):
-    """A third are presses with their noise: three charges explain nearly all of it, so these are near."""
-    (charge, residual), again = (draw_misfit_examples(trained.split.train, field, NOISE, 600, seed=1) for _ in range(2))
-    np.testing.assert_array_equal(again, [charge, residual])
+def test_misfit_examples_are_reproducible_and_have_small_and_large_misfits(field, trained):
+    """A third of the examples are presses with noise, whose misfits are small."""
+    charge, residual = draw_misfit_examples(trained.split.train, field, REFERENCE, 600, seed=1)
+    repeated = draw_misfit_examples(trained.split.train, field, REFERENCE, 600, seed=1)
+    np.testing.assert_array_equal(repeated, [charge, residual])
     distance = np.linalg.norm(residual, axis=1)
     assert 0.3 < np.mean(distance < 3.0) < 0.8
     assert np.mean(distance > 100.0) > 0.1

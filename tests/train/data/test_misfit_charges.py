@@ -19,20 +19,21 @@ def solved_charges(touches):
     """Return the charges of touches at the same time from the independent solver, shape (n_electrode,), pC."""
     solution = solve_touches(Membrane(), touches)
     piezo = SENSOR.piezo
-    return np.array([solution.charge(np.array(e.corners), piezo.d31, piezo.d32) for e in SENSOR.electrodes])
+    corners = [np.array(electrode.corners) for electrode in SENSOR.electrodes]
+    return np.array([solution.charge(pad_corners, piezo.d31, piezo.d32) for pad_corners in corners])
 
 
 def test_two_presses_at_one_place_are_a_press_with_the_sum_of_the_forces():
     """On a slack membrane, the charge grows with the force to the power 2/3."""
-    place = np.array([[300.0, 100.0, -20.0]])
-    first = place * 0.3 ** (2.0 / 3.0)
-    second = place * 0.5 ** (2.0 / 3.0)
-    np.testing.assert_allclose(combined_charge(first, second, 1.5), place * 0.8 ** (2.0 / 3.0))
+    charge_at_1_N = np.array([[300.0, 100.0, -20.0]])
+    first = charge_at_1_N * 0.3 ** (2.0 / 3.0)
+    second = charge_at_1_N * 0.5 ** (2.0 / 3.0)
+    np.testing.assert_allclose(combined_charge(first, second, 1.5), charge_at_1_N * 0.8 ** (2.0 / 3.0))
     np.testing.assert_allclose(combined_charge(first, second, 1.0), first + second)
 
 
 def test_charges_of_pairs_lie_between_those_of_the_two_exponents():
-    """Pairs that are solved with both loads at once, by an independent solver. The sum of the charges is too large."""
+    """The pairs are solved with both loads at once by an independent solver."""
     smallest_exponent, largest_exponent = PAIR_EXPONENTS
     for pair in PAIRS:
         first, second = (solved_charges([touch])[None] for touch in pair)
@@ -48,7 +49,10 @@ def test_the_independent_solver_agrees_with_the_simulator_for_one_touch():
 
 
 def test_examples_of_presses_outside_the_working_area_have_the_exact_misfit():
-    """Presses inside have the charges 100 pC times the force; the press outside has 900 pC on one electrode."""
+    """Presses inside have the same charge on all electrodes, and the press outside has 900 pC on one electrode.
+
+    The nearest contact of the press outside therefore has the same charge on all electrodes.
+    """
 
     class ProportionalMap:
         electrodes = ("A", "B", "C")
@@ -65,5 +69,5 @@ def test_examples_of_presses_outside_the_working_area_have_the_exact_misfit():
     outside = np.array([[100.0, 100.0, 900.0]])
     charge, residual = draw_outside_examples(outside, ProportionalMap(), NOISE, 400, 1, candidates=64)
     assert np.all(np.abs(charge / outside - 1.0) < 0.12)
-    nearest = charge - residual * NOISE.sigma(charge)
-    np.testing.assert_allclose(nearest, nearest[:, :1] * np.ones(3), rtol=1e-3)  # a press inside
+    nearest_charge = charge - residual * NOISE.sigma(charge)
+    np.testing.assert_allclose(nearest_charge, nearest_charge[:, :1] * np.ones(3), rtol=1e-3)

@@ -1,4 +1,4 @@
-"""Which presses train and which measure; of measured ones, the one split that every command makes."""
+"""Tests of the split of presses into training and test presses, and of the checks of datasets."""
 
 from dataclasses import replace
 
@@ -15,41 +15,59 @@ from isocharge.train.training.source import TrainingData
 
 
 def with_samples(dataset, **columns):
+    """Return a dataset with other values in some columns of its samples."""
     return replace(dataset, samples=replace(dataset.samples, **columns))
 
 
-def test_no_position_is_on_both_sides_and_the_seed_alone_decides(dataset):
-    positions = np.random.default_rng(0).integers(0, 400, len(dataset.samples))
-    repeated = with_samples(
-        dataset, x_mm=dataset.samples.x_mm[positions], y_mm=dataset.samples.y_mm[positions]
-    )  # many forces at each of 400 positions
-    train, held = split_by_position(presses_of(repeated), 0.2, seed=3)
-    seen, kept = ({tuple(row) for row in part.contact[:, :2]} for part in (train, held))
-    assert not seen & kept
-    assert len(train) + len(held) == len(dataset.samples)
-    assert len(kept) == pytest.approx(0.2 * len(seen | kept), abs=1)
-    again, other = (split_by_position(presses_of(repeated), 0.2, seed)[1].contact for seed in (3, 4))
-    assert np.array_equal(again, held.contact)
-    assert not np.array_equal(other, held.contact)
+def positions_of(contact):
+    """Return the set of the positions (x, y) of contacts, mm."""
+    return {tuple(position) for position in contact[:, :2]}
 
 
-def test_the_domain_is_what_the_manifest_says_or_the_samples_show(dataset):
+@pytest.fixture(scope="module")
+def repeated_positions(dataset):
+    """The presses of the dataset, moved to 400 positions with many forces at each."""
+    position = np.random.default_rng(0).integers(0, 400, len(dataset.samples))
+    samples = dataset.samples
+    return presses_of(with_samples(dataset, x_mm=samples.x_mm[position], y_mm=samples.y_mm[position]))
+
+
+def test_split_puts_each_position_into_one_part(repeated_positions):
+    train, test = split_by_position(repeated_positions, 0.2, seed=3)
+    train_positions = positions_of(train.contact)
+    test_positions = positions_of(test.contact)
+    assert not train_positions & test_positions
+    assert len(train) + len(test) == len(repeated_positions)
+    assert len(test_positions) == pytest.approx(0.2 * len(train_positions | test_positions), abs=1)
+
+
+def test_split_depends_on_the_seed_only(repeated_positions):
+    _, test = split_by_position(repeated_positions, 0.2, seed=3)
+    _, same_seed = split_by_position(repeated_positions, 0.2, seed=3)
+    _, other_seed = split_by_position(repeated_positions, 0.2, seed=4)
+    assert np.array_equal(same_seed.contact, test.contact)
+    assert not np.array_equal(other_seed.contact, test.contact)
+
+
+def test_domain_is_that_of_the_manifest_or_of_the_samples(dataset):
     assert domain_of(dataset) == Domain(8.0, (0.05, 2.0))
     samples = dataset.samples
-    reach = np.hypot(samples.x_mm, samples.y_mm).max()
-    forces = (samples.force_N.min(), samples.force_N.max())
-    assert domain_of(replace(dataset, manifest={})) == Domain(reach, forces)
+    largest_distance = np.hypot(samples.x_mm, samples.y_mm).max()
+    force_range = (samples.force_N.min(), samples.force_N.max())
+    assert domain_of(replace(dataset, manifest={})) == Domain(largest_distance, force_range)
     with pytest.raises(DatasetError, match="do not hold the samples"):
         domain_of(replace(dataset, manifest={"ranges": {"radius_mm": 5.0}}))
 
 
-def changed(dataset, value):
+def with_one_charge(dataset, value):
+    """Return a dataset with another charge of the electrode B in sample 17."""
     charge = dataset.samples.charge_pC.copy()
     charge[17, 1] = value
     return with_samples(dataset, charge_pC=charge)
 
 
-def few(dataset):
+def first_hundred(dataset):
+    """Return a dataset with the first hundred samples of another one."""
     columns = {name: column[:100] for name, column in dataset.samples.columns().items()}
     return replace(dataset, samples=Samples(**columns))
 
@@ -57,7 +75,7 @@ def few(dataset):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (few, "expected at least 500 presses at 50 positions, got 100 at 100"),
+        (first_hundred, "expected at least 500 presses at 50 positions, got 100 at 100"),
         (lambda d: with_samples(d, x_mm=0.0 * d.samples.x_mm, y_mm=0.0 * d.samples.y_mm), "got 6000 at 1"),
         (lambda d: with_samples(d, charge_pC=d.samples.charge_pC[:, :2]), "at least three electrodes"),
         (lambda d: with_samples(d, force_N=-d.samples.force_N), "sample 0: expected a positive force, got -"),
@@ -65,10 +83,11 @@ def few(dataset):
             lambda d: with_samples(d, charge_pC=d.samples.charge_pC * [1, 0, 1]),
             "electrode 'B': expected charges that vary",
         ),
-        (lambda d: changed(d, np.nan), r"sample 17: expected finite numbers, .*nan.* pC"),
+        (lambda d: with_one_charge(d, np.nan), r"sample 17: expected finite numbers, .*nan.* pC"),
     ],
+    ids=["few presses", "one position", "two electrodes", "negative forces", "dead electrode", "NaN"],
 )
-def test_presses_that_cannot_train_are_refused(dataset, change, message):
+def test_dataset_that_a_network_cannot_be_trained_on_is_refused(dataset, change, message):
     with pytest.raises(DatasetError, match=message):
         presses_of(change(dataset))
 
@@ -76,11 +95,15 @@ def test_presses_that_cannot_train_are_refused(dataset, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: changed(d, 1e30), r"^sample 17, column 'B': expected a value of the size of the others.*got 1e\+30"),
-        (lambda d: changed(d, 1e39), r"^sample 17, column 'B': expected a charge in pC, got 1e\+39"),
+        (
+            lambda d: with_one_charge(d, 1e30),
+            r"^sample 17, column 'B': expected a value of the size of the others.*got 1e\+30",
+        ),
+        (lambda d: with_one_charge(d, 1e39), r"^sample 17, column 'B': expected a charge in pC, got 1e\+39"),
         (lambda d: with_samples(d, charge_pC=d.samples.charge_pC[:, [0, 0, 2]]), "channels 'A', 'B': expected charges"),
         (lambda d: with_samples(d, charge_pC=1e-310 * d.samples.charge_pC), "channel 'A': expected charges in pC"),
     ],
+    ids=["large charge", "impossible charge", "copied channel", "tiny charges"],
 )
 def test_a_measured_dataset_with_a_fault_is_refused(dataset, change, message):
     measured = replace(dataset, manifest={})
@@ -89,48 +112,60 @@ def test_a_measured_dataset_with_a_fault_is_refused(dataset, change, message):
         TrainingData.of(change(measured))
 
 
-def contacts(count: int, seed: int) -> np.ndarray:
+def random_contacts(count: int, seed: int) -> np.ndarray:
+    """Return random contacts (x, y, F), shape (count, 3), mm and N."""
     rng = np.random.default_rng(seed)
     return np.column_stack([rng.uniform(-6, 6, (count, 2)), rng.uniform(0.05, 2.0, count)])
 
 
-def presses(contact: np.ndarray, charge: np.ndarray) -> MeasuredPresses:
+def measured_presses(contact: np.ndarray, charge: np.ndarray) -> MeasuredPresses:
+    """Return measured presses with standard deviations of 0.1 mm and 1 % of the force."""
     count = len(contact)
     return MeasuredPresses(
-        contact, charge, np.full(count, 0.1), np.full(count, 0.01), ("A", "B", "C"), tuple(range(2, count + 2))
+        contact=contact,
+        charge_pC=charge,
+        position_std_mm=np.full(count, 0.1),
+        force_std=np.full(count, 0.01),
+        electrodes=("A", "B", "C"),
+        lines=tuple(range(2, count + 2)),
     )
 
 
 @given(count=st.integers(50, 300), seed=st.integers(0, 999), forces=st.integers(1, 5))
 @settings(max_examples=40, deadline=None)
-def test_the_split_keeps_positions_together_and_does_not_hang_on_the_order(count, seed, forces):
-    contact = np.repeat(contacts(count, seed), forces, axis=0)
-    held = held_out(contact)
-    assert held.sum() >= max(10, 0.2 * len(contact))
-    assert held.sum() <= max(10, 0.2 * len(contact)) + forces
-    assert not {tuple(p) for p in contact[held, :2]} & {tuple(p) for p in contact[~held, :2]}
+def test_held_out_presses_are_whole_positions_and_do_not_depend_on_the_order(count, seed, forces):
+    contact = np.repeat(random_contacts(count, seed), forces, axis=0)
+    is_held_out = held_out(contact)
+    expected_count = max(10, 0.2 * len(contact))
+    assert expected_count <= is_held_out.sum() <= expected_count + forces
+    assert not positions_of(contact[is_held_out]) & positions_of(contact[~is_held_out])
     order = np.random.default_rng(seed).permutation(len(contact))
-    assert np.array_equal(held_out(contact[order]), held[order])
+    assert np.array_equal(held_out(contact[order]), is_held_out[order])
 
 
-def test_presses_held_out_of_all_are_first_to_be_held_out_of_a_part():
-    contact = contacts(400, 1)
-    part = contact[np.hypot(*contact[:, :2].T) < 5.0]
-    held = {tuple(row) for row in contact[held_out(contact)]}
-    of_part = {tuple(row) for row in part[held_out(part)]}
-    assert len(of_part & held) >= min(len(of_part), len(held & {tuple(row) for row in part}))
+def test_held_out_presses_of_a_part_are_also_held_out_of_all_presses():
+    """The part has fewer held-out presses, or more of them than there are held-out presses of all in this part."""
+    contact = random_contacts(400, 1)
+    part = contact[np.hypot(contact[:, 0], contact[:, 1]) < 5.0]
+    held_out_of_all = {tuple(row) for row in contact[held_out(contact)]}
+    held_out_of_part = {tuple(row) for row in part[held_out(part)]}
+    in_part = {tuple(row) for row in part}
+    n_expected = min(len(held_out_of_part), len(held_out_of_all & in_part))
+    assert len(held_out_of_part & held_out_of_all) >= n_expected
 
 
-def test_a_simulated_dataset_is_not_measured(dataset, sensor):
+def test_simulated_and_measured_datasets_are_distinguished(dataset, sensor):
     assert not is_measured(dataset)
-    assert is_measured(dataset_of(presses(contacts(60, 2), np.ones((60, 3))), sensor, Circle(1.0)))
+    presses = measured_presses(random_contacts(60, 2), np.ones((60, 3)))
+    assert is_measured(dataset_of(presses, sensor, Circle(1.0)))
 
 
-def test_unknown_places_and_charges_do_not_count(sensor):
-    contact = contacts(55, 3)
+def test_presses_with_unknown_places_forces_or_charges_are_left_out(sensor):
+    contact = random_contacts(55, 3)
     charge = np.ones((55, 3))
-    contact[0, 2] = charge[1, 0] = np.nan
-    assert len(dataset_of(presses(contact, charge), sensor, Circle(1.0)).samples) == 53
+    contact[0, 2] = np.nan
+    charge[1, 0] = np.nan
+    assert len(dataset_of(measured_presses(contact, charge), sensor, Circle(1.0)).samples) == 53
     contact[2:7, :2] = np.nan
     with pytest.raises(PressError, match=r"at least 50 presses .* got 48 of 55.*train calibrate"):
-        dataset_of(presses(contact, charge), sensor, Circle(1.0))
+        dataset_of(measured_presses(contact, charge), sensor, Circle(1.0))

@@ -1,10 +1,10 @@
-"""From measured presses to a model: judged by presses of a film that is not the described one, and by nothing else."""
+"""Tests of models for a described film that is corrected by measured presses, on presses that were held out."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.train.rig.conftest import DOMAIN, measured, systematic
+from tests.train.rig.conftest import DOMAIN, measured_presses, systematic_error
 
 from isocharge.common.errors import PressError
 from isocharge.serve import Predictor, check_presses, read_presses
@@ -22,7 +22,7 @@ PROBE = Circle(1.0)
 
 @pytest.fixture(scope="module", autouse=True)
 def solved_once():
-    """The described film is solved once for all tests of this file."""
+    """Solve the described film once for all tests of this file."""
     build = ForwardMap.build
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ForwardMap, "build", lambda *arguments: kept(build, *arguments))
@@ -31,26 +31,27 @@ def solved_once():
 
 @pytest.fixture(scope="module")
 def model(truth, tmp_path_factory):
-    """Trained without a network for all films: the presses correct the sensor as described."""
-    data = rig_data(Rig(measured(truth, 300), DESCRIBED, PROBE), drawn=4000)
+    """A released model of the described film, corrected by measured presses, after a short training."""
+    data = rig_data(Rig(measured_presses(truth, 300), DESCRIBED, PROBE), drawn=4000)
     return release(fit(data, TINY), tmp_path_factory.mktemp("models") / "rig")
 
 
-def test_the_errors_are_what_serve_check_says_of_presses_that_nobody_trained_on(model, truth):
-    presses = measured(truth, 300)
-    seen, held = (read_presses(model.folder / name) for name in ("presses.csv", "held_out.csv"))
-    assert held == presses[held_out(presses.contact)]
-    assert seen == presses[~held_out(presses.contact)]
-    check = check_presses(Predictor(model.folder), held)
+def test_stated_errors_are_those_of_serve_check_on_the_held_out_presses(model, truth):
+    presses = measured_presses(truth, 300)
+    is_held_out = held_out(presses.contact)
+    training_presses = read_presses(model.folder / "presses.csv")
+    held_out_presses = read_presses(model.folder / "held_out.csv")
+    assert training_presses == presses[~is_held_out]
+    assert held_out_presses == presses[is_held_out]
+    check = check_presses(Predictor(model.folder), held_out_presses)
     errors = model.metadata.errors
-    assert errors["measured_presses"] == len(held) == check.compared >= 10
-    message = [errors[name] for name in ("position_rms_mm", "position_median_mm", "force_rms_percent")]
-    assert message == pytest.approx(
-        [check.position_mm.rms, check.position_mm.median, check.force_percent.rms], rel=1e-3
-    )
+    assert errors["measured_presses"] == len(held_out_presses) == check.compared >= 10
+    assert errors["position_rms_mm"] == pytest.approx(check.position_mm.rms, rel=1e-3)
+    assert errors["position_median_mm"] == pytest.approx(check.position_mm.median, rel=1e-3)
+    assert errors["force_rms_percent"] == pytest.approx(check.force_percent.rms, rel=1e-3)
 
 
-def test_card_and_metadata_say_that_it_was_fitted_to_measurements(model):
+def test_card_and_metadata_state_the_measured_presses(model):
     card = (model.folder / "card.md").read_text("utf-8")
     errors = model.metadata.errors
     assert f"## Errors on {errors['measured_presses']:.0f} measured presses that were not used in the training" in card
@@ -59,20 +60,23 @@ def test_card_and_metadata_say_that_it_was_fitted_to_measurements(model):
     assert measurement["trained_on"] + measurement["held_out"] == 300
 
 
-def test_the_model_is_right_about_the_film_and_not_about_the_described_one(model, truth):
-    """On clean charges of the true film, which neither training nor card has seen."""
+def test_errors_are_smaller_on_the_measured_film_than_on_the_described_film(model, truth):
+    """The charges are those of new contacts without noise."""
     contact = draw_contacts(np.random.default_rng(77), DOMAIN.within(7.0), 500)
-    error = {}
-    for name, forward_map in (("true", truth), ("described", replace(truth, sensor=DESCRIBED))):
-        charge = forward_map.charges(contact) * np.exp(systematic(contact))
+
+    def median_error_mm(forward_map):
+        """Return the median position error on a film with the systematic error."""
+        charge = forward_map.charges(contact) * np.exp(systematic_error(contact))
         answer = Predictor(model.folder).predict_batch(charge)
-        error[name] = np.median(np.hypot(answer.x_mm - contact[:, 0], answer.y_mm - contact[:, 1]))
-    assert error["true"] < 0.3
-    assert error["described"] > 2.0 * error["true"]
+        return np.median(np.hypot(answer.x_mm - contact[:, 0], answer.y_mm - contact[:, 1]))
+
+    measured_film_error_mm = median_error_mm(truth)
+    assert measured_film_error_mm < 0.3
+    assert median_error_mm(replace(truth, sensor=DESCRIBED)) > 2.0 * measured_film_error_mm
 
 
-def test_what_does_not_count_is_said_and_too_few_presses_are_refused(truth, caplog):
-    presses = measured(truth, 60)
+def test_unusable_presses_are_logged_and_too_few_presses_are_refused(truth, caplog):
+    presses = measured_presses(truth, 60)
     presses.contact[:3, 0] = 30.0
     presses.charge_pC[3, 1] = np.nan
     assert len(rig_data(Rig(presses, DESCRIBED, PROBE), drawn=1000).test) >= 10

@@ -1,4 +1,4 @@
-"""Correlations of a network: against Cholesky factors, against SciPy, and against a known covariance."""
+"""Tests of the correlations of a network against Cholesky factors, SciPy, and a known covariance."""
 
 from dataclasses import replace
 
@@ -35,6 +35,7 @@ def correlation_matrices(correlations):
 
 
 def matrices_of_angles(angles):
+    """Return the correlation matrices, shape (n, 3, 3), of angles of shape (n, 3), rad."""
     return correlation_matrices(np.cos(angles @ ANGLE_SUMS) @ COSINES_TO_CORRELATIONS)
 
 
@@ -75,14 +76,14 @@ def test_the_gradient_of_the_loss_is_its_finite_difference(rng):
     np.testing.assert_allclose(gradient.ravel(), approx_fprime(angles, loss), atol=1e-6)
 
 
-def test_known_correlations_are_found_and_the_other_answers_stay(trained, rng, caplog):
-    """The true contacts are drawn about the network's answers, with correlations that depend on the charges."""
+def test_known_correlations_are_found_and_the_other_outputs_do_not_change(trained, rng, caplog):
+    """The true contacts are drawn around the contacts of the network, with correlations that depend on the charges."""
     network = fold_network(trained.network)
     charge = trained.split.train.charge
     no_noise = replace(noise_model("reference"), white=0.0, gain=0.0)
     contact, std, _ = network.predict(charge)
-    ratio = np.tanh(np.log(charge[:, 0] / charge[:, 1]))
-    true_correlations = np.stack([0.9 * ratio, np.full_like(ratio, 0.5), 0.4 * ratio], axis=1)
+    charge_ratio = np.tanh(np.log(charge[:, 0] / charge[:, 1]))  # from -1 to 1
+    true_correlations = np.stack([0.9 * charge_ratio, np.full_like(charge_ratio, 0.5), 0.4 * charge_ratio], axis=1)
     factor = np.linalg.cholesky(correlation_matrices(true_correlations))
     error = (factor @ rng.standard_normal((len(charge), 3, 1)))[..., 0] * std
     true_force = contact[:, 2] * np.exp(error[:, 2] / contact[:, 2])

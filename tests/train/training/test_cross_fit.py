@@ -1,4 +1,4 @@
-"""Models of measured presses alone, of a sensor whose least error is known in closed form."""
+"""Tests of models of measured presses alone, for a sensor whose smallest error is known in closed form."""
 
 import re
 from dataclasses import replace
@@ -12,6 +12,7 @@ from isocharge.common.measured_presses import write_presses
 from isocharge.serve import Contact, MeasuredPresses, Predictor, find_model, load_model, read_presses
 from isocharge.serve.prediction.press_check import check_presses
 from isocharge.simulate import Domain
+from isocharge.simulate.numerics.polygon import area_of
 from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, evaluate, fit_presses
 from isocharge.train.data.channel_noise import ChannelNoise
 from isocharge.train.data.measured_sensor import PressedArea, outline
@@ -26,232 +27,310 @@ QUICK = FitConfig(
     training=TrainingConfig(steps=400, misfit_steps=400, misfit_charges=6_000, batch=256),
 )
 SLOPES = np.array([[0.6, 0.1, 2.0], [-0.5, 0.4, 1.0], [0.1, -0.6, 2.0], [0.2, 0.2, -4.0]])
-"""d(Q)/d(x, y, ln F), pC/mm and pC: half of the charges are negative."""
+"""Derivatives of the charges with respect to (x, y, ln F), shape (4, 3), pC/mm and pC. Half of the charges are
+negative."""
 
-NOISE = np.array([0.3, 0.2, 0.3, 0.4])
+NOISE_pC = np.array([0.3, 0.2, 0.3, 0.4])
+"""Standard deviation of the white noise of each channel, pC."""
+
+FORCES_N = (0.2, 5.0)
+"""Smallest and largest force of the presses, N."""
 
 
-def contacts(count, seed):
-    """On an L of 1,200 mm^2, whose middle is not the origin; 0.2 to 5 N."""
+def draw_forces(rng, count):
+    """Draw log-uniform forces, shape (count,), N."""
+    return np.exp(rng.uniform(*np.log(FORCES_N), count))
+
+
+def linear_charges(contact, centre_mm):
+    """Return charges without noise, shape (n, 4), pC, that are linear in x, y and ln F.
+
+    Args:
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        centre_mm: Position at which a force of 1 N gives no charge.
+    """
+    return np.column_stack([contact[:, :2] - centre_mm, np.log(contact[:, 2])]) @ SLOPES.T
+
+
+def contacts_on_l(count, seed):
+    """Draw contacts on an area with the shape of an L, of 1,200 mm^2, whose middle is not the origin."""
     rng = np.random.default_rng(seed)
-    place = rng.uniform((0.0, -25.0), (40.0, 15.0), (3 * count, 2))
-    place = place[(place[:, 0] < 20.0) | (place[:, 1] < -5.0)][:count]
-    return np.column_stack([place, np.exp(rng.uniform(*np.log([0.2, 5.0]), count))])
+    square = rng.uniform((0.0, -25.0), (40.0, 15.0), (3 * count, 2))
+    is_on_l = (square[:, 0] < 20.0) | (square[:, 1] < -5.0)
+    return np.column_stack([square[is_on_l][:count], draw_forces(rng, count)])
 
 
-def charges(contact, seed):
-    """Linear in x, y and ln F, with white noise."""
-    noise = NOISE * np.random.default_rng(seed).standard_normal((len(contact), 4))
-    return np.column_stack([contact[:, :2] - [20.0, -5.0], np.log(contact[:, 2])]) @ SLOPES.T + noise
+def charges_on_l(contact, seed):
+    """Return the charges of contacts on the L with white noise, shape (n, 4), pC."""
+    noise = NOISE_pC * np.random.default_rng(seed).standard_normal((len(contact), 4))
+    return linear_charges(contact, [20.0, -5.0]) + noise
 
 
-def measured(contact, charge, names=("Q1", "Q2", "Q3", "Q4")):
-    stds = np.full(len(contact), 0.05), np.full(len(contact), 0.005)
-    return MeasuredPresses(contact, charge, *stds, names, tuple(range(2, len(contact) + 2)))
+def measured_presses(contact, charge, names=("Q1", "Q2", "Q3", "Q4")):
+    """Return measured presses with standard deviations of 0.05 mm and 0.5 % of the force."""
+    count = len(contact)
+    return MeasuredPresses(
+        contact=contact,
+        charge_pC=charge,
+        position_std_mm=np.full(count, 0.05),
+        force_std=np.full(count, 0.005),
+        electrodes=names,
+        lines=tuple(range(2, count + 2)),
+    )
 
 
-def l_shaped():
-    contact = contacts(1_200, 0)
-    return measured(contact, charges(contact, 1))
+def presses_on_l():
+    """Return the presses on the L with which the network is trained."""
+    contact = contacts_on_l(1_200, 0)
+    return measured_presses(contact, charges_on_l(contact, 1))
 
 
-def made():
-    return fit_presses(l_shaped(), "pad", QUICK)
+def fit_to_l():
+    """Train a network on the presses on the L."""
+    return fit_presses(presses_on_l(), "pad", QUICK)
 
 
 @pytest.fixture(scope="module")
-def alone():
-    return kept(made)
+def fitted_pad():
+    """The network that was trained on the presses on the L."""
+    return kept(fit_to_l)
 
 
 @pytest.fixture(scope="module")
 def fresh():
-    contact = contacts(4_000, 2)
-    return LabelledPresses(contact, charges(contact, 3), measured=True)
+    """Presses on the L that were not used in the training."""
+    contact = contacts_on_l(4_000, 2)
+    return LabelledPresses(contact, charges_on_l(contact, 3), measured=True)
 
 
-def test_the_noise_is_learned(alone):
-    np.testing.assert_allclose(alone.noise.sigma(np.zeros((1, 4)))[0], NOISE, rtol=0.1)
-    assert (alone.noise.gain < 0.03).all()
+def test_the_noise_of_the_channels_is_estimated(fitted_pad):
+    np.testing.assert_allclose(fitted_pad.noise.sigma(np.zeros((1, 4)))[0], NOISE_pC, rtol=0.1)
+    assert (fitted_pad.noise.gain < 0.03).all()
 
 
-def test_errors_are_those_of_the_least_variance(alone, fresh):
-    """Weighted least squares; edges tell a network where presses cannot be, so it may be a little better."""
-    least = np.linalg.inv(SLOPES.T @ np.diag(NOISE**-2.0) @ SLOPES)
-    errors = evaluate(alone, fresh)
-    assert errors["position_rms_mm"] == pytest.approx(np.sqrt(least[0, 0] + least[1, 1]), rel=0.12)
-    assert errors["force_rms_percent"] == pytest.approx(100.0 * np.sqrt(least[2, 2]), rel=0.12)
+def test_errors_are_those_of_weighted_least_squares(fitted_pad, fresh):
+    """Weighted least squares has the smallest variance of all linear estimators.
+
+    The network may have slightly smaller errors, because it learns the edges of the area.
+    """
+    x_variance, y_variance, force_variance = np.diag(np.linalg.inv(SLOPES.T @ np.diag(NOISE_pC**-2.0) @ SLOPES))
+    errors = evaluate(fitted_pad, fresh)
+    assert errors["position_rms_mm"] == pytest.approx(np.sqrt(x_variance + y_variance), rel=0.12)
+    assert errors["force_rms_percent"] == pytest.approx(100.0 * np.sqrt(force_variance), rel=0.12)
 
 
-def test_errors_and_intervals_hold_for_presses_at_other_places(alone, fresh):
-    stated = evaluate(alone)
-    true = evaluate(alone, fresh)
-    assert stated["position_rms_mm"] == pytest.approx(true["position_rms_mm"], rel=0.08)
-    assert true["coverage_68"] == pytest.approx(0.683, abs=0.04)
-    assert true["coverage_95"] == pytest.approx(0.95, abs=0.02)
+def test_errors_and_intervals_hold_for_presses_at_other_places(fitted_pad, fresh):
+    stated_errors = evaluate(fitted_pad)
+    fresh_errors = evaluate(fitted_pad, fresh)
+    assert stated_errors["position_rms_mm"] == pytest.approx(fresh_errors["position_rms_mm"], rel=0.08)
+    assert fresh_errors["coverage_68"] == pytest.approx(0.683, abs=0.04)
+    assert fresh_errors["coverage_95"] == pytest.approx(0.95, abs=0.02)
 
 
-def test_charges_of_no_press_have_a_large_misfit(alone, fresh):
-    limit = evaluate(alone)["misfit_p99"]
-    assert np.mean(alone.predict(fresh.charge)[2] > limit) < 0.03
-    off = fresh.charge + 15.0 * NOISE * np.linalg.svd(SLOPES / NOISE[:, None])[0][:, 3]  # across the map's image
-    assert np.mean(alone.predict(off)[2] > limit) > 0.97
+def test_charges_that_no_press_gives_have_a_large_misfit(fitted_pad, fresh):
+    limit = evaluate(fitted_pad)["misfit_p99"]
+    _, _, misfit = fitted_pad.predict(fresh.charge)
+    assert np.mean(misfit > limit) < 0.03
+    # The last left singular vector is perpendicular to all charges that contacts give.
+    left_singular_vectors, _, _ = np.linalg.svd(SLOPES / NOISE_pC[:, None])
+    impossible_charge = fresh.charge + 15.0 * NOISE_pC * left_singular_vectors[:, 3]
+    _, _, large_misfit = fitted_pad.predict(impossible_charge)
+    assert np.mean(large_misfit > limit) > 0.97
 
 
-def test_the_released_model_is_served_and_checked(alone, fresh, tmp_path, command, monkeypatch):
-    """By the command, from a file of presses."""
-    monkeypatch.setattr(fit_command, "fit_presses", lambda *_, probes, **__: replace(alone, probes=probes))
-    write_presses(tmp_path / "pad.csv", l_shaped())
+@pytest.fixture
+def released_pad(fitted_pad, tmp_path, command, monkeypatch):
+    """The version folder that `isocharge train fit` writes from a file of presses."""
+    monkeypatch.setattr(fit_command, "fit_presses", lambda *_, probes, **__: replace(fitted_pad, probes=probes))
+    write_presses(tmp_path / "pad.csv", presses_on_l())
     assert command("train", "fit", tmp_path / "pad.csv", "-o", tmp_path / "pad")[0] == 0
-    folder = tmp_path / "pad" / "1"
-    predictor = Predictor(folder)
-    presses = measured(fresh.contact[:200], fresh.charge[:200])
-    np.testing.assert_allclose(predictor.predict(fresh.charge[0])[:3], alone.predict(fresh.charge[:1])[0][0], rtol=1e-3)
-    assert check_presses(predictor, presses).fits
+    return tmp_path / "pad" / "1"
+
+
+def test_fit_command_releases_a_model_of_measured_presses(fitted_pad, fresh, released_pad):
+    predictor = Predictor(released_pad)
+    expected_contact, _, _ = fitted_pad.predict(fresh.charge[:1])
+    np.testing.assert_allclose(predictor.predict(fresh.charge[0])[:3], expected_contact[0], rtol=1e-3)
+    assert check_presses(predictor, measured_presses(fresh.contact[:200], fresh.charge[:200])).fits
     assert predictor.metadata.sensor == {"name": "pad", "electrodes": ["Q1", "Q2", "Q3", "Q4"]}
-    assert read_presses(folder / "presses.csv") == l_shaped()
-    card = (folder / "card.md").read_text()
-    errors = predictor.metadata.errors
-    assert f"```bash\n{predictor.metadata.made_with['command']}\n```" in card
-    assert {"| fitted to | 1200 presses at 1200 places, in `presses.csv` |", "| probes | unknown |"} <= {
-        *card.splitlines()
-    }
-    message = re.findall(r"(?:\| \S+ and|intervals \|) (\S+) %", card)
-    expected = [*alone.noise.gain, errors["coverage_68"], errors["coverage_95"]]
-    np.testing.assert_allclose(np.array(message, float), 100.0 * np.array(expected), rtol=1e-2)
+    assert read_presses(released_pad / "presses.csv") == presses_on_l()
 
 
-def presses_off_the_origin(count, seed):
-    """On a pad with x from 0 to 60 mm and y from -15 to 15 mm, charges linear in place and ln F."""
+def test_card_of_a_model_of_measured_presses_states_noise_and_coverage(fitted_pad, released_pad):
+    metadata = Predictor(released_pad).metadata
+    card = (released_pad / "card.md").read_text()
+    assert f"```bash\n{metadata.made_with['command']}\n```" in card
+    assert "\n| fitted to | 1200 presses at 1200 places, in `presses.csv` |\n" in card
+    assert "\n| probes | unknown |\n" in card
+    percentages = re.findall(r"(?:\| \S+ and|intervals \|) (\S+) %", card)
+    expected = [*fitted_pad.noise.gain, metadata.errors["coverage_68"], metadata.errors["coverage_95"]]
+    np.testing.assert_allclose(np.array(percentages, float), 100.0 * np.array(expected), rtol=1e-2)
+
+
+LONG_PAD_CENTRE_mm = (30.0, 0.0)
+"""Centre of a pad with x from 0 to 60 mm and y from -15 to 15 mm, so that the origin lies on its edge."""
+
+
+def presses_on_long_pad(count, seed):
+    """Draw presses on the long pad, with charges that are linear in x, y and ln F."""
     rng = np.random.default_rng(seed)
     place = rng.uniform((0.0, -15.0), (60.0, 15.0), (count, 2))
-    contact = np.column_stack([place, np.exp(rng.uniform(*np.log([0.2, 5.0]), count))])
-    centred = np.column_stack([place - [30.0, 0.0], np.log(contact[:, 2])])
-    return measured(contact, centred @ SLOPES.T + NOISE * rng.standard_normal((count, 4)))
+    contact = np.column_stack([place, draw_forces(rng, count)])
+    noise = NOISE_pC * rng.standard_normal((count, 4))
+    return measured_presses(contact, linear_charges(contact, LONG_PAD_CENTRE_mm) + noise)
 
 
-def made_off_the_origin():
-    return fit_presses(presses_off_the_origin(900, 7), "long-pad", QUICK)
+def fit_to_long_pad():
+    """Train a network on presses on the long pad."""
+    return fit_presses(presses_on_long_pad(900, 7), "long-pad", QUICK)
 
 
 @pytest.fixture(scope="module")
 def long_pad(tmp_path_factory):
-    """The folder of a model of a pad whose area begins at the origin."""
+    """The folder of a model of the long pad."""
     folder = tmp_path_factory.mktemp("models") / "long-pad"
-    release(kept(made_off_the_origin), folder)
+    release(kept(fit_to_long_pad), folder)
     return folder
 
 
-def test_an_area_that_begins_at_the_origin_holds_its_own_presses():
-    contact = presses_off_the_origin(900, 7).contact
+def test_pressed_area_contains_its_own_presses_and_no_others():
+    contact = presses_on_long_pad(900, 7).contact
     area = PressedArea.of(contact)
     assert area.contains(contact).all()
     area.check(np.array([[50.0, 0.0, 1.0]]), "pad")
-    beside = np.array([[-20.0, 0.0, 1.0], [50.0, 20.0, 1.0], [50.0, 0.0, 9.0], [np.nan, 0.0, 1.0]])
-    assert not area.contains(beside).any()
+    outside = np.array([[-20.0, 0.0, 1.0], [50.0, 20.0, 1.0], [50.0, 0.0, 9.0], [np.nan, 0.0, 1.0]])
+    assert not area.contains(outside).any()
     with pytest.raises(SceneError, match=r"press 0 at \(-20, 0\) mm .* in the pressed area, x from -\d.* to 6\d"):
-        area.check(beside, "pad")
+        area.check(outside, "pad")
 
 
-def test_the_domain_of_a_released_pad_is_its_area(long_pad):
-    """Not the largest disk about the origin in it, which has 2 mm here."""
-    about = Predictor(long_pad).metadata
-    domain = model_domain(about)
-    trained = kept(made_off_the_origin).domain
-    assert domain == trained
-    contact = presses_off_the_origin(900, 7).contact
-    assert domain.contains(contact).all()
-    disk = load_model(find_model("three-25um-biaxial")).metadata
-    assert model_domain(disk) == Domain(pytest.approx(8.0, abs=0.1), disk.force_range_N)
+def test_domain_of_a_released_model_is_the_pressed_area(long_pad):
+    domain = model_domain(Predictor(long_pad).metadata)
+    assert domain == kept(fit_to_long_pad).domain
+    assert domain.contains(presses_on_long_pad(900, 7).contact).all()
 
 
-def test_a_pad_that_begins_at_the_origin_is_answered_and_flagged_where_it_lies(long_pad):
-    """(50, 0) is on the pad, (-20, 0) is nearer to the origin and beside it."""
+def test_domain_of_a_released_model_of_a_film_is_a_disk():
+    metadata = load_model(find_model("three-25um-biaxial")).metadata
+    assert model_domain(metadata) == Domain(pytest.approx(8.0, abs=0.1), metadata.force_range_N)
+
+
+def test_contacts_on_a_pad_beside_the_origin_are_estimated_and_not_flagged(long_pad):
+    """The flags depend on the pressed area and not on the distance from the origin."""
     predictor = Predictor(long_pad)
-    places = np.array([[50.0, 0.0, 1.0], [5.0, -10.0, 1.0], [-20.0, 0.0, 1.0]])
-    charge = np.column_stack([places[:, :2] - [30.0, 0.0], np.log(places[:, 2])]) @ SLOPES.T
-    answers = predictor.predict_batch(charge)
-    assert np.hypot(answers.x_mm - places[:, 0], answers.y_mm - places[:, 1])[:2].max() < 3.0
-    flags = predictor.validity.batch_flags(answers)
+    on_pad = np.array([[50.0, 0.0, 1.0], [5.0, -10.0, 1.0]])
+    beside_pad = np.array([[-20.0, 0.0, 1.0]])
+    charge = linear_charges(np.concatenate([on_pad, beside_pad]), LONG_PAD_CENTRE_mm)
+    contacts = predictor.predict_batch(charge)
+    assert np.hypot(contacts.x_mm[:2] - on_pad[:, 0], contacts.y_mm[:2] - on_pad[:, 1]).max() < 3.0
+    flags = predictor.validity.batch_flags(contacts)
     assert flags == [predictor.flags(predictor.predict(row)) for row in charge]
     assert flags[:2] == [(), ()]
-    on_pad = Contact(50.0, 0.0, 1.0, 0.1, 0.1, 0.1, 0.1)
-    assert predictor.flags(on_pad._replace(x_mm=-20.0)) == ("outside",)
-    radius = np.hypot(30.0, 15.0)
-    assert predictor.flags(on_pad._replace(x_mm=30.0 + 2.8 * radius)) == ("outside",)
-    assert predictor.flags(on_pad._replace(x_mm=30.0 + 3.5 * radius)) == ("outside", "beyond")
-    assert predictor.flags(on_pad._replace(x_mm=30.0 - 3.5 * radius)) == ("outside", "beyond")
     assert "positions from (-" in repr(predictor)
-    check = check_presses(predictor, presses_off_the_origin(200, 8))
-    assert check.fits
+    assert check_presses(predictor, presses_on_long_pad(200, 8)).fits
 
 
-def test_the_outline_is_that_of_the_area():
-    place = np.stack(np.meshgrid(np.arange(11.0), np.arange(11.0)), axis=-1).reshape(-1, 2)
-    assert sorted(map(tuple, outline(place))) == [(-0.5, -0.5), (-0.5, 10.5), (10.5, -0.5), (10.5, 10.5)]
-    x, y = outline(contacts(2_000, 4)[:, :2]).T
-    assert 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) == pytest.approx(1200.0, rel=0.05)
-    assert PressedArea.of(np.pad(place, ((0, 0), (0, 1)), constant_values=1.0)).radius == pytest.approx(5.5 * 2**0.5)
+def test_flags_of_contacts_depend_on_the_distance_from_the_centre_of_the_pad(long_pad):
+    predictor = Predictor(long_pad)
+    contact = Contact(50.0, 0.0, 1.0, 0.1, 0.1, 0.1, 0.1)
+    centre_mm, _ = LONG_PAD_CENTRE_mm
+    radius = np.hypot(30.0, 15.0)
+    assert predictor.flags(contact._replace(x_mm=-20.0)) == ("outside",)
+    assert predictor.flags(contact._replace(x_mm=centre_mm + 2.8 * radius)) == ("outside",)
+    assert predictor.flags(contact._replace(x_mm=centre_mm + 3.5 * radius)) == ("outside", "beyond")
+    assert predictor.flags(contact._replace(x_mm=centre_mm - 3.5 * radius)) == ("outside", "beyond")
+
+
+def test_outline_of_a_square_grid_is_larger_by_half_the_grid_step():
+    places = np.stack(np.meshgrid(np.arange(11.0), np.arange(11.0)), axis=-1).reshape(-1, 2)
+    assert sorted(map(tuple, outline(places))) == [(-0.5, -0.5), (-0.5, 10.5), (10.5, -0.5), (10.5, 10.5)]
+    contact = np.column_stack([places, np.ones(len(places))])
+    assert PressedArea.of(contact).radius == pytest.approx(5.5 * np.sqrt(2.0))
+
+
+def test_outline_of_the_l_has_its_area():
+    corners = outline(contacts_on_l(2_000, 4)[:, :2])
+    assert area_of(corners) == pytest.approx(1200.0, rel=0.05)
+
+
+def test_places_on_a_line_have_no_outline():
     with pytest.raises(PressError, match="expected presses over an area"):
         outline(np.column_stack([np.arange(9.0), np.arange(9.0)]))
 
 
-def test_one_force_and_channels_that_are_mostly_zero():
-    contact = contacts(600, 6) * [1.0, 1.0, 0.0] + [0.0, 0.0, 2.0]
+def test_pressed_area_of_presses_with_one_force_has_a_range_of_forces():
+    contact = contacts_on_l(600, 6)
+    contact[:, 2] = 2.0
     low, high = PressedArea.of(contact).force_range
     assert low < 2.0 < high
-    charge = np.where(np.random.default_rng(7).random((600, 4)) < 0.6, 0.0, charges(contact, 8))
+
+
+def test_noise_of_channels_that_are_mostly_zero_is_finite():
+    contact = contacts_on_l(600, 6)
+    contact[:, 2] = 2.0
+    is_zero = np.random.default_rng(7).random((600, 4)) < 0.6
+    charge = np.where(is_zero, 0.0, charges_on_l(contact, 8))
     noise = ChannelNoise.of(charge, PressedArea.of(contact).to_unit(contact))
     np.testing.assert_allclose(noise.charge(noise.level(charge)), charge, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(noise.bend(np.abs(charge)), noise.bend(-np.abs(charge)))
     assert np.isfinite(WhitenedFeatures.fit_signed(charge, noise.bend(charge)).matrix).all()
 
 
-def test_a_place_is_in_one_fold():
-    place = np.repeat(contacts(100, 5), 7, axis=0)
-    fold = folds_by_place(place, 5)
+def test_presses_at_one_place_are_in_the_same_fold():
+    contact = np.repeat(contacts_on_l(100, 5), 7, axis=0)
+    fold = folds_by_place(contact, 5)
     assert (fold.reshape(100, 7) == fold[::7, None]).all()
     assert np.bincount(fold).tolist() == [140] * 5
-    assert ((fold == 0) == held_out(place)).all()
+    np.testing.assert_array_equal(fold == 0, held_out(contact))
 
 
-def test_deviations_that_are_too_small_are_multiplied():
+def test_factors_of_standard_deviations_are_the_ratio_of_errors_to_standard_deviations():
     rng = np.random.default_rng(0)
     truth = rng.standard_normal((20_000, 3))
-    off = np.array([2.0, 2.0, 0.5]) * rng.standard_normal(truth.shape)
-    assert std_factors(truth + off, np.ones_like(truth), truth) == pytest.approx((2.0, 0.5), rel=0.03)
+    error = np.array([2.0, 2.0, 0.5]) * rng.standard_normal(truth.shape)
+    assert std_factors(truth + error, np.ones_like(truth), truth) == pytest.approx((2.0, 0.5), rel=0.03)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda given: given[:499], "expected at least 500 presses at 50 places with .* got 499 at 499; .*--sensor"),
-        (lambda given: given.of_electrodes(("Q1", "Q2"), "us"), r"expected 3 to 8 channels, got 2 \(Q1, Q2\)"),
-    ],
-)
-def test_too_few_presses_or_channels_train_no_model(change, message):
+def test_too_few_presses_are_refused():
+    message = "expected at least 500 presses at 50 places with .* got 499 at 499; .*--sensor"
     with pytest.raises(PressError, match=message):
-        usable_presses(change(l_shaped()))
+        usable_presses(presses_on_l()[:499])
 
 
-def with_channel(channel, values):
-    """Return the presses of the L with other charges of one channel, which are a function of the charges."""
-    presses = l_shaped()
+def test_too_few_channels_are_refused():
+    two_channels = presses_on_l().of_electrodes(("Q1", "Q2"), "pad")
+    with pytest.raises(PressError, match=r"expected 3 to 8 channels, got 2 \(Q1, Q2\)"):
+        usable_presses(two_channels)
+
+
+def with_channel(channel, new_charge):
+    """Return the presses on the L with other charges of one channel.
+
+    Args:
+        channel: Number of the channel.
+        new_charge: Function from the charges of all channels, shape (n, 4), to those of the channel, shape (n,).
+    """
+    presses = presses_on_l()
     charge = presses.charge_pC.copy()
-    charge[:, channel] = values(charge)
-    return measured(presses.contact, charge)
+    charge[:, channel] = new_charge(charge)
+    return measured_presses(presses.contact, charge)
 
 
-def with_contact(column, values):
-    """Return the presses of the L with another column of the contact, which is a function of the contact."""
-    presses = l_shaped()
+def with_contact(column, new_values):
+    """Return the presses on the L with another column of the contact.
+
+    Args:
+        column: Number of the column: 0 for x, 1 for y, 2 for the force.
+        new_values: Function from the contacts, shape (n, 3), to the values of the column, shape (n,).
+    """
+    presses = presses_on_l()
     contact = presses.contact.copy()
-    contact[:, column] = values(contact)
-    return measured(contact, presses.charge_pC)
+    contact[:, column] = new_values(contact)
+    return measured_presses(contact, presses.charge_pC)
 
 
-def once(value, column):
-    """Return a function that gives a column with another value in the eighth press."""
+def in_eighth_press(value, column):
+    """Return a function that returns a column of an array with another value in the eighth row."""
     return lambda rows: np.where(np.arange(len(rows)) == 7, value, rows[:, column])
 
 
@@ -269,16 +348,16 @@ FAULTY_PRESSES = {
     "a scaled and shifted copy": (with_channel(3, lambda charge: 3.0 - 2.0 * charge[:, 1]), "channels 'Q2', 'Q4': "),
     "a sum of channels": (with_channel(3, lambda charge: charge[:, 0] + charge[:, 2]), "channels 'Q1', 'Q3', 'Q4': "),
     "a charge of 1e37": (
-        with_channel(2, once(1e37, 2)),
+        with_channel(2, in_eighth_press(1e37, 2)),
         r"^line 9, column 'Q3': expected a value of the size of the others, whose median is .* got 1e\+37; correct it",
     ),
     "a charge of -1e6": (
-        with_channel(0, once(-1e6, 0)),
+        with_channel(0, in_eighth_press(-1e6, 0)),
         r"^line 9, column 'Q1': .* got -1e\+06; correct it, or remove",
     ),
-    "a position in another unit": (with_contact(0, once(1e6, 0)), r"^line 9, column 'x_mm': .* got 1e\+06"),
-    "a force of 1e20": (with_contact(2, once(1e20, 2)), r"^line 9, column 'force_N': .* got 1e\+20"),
-    "a force of 1e-20": (with_contact(2, once(1e-20, 2)), "^line 9, column 'force_N': .* got 1e-20"),
+    "a position in another unit": (with_contact(0, in_eighth_press(1e6, 0)), r"^line 9, column 'x_mm': .* got 1e\+06"),
+    "a force of 1e20": (with_contact(2, in_eighth_press(1e20, 2)), r"^line 9, column 'force_N': .* got 1e\+20"),
+    "a force of 1e-20": (with_contact(2, in_eighth_press(1e-20, 2)), "^line 9, column 'force_N': .* got 1e-20"),
     "denormal charges": (
         with_channel(1, lambda charge: 1e-310 * charge[:, 1]),
         "channel 'Q2': expected charges in pC, of 1e-30 to 1e.30, got .*e-310 as the median .* check the unit",
@@ -318,18 +397,18 @@ def test_presses_of_one_force_are_learned_with_a_warning(caplog):
     usable_presses(with_contact(2, lambda _: np.full(1_200, 2.0)))
     assert "all presses have a force of about 2 N: the model can estimate no other force" in caplog.text
     caplog.clear()
-    usable_presses(l_shaped())
+    usable_presses(presses_on_l())
     assert not caplog.text
 
 
-def test_the_faults_are_found_in_no_intact_presses():
-    """Charges of any unit, channels that are mostly zero, a few percent of noise, and a measured pad."""
+def test_intact_presses_are_accepted():
+    """Charges in other units, channels that are mostly zero, similar channels, and presses on a real pad."""
     usable_presses(read_presses(ROOT / "tests" / "data" / "tactile_fsi.csv"))
-    given = l_shaped()
+    presses = presses_on_l()
     for unit in (1e-12, 1e12):
-        usable_presses(measured(given.contact, unit * given.charge_pC))
-    mostly_zero = np.random.default_rng(7).random((1_200, 4)) < 0.9
-    usable_presses(measured(given.contact, np.where(mostly_zero, 0.0, given.charge_pC)))
+        usable_presses(measured_presses(presses.contact, unit * presses.charge_pC))
+    is_zero = np.random.default_rng(7).random((1_200, 4)) < 0.9
+    usable_presses(measured_presses(presses.contact, np.where(is_zero, 0.0, presses.charge_pC)))
     usable_presses(with_channel(1, lambda charge: charge[:, 0] * (1.0 + 0.01 * JITTER)))
 
 
@@ -345,11 +424,15 @@ def test_a_faulty_file_leaves_no_folder(refused, tmp_path):
 
 @pytest.mark.slow
 def test_a_real_pad_is_learned_better_than_by_boosted_trees():
-    """TactileFSI (SDU Soft Robotics, CC BY 4.0): errors at a fifth of the places; trees: 6.93 mm and 27.0 %."""
+    """The data are TactileFSI (SDU Soft Robotics, CC BY 4.0), of which a fifth of the places is held out.
+
+    Boosted trees have errors of 6.93 mm and 27.0 % on the held-out presses.
+    """
     presses = read_presses(ROOT / "tests" / "data" / "tactile_fsi.csv")
-    out = held_out(presses.contact)
-    fitted = fit_presses(presses[~out], "pad")
-    errors = evaluate(fitted, LabelledPresses(presses.contact[out], presses.charge_pC[out], measured=True))
+    is_held_out = held_out(presses.contact)
+    fitted = fit_presses(presses[~is_held_out], "pad")
+    held_out_presses = presses[is_held_out]
+    errors = evaluate(fitted, LabelledPresses(held_out_presses.contact, held_out_presses.charge_pC, measured=True))
     assert errors["position_rms_mm"] < 6.93
     assert errors["force_rms_percent"] < 27.0
     assert 0.63 < errors["coverage_68"] < 0.75

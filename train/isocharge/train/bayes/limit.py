@@ -1,4 +1,4 @@
-"""The Bayes limit: the errors of the posterior mean. No estimator of x, y and F has smaller mean squared errors.
+"""The Bayes limit: the errors of the posterior mean, which has the smallest mean squared errors of all estimators.
 
     problem = BayesProblem(load_sensor("three-25um-biaxial"), Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
     print(bayes_limit(problem).position_rms_mm)
@@ -19,8 +19,8 @@ from isocharge.simulate import ChargeSpline, ForwardMap, NoiseModel, Probe, Sens
 from isocharge.train.bayes.posterior import Posterior
 
 N_PRESSES = 4000
-"""Number of presses of `bayes_limit`. The rms then has a statistical error of 3 %; its ratio to the rms of an estimator
-on the same presses has a smaller one."""
+"""Number of presses of `bayes_limit`. The rms error then has a statistical error of 3 %. The ratio of the rms errors of
+two estimators on the same presses has a smaller statistical error."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def bayes_estimate(
 
     Raises:
         ChargeError: If there are no charges, or they are not finite or of another number of electrodes.
-        InputError: If the noise is zero, or the map is of other forces or too small.
+        InputError: If the noise is zero, or if the map has another range of forces or a smaller radius.
     """
     charges = charge_map or problem.forward_map(executor)
     if charges.domain.force_range != problem.force_range:

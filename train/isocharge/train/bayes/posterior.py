@@ -6,12 +6,12 @@ the likelihood includes its normalisation:
 
     p(Q | x, y, ln F) = prod_e exp(-(Q_e - q_e)^2 / (2 sigma_e^2)) / sigma_e,   q = Q(x, y, F),   sigma_e = sigma(q_e).
 
-The positions are integrated over square cells. A cell is dropped only if no contact in it can explain the charges, so
-posteriors of any shape are covered, also with several maxima. The other cells are divided into four until they are
-small compared with the width of the posterior. In each cell the logarithm of the force is integrated about its best
-value by Gauss-Legendre quadrature, within the range of forces. The midpoint rule on a Gaussian has a relative error of
-1e-5 with cells of 1.25 standard deviations (Trefethen and Weideman 2014). Only cells at the edge of the disk must be
-smaller.
+The integral over the positions is a sum over square cells. A cell is dropped only if no contact in it can explain the
+charges, so that posteriors of any shape are covered, also those with several maxima. The other cells are divided into
+four until they are small compared with the width of the posterior. In each cell, the logarithm of the force is
+integrated by Gauss-Legendre quadrature over an interval around its best value. With cells of 1.25 standard deviations,
+the midpoint rule has a relative error of 1e-5 on a Gaussian (Trefethen and Weideman 2014). Only cells at the edge of
+the disk must be smaller.
 """
 
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ from isocharge.simulate.identifiability.force_profile import ForceProfile
 from isocharge.simulate.numerics.disk import onto_disk
 
 CHUNK = 64
-"""Number of presses that are integrated at once; the working arrays then stay within about 100 MB."""
+"""Number of presses that are integrated at once. The arrays then need at most about 100 MB."""
 
 CELLS_ACROSS = 32
 """Number of first cells across the disk."""
@@ -42,7 +42,7 @@ EDGE_POINTS = 8
 """Number of points across a cell at the edge of the disk; each point is either inside or outside."""
 
 MAX_DIVISIONS = 10
-"""Largest number of times that a cell is divided into four: down to a thirty-thousandth of the disk."""
+"""Largest number of times that a cell is divided into four. The smallest side is a thirty-thousandth of the disk."""
 
 MAX_SIDE_STD = 1.25
 """Largest side of a cell, in standard deviations of the position along its most certain direction."""
@@ -98,9 +98,17 @@ class Cells:
         return parts[_overlaps_disk(parts.centre, parts.side, radius)]
 
     def finer(self, radius: float) -> Iterator["Cells"]:
-        """Yield finer cells: the four Gauss-Legendre points of cells inside the disk, and sixteenths of the others."""
+        """Yield finer cells for the last integration.
+
+        A cell inside the disk is replaced by four cells, whose centres are the points of Gauss-Legendre quadrature. A
+        cell on the edge of the disk is divided into sixteen cells.
+
+        Args:
+            radius: Radius of the disk, mm.
+        """
+        gauss_offset = 1.0 / np.sqrt(12.0)
         is_on_edge = self.on_edge(radius)
-        yield self[~is_on_edge]._quarters(1.0 / np.sqrt(12.0))
+        yield self[~is_on_edge]._quarters(gauss_offset)
         yield self[is_on_edge].divided(radius).divided(radius)
 
     def _quarters(self, offset: float) -> "Cells":
@@ -150,9 +158,9 @@ def _grid(count: int, step: float) -> Array:
 
 
 def _overlaps_disk(centre: Array, side: float, radius: float) -> Booleans:
-    """Return which squares with centres of shape (n, 2) overlap the disk."""
-    nearest_corner = np.maximum(np.abs(centre) - 0.5 * side, 0.0)
-    return np.asarray(np.hypot(nearest_corner[:, 0], nearest_corner[:, 1]) < radius)
+    """Return which squares with centres of shape (n, 2) overlap the disk around the origin, shape (n,)."""
+    nearest_point = np.maximum(np.abs(centre) - 0.5 * side, 0.0)  # of each square to the origin, up to signs
+    return np.asarray(np.hypot(nearest_point[:, 0], nearest_point[:, 1]) < radius)
 
 
 class _RootCells(NamedTuple):
@@ -258,14 +266,15 @@ class Posterior:
     def _integration_cells(self, charge: Array) -> Iterator[Cells]:
         """Yield cells that cover the posterior and are small compared with its width.
 
-        All cells of a press have the same side.
+        All cells of a press have the same side. In each round, the cells of the presses whose cells are small enough
+        are yielded, and the cells of the other presses are divided into four.
 
         Args:
-            charge: Shape (n, n_electrode), pC.
+            charge: Charges with noise, shape (n_press, n_electrode), pC.
         """
         n_press = len(charge)
         roots = self._roots
-        press, root = (numbers.ravel() for numbers in np.indices((n_press, len(roots.cells))))
+        press, root = np.indices((n_press, len(roots.cells))).reshape(2, -1)
         cells = Cells(press, root, roots.cells.centre[root], roots.cells.side)
         terms = roots.terms[root]
         for division in range(MAX_DIVISIONS + 1):
@@ -274,23 +283,28 @@ class Posterior:
             chi2, slope = self._chi2_and_slope(terms, log_force, cell_charge, roots.largest_slope[cells.root])
             smallest_chi2 = np.full(n_press, np.inf)
             np.minimum.at(smallest_chi2, cells.press, chi2)
+            excess_chi2 = chi2 - smallest_chi2[cells.press]
 
             # A lower bound of chi-squared in the whole cell: no position is farther from the centre than the corners.
             half_diagonal = np.sqrt(0.5) * cells.side
             lower_bound = np.maximum(np.sqrt(chi2) - half_diagonal * slope, 0.0) ** 2
             possible = np.flatnonzero(lower_bound - smallest_chi2[cells.press] <= NEGLIGIBLE_CHI2)
 
-            smallest_std_inverse = np.zeros(n_press)
-            std_inverse = self._inverse_std(cells[possible], terms[possible], log_force[possible])
-            np.maximum.at(smallest_std_inverse, cells.press[possible], std_inverse)
-            is_last = division == MAX_DIVISIONS
-            is_fine = (smallest_std_inverse * cells.side <= MAX_SIDE_STD)[cells.press] | is_last
+            # The cells of a press are small enough if their side is small compared with the smallest standard deviation
+            # of the position in any of them.
+            largest_inverse_std = np.zeros(n_press)
+            inverse_std = self._inverse_std(cells[possible], terms[possible], log_force[possible])
+            np.maximum.at(largest_inverse_std, cells.press[possible], inverse_std)
+            press_is_fine = largest_inverse_std * cells.side <= MAX_SIDE_STD
+            if division == MAX_DIVISIONS:
+                press_is_fine[:] = True
+            is_fine = press_is_fine[cells.press]
 
+            # A posterior that reaches the edge of the disk needs finer cells.
             touches_edge = np.zeros(n_press, dtype=bool)
-            is_near_best = chi2 <= smallest_chi2[cells.press] + EDGE_CHI2
-            touches_edge[cells.press[cells.on_edge(self.radius) & is_near_best]] = True
-            has_mass = chi2 <= smallest_chi2[cells.press] + NEGLIGIBLE_CHI2
-            finished = cells[is_fine & has_mass]
+            is_near_edge = cells.on_edge(self.radius) & (excess_chi2 <= EDGE_CHI2)
+            touches_edge[cells.press[is_near_edge]] = True
+            finished = cells[is_fine & (excess_chi2 <= NEGLIGIBLE_CHI2)]
             yield finished[~touches_edge[finished.press]]
             yield from finished[touches_edge[finished.press]].finer(self.radius)
 

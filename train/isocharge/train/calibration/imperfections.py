@@ -1,8 +1,8 @@
 """Effects of traces and of an uneven tension on the charges of a film.
 
-A trace that the sensor file does not describe collects charge beyond the pad of its electrode. It is modelled by lines
-from the edge of the pad to the rim of the film, whose widths are unknown. An uneven tension acts like a smaller tension
-to second order.
+A trace that the sensor file does not describe collects charge beyond the pad of its electrode. Such a trace is modelled
+by several lines of unknown width, which lead from the edge of the pad to the rim of the film. To second order, an
+uneven tension acts like a smaller even tension.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ LARGEST_SQUARED_RATIO = 0.9
 """Largest squared ratio of the uneven part of the tension to the mean tension."""
 
 SLACKENING = 1.75
-"""Exponent in `log_unevenness`, fitted to full simulations."""
+"""Exponent in `log_unevenness`, which was fitted to full simulations."""
 
 MIN_TENSION = 1e-3
 """Lower bound for the pretension to which the uneven part is related, MPa."""

@@ -160,11 +160,15 @@ def without_nuisances(data: PressData, values: Sequence[float] | Array) -> Press
 
 
 def nuisance_derivatives(data: PressData, pretension_derivative: Array) -> Array:
-    """Return the derivatives of the residual by the nuisances, shape (n, n_electrode + 3, n_nuisance).
+    """Compute the derivatives of the residuals with respect to the nuisances.
 
     Args:
         data: The presses as they were measured.
-        pretension_derivative: Derivative of the residual by the pretension, shape (n, n_electrode + 3), 1/MPa.
+        pretension_derivative: Derivatives of the residuals with respect to the pretension, shape (n, n_electrode + 3),
+            1/MPa.
+
+    Returns:
+        Shape (n, n_electrode + 3, n_nuisance).
     """
     rig_rows = np.zeros((len(data), 3))
     columns = []

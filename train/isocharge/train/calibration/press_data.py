@@ -103,20 +103,27 @@ class PressData:
         return replace(self, contact_weight=np.column_stack([x_weight, y_weight, scattered_weight]))
 
     def force_derivative(self) -> Array:
-        """Return the derivative of the residual by the logarithm of the stated force, shape (n, n_electrode + 3)."""
+        """Return the derivatives of the residuals with respect to the logarithm of the measured force.
+
+        Only the last residual of each press, which is that of the force, depends on the measured force.
+
+        Returns:
+            Shape (n, n_electrode + 3).
+        """
+        _, _, force_weight = self.contact_weight.T
         derivative = np.zeros(self.measured.shape)
-        derivative[:, -1] = -self.contact_weight[:, 2]  # only the residual of the force depends on it
+        derivative[:, -1] = -force_weight
         return derivative
 
     def pretension_nodes(self, pretension: float, bounds: tuple[float, float]) -> tuple[Array, Array]:
-        """Return pretensions between which the charges of the presses are interpolated.
+        """Return pretensions at which charges are computed, and with which weights they are interpolated.
 
         Args:
             pretension: Pretension of the film, MPa.
             bounds: Smallest and largest pretension that a film may have, MPa.
 
         Returns:
-            Pretensions, shape (k,), MPa, and the weight of each in each press, shape (n, k).
+            Pretensions, shape (k,), MPa, and the weight of each pretension for each press, shape (n, k).
         """
         press_pretensions = np.clip(pretension + self.tension_change, *bounds)
         low = float(press_pretensions.min(initial=np.inf))
@@ -138,10 +145,13 @@ class PressData:
         return np.column_stack([charge_residual, self.contact_weight * (contact - self.contact)])
 
     def residual_slopes(self, charge_slopes: Array) -> Array:
-        """Return the derivatives of the residuals by the contact (x, y, ln F), shape (n, n_electrode + 3, 3).
+        """Return the derivatives of the residuals with respect to the contact (x, y, ln F).
 
         Args:
-            charge_slopes: Derivatives of the charges by the contact, shape (n, n_electrode, 3).
+            charge_slopes: Derivatives of the charges with respect to the contact, shape (n, n_electrode, 3).
+
+        Returns:
+            Shape (n, n_electrode + 3, 3).
         """
         rig_slopes = self.contact_weight[:, :, None] * np.eye(3)
         return np.concatenate([self.weight[:, :, None] * charge_slopes, rig_slopes], axis=1)
@@ -166,13 +176,19 @@ def _film_excess(presses: MeasuredPresses) -> Array:
 
 
 def _without_gaps(temperature_C: Array) -> Array:
-    """Interpolate missing temperatures between those of the presses before and after; both have the shape (n,)."""
-    number = np.arange(len(temperature_C))
-    measured = np.isfinite(temperature_C)
-    return np.interp(number, number[measured], temperature_C[measured])
+    """Interpolate missing temperatures between those of the presses before and after, shape (n,), degrees Celsius."""
+    press = np.arange(len(temperature_C))
+    is_measured = np.isfinite(temperature_C)
+    return np.interp(press, press[is_measured], temperature_C[is_measured])
 
 
 def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:
     """Return an empty list of presses for electrodes of these names."""
-    no_std = np.empty(0)
-    return MeasuredPresses(np.empty((0, 3)), np.empty((0, len(electrodes))), no_std, no_std, electrodes, ())
+    return MeasuredPresses(
+        contact=np.empty((0, 3)),
+        charge_pC=np.empty((0, len(electrodes))),
+        position_std_mm=np.empty(0),
+        force_std=np.empty(0),
+        electrodes=electrodes,
+        lines=(),
+    )

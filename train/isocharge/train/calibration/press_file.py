@@ -1,10 +1,10 @@
 """CSV file of a press session, with a second file that states on which sensor the presses are made.
 
-    presses.csv                  the measured presses, replaced as a whole after each press
-    .presses.csv.session.json    sensor and probe of the session; held by the process that takes presses
+    presses.csv                  the measured presses; the whole file is replaced after each press
+    .presses.csv.session.json    sensor and probe of the session; locked by the process that takes presses
 
-The file of presses is complete at any time, so an interrupted session can continue with it. The second file prevents a
-session from continuing with presses of another sensor or probe, and two processes from writing to the same file.
+The file of presses is complete at any time, so that an interrupted session can be continued. The second file prevents
+a session from being continued with another sensor or probe, and prevents two processes from writing to the same file.
 """
 
 import json
@@ -37,8 +37,8 @@ class PressFile:
         """Return the presses of an earlier session, or None if there are none.
 
         Args:
-            position_std_mm: Standard deviation of x and of y where the file has none, mm.
-            force_std: Standard deviation of a force where the file has none, as a share of the force.
+            position_std_mm: Standard deviation of x and y of presses for which the file states none, mm.
+            force_std: Standard deviation of the force of such presses, relative to the force.
 
         Raises:
             PressError: If the file is not a file of presses, or if it has further columns, which would be lost.
@@ -73,7 +73,8 @@ def open_press_file(path: Path, sensor: Sensor, probe: Probe, *, fresh: bool = F
     """Open a file of presses for one session.
 
     Args:
-        path: The file; CSV, or Parquet if its name ends in `.parquet`. It may have the presses of an earlier session.
+        path: The file, in the format CSV, or Parquet if its name ends in `.parquet`. It may contain the presses of an
+            earlier session.
         sensor: Sensor on which the presses are made.
         probe: Probe with which the presses are made.
         fresh: Whether to delete the presses of an earlier session.

@@ -1,9 +1,10 @@
 """Quantities of a film that presses can identify: products and ratios of parameters besides single parameters.
 
-Charges depend on Young's modulus, the piezoelectric coefficients and the gains almost only through their product, and
-on modulus and thickness through E h. A single parameter may therefore be as uncertain after the calibration as before,
-while the product is known to 0.1 %. Such combinations are reported with their standard deviations. A quantity counts as
-not identified if the presses hardly reduced its standard deviation.
+The charges depend on Young's modulus E, the piezoelectric coefficients and the gains almost only through their product,
+and on E and the thickness h almost only through E h. A single parameter may therefore be as uncertain after the
+calibration as before, although the product is known to 0.1 %. For this reason, such products and ratios are reported
+with their standard deviations. A quantity counts as not identified if the presses hardly reduced its standard
+deviation.
 """
 
 from collections.abc import Mapping
@@ -17,7 +18,7 @@ from isocharge.simulate.sensor.film_prior import FilmPrior
 from isocharge.train.calibration.problem import MAX_IDENTIFIED_STD_RATIO, FilmEstimate
 
 RELATIVE = " relative to the sensor file"
-"""Words after the meaning of quantities that are relative to their described values."""
+"""Text that is appended to the meaning of quantities that are given relative to the sensor file."""
 
 SINGLE_PARAMETERS = ("young_percent", "thickness_percent", "d31_percent", "d32_percent", "mean_gain_percent")
 """Quantities of single parameters, which presses identify only in products with others."""

@@ -1,7 +1,7 @@
-"""Session of presses that are taken one after the other, with the next press that a person or a machine should make.
+"""Session in which a person or a machine makes presses one after the other, at proposed contacts.
 
-A session has no port, no screen and no clock. Its caller shows the proposed press, measures the charges, and passes on
-the answer of the person. After each press the film is fitted again, and the next proposal follows from the fit.
+After each press, the film is fitted again, and the next press is proposed. A session has no port, no screen and no
+clock: the caller shows the proposed press, measures the charges, and passes on the answer of the person.
 """
 
 import math
@@ -22,10 +22,11 @@ from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.result import CalibrationResult
 
 MIN_PRESSES = 2
-"""Number of presses from which on the remaining error is reported; a single press says too little."""
+"""Smallest number of presses after which the remaining error is reported. One press does not determine it."""
 
 ENOUGH = 0.5
-"""Position error left by the film at which a session is complete, as a share of the error by noise alone."""
+"""Ratio of the position error that the uncertainty of the film causes to the error that noise causes, at which a
+session is complete."""
 
 EXPECTED_ANSWER = (
     'Enter for "as proposed", the real "x y force" in mm and N (? for a value that is unknown), s to skip the place, '
@@ -89,7 +90,11 @@ def read_answer(text: str) -> Answer:
 
 
 def _cell_value(cell: str) -> float:
-    """Return the number in a cell, NaN if it is unknown; ValueError if the cell is not a finite number."""
+    """Return the number in a cell; NaN if the value is unknown.
+
+    Raises:
+        ValueError: If the cell is not a finite number.
+    """
     if cell in UNKNOWN_CELLS:
         return math.nan
     value = float(cell)

@@ -14,7 +14,7 @@ from isocharge.train.calibration.nuisances import NUISANCES
 
 @dataclass(frozen=True)
 class UnknownLayout:
-    """Places of the unknowns in their vector.
+    """Positions of the unknowns in their vector.
 
     Attributes:
         parameter_names: Names of the film's parameters.
@@ -38,12 +38,12 @@ class UnknownLayout:
 
     @cached_property
     def traces(self) -> slice:
-        """Coefficients of traces that are not described: for each electrode those of `TRACE_ANGLES`."""
+        """Coefficients of traces that are not described: one for each electrode and each of `TRACE_ANGLES`."""
         return _after(self.modes, len(TRACE_ANGLES) * len(self.electrode_names))
 
     @cached_property
     def terms(self) -> slice:
-        """Coefficients of the discrepancy: for each term those of the electrodes."""
+        """Coefficients of the discrepancy: one for each term and each electrode, with the electrodes in turn."""
         return _after(self.traces, term_count() * len(self.electrode_names))
 
     @cached_property
@@ -58,7 +58,7 @@ class UnknownLayout:
 
     @cached_property
     def imperfections(self) -> slice:
-        """Modes and traces together: the coefficients that act on the charges as a film does."""
+        """Modes and traces together: the coefficients of physical imperfections."""
         return slice(self.modes.start, self.traces.stop)
 
     @cached_property
@@ -87,20 +87,20 @@ class UnknownLayout:
         return self.film_count + _count(self.nuisances)
 
     def parameter(self, name: str) -> int:
-        """Return the place of a parameter."""
+        """Return the index of a parameter in the vector of unknowns."""
         return self.parameter_names.index(name)
 
     def nuisance(self, name: str) -> int:
-        """Return the place of a nuisance."""
+        """Return the index of a nuisance in the vector of unknowns."""
         names = [nuisance.name for nuisance in NUISANCES]
         return self.film_count + names.index(name)
 
 
-def _count(places: slice) -> int:
-    """Return the number of places of a slice."""
-    return int(places.stop - places.start)
+def _count(unknowns: slice) -> int:
+    """Return the number of unknowns in a slice."""
+    return int(unknowns.stop - unknowns.start)
 
 
 def _after(previous: slice, count: int) -> slice:
-    """Return the slice of so many unknowns that follow others."""
+    """Return the slice of the next `count` unknowns after a slice."""
     return slice(previous.stop, previous.stop + count)

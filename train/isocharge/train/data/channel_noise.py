@@ -1,8 +1,8 @@
 """Estimation of the noise of measured presses from the presses themselves.
 
-A plane that is fitted to the nearest presses, in position and force, predicts the charges of the press between them.
-The residuals are the noise of the channels and of the rig, which does not know position and force exactly. The variance
-of each channel is modelled as s^2 = white^2 + (gain * Q)^2.
+For each press, a plane is fitted to the charges of the presses with the most similar positions and forces. The plane
+predicts the charges of the press. The residuals are the noise of the channels, including the effect of errors of the
+rig in position and force. The variance of each channel is modelled as s^2 = white^2 + (gain * Q)^2.
 """
 
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ NEIGHBOURS = 16
 """Number of presses to which a plane is fitted: four for each of its coefficients."""
 
 ROUNDS = 10
-"""Number of weighted least-squares fits. Each uses the variances that the fit before has found."""
+"""Number of weighted least-squares fits. The weights of each fit follow from the variances of the previous fit."""
 
 OUTLIER = 3.0
-"""Number of standard deviations to which residuals are clipped, because a knock against the rig is not noise."""
+"""Number of standard deviations to which residuals are clipped, because larger residuals have other causes."""
 
 LEAST_SHARE = 0.01
 """Smallest ratio of white noise to gain, relative to the usual size of the charges of a channel.
@@ -30,19 +30,20 @@ If no charge is small, the presses do not determine the white noise.
 """
 
 BOTH_SIGNS = 0.01
-"""Share of presses above which the rarer sign of the charges of a channel is taken into account."""
+"""Fraction of the presses with the rarer sign above which a channel counts as one with charges of both signs."""
 
 LEAST_BEND = 0.5
-"""Smallest charge from which features are logarithmic for channels of both signs, relative to the usual size.
+"""Smallest charge from which on features are logarithmic for channels with both signs, relative to the usual size.
 
-With less, features of charges without noise would have a kink where the charge changes its sign.
+With a smaller value, the features of charges with little noise would have a kink where the charge changes its sign.
 """
 
 LARGEST_EXPONENT = 50.0
 """Largest exponent in the conversion of levels to charges. It limits charges to 1e21 times white noise over gain."""
 
 LEAST_GAIN = 1e-4
-"""Smallest gain noise, that of a good amplifier. With less, asinh(gain Q / white) / gain would equal Q / white."""
+"""Smallest noise of the gain, which is that of a good amplifier. With a smaller value, the level
+asinh(gain Q / white) / gain would practically be Q / white."""
 
 CANDIDATES = 8
 """Number of planes among which the nearest one is searched."""
@@ -74,15 +75,24 @@ class ChannelNoise:
             White noise and noise of the gain of each channel.
         """
         planes = LocalPlanes.through(unit, charge)
-        fits = [_variance(*columns) for columns in zip(planes.value.T, planes.residual.T, strict=True)]
-        white, gain = np.sqrt(np.array(fits)).T
-        gain = np.maximum(gain, LEAST_GAIN)
-        return cls(np.maximum(white, LEAST_SHARE * gain * usual_size(charge)), gain)
+        variances = [
+            _variance(value, residual) for value, residual in zip(planes.value.T, planes.residual.T, strict=True)
+        ]
+        white_std, gain_std = np.sqrt(np.array(variances)).T
+        gain = np.maximum(gain_std, LEAST_GAIN)
+        white = np.maximum(white_std, LEAST_SHARE * gain * usual_size(charge))
+        return cls(white, gain)
 
     @classmethod
     def alike(cls, noise: NoiseModel, electrodes: int) -> "ChannelNoise":
-        """Return the noise model with the same noise on every electrode; `electrodes` is their number."""
-        return cls(np.full(electrodes, noise.white), np.full(electrodes, max(noise.gain, LEAST_GAIN)), noise.name)
+        """Create a noise model with the same noise on every electrode.
+
+        Args:
+            noise: Noise of each electrode.
+            electrodes: Number of electrodes.
+        """
+        gain = max(noise.gain, LEAST_GAIN)
+        return cls(np.full(electrodes, noise.white), np.full(electrodes, gain), noise.name)
 
     def sigma(self, charge: Array) -> Array:
         """Return the standard deviations of charges of shape (n, n_electrode), pC, as an array of the same shape."""
@@ -93,7 +103,10 @@ class ChannelNoise:
         return np.asarray(charge + self.sigma(charge) * rng.standard_normal(charge.shape))
 
     def level(self, charge: Array) -> Array:
-        """Return charges of shape (n, n_electrode), pC, in units of their noise: asinh(gain Q / white) / gain."""
+        """Return the levels of charges Q of shape (n, n_electrode), pC: asinh(gain Q / white) / gain.
+
+        All levels have a noise with a standard deviation of about 1.
+        """
         return np.asarray(np.arcsinh(charge * self.gain / self.white) / self.gain)
 
     def charge(self, level: Array) -> Array:
@@ -102,7 +115,7 @@ class ChannelNoise:
         return np.asarray(np.sinh(exponent) * self.white / self.gain)
 
     def bend(self, charge: Array) -> Array:
-        """Return the charges from which features are logarithmic, shape (n_electrode,), pC.
+        """Return the charges from which on features are logarithmic, shape (n_electrode,), pC.
 
         Args:
             charge: Charges of presses, shape (n, n_electrode), pC.
@@ -112,13 +125,16 @@ class ChannelNoise:
         return np.asarray(np.maximum(self.white / self.gain, smallest))
 
     def scaled(self, factor: float) -> "ChannelNoise":
-        """Return the noise model with standard deviations that are larger by a factor."""
+        """Return the noise model with all standard deviations multiplied by a factor."""
         return ChannelNoise(factor * self.white, factor * self.gain, self.name)
 
     def to_dict(self) -> dict[str, object]:
         """Return the noise model as it is stored in the metadata of a model."""
-        white, gain = ([float(f"{number:.4g}") for number in row] for row in (self.white, self.gain))
-        return {"name": self.name, "white_pC": white, "gain": gain}
+        return {
+            "name": self.name,
+            "white_pC": [float(f"{white:.4g}") for white in self.white],
+            "gain": [float(f"{gain:.4g}") for gain in self.gain],
+        }
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A sensor of measured presses alone, without a simulator: the names of its channels, and the area that was pressed."""
+"""A sensor that is only known by measured presses: the names of its channels, and the area that was pressed."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -14,32 +14,33 @@ from isocharge.simulate import Domain
 from isocharge.simulate.numerics.polygon import area_of, to_complex, to_corners
 
 LEAST_HOLE = 6.0
-"""Smallest gap between places that may be outside the area, over the distance between neighbours."""
+"""Radius of the circumscribed circle from which on a triangle between places may lie outside the area, relative to the
+distance between neighbouring places."""
 
 LEAST_RANGE = 1.1
-"""Least ratio of the largest to the smallest force: presses of one force are learned, too."""
+"""Smallest ratio of the largest to the smallest force of an area, also if all presses have the same force."""
 
 LEAST_WIDTH = 1e-3
-"""Smallest standard deviation of the places across the line on which they almost lie, relative to that along it."""
+"""Smallest ratio of the standard deviations of the places across and along their main direction."""
 
 LONGEST_MITRE = 2.0
-"""Largest distance by which a corner moves out, over that of the sides."""
+"""Largest ratio of the distance by which a corner is moved outwards to the distance by which the sides are moved."""
 
 
 @dataclass(frozen=True)
 class MeasuredSensor:
-    """What a model of measured presses says about its sensor.
+    """Description of a sensor in the metadata of a model of measured presses.
 
     Attributes:
-        name: Of the sensor: the frame of x and y.
-        electrode_names: Of the channels, in the order of their charges.
+        name: Name of the sensor, to whose frame x and y refer.
+        electrode_names: Names of the channels, in the order of their charges.
     """
 
     name: str
     electrode_names: tuple[str, ...]
 
     def to_dict(self) -> dict[str, object]:
-        """For metadata."""
+        """Return the description for the metadata of a model."""
         return {"name": self.name, "electrodes": list(self.electrode_names)}
 
 
@@ -59,14 +60,19 @@ class PressedArea(Domain):
     def of(cls, contact: Array) -> "PressedArea":
         """Return the area of contacts (x, y, F), shape (n, 3), mm and N.
 
+        If all forces are nearly equal, the range of forces is enlarged.
+
         Raises:
             PressError: If the places lie on a line.
         """
-        corners = np.round(outline(np.unique(contact[:, :2], axis=0)), 4)
-        low, high = float(contact[:, 2].min()), float(contact[:, 2].max())
-        if high < LEAST_RANGE * low:
-            low, high = low / LEAST_RANGE**0.5, high * LEAST_RANGE**0.5
-        return cls.of_corners(corners, (low, high))
+        places = np.unique(contact[:, :2], axis=0)
+        corners = np.round(outline(places), 4)
+        min_force = float(contact[:, 2].min())
+        max_force = float(contact[:, 2].max())
+        if max_force < LEAST_RANGE * min_force:
+            min_force /= LEAST_RANGE**0.5
+            max_force *= LEAST_RANGE**0.5
+        return cls.of_corners(corners, (min_force, max_force))
 
     @classmethod
     def of_corners(cls, corners: Array, force_range: tuple[float, float]) -> "PressedArea":

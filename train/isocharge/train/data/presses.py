@@ -127,17 +127,21 @@ def domain_of(dataset: Dataset) -> Domain:
 
 
 def split_by_position(presses: LabelledPresses, share: float, seed: int) -> tuple[LabelledPresses, LabelledPresses]:
-    """Split presses at random into those at most positions and those at a share of the positions.
+    """Split presses at random into two parts, such that all presses at one position belong to the same part.
 
     Args:
         presses: The presses.
         share: Share of the positions in the second part, 0 to 1.
         seed: Seed of the choice.
+
+    Returns:
+        The first and the second part.
     """
-    _, position = np.unique(np.round(presses.contact[:, :2], 6), axis=0, return_inverse=True)
-    order = np.random.default_rng(seed).permutation(position.max() + 1)
-    held = np.isin(position.ravel(), order[: max(1, round(share * order.size))])
-    return presses[~held], presses[held]
+    _, position_of_press = np.unique(np.round(presses.contact[:, :2], 6), axis=0, return_inverse=True)
+    position_order = np.random.default_rng(seed).permutation(position_of_press.max() + 1)
+    second_count = max(1, round(share * position_order.size))
+    is_in_second = np.isin(position_of_press.ravel(), position_order[:second_count])
+    return presses[~is_in_second], presses[is_in_second]
 
 
 def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
@@ -204,18 +208,25 @@ def held_out(contact: Array) -> Booleans:
     Returns:
         Whether each press is held out, shape (n,).
     """
-    return _before(contact) < max(HELD_SHARE * len(contact), min(FEWEST_HELD, 0.5 * len(contact)))
+    count = len(contact)
+    held_count = max(HELD_SHARE * count, min(FEWEST_HELD, 0.5 * count))
+    return _count_before(contact) < held_count
 
 
 def folds_by_place(contact: Array, count: int) -> Integers:
     """Return the fold of each measured press, from 0 to `count` - 1, shape (n,).
 
-    Presses at one place are in the same fold. Places are assigned in the order of `held_out`.
+    Presses at one place are in the same fold. Places are assigned to the folds in the order in which `held_out` chooses
+    them.
+
+    Args:
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        count: Number of folds.
     """
-    return np.asarray(_before(contact) * count // len(contact), dtype=np.intp)
+    return np.asarray(_count_before(contact) * count // len(contact), dtype=np.intp)
 
 
-def _before(contact: Array) -> Integers:
+def _count_before(contact: Array) -> Integers:
     """Return, for each press, the number of presses at positions that are chosen before its own position.
 
     Positions are chosen in the order of their checksums, which is random but the same for every run.
