@@ -1,11 +1,15 @@
 """What README.md and the pages show is true: every example runs and prints what it says, links lead somewhere."""
 
 import re
+from functools import partial
 
 import pytest
 
 from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
+from isocharge.simulate.forward.whole_film import whole_film_map
+from isocharge.train.data import outside_presses
+from isocharge.train.training import correlation
 from kept import ROOT, kept
 
 FOLDERS = ("simulate", "train", "serve")
@@ -41,8 +45,8 @@ RESEARCH_TUTORIAL = "simulate/docs/tutorial.md"
 """Tutorial that goes from a press to records of a virtual sensor."""
 
 
-SLOW = ("simulate identify", "train report", "examples/paper", "make paper", "fit presses --config quick.toml")
-"""What takes an example of a README more than a few seconds, or stands in that of another."""
+SLOW = ("simulate identify", "train report", "examples/paper", "make paper", "train fit presses")
+"""Parts of examples that take more than a few seconds."""
 
 
 def is_slow(example):
@@ -82,11 +86,14 @@ def desk(page_example, desks, presses):
     return folder
 
 
-def test_an_example_does_what_it_says(page_example, desk, installed, run_example, run_commands):
+def test_an_example_does_what_it_says(page_example, desk, installed, run_example, run_commands, train_in_this_process):
     """In the order of the page, in the install that it names; Python prints what the comments say."""
     text, environment = page_example.text, installed(*page_example.extras)
     for shown, smaller in SMALLER.items():
         text = text.replace(shown, smaller)
+    if "from isocharge.train import" in text:
+        train_in_this_process(text, desk)
+        return
     if page_example.language == "python":
         run_example(text, desk, environment)
         return
@@ -94,6 +101,24 @@ def test_an_example_does_what_it_says(page_example, desk, installed, run_example
     if page_example.page == RESEARCH_TUTORIAL and "simulate point" in text:
         assert '"charge_pC"' in printed
         assert printed.count('"frame_id": "three-25um-biaxial"') == 1000
+
+
+@pytest.fixture
+def train_in_this_process(monkeypatch, capsys):
+    """Run a Python example that trains, in this process, where the map of the whole film is solved already.
+
+    The last line of the output is the comment on the last `print`.
+    """
+    monkeypatch.setattr(outside_presses, "whole_film_map", partial(kept, whole_film_map))
+    monkeypatch.setattr(correlation, "N_EXAMPLES", 3_000)
+
+    def run(example, folder):
+        monkeypatch.chdir(folder)
+        exec(compile(example, "example", "exec"), {})
+        (expected,) = re.findall(r"^print\(.*\)  # (.*)$", example, re.MULTILINE)
+        assert capsys.readouterr().out == f"{expected}\n"
+
+    return run
 
 
 def anchors(text):

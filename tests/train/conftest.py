@@ -9,6 +9,7 @@ from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.forward.whole_film import whole_film_map
 from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, TrainingData, fit
 from isocharge.train.data import outside_presses
+from isocharge.train.training import correlation
 from isocharge.train.training import fit as fit_module
 from isocharge.train.training.fit import train_network
 from kept import kept
@@ -24,6 +25,14 @@ def kept_map_of_the_whole_film():
     """Solve the coarse map of a whole film once for all trainings of a film, because it takes several seconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(outside_presses, "whole_film_map", partial(kept, whole_film_map))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_examples_of_correlations():
+    """Fit the correlations of each network to a tenth of the examples, because the tests train many networks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(correlation, "N_EXAMPLES", 3_000)
         yield
 
 

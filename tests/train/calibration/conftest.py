@@ -5,22 +5,21 @@ import pytest
 
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import Circle, load_sensor
-from isocharge.train import CalibrationProblem
+from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.calibration import contact_error
 from isocharge.train.data.presses import draw_contacts
-from isocharge.train.training import correlation
+from kept import kept
 
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse():
-    """Average errors over fewer contacts, plan with fewer positions, and fit correlations to fewer examples.
+    """Average errors over fewer contacts, and plan with fewer positions.
 
     A calibration then takes a fourth of the time.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contact_error, "N_CONTACTS", 50)
         patch.setattr(contact_error, "N_CANDIDATE_POSITIONS", 30)
-        patch.setattr(correlation, "N_EXAMPLES", 3_000)
         yield
 
 
@@ -28,6 +27,26 @@ def coarse():
 def layout(request) -> CalibrationProblem:
     """The calibration problem of a sensor with four electrodes, and that of a sensor with three."""
     return CalibrationProblem.of(load_sensor(request.param), Circle(1.0))
+
+
+def add_discrepancy(contact: np.ndarray, charge: np.ndarray) -> np.ndarray:
+    """Change charges by 3 % that no parameter describes, differently for each electrode."""
+    x, y, _ = contact.T
+    return charge * np.exp(0.03 * np.column_stack([np.sin(x / 4 + k) * np.cos(y / 5) for k in range(4)]))
+
+
+def calibration_with_discrepancy(sensor: str):
+    """Return the parameters of a film with this discrepancy and its calibration with 20 presses."""
+    problem = CalibrationProblem.of(load_sensor(sensor), Circle(1.0))
+    truth, presses = rig(problem, 20, seed=41)
+    charge = add_discrepancy(presses.contact, presses.charge_pC)
+    return truth, calibrate(presses_of(problem, presses.contact, charge), problem)
+
+
+@pytest.fixture(scope="module")
+def film_with_discrepancy():
+    """Parameters and calibration of a film with a discrepancy."""
+    return kept(calibration_with_discrepancy, "four-25um-biaxial")
 
 
 def rig(problem, count, seed, position_std_mm=0.1, force_std=0.01) -> tuple[np.ndarray, MeasuredPresses]:

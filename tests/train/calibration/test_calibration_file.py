@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.train.calibration.conftest import presses_of, rig
 
 from isocharge.common.errors import PressError
 from isocharge.common.json_values import plain_values
 from isocharge.serve import write_presses
-from isocharge.train import calibrate, next_presses, read_earlier
+from isocharge.train import next_presses, read_earlier
 from isocharge.train.calibration import result as result_module
 from isocharge.train.calibration.calibration_file import film_table, read_film
 from isocharge.train.calibration.folder import result_table
@@ -20,16 +19,12 @@ from isocharge.train.calibration.problem import Warming
 
 
 @pytest.fixture(scope="module")
-def imperfect(problem):
+def imperfect(film_with_discrepancy):
     """A calibration by presses whose charges have errors of 3 % that no parameter describes.
 
     The result has a discrepancy and no traces, so that some unknowns have no variance.
     """
-    _, presses = rig(problem, 20, seed=41)
-    x, y, _ = presses.contact.T
-    log_error = 0.03 * np.column_stack([np.sin(x / 4 + k) * np.cos(y / 5) for k in range(4)])
-    charge = presses.charge_pC * np.exp(log_error)
-    result = calibrate(presses_of(problem, presses.contact, charge), problem)
+    _, result = film_with_discrepancy
     assert result.posterior.imperfect
     assert (np.diag(result.posterior.joint) == 0.0).any()
     return result

@@ -33,6 +33,7 @@ def solved_charges(sensor, contacts):
     return np.array([touch_charge(sensor, press(sensor.film, Circle(1.0), (x, y), force)) for x, y, force in contacts])
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("pretension", [0.3])
 def test_closed_back_is_recognised(layout, pretension):
     assert has_closed_back(presses_with(layout, CAVITY, pretension), layout.charges)

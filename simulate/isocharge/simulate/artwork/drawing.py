@@ -54,7 +54,7 @@ def draw_layout(sensor: Sensor, leads: Leads) -> Drawing:
         leads: Leads of the electrodes.
     """
     with _fixed_metadata():
-        document = ezdxf.new("R2010")  # type: ignore[attr-defined]
+        document = ezdxf.new("R2010")
     document.units = units.MM
     for name, colour in LAYERS.items():
         document.layers.add(name, color=colour)
@@ -116,13 +116,14 @@ def to_svg(document: Drawing) -> str:
     configuration = Configuration(background_policy=BackgroundPolicy.WHITE)
     Frontend(RenderContext(document), backend, config=configuration).draw_layout(document.modelspace())
     page = Page(0.0, 0.0, Units.mm, margins=Margins.all(MARGIN))
-    return backend.get_string(page, settings=Settings(fit_page=False))
+    text: str = backend.get_string(page, settings=Settings(fit_page=False))
+    return text
 
 
 @contextmanager
 def _fixed_metadata() -> Iterator[None]:
     """Write fixed dates and identifiers instead of current ones, so that equal drawings give equal files."""
-    options: Any = ezdxf.options  # type: ignore[attr-defined]
+    options: Any = ezdxf.options
     previous_setting = options.write_fixed_meta_data_for_testing
     options.write_fixed_meta_data_for_testing = True
     try:

@@ -49,8 +49,8 @@ def read_artwork(path: str | Path, layer: str = "ELECTRODES", back: str = "") ->
             is open and has no width.
     """
     try:
-        document: Any = ezdxf.readfile(path)  # type: ignore[attr-defined]
-    except (OSError, ezdxf.DXFError) as error:  # type: ignore[attr-defined]
+        document: Any = ezdxf.readfile(path)
+    except (OSError, ezdxf.DXFError) as error:
         raise SensorError(f"{path}: expected a DXF file: {error}") from error
     scale = conversion_factor(InsertUnits(document.units or InsertUnits.Millimeters), InsertUnits.Millimeters)
     groups = _touching_groups(_polygons(document, layer, scale, path))
