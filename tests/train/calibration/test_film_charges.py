@@ -10,59 +10,82 @@ from isocharge.simulate.forward.film_modes import MODES
 from isocharge.simulate.sensor.film_prior import SHARED
 from isocharge.train.data.presses import draw_contacts
 
+STEP = 0.01
+"""Step of the central differences, in standard deviations of a parameter."""
 
-def test_derivatives_are_those_of_the_charges(layout):
-    """Every column against central differences of the forward map of a film built from its parameters."""
+
+def test_derivatives_with_respect_to_parameters_and_contacts_equal_differences(layout):
+    """Each derivative is compared with central differences of the charges of films that are built from parameters."""
     charges = layout.charges
     rng = np.random.default_rng(3)
     parameters = layout.prior.draw(rng, 1)[0]
-    at = draw_contacts(rng, layout.domain.within(7.0), 6)
-    by_contact = charges.by_contact(parameters, at)
-    by_parameter = charges.by_parameter(parameters, at, by_contact)
-    size = np.abs(charges.charges(parameters, at)).max(axis=1)[:, None]
-    for number, std in enumerate(layout.prior.std):
+    contact = draw_contacts(rng, layout.domain.within(7.0), 6)
+    contact_derivative = charges.by_contact(parameters, contact)
+    parameter_derivative = charges.by_parameter(parameters, contact, contact_derivative)
+    largest_charge = np.abs(charges.charges(parameters, contact)).max(axis=1)[:, None]
+
+    for index, std in enumerate(layout.prior.std):
         step = np.zeros_like(parameters)
-        step[number] = 0.01 * std
-        change = charges.charges(parameters + step, at) - charges.charges(parameters - step, at)
-        np.testing.assert_allclose(by_parameter[:, :, number] / size, change / 0.02 / size, atol=1e-3)
-    by_map = charges.forward_map(parameters).derivatives(at)
-    np.testing.assert_allclose(by_contact / size[:, :, None], by_map / size[:, :, None], atol=2e-3)
+        step[index] = STEP * std
+        charge_above = charges.charges(parameters + step, contact)
+        charge_below = charges.charges(parameters - step, contact)
+        difference = (charge_above - charge_below) / (2.0 * STEP)
+        np.testing.assert_allclose(
+            parameter_derivative[:, :, index] / largest_charge, difference / largest_charge, atol=1e-3
+        )
+
+    expected = charges.forward_map(parameters).derivatives(contact)
+    scale = largest_charge[:, :, None]
+    np.testing.assert_allclose(contact_derivative / scale, expected / scale, atol=2e-3)
 
 
 @pytest.mark.parametrize(
-    ("names", "besides"),
+    ("names", "coefficients"),
     [(("pretension", "young", "thickness"), [1.5, -1.0, 1.5]), (SHARED, [0.0] * len(MODES) + [0.2, 0.9, -0.1] * 4)],
     ids=["modes", "traces"],
 )
-def test_derivatives_contain_what_a_parameter_does_to_the_rest(problem, names, besides):
+def test_derivatives_include_the_effect_of_parameters_on_modes_and_traces(problem, names, coefficients):
     charges = problem.charges
     rng = np.random.default_rng(4)
-    film = problem.before.parameters
-    at = draw_contacts(rng, problem.domain.within(7.0), 6)
-    unknowns = np.pad(np.append(film, besides), (0, charges.n_coefficient - len(besides)))
-    size = charges.charges(unknowns, at)
-    found = charges.by_parameter(unknowns, at, charges.by_contact(unknowns, at))
-    for number, name in enumerate(names):
-        change = np.pad(0.01 * np.diag(charges.prior.std)[number], (0, charges.n_coefficient))
-        expected = (charges.charges(unknowns + change, at) - charges.charges(unknowns - change, at)) / 0.02
-        np.testing.assert_allclose(found[:, :, number] / size, expected / size, atol=1e-3, err_msg=name)
+    contact = draw_contacts(rng, problem.domain.within(7.0), 6)
+    unknowns = np.zeros(charges.layout.film_count)
+    given = np.append(problem.before.parameters, coefficients)
+    unknowns[: given.size] = given
+    charge = charges.charges(unknowns, contact)
+    derivative = charges.by_parameter(unknowns, contact, charges.by_contact(unknowns, contact))
+
+    for index, name in enumerate(names):
+        step = np.zeros_like(unknowns)
+        step[index] = STEP * charges.prior.std[index]
+        charge_above = charges.charges(unknowns + step, contact)
+        charge_below = charges.charges(unknowns - step, contact)
+        difference = (charge_above - charge_below) / (2.0 * STEP)
+        np.testing.assert_allclose(derivative[:, :, index] / charge, difference / charge, atol=1e-3, err_msg=name)
 
 
 @pytest.mark.parametrize(("pretension", "force"), [(0.8, 0.2), (1.6, 0.1)])
-def test_an_uneven_tension_acts_as_a_lower_one(problem, pretension, force):
-    """To second order on all charges alike: against full solves, where first order gives nothing."""
+def test_uneven_tension_changes_all_charges_to_second_order_like_a_lower_tension(problem, pretension, force):
+    """The second difference of ln Q, averaged over the electrodes, is compared with that of direct solves."""
     charges = problem.charges
-    at = np.array([[2.0, 1.0, force]])
     parameters = np.append(pretension, problem.prior.mean[1:])
-    solved = []
-    known = []
     sensor, probe = problem.prior.film(parameters)
-    for share in (0.0, 0.4, -0.4):
-        uneven = replace(sensor, film=replace(sensor.film, deviator=(0.0, share * pretension)))
-        modes = np.zeros(charges.n_coefficient)
-        modes[charges.modes.index("tension_shear")] = share * pretension / MODES["tension_shear"].std
-        solved.append(np.log(touch_charge(uneven, press(uneven.film, probe, (2.0, 1.0), force))).mean())
-        known.append(np.log(charges.charges(np.concatenate([parameters, modes]), at)).mean())
-    second = [0.5 * (values[1] + values[2]) - values[0] for values in (solved, known)]
-    assert second[0] > 0.005
-    assert second[1] == pytest.approx(second[0], rel=0.15)
+    position = (2.0, 1.0)
+    shear = 0.4 * pretension
+
+    def solved_log_charge(film_shear: float) -> float:
+        film = replace(sensor.film, deviator=(0.0, film_shear))
+        charge = touch_charge(replace(sensor, film=film), press(film, probe, position, force))
+        return float(np.log(charge).mean())
+
+    def expanded_log_charge(film_shear: float) -> float:
+        coefficients = np.zeros(charges.n_coefficient)
+        coefficients[charges.modes.index("tension_shear")] = film_shear / MODES["tension_shear"].std
+        unknowns = np.concatenate([parameters, coefficients])
+        return float(np.log(charges.charges(unknowns, np.array([[*position, force]]))).mean())
+
+    def second_difference(log_charge) -> float:
+        return 0.5 * (log_charge(shear) + log_charge(-shear)) - log_charge(0.0)
+
+    expected = second_difference(solved_log_charge)
+    assert expected > 0.005
+    assert second_difference(expanded_log_charge) == pytest.approx(expected, rel=0.15)
