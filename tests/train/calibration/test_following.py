@@ -28,7 +28,7 @@ from isocharge.serve.live import recorded_stream
 from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.model.pretensions import read_pretensions
 from isocharge.serve.signal_chain.thermal import TRIED_PC, ThermalRule
-from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule, HardestFrame
+from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule, PeakFrame
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
 from isocharge.train.calibration import contact_error
@@ -211,7 +211,7 @@ def test_a_gain_that_goes_off_late_is_not_followed(mine, problem, film):
     charge = problem.noise.add(film(1.0).charges(draw_contacts(rng, problem.domain, 360)), rng)
     charge[300:, 0] *= 0.985
     for number, row in enumerate(charge):
-        follower.observe_touch(HardestFrame(follower.predictor.predict(row), row), 5.0 * number)
+        follower.observe_touch(PeakFrame(follower.predictor.predict(row), row), 5.0 * number)
         pretensions.append(follower.film.pretension_MPa)
     assert np.ptp(pretensions[299:]) < 0.1
 

@@ -1,15 +1,17 @@
-"""The pretension of a film, followed by ordinary touches of unknown place and force.
+"""Correction of contacts for changes of the film, which are estimated from ordinary touches.
 
-Four charges have one degree of freedom more than a contact (x, y, force): the misfit. If a film has become tauter or
-slacker, for instance because the room is a degree warmer, the misfits of all touches grow, and the pretension at which
-they are smallest is that of the film. `isocharge.serve.tracking.film_filter` estimates the pretension from the hardest
-frame of each touch, together with the gains, a common offset, and the directions in which the calibration left the film
-uncertain (`FilmDirections`). Contacts are corrected for the estimated pretension and directions.
+Four charges have one degree of freedom more than a contact (x, y, force). This degree of freedom is the misfit. If the
+pretension of a film changes, for example because the room is warmer by 1 K, the misfits of all touches grow. The
+pretension of the film is the pretension at which the misfits are smallest.
 
-Touches that no pretension explains hardly change the estimate. The film counts as lost, which means that it is no
-longer followed, if the last touches are of that kind (two contacts, for instance), if a wrong gain explains them far
-better, or if their charges have a common offset (the warmth of a hand) that is larger than the settings allow. Contacts
-are then computed with the estimate before these touches.
+The module `isocharge.serve.tracking.film_filter` estimates the pretension from the frame with the largest force of each
+touch. The filter also estimates the gains, a common offset, and the directions in which the film remained uncertain
+after the calibration (`FilmDirections`). Contacts are corrected for the estimated pretension and directions.
+
+If no pretension explains a touch, for example a touch with two contacts, the touch hardly changes the estimate. The
+film is lost if no pretension explains the latest touches, or if a wrong gain explains the latest touches far better.
+The film is also lost if the charges have a common offset, for example from a warm hand, that is larger than the
+settings allow. The contacts on a lost film are computed with the estimate before the latest touches.
 """
 
 import math
@@ -31,32 +33,37 @@ from isocharge.serve.signal_chain.rule import Rule, Setting
 from isocharge.serve.tracking.film_filter import FilmFilter, TouchResiduals
 
 HARMLESS_FLAGS = frozenset({STRESS, GAP, REPEAT})
-"""Flags of frames that do not exclude a touch. GAP and REPEAT only mean that frames were lost."""
+"""Flags of a frame that do not make its touch unusable. GAP and REPEAT only mean that frames were lost."""
 
 HARMLESS_FLAGS_OUTSIDE = HARMLESS_FLAGS | {OUTSIDE, BEYOND, MISFIT}
-"""Flags that do not exclude a touch if a frame has the flag OUTSIDE, which the first frames of every touch have."""
+"""Flags of a frame with the flag OUTSIDE that do not make its touch unusable.
+
+The first frames of every touch have the flag OUTSIDE.
+"""
 
 RECENT_TOUCHES = 40
 """Number of the latest touches from which the follower decides whether the film is lost."""
 
 FEWEST_TOUCHES = 12
-"""Number of touches after which contacts are corrected for the first time."""
+"""Number of touches before the first correction of contacts."""
 
 LARGEST_SQUARE = 9.0
-"""Upper bound of the squared misfit of a touch in this decision, in units of the mean square of good touches."""
+"""Upper bound of the squared misfit of a touch in this decision, relative to the mean square of good touches."""
 
 EXPLAINED_SQUARE = 1.25
-"""Largest mean of the squared misfits of very many touches for which the touches count as explained."""
+"""Largest mean of the squared misfits of very many touches that are explained by a pretension."""
 
 EXPLAINED_SCATTER = 5.0
-"""Amount, times the square root of n, by which the sum for n touches may exceed n times `EXPLAINED_SQUARE`."""
+"""Amount by which the sum of n squared misfits may exceed n times `EXPLAINED_SQUARE`, relative to the root of n."""
 
 WRONG_GAINS = np.outer([-1.0, 1.0], [0.03, 0.04, 0.06, 0.09]).ravel()
 """Gain errors of a single electrode that are compared with a change of the pretension."""
 
 WRONG_GAIN_MARGIN = 9.0
-"""Amount by which the sum of the squared misfits with a wrong gain must be smaller than the sum for any pretension, so
-that the gain counts as the cause."""
+"""Smallest difference of two sums of squared misfits that shows a wrong gain.
+
+The first sum is the smallest sum for any pretension, and the second sum is the sum with the wrong gain.
+"""
 
 OFFSET_CORRECTION_ERROR = 0.5
 """Standard deviation of the correction of the pretension for offsets, in units of the correction."""
@@ -69,14 +76,15 @@ SMALLEST_CHANGE_MPa = 0.01
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):
-    """How a film is followed; the section `[follow]` of a device file.
+    """Settings of the correction for changes of the film; the section `[follow]` of a device file.
 
     Attributes:
-        drift_MPa_per_root_hour: Standard deviation of the pretension's change in an hour; it grows with the root of
-            the time. A degree is 0.3 to 0.44 MPa on a ring of aluminium.
+        drift_MPa_per_root_hour: Standard deviation of the change of the pretension in an hour. The standard deviation
+            is proportional to the square root of the time. On a ring of aluminium, a change of the temperature by 1 K
+            changes the pretension by 0.3 to 0.44 MPa.
         largest_offset_pC: Standard deviation of the largest charges that warmth may add to all electrodes during a
-            touch. The film is not followed while the charges are more than twice as large. 0 assumes that there are
-            none.
+            touch. The film is not followed while the charges are more than twice as large. 0 means that warmth adds no
+            charges.
     """
 
     drift_MPa_per_root_hour: Setting = 0.35
@@ -84,7 +92,7 @@ class FollowRule(Rule, frozen=True, kw_only=True):
 
 
 class FilmStateEstimate(NamedTuple):
-    """Estimate of the film.
+    """Estimate of the pretension of the film and of the directions in which the film is uncertain.
 
     Attributes:
         pretension_MPa: Estimate of the pretension.
@@ -99,21 +107,21 @@ class FilmStateEstimate(NamedTuple):
     directions_per_MPa: Array
 
     def charge_factor(self, log_changes: Array, step_MPa: float = 0.0) -> Array:
-        """Compute the charges of this film over those of the calibrated film, both at the same pretension.
+        """Compute the ratio of the charges of this film to the charges of the calibrated film at the same pretension.
 
         Args:
             log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode).
-            step_MPa: Distance of that pretension from the estimated one.
+            step_MPa: Difference of this pretension from the estimated pretension.
 
         Returns:
-            Shape (n_electrode,), dimensionless.
+            Ratios, shape (n_electrode,), dimensionless.
         """
         directions = self.directions + step_MPa * self.directions_per_MPa
         return np.asarray(np.exp(directions @ log_changes))
 
 
 class FollowedContact(NamedTuple):
-    """A contact on the followed film.
+    """A contact after the correction for the estimate of the film.
 
     Attributes:
         contact: The contact.
@@ -124,122 +132,135 @@ class FollowedContact(NamedTuple):
     charge_pC: Array
 
 
-class HardestFrame(NamedTuple):
-    """The contact of the frame of a touch with the largest force, and its touch charges, shape (n_electrode,), pC."""
+class PeakFrame(NamedTuple):
+    """The frame with the largest force of a touch.
+
+    Attributes:
+        contact: Contact of the frame.
+        charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
+    """
 
     contact: Contact
     charge_pC: Array
 
 
-class TouchSquares(NamedTuple):
-    """Squared misfits of one touch, each at most LARGEST_SQUARE, in units of the mean square of good touches.
+class SquaredMisfits(NamedTuple):
+    """Squared misfits of one touch, relative to the mean squared misfit of good touches, at most `LARGEST_SQUARE`.
 
     Attributes:
-        filtered: With the estimated gains and offset, at each pretension, shape (n_pretension,).
-        filtered_then: The same at the pretension that was estimated then.
-        without_gains: With the estimated offset only, at each pretension, shape (n_pretension,).
-        wrong_gain: With each of the wrong gains, for the calibrated film and for the followed film, shape (n_case,).
+        filtered: Squared misfit after the correction by all linear unknowns, at each pretension, shape (n_pretension,).
+        filtered_at_estimate: Element of `filtered` at the pretension that was estimated at the time of the touch.
+        without_gains: Squared misfit after the correction by the offset and the directions, but not by the gains, at
+            each pretension, shape (n_pretension,).
+        wrong_gain: Squared misfit with each of the wrong gains, for the calibrated film and for the followed film,
+            shape (n_case,).
     """
 
     filtered: Array
-    filtered_then: float
+    filtered_at_estimate: float
     without_gains: Array
     wrong_gain: Array
 
 
 class FilmFollower:
-    """Follows one film; belongs to one thread. The same frames give the same answers, bit for bit.
+    """Estimates changes of one film from its touches, and corrects contacts for these changes.
+
+    The methods must be called from one thread. The same frames always give bitwise equal contacts.
 
     Attributes:
-        predictor: The model of the film as it is now.
-        is_lost: Whether the film is not followed, because no pretension explains the last touches.
+        predictor: Model of the film with the pretension that is estimated now.
+        is_lost: Whether the estimate is not updated, because no pretension explains the latest touches.
     """
 
     def __init__(self, predictor: Predictor, rule: FollowRule | None = None, offset_ratio: Array | float = 1.0) -> None:
-        """Begin with the film as it was calibrated.
+        """Begin with the estimate that the film has not changed since the calibration.
 
         Args:
             predictor: The calibrated model.
-            rule: By default the settings of an empty section.
-            offset_ratio: Charge that warmth gives each electrode over the common offset, shape (n_electrode,), or one
-                number for all.
+            rule: Settings; None for the settings of an empty section.
+            offset_ratio: Ratio of the charge that warmth adds to an electrode to the common offset, shape
+                (n_electrode,), or one number for all electrodes.
 
         Raises:
-            ModelError: If the model has three electrodes, or no file of pretensions, or one of another model.
+            ModelError: If the model has three electrodes, or has no file of pretensions, or the file of pretensions
+                belongs to another model.
         """
         self._calibrated = predictor
         self._pretensions = followable_pretensions(predictor)
-        self._directions = read_film_directions(predictor.folder, self._pretensions.typical_pC.size)
+        electrodes = self._pretensions.typical_pC.size
+        self._directions = read_film_directions(predictor.folder, electrodes)
         rule = rule or FollowRule()
         self._filter = FilmFilter(
             self._pretensions,
             self._directions,
             rule.drift_MPa_per_root_hour,
             rule.largest_offset_pC,
-            np.broadcast_to(np.asarray(offset_ratio, dtype=float), self._pretensions.typical_pC.shape),
+            np.broadcast_to(np.asarray(offset_ratio, dtype=float), (electrodes,)),
         )
         self._calibrated_estimate = FilmStateEstimate(
-            self._pretensions.calibrated_MPa,
-            self._pretensions.std_MPa,
-            np.zeros(self._directions.count),
-            np.zeros(self._directions.count),
+            pretension_MPa=self._pretensions.calibrated_MPa,
+            std_MPa=self._pretensions.std_MPa,
+            directions=np.zeros(self._directions.count),
+            directions_per_MPa=np.zeros(self._directions.count),
         )
-        self._wrong_gains = 1.0 + np.kron(np.eye(self._pretensions.typical_pC.size), WRONG_GAINS[:, None])
+        # Each row contains a wrong gain of one electrode, and the gain 1 of the other electrodes.
+        self._wrong_gains = 1.0 + np.kron(np.eye(electrodes), WRONG_GAINS[:, None])
         self.reset()
 
     def reset(self) -> None:
-        """Return to the film as it was calibrated, and begin to follow it again."""
+        """Discard all touches, and return to the estimate that the film has not changed since the calibration."""
         self._filter.reset()
         self.predictor = self._calibrated
         self.is_lost = False
         self._applied_estimate = self._calibrated_estimate
-        self._neighbour: Predictor | None = None
-        self._neighbour_step_MPa = SENSITIVITY_STEP_MPa
+        self._neighbouring_model: Predictor | None = None
+        self._neighbouring_step_MPa = SENSITIVITY_STEP_MPa
         self._factors: tuple[Array, Array] | None = None
         self._factors_contact: Contact | None = None
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
-        self._touches = 0
-        self._recent: deque[TouchSquares] = deque(maxlen=RECENT_TOUCHES)
-        self._earlier: deque[FilmStateEstimate] = deque(maxlen=RECENT_TOUCHES)
+        self._touch_count = 0
+        self._recent_misfits: deque[SquaredMisfits] = deque(maxlen=RECENT_TOUCHES)
+        self._recent_estimates: deque[FilmStateEstimate] = deque(maxlen=RECENT_TOUCHES)
         self.discard_touch()
 
     def discard_touch(self) -> None:
-        """Discard the touch that is under way, as after an outage or a new tare."""
-        self._hardest: HardestFrame | None = None
-        self._is_spoiled = False
+        """Discard the present touch, for example after an outage or a new tare."""
+        self._peak: PeakFrame | None = None
+        self._is_touch_usable = True
 
     @property
     def film(self) -> FollowedFilm:
-        """The film as it is now."""
-        return FollowedFilm(self._applied_estimate.pretension_MPa, self._applied_estimate.std_MPa, self._touches)
+        """Present estimate of the film for a record."""
+        estimate = self._applied_estimate
+        return FollowedFilm(estimate.pretension_MPa, estimate.std_MPa, self._touch_count)
 
     def observe_frame(
         self, charge_pC: Array | None, contact: Contact | None, flags: tuple[str, ...], clock_s: float
     ) -> None:
-        """Process a frame. The film is estimated again when a touch has ended.
+        """Process a frame. After the last frame of a touch, the estimate of the film is updated.
+
+        The estimate is updated with the frame of the touch that has the largest force and no flags.
 
         Args:
-            charge_pC: Touch charges, shape (n_electrode,), pC.
-            contact: The model's answer to them; None where nothing touches.
+            charge_pC: Touch charges, shape (n_electrode,), pC; None if nothing touches the film.
+            contact: Contact that the model computed from the charges; None if nothing touches the film.
             flags: Flags of the frame.
             clock_s: Time of the frame on a clock that does not jump, s.
         """
         if contact is None:
             self._end_touch(clock_s)
-            return
-        if flags:
-            harmless = HARMLESS_FLAGS_OUTSIDE if OUTSIDE in flags else HARMLESS_FLAGS
-            if not harmless.issuperset(flags):
-                self._is_spoiled = True
-            return
-        if self._hardest is None or contact.force_N > self._hardest.contact.force_N:
+        elif flags:
+            harmless_flags = HARMLESS_FLAGS_OUTSIDE if OUTSIDE in flags else HARMLESS_FLAGS
+            if not harmless_flags.issuperset(flags):
+                self._is_touch_usable = False
+        elif self._peak is None or contact.force_N > self._peak.contact.force_N:
             assert charge_pC is not None
-            self._hardest = HardestFrame(contact, charge_pC)
+            self._peak = PeakFrame(contact, charge_pC)
 
     def _end_touch(self, clock_s: float) -> None:
-        """Use the touch that has just ended, unless one of its frames had a flag that makes the touch unusable."""
-        if self._hardest is not None and not self._is_spoiled:
-            self.observe_touch(self._hardest, clock_s)
+        """Update the estimate with the touch that has just ended, unless the flags of a frame make it unusable."""
+        if self._peak is not None and self._is_touch_usable:
+            self.observe_touch(self._peak, clock_s)
         self.discard_touch()
 
     def follow_contact(self, contact: Contact, charge_pC: Array) -> FollowedContact:
@@ -248,23 +269,20 @@ class FilmFollower:
         Before the first estimate, the contact is returned unchanged.
 
         Args:
-            contact: Answer of `predictor` to the charges.
+            contact: Contact that `predictor` computed from the charges.
             charge_pC: Touch charges, shape (n_electrode,), pC.
         """
-        if self._neighbour is None:
+        if self._neighbouring_model is None:
             return FollowedContact(contact, charge_pC)
-        estimate = self._applied_estimate
-        if self._directions.count == 0:
-            neighbour = partial(self._neighbour.predict, charge_pC)
-            return FollowedContact(
-                contact.widened(self._sensitivity.shift(contact, estimate.std_MPa, neighbour)), charge_pC
-            )
-        factor, neighbour_factor = self._charge_factors(contact)
-        corrected_pC = charge_pC / factor
-        corrected = self.predictor.predict(corrected_pC)
-        neighbour = partial(self._neighbour.predict, charge_pC / neighbour_factor)
-        shift = self._sensitivity.shift(corrected, estimate.std_MPa, neighbour)
-        return FollowedContact(corrected.widened(shift), corrected_pC)
+        neighbouring_pC = charge_pC
+        if self._directions.count > 0:
+            factor, neighbouring_factor = self._charge_factors(contact)
+            neighbouring_pC = charge_pC / neighbouring_factor
+            charge_pC = charge_pC / factor
+            contact = self.predictor.predict(charge_pC)
+        predict_neighbouring = partial(self._neighbouring_model.predict, neighbouring_pC)
+        shift = self._sensitivity.shift(contact, self._applied_estimate.std_MPa, predict_neighbouring)
+        return FollowedContact(contact.widened(shift), charge_pC)
 
     def _charge_factors(self, contact: Contact) -> tuple[Array, Array]:
         """Return the factors by which the charges are divided before they are passed to the models.
@@ -281,47 +299,59 @@ class FilmFollower:
         if self._factors is None or not is_close(contact, self._factors_contact):
             (log_changes,) = self._directions.log_changes(np.array([contact[:3]]))
             factor = self._applied_estimate.charge_factor(log_changes)
-            neighbour_factor = self._applied_estimate.charge_factor(log_changes, self._neighbour_step_MPa)
-            self._factors = factor, neighbour_factor
+            neighbouring_factor = self._applied_estimate.charge_factor(log_changes, self._neighbouring_step_MPa)
+            self._factors = factor, neighbouring_factor
             self._factors_contact = contact
         return self._factors
 
-    def observe_touch(self, touch: HardestFrame, clock_s: float) -> None:
+    def observe_touch(self, peak: PeakFrame, clock_s: float) -> None:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
 
         Args:
-            touch: The hardest frame of the touch.
+            peak: Frame with the largest force of the touch.
             clock_s: Time of the touch on a clock that does not jump, s.
         """
-        (log_changes,) = self._directions.log_changes(np.array([touch.contact[:3]]))
+        (log_changes,) = self._directions.log_changes(np.array([peak.contact[:3]]))
         self._filter.predict(clock_s)
-        residuals = self._filter.update(touch.charge_pC, log_changes)
-        self._touches += 1
-        self._recent.append(self._touch_squares(touch.charge_pC, log_changes, residuals))
-        if len(self._recent) < FEWEST_TOUCHES:
+        residuals = self._filter.update(peak.charge_pC, log_changes)
+        self._touch_count += 1
+        self._recent_misfits.append(self._squared_misfits(peak.charge_pC, log_changes, residuals))
+        if len(self._recent_misfits) < FEWEST_TOUCHES:
             return
         was_lost = self.is_lost
         self.is_lost = self._is_unexplained() or self._is_gain_wrong() or self._filter.is_offset_too_large
         if not self.is_lost:
-            self._earlier.append(self._estimate())
-            self._apply_estimate(self._earlier[-1])
+            estimate = self._estimate()
+            self._recent_estimates.append(estimate)
+            self._apply_estimate(estimate)
         elif not was_lost:
-            before_recent = len(self._earlier) == RECENT_TOUCHES
-            self._apply_estimate(self._earlier[0] if before_recent else self._calibrated_estimate)
-            self._earlier.clear()
+            self._apply_estimate(self._estimate_before_recent_touches())
+            self._recent_estimates.clear()
 
-    def _touch_squares(self, charge_pC: Array, log_changes: Array, residuals: TouchResiduals) -> TouchSquares:
-        """Return the squared misfits of a touch that decide whether the film is lost."""
+    def _estimate_before_recent_touches(self) -> FilmStateEstimate:
+        """Return the estimate before the latest `RECENT_TOUCHES` touches."""
+        is_old_enough = len(self._recent_estimates) == RECENT_TOUCHES
+        return self._recent_estimates[0] if is_old_enough else self._calibrated_estimate
+
+    def _squared_misfits(self, charge_pC: Array, log_changes: Array, residuals: TouchResiduals) -> SquaredMisfits:
+        """Return the squared misfits of a touch by which it is decided whether the film is lost.
+
+        Args:
+            charge_pC: Touch charges of the frame with the largest force, shape (n_electrode,), pC.
+            log_changes: Changes of ln Q by one unit of each direction, shape (n_direction, n_electrode).
+            residuals: Squared misfits that the filter computed for the touch.
+        """
         directions = self._filter.direction_means(self._filter.mean_MPa)
         corrected_pC = (charge_pC - self._filter.offset_pC) * np.exp(-directions @ log_changes)
-        candidates = corrected_pC * self._wrong_gains
-        misfits = [model.predict_batch(candidates).misfit for model in (self._calibrated, self.predictor)]
-        scale = self._pretensions.misfit_rms**2 * (1.0 + residuals.offset_variance)
-        wrong_gain = np.concatenate(misfits).astype(float) ** 2 / scale
+        charges_with_wrong_gain_pC = corrected_pC * self._wrong_gains
+        models = (self._calibrated, self.predictor)
+        misfits = [model.predict_batch(charges_with_wrong_gain_pC).misfit for model in models]
+        mean_square_of_good_touches = self._pretensions.misfit_rms**2 * (1.0 + residuals.offset_variance)
+        wrong_gain = np.concatenate(misfits).astype(float) ** 2 / mean_square_of_good_touches
         filtered = np.minimum(residuals.filtered, LARGEST_SQUARE)
-        return TouchSquares(
+        return SquaredMisfits(
             filtered=filtered,
-            filtered_then=float(filtered[self._filter.nearest]),
+            filtered_at_estimate=float(filtered[self._filter.nearest]),
             without_gains=np.minimum(residuals.without_gains, LARGEST_SQUARE),
             wrong_gain=np.minimum(wrong_gain, LARGEST_SQUARE),
         )
@@ -329,76 +359,98 @@ class FilmFollower:
     def _is_unexplained(self) -> bool:
         """Return whether no pretension explains the latest touches.
 
-        The squared misfits of the touches are added up for the pretension that is estimated now, and for the
-        pretensions that were estimated at each touch. The smaller sum is compared with a limit.
+        Two sums of the squared misfits of these touches are computed: one at the present estimate of the pretension,
+        and one at the estimates at the times of the touches. The smaller sum is compared with a limit.
         """
-        count = len(self._recent)
+        count = len(self._recent_misfits)
         nearest = self._filter.nearest
-        sum_at_present_estimate = sum(float(touch.filtered[nearest]) for touch in self._recent)
-        sum_at_earlier_estimates = sum(touch.filtered_then for touch in self._recent)
+        sum_at_present_estimate = sum(float(touch.filtered[nearest]) for touch in self._recent_misfits)
+        sum_at_earlier_estimates = sum(touch.filtered_at_estimate for touch in self._recent_misfits)
         limit = EXPLAINED_SQUARE * count + EXPLAINED_SCATTER * math.sqrt(count)
         return min(sum_at_present_estimate, sum_at_earlier_estimates) > limit
 
     def _is_gain_wrong(self) -> bool:
         """Return whether a wrong gain of one electrode explains the latest touches far better than any pretension."""
-        sum_by_pretension = np.sum([touch.without_gains for touch in self._recent], axis=0)
-        sum_by_wrong_gain = np.sum([touch.wrong_gain for touch in self._recent], axis=0)
+        sum_by_pretension = np.sum([touch.without_gains for touch in self._recent_misfits], axis=0)
+        sum_by_wrong_gain = np.sum([touch.wrong_gain for touch in self._recent_misfits], axis=0)
         return bool(sum_by_wrong_gain.min() < sum_by_pretension.min() - WRONG_GAIN_MARGIN)
 
     def _estimate(self) -> FilmStateEstimate:
-        """Return the estimate of the film.
+        """Return the mean estimate of the film over two hypotheses, which have equal prior probabilities.
 
-        The estimate is the mean over two hypotheses, which have the same prior probability: the pretension has changed
-        since the calibration, or it has not.
+        The first hypothesis is that the pretension has changed since the calibration. The second hypothesis is that it
+        has not changed.
         """
-        pretensions = self._pretensions
-        mean_MPa = self._filter.mean_MPa
-        change = mean_MPa - pretensions.calibrated_MPa
-        variance = float(self._filter.probability @ (self._filter.grid_MPa - mean_MPa) ** 2)
-        variance += (OFFSET_CORRECTION_ERROR * self._filter.offset_correction_MPa) ** 2
-        unchanged_variance = variance + pretensions.floor_MPa**2
-        changed_variance = unchanged_variance + pretensions.std_MPa**2
-        exponent = -0.5 * change**2 * (1.0 / unchanged_variance - 1.0 / changed_variance)
-        odds_of_unchanged = math.sqrt(changed_variance / unchanged_variance) * math.exp(exponent)
-        share = 1.0 / (1.0 + odds_of_unchanged)
-        std = math.sqrt(unchanged_variance + share * (1.0 - share) * change**2)
-        pretension_MPa = pretensions.calibrated_MPa + share * change
+        calibrated_MPa = self._pretensions.calibrated_MPa
+        change = self._filter.mean_MPa - calibrated_MPa
+        unchanged_variance = self._filter_variance() + self._pretensions.floor_MPa**2
+        changed_probability = self._changed_probability(change, unchanged_variance)
+        std = math.sqrt(unchanged_variance + changed_probability * (1.0 - changed_probability) * change**2)
+        pretension_MPa = calibrated_MPa + changed_probability * change
         directions = self._filter.direction_means(pretension_MPa)
-        neighbouring = self._filter.direction_means(pretension_MPa + SENSITIVITY_STEP_MPa)
-        return FilmStateEstimate(pretension_MPa, std, directions, (neighbouring - directions) / SENSITIVITY_STEP_MPa)
+        neighbouring_directions = self._filter.direction_means(pretension_MPa + SENSITIVITY_STEP_MPa)
+        directions_per_MPa = (neighbouring_directions - directions) / SENSITIVITY_STEP_MPa
+        return FilmStateEstimate(pretension_MPa, std, directions, directions_per_MPa)
+
+    def _filter_variance(self) -> float:
+        """Return the variance of the pretension in the filter, with the error of the correction for offsets, MPa^2."""
+        deviations_MPa = self._filter.grid_MPa - self._filter.mean_MPa
+        variance = float(self._filter.probability @ deviations_MPa**2)
+        return variance + (OFFSET_CORRECTION_ERROR * self._filter.offset_correction_MPa) ** 2
+
+    def _changed_probability(self, change_MPa: float, unchanged_variance: float) -> float:
+        """Return the probability that the pretension has changed since the calibration.
+
+        Args:
+            change_MPa: Measured change of the pretension.
+            unchanged_variance: Variance of the measured change if the pretension has not changed, MPa^2.
+        """
+        changed_variance = unchanged_variance + self._pretensions.std_MPa**2
+        exponent = -0.5 * change_MPa**2 * (1.0 / unchanged_variance - 1.0 / changed_variance)
+        odds_of_unchanged = math.sqrt(changed_variance / unchanged_variance) * math.exp(exponent)
+        return 1.0 / (1.0 + odds_of_unchanged)
 
     def _apply_estimate(self, estimate: FilmStateEstimate) -> None:
-        """Set the models with which contacts are computed to those of a new estimate of the film.
+        """Compute contacts from now on with a new estimate of the film.
 
         If the pretension has changed by less than `SMALLEST_CHANGE_MPa`, the present models are kept.
         """
-        is_same_film = abs(estimate.pretension_MPa - self._applied_estimate.pretension_MPa) < SMALLEST_CHANGE_MPa
-        if is_same_film:
-            estimate = estimate._replace(pretension_MPa=self._applied_estimate.pretension_MPa)
+        present_MPa = self._applied_estimate.pretension_MPa
+        is_same_pretension = abs(estimate.pretension_MPa - present_MPa) < SMALLEST_CHANGE_MPa
+        if is_same_pretension:
+            estimate = estimate._replace(pretension_MPa=present_MPa)
         self._applied_estimate = estimate
         self._factors = None
-        if is_same_film and self._neighbour is not None:
-            return
-        if not is_same_film:
+        if not is_same_pretension:
             self.predictor = self._model_at(estimate.pretension_MPa)
-        largest_MPa = self._pretensions.range_MPa[1]
-        step = SENSITIVITY_STEP_MPa
-        if estimate.pretension_MPa + step > largest_MPa:
-            step = -step
-        self._neighbour_step_MPa = step
-        self._neighbour = self._model_at(estimate.pretension_MPa + step)
+        if not is_same_pretension or self._neighbouring_model is None:
+            self._set_neighbouring_model(estimate.pretension_MPa)
+
+    def _set_neighbouring_model(self, pretension_MPa: float) -> None:
+        """Set the model with which the sensitivity of contacts to the pretension is computed.
+
+        Args:
+            pretension_MPa: The estimated pretension, whose neighbour within the range of the weights is used.
+        """
+        step_MPa = SENSITIVITY_STEP_MPa
+        _, largest_MPa = self._pretensions.range_MPa
+        if pretension_MPa + step_MPa > largest_MPa:
+            step_MPa = -step_MPa
+        self._neighbouring_step_MPa = step_MPa
+        self._neighbouring_model = self._model_at(pretension_MPa + step_MPa)
         self._sensitivity = Sensitivity(SENSITIVITY_STEP_MPa)
 
     def _model_at(self, pretension_MPa: float) -> Predictor:
-        """Return the model of the film at another pretension."""
+        """Return the model of the film at a pretension."""
         return self._calibrated.with_constants(self._pretensions.constants(pretension_MPa))
 
 
 def followable_pretensions(predictor: Predictor) -> Pretensions:
-    """Read the file of pretensions beside a model, and check that the film can be followed with it.
+    """Read the file of pretensions of a model, and check that changes of its film can be estimated.
 
     Raises:
-        ModelError: If the model has three electrodes, or no file of pretensions, or one of another model.
+        ModelError: If the model has three electrodes, or has no file of pretensions, or the file of pretensions belongs
+            to another model.
     """
     electrodes = predictor.metadata.electrodes
     if len(electrodes) <= 3:
@@ -413,19 +465,24 @@ def followable_pretensions(predictor: Predictor) -> Pretensions:
 
 
 def _check_same_model(predictor: Predictor, pretensions: Pretensions) -> None:
-    """Refuse weights of another model.
+    """Check that the weights of a file of pretensions belong to a model.
 
-    With the weights of the calibrated pretension, the graph must compute the same contacts as with its own weights.
-    With the weights of another pretension, it must compute other contacts.
+    With the weights of the calibrated pretension, the graph of the model must compute the same contacts as with its own
+    weights. With the weights of another pretension, the graph must compute other contacts.
+
+    Raises:
+        ModelError: If the weights belong to another model.
     """
     lowest_MPa, highest_MPa = pretensions.range_MPa
     other_MPa = highest_MPa if pretensions.calibrated_MPa == lowest_MPa else lowest_MPa
-    charges = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)
-    own = np.asarray(predictor.predict_batch(charges))
-    calibrated = predictor.with_constants(pretensions.constants(pretensions.calibrated_MPa))
-    other = predictor.with_constants(pretensions.constants(other_MPa))
-    is_same = np.allclose(np.asarray(calibrated.predict_batch(charges)), own, rtol=1e-5, atol=1e-5, equal_nan=True)
-    if not is_same or np.array_equal(np.asarray(other.predict_batch(charges)), own):
+    charges_pC = np.outer([0.5, 1.0, 2.0], pretensions.typical_pC)
+    calibrated_model = predictor.with_constants(pretensions.constants(pretensions.calibrated_MPa))
+    other_model = predictor.with_constants(pretensions.constants(other_MPa))
+    own, calibrated, other = (
+        np.asarray(model.predict_batch(charges_pC)) for model in (predictor, calibrated_model, other_model)
+    )
+    is_same_model = np.allclose(calibrated, own, rtol=1e-5, atol=1e-5, equal_nan=True)
+    if not is_same_model or np.array_equal(other, own):
         raise ModelError(
             f"{predictor.folder}: pretensions.npz is not of this model.onnx; copy the model's folder again, or "
             "calibrate again"

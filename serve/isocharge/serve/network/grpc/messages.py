@@ -1,7 +1,7 @@
 """Messages of `inference.GRPCInferenceService`, and their translation into requests and answers.
 
-The message classes are built from the compiled `inference.proto` in a separate descriptor pool, so that a program may
-also use another implementation of the protocol, whose messages have the same names.
+The message classes are built from the compiled `inference.proto` in a separate descriptor pool. A program may therefore
+also use another implementation of the protocol, although its messages have the same names.
 """
 
 from importlib.resources import files
@@ -47,7 +47,7 @@ CONTENT_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
 def read_request(message: Any, loaded: LoadedVersion, batch: int) -> InferRequest:
     """Parse a ModelInferRequest, and return the charges and the requested outputs.
 
-    If the charges are raw contents, the outputs are sent as raw contents, too.
+    If the charges of the request are raw contents, the outputs of the response are raw contents, too.
 
     Args:
         message: The message.
@@ -63,13 +63,13 @@ def read_request(message: Any, loaded: LoadedVersion, batch: int) -> InferReques
     if len(raw_contents) > 1:
         raise RequestError(f"expected one input tensor, got {len(raw_contents)} raw contents")
     raw = raw_contents[0] if raw_contents else None
-    content = {
+    json_object = {
         "id": message.id,
         "inputs": [_input_object(tensor, raw) for tensor in message.inputs],
         "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
         "parameters": {"binary_data_output": raw is not None},
     }
-    return parse_request(content, raw or b"", loaded, batch)
+    return parse_request(json_object, raw or b"", loaded, batch)
 
 
 def _input_object(tensor: Any, raw: bytes | None) -> dict[str, Any]:
@@ -80,13 +80,18 @@ def _input_object(tensor: Any, raw: bytes | None) -> dict[str, Any]:
         raw: Raw content of the message, which follows the JSON text in the HTTP protocol; None if there is none.
     """
     parameters: dict[str, Any] = _unsupported_parameters(tensor)
-    content = {"name": tensor.name, "datatype": tensor.datatype, "shape": list(tensor.shape), "parameters": parameters}
+    json_object = {
+        "name": tensor.name,
+        "datatype": tensor.datatype,
+        "shape": list(tensor.shape),
+        "parameters": parameters,
+    }
     if raw is not None:
         parameters["binary_data_size"] = len(raw)
     if tensor.HasField("contents") or raw is None:
         field = CONTENT_FIELDS.get(tensor.datatype, "fp32_contents")
-        content["data"] = list(getattr(tensor.contents, field))
-    return content
+        json_object["data"] = list(getattr(tensor.contents, field))
+    return json_object
 
 
 def _unsupported_parameters(tensor: Any) -> dict[str, bool]:

@@ -1,6 +1,6 @@
-"""gRPC server: a port on which a `Service` is available, with its own event loop.
+"""gRPC server, which makes a `Service` available on a port and has its own event loop.
 
-An open call needs no thread, so that idle calls do not delay other clients.
+An open call needs no thread. Idle calls therefore do not delay other clients.
 """
 
 import asyncio
@@ -22,8 +22,10 @@ GRACE_SECONDS = 10
 """Time that requests which have begun have to finish when the server stops, s."""
 
 MAX_CALLS_PER_CONNECTION = 100
-"""Largest number of open calls of one connection, which is the smallest number that HTTP/2 recommends. Further calls
-wait on the side of the client."""
+"""Largest number of open calls of one connection, which is the smallest number that HTTP/2 recommends.
+
+Further calls of the connection wait on the side of the client.
+"""
 
 
 @contextmanager

@@ -1,8 +1,8 @@
 """Answers to the calls of `inference.GRPCInferenceService`, with the models, limits and token of the HTTP server.
 
 All methods are declared as streams of messages from the client. The token and the limits can therefore be checked
-before the first message arrives. If the largest number of calls is open, a new call replaces the call that has waited
-longest for a message from its client.
+before the first message arrives. If the largest number of calls is open, the call that has waited longest for a message
+from its client is ended when a new call begins.
 """
 
 import asyncio
@@ -26,13 +26,13 @@ from isocharge.serve.network.protocol.response import client_message, statuses
 from isocharge.serve.network.traffic import Exchange
 
 METHODS_WITHOUT_TOKEN = ("ServerLive", "ServerReady")
-"""Methods that need no token."""
+"""Names of the methods that need no token."""
 
 SLOW_METHODS = ("RepositoryModelLoad", "RepositoryModelUnload")
-"""Methods that may take long and are answered in other threads."""
+"""Names of the methods that may take long and are therefore answered in other threads."""
 
 STREAM = "ModelStreamInfer"
-"""Name of the method that receives and sends many messages."""
+"""Name of the method that receives and sends several messages in one call."""
 
 
 @dataclass
@@ -64,10 +64,10 @@ class Service:
         self._limits = handler.limits
         self._traffic = handler.traffic
         self._token = handler.token
-        self._open_calls = 0
+        self._open_count = 0
         self._waiting: dict[asyncio.Timeout, None] = {}  # an ordered set of the calls that wait for a message
-        self._traffic.open["grpc"] = lambda: self._open_calls
-        self._answers: dict[str, Callable[[Any], Any]] = {
+        self._traffic.open["grpc"] = lambda: self._open_count
+        self._functions: dict[str, Callable[[Any], Any]] = {
             "ServerLive": lambda _: {"live": True},
             "ServerReady": lambda _: {"ready": bool(store.loaded_versions())},
             "ModelReady": lambda request: {"ready": store.label(request.name, request.version) is not None},
@@ -144,7 +144,7 @@ class Service:
         Returns:
             The response; None for the method `STREAM`, whose responses have been sent.
         """
-        with self._open_call():
+        with self._count_open_call():
             if self._token is not None and name not in METHODS_WITHOUT_TOKEN:
                 self._token.check(_authorization(context))
             if name == STREAM:
@@ -168,8 +168,8 @@ class Service:
         if data is grpc.aio.EOF:
             raise RequestError(f"{name}: expected a message, got none")
         if name in SLOW_METHODS:
-            return await asyncio.to_thread(self._answer, name, data, call)
-        return self._answer(name, data, call)
+            return await asyncio.to_thread(self._respond, name, data, call)
+        return self._respond(name, data, call)
 
     async def _answer_stream(self, context: grpc.aio.ServicerContext, call: _Call) -> None:
         """Send a response to each message of a stream.
@@ -184,10 +184,10 @@ class Service:
         timeout_s = self._limits.header_seconds
         while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
             async with asyncio.timeout(self._limits.body_seconds):
-                await context.write(self._answer(STREAM, data, call))
+                await context.write(self._respond(STREAM, data, call))
             timeout_s = self._limits.idle_seconds
 
-    def _answer(self, name: str, data: bytes, call: _Call) -> bytes:
+    def _respond(self, name: str, data: bytes, call: _Call) -> bytes:
         """Return the serialized response to a serialized message.
 
         Args:
@@ -207,14 +207,18 @@ class Service:
         model_version = getattr(request, "model_version", "") or getattr(request, "version", "")
         call.model = self._store.label(model_name, model_version)
 
-        answer = self._answers[name](request)
+        answer = self._functions[name](request)
         response = answer if isinstance(answer, Message) else ParseDict(answer or {}, response_type())
         response_data: bytes = response.SerializeToString()
         call.bytes_out += len(response_data)
         return response_data
 
     def _load(self, request: Any) -> None:
-        """Read the files of a model again; raise RequestError if the request has parameters."""
+        """Read the files of a model again.
+
+        Raises:
+            RequestError: If the request has parameters.
+        """
         if request.parameters:
             raise RequestError(describe.NO_LOAD_PARAMETERS)
         self._store.load(request.model_name)
@@ -231,45 +235,58 @@ class Service:
         If an error occurs, its message is returned as a response, so that the stream continues.
         """
         _, response_type = METHODS[STREAM]
+        status = "OK"
         try:
             response = response_type(infer_response=self._infer(request))
-            status = "OK"
-        except Exception as error:
-            response = response_type(error_message=client_message(error))
+        except Exception as error:  # every error is sent to the client
             _, status = statuses(error)
+            response = response_type(error_message=client_message(error))
         self._traffic.count("grpc", f"{STREAM} message", status)
         return response
 
     @contextmanager
-    def _open_call(self) -> Iterator[None]:
-        """Count an open call. If there are too many calls, end the call that has waited longest for a message.
+    def _count_open_call(self) -> Iterator[None]:
+        """Count a call as open while the block runs.
+
+        If there are too many calls, the call that has waited longest for a message is ended.
 
         Raises:
             TooMany: If there are too many calls, and no call waits for a message.
         """
-        if self._open_calls >= self._limits.connections:
-            if not self._waiting:
-                raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
-            oldest = next(iter(self._waiting))
-            del self._waiting[oldest]
-            oldest.reschedule(asyncio.get_running_loop().time())
-        self._open_calls += 1
+        if self._open_count >= self._limits.connections:
+            self._end_waiting_call()
+        self._open_count += 1
         try:
             yield
         finally:
-            self._open_calls -= 1
+            self._open_count -= 1
+
+    def _end_waiting_call(self) -> None:
+        """End the call that has waited longest for a message.
+
+        Raises:
+            TooMany: If no call waits for a message.
+        """
+        if not self._waiting:
+            raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
+        oldest = next(iter(self._waiting))
+        del self._waiting[oldest]
+        oldest.reschedule(asyncio.get_running_loop().time())
 
     async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
-        """Wait for the next message of a call, and return it; return grpc.aio.EOF at the end of the call.
+        """Wait for the next message of a call.
 
-        While the call waits, a new call may replace it.
+        While a call waits for a message, the call may be ended because of a new call.
 
         Args:
             context: Context of the call.
             timeout_s: Longest time to wait, s.
 
+        Returns:
+            The message; grpc.aio.EOF at the end of the call.
+
         Raises:
-            TimeoutError: If the message does not arrive in time, or a new call replaces this call.
+            TimeoutError: If the message does not arrive in time, or this call is ended because of a new call.
         """
         async with asyncio.timeout(timeout_s) as timeout:
             self._waiting[timeout] = None
@@ -280,6 +297,6 @@ class Service:
 
 
 def _authorization(context: grpc.aio.ServicerContext) -> bytes:
-    """Return the value of the metadata field `authorization`; empty if the client did not send this field."""
+    """Return the value of the metadata field `authorization`, which is empty if the client did not send the field."""
     value = dict(context.invocation_metadata() or ()).get("authorization", "")
     return value.encode() if isinstance(value, str) else bytes(value)

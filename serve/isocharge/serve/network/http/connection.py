@@ -1,13 +1,14 @@
 """HTTP/1.1 on one connection, with limits of size and time.
 
-A complete request is answered at once in the event loop, because most answers take microseconds. Requests that may take
-longer are answered in another thread; later requests of the same connection wait until the answer is sent.
+A complete request is answered at once in the event loop, because most answers take microseconds. A request that may
+take longer is answered in another thread. Later requests of the same connection wait until its answer is sent.
 
-A timer for each request would cost as much time as parsing the request. Each connection therefore stores the deadline
-of its next step, and the server regularly compares all deadlines with the clock (`close_overdue`).
+A timer for each request would cost as much time as parsing the request. Each connection therefore only stores a
+deadline, until which the client must have taken its next step. The server regularly compares all deadlines with the
+clock (`close_overdue`).
 
 A client may send thousands of requests at once, and all connections share one thread. Long data are therefore parsed in
-slices, and after `TURN_SECONDS` the event loop continues with the other connections.
+slices. After `TURN_SECONDS`, the event loop continues with the other connections.
 """
 
 import asyncio
@@ -26,7 +27,7 @@ from isocharge.serve.network.protocol.response import error_response, refusal
 from isocharge.serve.network.traffic import Client
 
 MAX_UNSENT_BYTES = 1 << 22
-"""Largest size of the responses that wait for a client that does not read, bytes. Then the connection is closed."""
+"""Largest total size of the responses that a client has not read, bytes, beyond which the connection is closed."""
 
 SLICE_BYTES = 4096
 """Number of bytes that are parsed at a time. Nearly every request is shorter."""
@@ -39,7 +40,7 @@ LINGER_SECONDS = 2.0
 
 
 class Phase(Enum):
-    """What a connection is waiting for. The values are used in error messages."""
+    """The part of a request for which a connection waits. The values are used in error messages."""
 
     IDLE = "a request"
     HEADERS = "the end of the headers"
@@ -86,7 +87,7 @@ class Connection(asyncio.Protocol):
         self._piece_begins_with_request = True
         self._piece_was_answered = False  # whether a request of the present piece of data was answered
         self._unparsed = bytearray()
-        self._turn: asyncio.Handle | None = None
+        self._next_turn: asyncio.Handle | None = None
 
         # The latest complete request. If it came in one piece, its text and size are stored to recognise a repetition.
         self._head: Head | None = None
@@ -109,19 +110,19 @@ class Connection(asyncio.Protocol):
         self._client = (str(peer[0]), int(peer[1])) if isinstance(peer, tuple) else None
         self._connections.add(self)
         self._set_deadline(self._limits.header_seconds)
-        if len(self._connections) > self._limits.connections and not self._make_room():
+        if len(self._connections) > self._limits.connections and not self._end_oldest_unused():
             self._refuse(refusal(503, f"all {self._limits.connections} connections are taken; try again later"))
 
-    def _make_room(self) -> bool:
-        """End the oldest connection that has not sent a complete request.
+    def _end_oldest_unused(self) -> bool:
+        """End the oldest connection on which no complete request has arrived.
 
         Returns:
             Whether there was such a connection.
         """
-        candidates = [other for other in self._connections if other is not self and not other.has_completed_request]
-        if not candidates:
+        unused = [other for other in self._connections if other is not self and not other.has_completed_request]
+        if not unused:
             return False
-        oldest = min(candidates, key=lambda connection: connection.deadline)
+        oldest = min(unused, key=lambda connection: connection.deadline)
         self._connections.discard(oldest)
         oldest._transport.abort()
         return True
@@ -133,17 +134,18 @@ class Connection(asyncio.Protocol):
         self._waiting.clear()
 
     def data_received(self, data: bytes) -> None:
-        """Parse short data at once, and long or postponed data in slices, in turns with other connections.
+        """Parse short data at once, and long data in slices, between which other connections are served.
 
-        A request with the same head as the latest request is answered without parsing the head again.
+        While an answer is computed, or the client does not read its responses, data are only stored. If a request has
+        the same head as the latest request, the head is not parsed again.
         """
         if self._is_refused or self._transport.is_closing():
             return
         must_wait = self._unparsed or self._answering or self._is_blocked
         if must_wait or len(data) > SLICE_BYTES:
             self._unparsed += data
-            if self._turn is None:
-                self._take_turn()
+            if self._next_turn is None:
+                self._parse_stored_data()
             return
 
         repeats_head = len(data) == self._remembered_bytes and data.startswith(self._remembered_head)
@@ -158,7 +160,11 @@ class Connection(asyncio.Protocol):
             self._remember(data)
 
     def eof_received(self) -> bool:
-        """Handle the end of the client's data, and return whether the connection stays open for further responses."""
+        """Handle the end of the data of the client.
+
+        Returns:
+            Whether the connection stays open for further responses.
+        """
         self._is_half_closed = bool(self._unparsed or self._answering)
         return self._is_half_closed and self._transport.can_write_eof()
 
@@ -175,8 +181,8 @@ class Connection(asyncio.Protocol):
         """Continue, because the client has read its responses."""
         self._is_blocked = False
         self._set_deadline(self._limits.idle_seconds)
-        if self._turn is None:
-            self._take_turn()
+        if self._next_turn is None:
+            self._parse_stored_data()
 
     def shutdown(self) -> None:
         """Close the connection, because the server stops.
@@ -191,7 +197,7 @@ class Connection(asyncio.Protocol):
             self._transport.close()
 
     def end_overdue(self) -> None:
-        """End the connection after its deadline. If a request has begun, the client receives the reason."""
+        """End the connection because its deadline has passed. If a request has begun, the reason is sent."""
         if self._phase is Phase.IDLE or self._is_refused:
             self._transport.abort()
         else:
@@ -201,15 +207,18 @@ class Connection(asyncio.Protocol):
         """End the connection at once."""
         self._transport.abort()
 
-    def _take_turn(self) -> None:
-        """Parse slices of the unparsed data for at most `TURN_SECONDS`."""
-        self._turn = None
+    def _parse_stored_data(self) -> None:
+        """Parse slices of the stored data for at most `TURN_SECONDS`.
+
+        If data remain, the event loop calls this method again after it has served the other connections.
+        """
+        self._next_turn = None
         turn_end = time.perf_counter() + TURN_SECONDS
         while self._unparsed and not (self._answering or self._is_blocked or self._is_refused):
             if self._transport.is_closing():
                 return
             if time.perf_counter() > turn_end:
-                self._turn = self._loop.call_soon(self._take_turn)
+                self._next_turn = self._loop.call_soon(self._parse_stored_data)
                 break
             piece = bytes(self._unparsed[:SLICE_BYTES])
             del self._unparsed[:SLICE_BYTES]
@@ -217,7 +226,10 @@ class Connection(asyncio.Protocol):
         self._resume_reading()
 
     def _resume_reading(self) -> None:
-        """Read more data after all data are parsed; close the connection if the client has ended its data."""
+        """Read more data if all data are parsed.
+
+        If the client has ended its data, the connection is closed instead.
+        """
         if self._transport.is_closing():
             return
         if self._unparsed:
@@ -282,7 +294,7 @@ class Connection(asyncio.Protocol):
         self._parse(b"\r\n".join([request_line, *header_lines, b"", data_after_headers]))
 
     def on_message_begin(self) -> None:
-        """Begin a request. The parser calls this method before it has read the request line.
+        """Begin a request, whose request line the parser has not yet read.
 
         The parser does not report where in the present piece of data the request begins. The bytes of the piece are
         therefore counted only for the request with which the piece begins.
@@ -300,7 +312,7 @@ class Connection(asyncio.Protocol):
         self._url += url
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Append a header, whose name may be in any case. Trailers, which follow the body, are ignored."""
+        """Append a header, whose name may contain capitals. Headers after the body (trailers) are ignored."""
         if self._phase is Phase.BODY:
             return
         lower_name = name.lower()
@@ -363,15 +375,18 @@ class Connection(asyncio.Protocol):
         self._write(response, head)
 
     def _answer_in_thread(self, head: Head, body: bytes) -> None:
-        """Begin to answer a request in another thread. The connection has no deadline until the response is sent."""
+        """Begin to answer a request in another thread.
+
+        The connection has no deadline until the response is sent.
+        """
         self._answering = self._loop.create_task(self._answer_later(head, body))
         self._timed_phase = Phase.IDLE
         self.deadline = math.inf
 
     async def _answer_later(self, head: Head, body: bytes) -> None:
-        """Answer a request in another thread, and then the requests that arrived meanwhile, in their order.
+        """Answer a request in another thread, and afterwards the requests that have arrived in the meantime.
 
-        If one of these also needs another thread, the remaining requests wait until it is answered.
+        If one of the later requests also needs another thread, the remaining requests wait for its answer.
         """
         response = await asyncio.to_thread(
             self._handler.answer, head.method, head.path, head.headers, body, self._client
@@ -384,13 +399,14 @@ class Connection(asyncio.Protocol):
                 self._answer_in_thread(next_head, next_body)
             else:
                 self._answer(next_head, next_body)
-        self._take_turn()
+        self._parse_stored_data()
 
     def _remember(self, data: bytes) -> None:
-        """Store the head of a request that came alone and in one piece, to recognise a repetition of the head.
+        """Store the head of a request, so that a request with the same head need not be parsed.
 
         Clients send the same head again and again. If the bytes of the head and the size of the body are equal, the
-        parser would give the same result again.
+        parser would give the same result again. Only the head of a request that arrived alone and in one piece is
+        stored.
         """
         head, blank_line, body = data.partition(b"\r\n\r\n")
         if body == self._body and self._phase is Phase.IDLE:
@@ -421,8 +437,9 @@ class Connection(asyncio.Protocol):
             self.deadline = self._loop.time() + seconds
 
     def _header_bytes(self) -> int:
-        """Return the size of the target and the headers, bytes. Each header has a colon, a blank and a line end."""
-        return len(self._url) + sum(len(name) + len(value) + 4 for name, value in self._headers)
+        """Return the size of the target and the headers, bytes."""
+        separator_bytes = len(b": \r\n")
+        return len(self._url) + sum(len(name) + len(value) + separator_bytes for name, value in self._headers)
 
     def _refuse_headers(self) -> None:
         """Refuse a request whose request line and headers are too long."""

@@ -1,4 +1,4 @@
-"""Requests and responses of HTTP/1.1: the head of a request as it was parsed, and a response as bytes."""
+"""The parsed head of an HTTP/1.1 request, and the conversion of a response to the bytes that are sent."""
 
 import urllib.parse
 from functools import lru_cache
