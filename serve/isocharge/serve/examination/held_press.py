@@ -196,17 +196,13 @@ def _describe(held_s: Reals, size: Reals) -> tuple[str, dict[str, dict[str, floa
     positive_size = np.maximum(size, 1e-9)  # the logarithm is fitted
     law = law_of_fading(list(zip(held_s.tolist(), positive_size.tolist(), strict=True)))
     if law.tau_s is not None:
-        tau_s = float(f"{law.tau_s:.2g}")
-        sentence = f"a held press leaks: [leak] tau_s = {tau_s:g} in a device file undoes it"
-        return sentence, {"leak": {"tau_s": tau_s}}
+        return f"a held press leaks: {law.settings} in a device file undoes it", law.sections
     if law.creep is not None:
         sentence = (
             f"a held press creeps by {100.0 * law.creep:.2g} % in each decade of time: the film does, so set no [leak] "
-            f"for it, and {law.remedy}"
+            f"for it, and {law.creep_remedy}"
         )
-        if law.memory is None:
-            return sentence, {}
-        return sentence, {"memory": law.memory}
+        return sentence, law.sections
     sentence = (
         f"a held press changes by {-100.0 * lost_share:.2g} % in {held_s[-1]:.0f} s, by no law that is clear: hold one "
         "longer, with a weight"

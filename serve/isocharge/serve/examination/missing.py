@@ -8,6 +8,7 @@ from isocharge.serve.examination.channel_health import MAINS_HZ, ChannelHealth
 from isocharge.serve.examination.held_press import HeldPress
 from isocharge.serve.examination.listening import Capture
 from isocharge.serve.live.device import Device
+from isocharge.serve.live.fading import section_text
 from isocharge.serve.signal_chain.tare import TareRule
 
 CLEAN_SHARE = 0.99
@@ -140,8 +141,7 @@ def _leak_sentences(findings: BoardFindings) -> Iterator[str]:
     if held is not None:
         for name, section in held.sections.items():
             if name not in device.table:
-                keys = ", ".join(f"{key} = {value:g}" for key, value in section.items())
-                yield f"[{name}] {keys} in a device file"
+                yield f"{section_text(name, section)} in a device file"
     elif device.leak is None:
         yield (
             "the amplifier's time constants ([leak] tau_s in a device file), of its circuit: without them held presses "

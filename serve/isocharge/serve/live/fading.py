@@ -15,7 +15,7 @@ The section [leak] of a device file corrects a leak, and the section [memory] co
 creep, the error grows with time.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -55,22 +55,39 @@ class Fading(NamedTuple):
     thermoelastic: float = 0.0
 
     @property
-    def memory(self) -> dict[str, float] | None:
-        """Settings of the section `[memory]` that correct the decrease; None if no settings correct it."""
+    def sections(self) -> dict[str, dict[str, float]]:
+        """Sections of a device file that correct the decrease, with two digits; empty if no section corrects it."""
+        if self.tau_s is not None:
+            return {"leak": {"tau_s": _two_digits(self.tau_s)}}
         if self.creep is None or not self.creep < MAX_CREEP:
-            return None
-        settings = {"creep": float(f"{self.creep:.2g}")}
+            return {}
+        settings = {"creep": _two_digits(self.creep)}
         if self.thermoelastic:
-            settings["thermoelastic"] = float(f"{self.thermoelastic:.2g}")
-        return settings
+            settings["thermoelastic"] = _two_digits(self.thermoelastic)
+        return {"memory": settings}
 
     @property
-    def remedy(self) -> str:
+    def settings(self) -> str:
+        """The sections as the user writes them, such as `[leak] tau_s = 10`; empty if there are none."""
+        return " ".join(section_text(name, section) for name, section in self.sections.items())
+
+    @property
+    def creep_remedy(self) -> str:
         """Advice to the user on how to deal with creep, as a part of a sentence."""
-        if self.memory is None:
+        if not self.settings:
             return "wait longer before each reading"
-        settings = ", ".join(f"{key} = {value:g}" for key, value in self.memory.items())
-        return f"wait longer before each reading, or put [memory] {settings} into a device file"
+        return f"wait longer before each reading, or put {self.settings} into a device file"
+
+
+def section_text(name: str, section: Mapping[str, float]) -> str:
+    """Return a section of a device file in one line, such as `[leak] tau_s = 10`."""
+    assignments = ", ".join(f"{key} = {value:g}" for key, value in section.items())
+    return f"[{name}] {assignments}"
+
+
+def _two_digits(value: float) -> float:
+    """Round a number to two significant digits."""
+    return float(f"{value:.2g}")
 
 
 class LineFit(NamedTuple):
@@ -148,11 +165,11 @@ def cause_of_fading(sizes: Sequence[tuple[float, float]]) -> str:
     """
     law = law_of_fading(sizes)
     if law.tau_s is not None:
-        return f"or the amplifier leaks: then put [leak] tau_s = {law.tau_s:.2g} into a device file"
+        return f"or the amplifier leaks: then put {law.settings} into a device file"
     if law.creep is not None:
         return (
-            f"or the film creeps, by {100.0 * law.creep:.2g} % in each decade of time: {law.remedy}; this is no leak, "
-            "so set no [leak] for it"
+            f"or the film creeps, by {100.0 * law.creep:.2g} % in each decade of time: {law.creep_remedy}; this is no "
+            "leak, so set no [leak] for it"
         )
     return UNDECIDED
 
