@@ -118,6 +118,22 @@ def _is_clear(received: ReceivedData, device: Device) -> bool:
     return read_frames(received, device).intact_share > RIGHT_BAUD_SHARE
 
 
+def _proposed_device(proposal: Proposal, *, is_gain_stated: bool) -> Device:
+    """Return the settings of a proposed device file.
+
+    Args:
+        proposal: The proposal.
+        is_gain_stated: Whether the user has stated the gain. Otherwise the proposed section `[gain]` is not applied.
+
+    Raises:
+        DeviceError: If the gain is wrong, or for other electrodes.
+    """
+    table = {key: value for key, value in proposal.table.items() if is_gain_stated or key != "gain"}
+    device = device_from_table(table, "board")
+    device.check_gain(proposal.electrodes)
+    return device
+
+
 def examine_received(
     received: ReceivedData,
     *,
@@ -140,10 +156,7 @@ def examine_received(
     is_proposed = device is ANY_BOARD
     if is_proposed:
         proposal = propose(received, electrodes, gain or {})
-        # A proposed section [gain] is only applied if the user has stated the gain.
-        applied_table = {key: value for key, value in proposal.table.items() if gain or key != "gain"}
-        device = device_from_table(applied_table, "board")
-        device.check_gain(proposal.electrodes)
+        device = _proposed_device(proposal, is_gain_stated=bool(gain))
 
     capture = read_frames(received, device)
     unit = "pC" if device.gain is not None else unit_of(capture)

@@ -6,8 +6,8 @@ within half a second. Warming, creep and the slow noise of amplifiers cause slow
 The median of each block of 0.1 s is computed, in which hum averages out. A single damaged value does not change the
 median of a block.
 
-A press that is held with constant force for the whole time does not change the charges. Such a press cannot be
-distinguished from an amplifier that rests at another level.
+A press that is held with constant force for the whole time does not change the charges. A press during the whole time
+cannot be distinguished from an amplifier that rests at another level.
 """
 
 from typing import NamedTuple

@@ -72,7 +72,7 @@ def decode_frame(piece: bytes) -> Frame:
 
 
 def crc16(data: bytes) -> int:
-    """Compute CRC-16/CCITT-FALSE: polynomial 0x1021, initial value 0xFFFF, not reflected."""
+    """Compute the checksum CRC-16/CCITT-FALSE, which has the polynomial 0x1021 and the initial value 0xFFFF."""
     return binascii.crc_hqx(data, 0xFFFF)
 
 

@@ -90,8 +90,8 @@ class CounterWrap:
     """Learns the value at which a counter in text wraps to 0, because text does not show the width of a counter.
 
     If the counter decreases, it has either wrapped or restarted. A wrap is assumed if a usual modulus explains the
-    decrease. Such a modulus is larger than all previous values, and the step modulo this modulus is about as small as
-    the previous steps.
+    decrease. The modulus must be larger than all previous values, and the step modulo this modulus must be about as
+    small as the previous steps.
 
     Args:
         usual_moduli: Moduli that boards use, in ascending order.

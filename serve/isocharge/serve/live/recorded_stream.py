@@ -239,7 +239,7 @@ def replay(
         RecordingError: If a line other than the last one is damaged.
         ModelError: If a model of the recording cannot be loaded.
     """
-    delay_s: float | None = None
+    delay_s: float | None = None  # time from the first chunk in the recording to the first chunk of the replay
     for event in recording.events():
         match event:
             case Marker():
@@ -254,9 +254,9 @@ def replay(
                 stream.tare()
             case Event(chunk=Chunk() as chunk, latencies_us=latencies_us):
                 clock.set(event)
+                if delay_s is None:
+                    delay_s = time.time() - chunk.timestamp
                 if real_time:
-                    if delay_s is None:
-                        delay_s = time.time() - chunk.timestamp
                     due_s = chunk.timestamp + delay_s
                     time.sleep(max(0.0, due_s - time.time()))
                 used_count = len(latencies_us)  # a recording has one latency for each record that was used

@@ -4,9 +4,9 @@
 time and its misfit alarms, for Triton's statistics and for `/metrics`. `RequestLog` writes one line of JSON for each
 request.
 
-A line of the log contains no text that a client has sent: routes, models, statuses and types of errors are names of
-this server, and the address of the client comes from the operating system. A client therefore cannot forge a line,
-fill the disk with long lines, write a secret into the log, or create counters.
+A line of the log contains no text that a client has sent. Routes, models, statuses and types of errors are names of
+this server, and the address of the client comes from the operating system. A client therefore cannot forge a line, fill
+the disk with long lines, write a secret into the log, or create counters.
 """
 
 import logging

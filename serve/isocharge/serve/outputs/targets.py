@@ -95,7 +95,7 @@ class Outputs:
     """
 
     def __init__(self, targets: Sequence[str], context: OutputContext) -> None:
-        """Find the kind of each target; nothing is opened yet.
+        """Find the kind of each target without opening it.
 
         Args:
             targets: Targets, such as `json` or `touch.csv`.

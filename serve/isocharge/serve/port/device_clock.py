@@ -2,8 +2,8 @@
 
 Arrival times jitter with the delays of the kernel, the cable and the reading program. The clock of the device does not
 jitter, but its rate differs from the rate of the clock of the host. A delay-locked loop of second order (Adriaensen,
-"Using a DLL to filter time", 2005) follows the arrivals with a small bandwidth, and computes a smooth host time for
-each reading. The bandwidth is larger in the first seconds, so that the loop locks soon.
+"Using a DLL to filter time", 2005) follows the arrivals with a small bandwidth. The loop computes a smooth host time
+for each reading. The bandwidth is larger in the first seconds, so that the loop locks soon.
 """
 
 import math
@@ -131,26 +131,38 @@ class DeviceClock:
 
         delay_s = arrival_s - self._predict(self._device_us)
         was_clock_set = abs(delay_s) > MAX_DEVIATION_s
-        if was_clock_set or self._is_first_fit:  # begin a new fit at this arrival
-            self._fitted_us = self._device_us
-            self._fitted_host_s = arrival_s
-            self._fit_age_s = 0.0
-            self.rate = 1.0
-            self._is_first_fit = False
-            if was_clock_set:
-                self._latest_host_s = -math.inf  # the host time may decrease here
-            return
+        if was_clock_set:
+            self._latest_host_s = -math.inf  # the host time may decrease here
+        if was_clock_set or self._is_first_fit:
+            self._begin_fit(arrival_s)
+        else:
+            step_s = (self._device_us - self._fitted_us) * 1e-6
+            self._continue_fit(delay_s, step_s)
+        self._fitted_us = self._device_us
 
-        # One step of the delay-locked loop (Adriaensen 2005): the delay corrects the time with the gain sqrt(2) * w,
-        # and the rate of the clock with the gain w^2.
-        step_s = (self._device_us - self._fitted_us) * 1e-6
+    def _begin_fit(self, arrival_s: float) -> None:
+        """Begin a new fit at the arrival of a chunk, unix seconds."""
+        self._fitted_host_s = arrival_s
+        self._fit_age_s = 0.0
+        self.rate = 1.0
+        self._is_first_fit = False
+
+    def _continue_fit(self, delay_s: float, step_s: float) -> None:
+        """Correct the fit by one step of the delay-locked loop (Adriaensen 2005).
+
+        With the gain w of the loop, the delay corrects the time with the gain sqrt(2) w and the rate of the clock with
+        the gain w^2.
+
+        Args:
+            delay_s: Time of the arrival minus its prediction, s.
+            step_s: Time of the device since the previous step, s.
+        """
         self._fit_age_s += step_s
         bandwidth_Hz = max(BANDWIDTH_Hz, FIRST_BANDWIDTH_Hz / (1.0 + self._fit_age_s))
         loop_gain = min(MAX_LOOP_GAIN, 2.0 * math.pi * bandwidth_Hz * step_s)
         self._fitted_host_s = self._predict(self._device_us) + math.sqrt(2.0) * loop_gain * delay_s
         if step_s > 0.0:
             self.rate += loop_gain**2 * delay_s / step_s
-        self._fitted_us = self._device_us
 
     def _predict(self, device_us: int) -> float:
         """Return the host time, unix seconds, at a time of the device, us."""

@@ -138,18 +138,26 @@ class Port:
             self._line.reset_input_buffer()  # A terminal drops its buffer by itself, a socket does not.
         except OPEN_ERRORS as error:
             self._close()
-            if is_path:
-                speed = f" at {self._baud} baud"
-                hint = (
-                    "check the cable and the name, that no other program has it open, and that you may read it (on "
-                    "Linux, the group 'dialout')"
-                )
-            else:
-                speed = ""
-                hint = "check the host and the port number, that the board is on, and that no other program uses it"
-            raise PortError(f"{self.url}: cannot be opened{speed} ({error}); {hint}") from error
+            raise self._opening_error(error, is_path=is_path) from error
         if self._requester:
             self._requester.reset()
+
+    def _opening_error(self, cause: Exception, *, is_path: bool) -> PortError:
+        """Return the error of a port that cannot be opened.
+
+        Args:
+            cause: Error of the operating system or of pyserial.
+            is_path: Whether the port is a device path, not a URL.
+        """
+        speed = ""
+        hint = "check the host and the port number, that the board is on, and that no other program uses it"
+        if is_path:
+            speed = f" at {self._baud} baud"
+            hint = (
+                "check the cable and the name, that no other program has it open, and that you may read it (on Linux, "
+                "the group 'dialout')"
+            )
+        return PortError(f"{self.url}: cannot be opened{speed} ({cause}); {hint}")
 
     def __exit__(self, *_: object) -> None:
         """Close the port."""

@@ -123,8 +123,8 @@ class Predictor:
         """Return the reasons why a contact of this model may be wrong: `outside`, `beyond`, `misfit`, `stress`.
 
         With three electrodes, the three charges determine the three unknowns without redundancy. A wrong charge then
-        usually gives the charges of another press, and is detected only if the resulting contact lies outside the
-        working area or the range of forces.
+        usually gives the charges of another press. The wrong charge is detected only if the contact of this press lies
+        outside the working area or the range of forces.
         """
         return self.validity.flags(contact)
 

@@ -118,9 +118,9 @@ class PressCheck:
 def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     """Compare a model with measured presses.
 
-    A press is compared if all its charges are known, its position or its force is known, and the known values lie in
-    the working area and the range of forces of the model. A few bad presses are reported and excluded if all other
-    presses agree with the model.
+    A press is compared if all its charges and its position or force are known. The known values must lie in the working
+    area and the range of forces of the model. A few bad presses are reported and excluded if all other presses agree
+    with the model.
 
     Args:
         predictor: The model.

@@ -5,8 +5,8 @@ therefore repeat after the length of a frame. The repetitions of each pair of by
 that covers the largest part is chosen. The position of this pair in the frame is not known yet.
 
 Named checksums are tried with every possible first byte. For cyclic redundancy checks without a name, only the
-polynomials have to be tried, because the initial value, the final value and all constant bytes contribute the same
-constant in all frames of one length.
+polynomials have to be tried. The initial value, the final value and all constant bytes contribute the same constant in
+all frames of one length.
 """
 
 from collections import Counter

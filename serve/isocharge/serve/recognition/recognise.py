@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.common.arrays import Booleans
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import SEQ, Frame, Parser
 from isocharge.serve.frames.frame_layout import PADDING, SYNC, ByteOrder
@@ -61,12 +62,23 @@ def described_frames(
     return None
 
 
+def _sync_lengths(may_be_sync: Booleans, start: int) -> Sequence[int]:
+    """Return the possible lengths of the sync of a frame, bytes.
+
+    Args:
+        may_be_sync: Whether each byte may belong to a sync, shape (length,).
+        start: Position of the first byte of the frame.
+    """
+    may_be_sync_from_start = np.roll(may_be_sync, -start)[:MAX_SYNC_BYTES]
+    longest_sync = int(np.argmin([*may_be_sync_from_start, False]))
+    return range(1, longest_sync + 1)
+
+
 def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterator[tuple[float, dict[str, Any]]]:
     """Yield the possible descriptions of the frames with their scores.
 
-    There is one description for each start, checksum and byte order.
-
-    Descriptions without a checksum are tried only if no checksum fits. The score is in bits for each byte of the
+    For each start, checksum and byte order, one description is yielded. Descriptions without a checksum are tried only
+    if no checksum fits. The score is in bits for each byte of the
     stream, including the bytes outside of all frames, so that frames of different lengths can be compared.
 
     Args:
@@ -91,11 +103,7 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
         for start, check in checks or starts_without_check:
             frame_parts = parts_at[start:] + parts_at[:start]  # from the first byte of the frame
             checked_parts = frame_parts[: length - check.size]
-            sync_lengths: Sequence[int] = [0]
-            if has_sync:
-                may_be_sync_from_start = np.roll(may_be_sync, -start)[:MAX_SYNC_BYTES]
-                longest_sync = int(np.argmin([*may_be_sync_from_start, False]))
-                sync_lengths = range(1, longest_sync + 1)
+            sync_lengths = _sync_lengths(may_be_sync, start) if has_sync else [0]
             score, sync_length, parts = split_frame(checked_parts, sync_lengths, weights)
             if any(part.role == "channel" for part in parts):
                 sync = np.roll(usual, -start)[:sync_length].tobytes()

@@ -6,8 +6,8 @@
 - `Limit` marks frames with a charge at the limit of the converter.
 - `HumStage` estimates and subtracts mains hum.
 - `TareStage` measures the mean and the noise of quiet frames, and subtracts the mean from all later frames.
-- `LeakStage` corrects the leak of the amplifiers, and estimates their inflow. It is replaced by `MemoryStage`, which
-  also corrects creep, the thermoelastic step and the warmth of the film, if the settings have a memory.
+- `LeakStage` corrects the leak of the amplifiers, and estimates their inflow. If the settings have a memory, it
+  is replaced by `MemoryStage`, which also corrects creep, the thermoelastic step and the warmth of the film.
 - `TouchStage` detects touches with hysteresis.
 - `PressFlags` flags saturated presses, and charges below zero.
 - `Warming` estimates the common charge of a warming film with the model, and subtracts it.

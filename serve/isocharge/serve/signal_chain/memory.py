@@ -348,12 +348,54 @@ def undo_memory(
     return after
 
 
+class RemainingCharge(NamedTuple):
+    """Charge that remains after a release, in the direction of the predicted charges.
+
+    The charges of all electrodes are projected onto the sum of the predicted charges of creep and thermoelastic step.
+
+    Attributes:
+        creep_pC: Projection of the predicted charge of creep.
+        step_pC: Projection of the predicted charge of the thermoelastic step.
+        charge_pC: Projection of the remaining charge minus its prediction.
+        variance_pC2: Variance of the remaining charge, which warmth and deviations from the law of creep cause.
+    """
+
+    creep_pC: float
+    step_pC: float
+    charge_pC: float
+    variance_pC2: float
+
+
+def _remaining_charge(memory: Memory, creep_pC: Array, step_pC: Array) -> RemainingCharge | None:
+    """Measure the charge that remains after a release, in the direction of the predicted charges.
+
+    Args:
+        memory: State of this frame.
+        creep_pC: Predicted charge of creep, shape (electrodes,).
+        step_pC: Predicted charge of the thermoelastic step, shape (electrodes,).
+
+    Returns:
+        The measurement; None if the predicted charges are too small for a direction.
+    """
+    predicted_pC = creep_pC + step_pC
+    size_pC = math.sqrt(float(predicted_pC @ predicted_pC))
+    if size_pC < MIN_CREEP_PC:
+        return None
+    remaining_pC = memory.rows_pC[WARMTH_ROW] - memory.expected_pC[0]
+    warmth_pC2 = WARMTH_CHANGE_PC**2 * len(predicted_pC) * memory.unseen_s
+    return RemainingCharge(
+        creep_pC=float(creep_pC @ predicted_pC) / size_pC,
+        step_pC=float(step_pC @ predicted_pC) / size_pC,
+        charge_pC=float(remaining_pC @ predicted_pC) / size_pC,
+        variance_pC2=warmth_pC2 + (CREEP_LAW_DEVIATION * size_pC) ** 2,
+    )
+
+
 def _learn_film(memory: Memory, dt_s: float) -> Memory:
     """Update the scale factors of creep and thermoelastic step with the charge that remains after a release.
 
-    This is a Kalman update of two scale factors with one measurement. The measurement is the remaining charge,
-    projected onto the sum of the predicted charges of creep and step. All frames after a release count as one
-    measurement together. The variance of each frame is therefore multiplied by the number of frames in `LEARN_S`.
+    The two scale factors are updated with one measurement by a Kalman filter. All frames after a release together count
+    as one measurement. The variance of each frame is therefore multiplied by the number of frames in `LEARN_S`.
 
     Args:
         memory: State of this frame.
@@ -364,38 +406,31 @@ def _learn_film(memory: Memory, dt_s: float) -> Memory:
         the next release.
     """
     film = memory.film
-    rows_pC = memory.rows_pC.copy()
-    # Predicted charges, each of shape (electrodes,), and their projection onto the sum of both.
-    unit_creep_pC, unit_step_pC = SCALE_RESPONSE.dot(rows_pC)
+    unit_creep_pC, unit_step_pC = SCALE_RESPONSE.dot(memory.rows_pC)
     creep_pC = film.creep * unit_creep_pC
     step_pC = film.thermoelastic * unit_step_pC
-    direction_pC = creep_pC + step_pC
-    size_pC = math.sqrt(float(direction_pC @ direction_pC))
-    if size_pC < MIN_CREEP_PC:
+    measured = _remaining_charge(memory, creep_pC, step_pC)
+    if measured is None:
         return memory
-    creep_jacobian = float(creep_pC @ direction_pC) / size_pC
-    step_jacobian = float(step_pC @ direction_pC) / size_pC
-    remaining_pC = rows_pC[WARMTH_ROW] - memory.expected_pC[0]
-    innovation_pC = float(remaining_pC @ direction_pC) / size_pC
 
     # Covariance of each scale factor with the measurement, and variance of the predicted measurement.
     variances = film.variances
-    creep_covariance = variances.creep * creep_jacobian + variances.covariance * step_jacobian
-    step_covariance = variances.covariance * creep_jacobian + variances.step * step_jacobian
-    prior_pC2 = creep_jacobian * creep_covariance + step_jacobian * step_covariance
-    warmth_pC2 = WARMTH_CHANGE_PC**2 * len(direction_pC) * memory.unseen_s
-    noise_pC2 = warmth_pC2 + (CREEP_LAW_DEVIATION * size_pC) ** 2
-    if innovation_pC * innovation_pC > OUTLIER_SIGMAS**2 * (prior_pC2 + noise_pC2):
+    creep_covariance = variances.creep * measured.creep_pC + variances.covariance * measured.step_pC
+    step_covariance = variances.covariance * measured.creep_pC + variances.step * measured.step_pC
+    prior_pC2 = measured.creep_pC * creep_covariance + measured.step_pC * step_covariance
+    is_explained = measured.charge_pC**2 <= OUTLIER_SIGMAS**2 * (prior_pC2 + measured.variance_pC2)
+    if not is_explained:
         return memory._replace(learn_s=0.0)
 
-    total_pC2 = prior_pC2 + noise_pC2 * LEARN_S / max(dt_s, MIN_STEP_S)
-    creep_scale = 1.0 + creep_covariance / total_pC2 * innovation_pC
-    step_scale = 1.0 + step_covariance / total_pC2 * innovation_pC
+    total_pC2 = prior_pC2 + measured.variance_pC2 * LEARN_S / max(dt_s, MIN_STEP_S)
+    creep_scale = 1.0 + creep_covariance / total_pC2 * measured.charge_pC
+    step_scale = 1.0 + step_covariance / total_pC2 * measured.charge_pC
     updated = ScaleVariances(
         variances.creep - creep_covariance**2 / total_pC2,
         variances.step - step_covariance**2 / total_pC2,
         variances.covariance - creep_covariance * step_covariance / total_pC2,
     )
+    rows_pC = memory.rows_pC.copy()
     rows_pC[WARMTH_ROW] -= (creep_scale - 1.0) * creep_pC + (step_scale - 1.0) * step_pC
     learned = Film.of(film.creep * creep_scale, film.thermoelastic * step_scale, updated)
     return memory._replace(film=learned, rows_pC=rows_pC)

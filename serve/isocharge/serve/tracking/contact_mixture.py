@@ -46,6 +46,7 @@ from isocharge.serve.tracking.mixture_components import (
     prune_components,
 )
 from isocharge.serve.tracking.mixture_update import (
+    LinearisedUpdate,
     Measurement,
     charges_and_jacobian,
     limit_iteration_step,
@@ -259,6 +260,29 @@ class ContactMixture:
         innovation = measurement.charge_pC - charge_pC[best]
         return float(innovation @ np.linalg.solve(innovation_covariance, innovation))
 
+    def _most_probable_states(
+        self, prior: Components, measurement: Measurement, iterations: int
+    ) -> tuple[Array, LinearisedUpdate]:
+        """Search for the most probable state of each component with the measured charges.
+
+        Args:
+            prior: Predicted components.
+            measurement: Charges of this step.
+            iterations: Number of iterations of the search.
+
+        Returns:
+            The states, shape (n_component, n_state), and the update that is linearised at these states.
+        """
+        state = prior.mean
+        linearised = linearise_update(self.charges, state, prior, measurement)
+        for _ in range(iterations):
+            transposed = linearised.cross_covariance.swapaxes(1, 2)
+            state_correction = (transposed @ linearised.weighted_innovation)[:, :, 0]
+            step = prior.mean + state_correction - state
+            state = state + limit_iteration_step(step)
+            linearised = linearise_update(self.charges, state, prior, measurement)
+        return state, linearised
+
     def _update(self, prior: Components, measurement: Measurement, iterations: int) -> Components | None:
         """Update the components with the charges, and prune and split them.
 
@@ -270,14 +294,7 @@ class ContactMixture:
         Returns:
             The components, or None if no component explains the charges.
         """
-        state = prior.mean
-        linearised = linearise_update(self.charges, state, prior, measurement)
-        for _ in range(iterations):
-            transposed = linearised.cross_covariance.swapaxes(1, 2)
-            state_correction = (transposed @ linearised.weighted_innovation)[:, :, 0]
-            step = prior.mean + state_correction - state
-            state = state + limit_iteration_step(step)
-            linearised = linearise_update(self.charges, state, prior, measurement)
+        state, linearised = self._most_probable_states(prior, measurement, iterations)
 
         # Likelihood of each component: -2 ln p = squared misfit + squared change of the state + ln det(covariance).
         weighted = linearised.weighted_innovation

@@ -1,6 +1,6 @@
 """Bayesian filter that estimates the pretension of a film and its other unknowns from touches.
 
-Every touch has one misfit vector: the part of its charges that no contact explains. The misfit vector depends on
+The misfit vector of a touch is the part of its charges that no contact explains. The misfit vector depends on
 
 - the pretension of the film, non-linearly: the pretension is estimated on a grid;
 - the linear unknowns, in which the misfit vector is linearised: the directions in which the calibration left the film
@@ -133,6 +133,20 @@ class TouchResiduals(NamedTuple):
     filtered: Array
     without_gains: Array
     offset_variance: float
+
+
+class KalmanUpdate(NamedTuple):
+    """Update of the linear unknowns by a good touch, at each level and pretension.
+
+    Attributes:
+        mean_change: Change of the mean, shape (n_level, n_pretension, n_unknown).
+        covariance_reduction: Reduction of the covariance, shape (n_level, n_pretension, n_unknown, n_unknown).
+        density: Probability density of the misfit vector without its constant factor, shape (n_level, n_pretension).
+    """
+
+    mean_change: Array
+    covariance_reduction: Array
+    density: Array
 
 
 class FilmFilter:
@@ -370,7 +384,27 @@ class FilmFilter:
         misfit, jacobian = self._linearise(charge_pC, log_changes)
         noise_covariance = self._noise_covariance(jacobian)
 
-        # Kalman update of the linear unknowns at each level and pretension.
+        kalman = self._kalman_update(misfit, jacobian, noise_covariance)
+
+        # The update is weighted by the probability that the touch is not an outlier.
+        good_density = (1.0 - OUTLIER_PROBABILITY) * kalman.density
+        total_density = good_density + OUTLIER_PROBABILITY * OUTLIER_DENSITY
+        good_probability = good_density / total_density
+        self._mean = self._mean + good_probability[..., None] * kalman.mean_change
+        self._covariance = self._covariance - good_probability[..., None, None] * kalman.covariance_reduction
+        posterior = self._probability * total_density
+        self._probability = posterior / posterior.sum()
+        return self._residuals(misfit, jacobian, noise_covariance)
+
+    def _kalman_update(self, misfit: Array, jacobian: Array, noise_covariance: Array) -> KalmanUpdate:
+        """Compute the update of the linear unknowns by a touch at each level and pretension.
+
+        Args:
+            misfit: Misfit vectors of the touch, shape (n_pretension, n_electrode).
+            jacobian: Jacobian of the misfit vectors for the linear unknowns, shape (n_level, n_pretension, n_electrode,
+                n_unknown).
+            noise_covariance: Result of `_noise_covariance`.
+        """
         cross_covariance = jacobian @ self._covariance
         transposed = cross_covariance.swapaxes(-1, -2)
         innovation_covariance = noise_covariance + cross_covariance @ jacobian.swapaxes(-1, -2)
@@ -379,20 +413,12 @@ class FilmFilter:
         solutions = np.linalg.solve(innovation_covariance, right_sides)
         weighted_innovation = solutions[..., :1]
         weighted_covariance = solutions[..., 1:]
-        mean_change = (transposed @ weighted_innovation)[..., 0]
-        covariance_reduction = transposed @ weighted_covariance
-
-        # The update is weighted by the probability that the touch is not an outlier.
         squared_distance = (innovation * weighted_innovation).sum(axis=(-1, -2))
-        density = np.exp(-0.5 * squared_distance) / np.sqrt(np.linalg.det(innovation_covariance))
-        good_density = (1.0 - OUTLIER_PROBABILITY) * density
-        total_density = good_density + OUTLIER_PROBABILITY * OUTLIER_DENSITY
-        good_probability = good_density / total_density
-        self._mean = self._mean + good_probability[..., None] * mean_change
-        self._covariance = self._covariance - good_probability[..., None, None] * covariance_reduction
-        posterior = self._probability * total_density
-        self._probability = posterior / posterior.sum()
-        return self._residuals(misfit, jacobian, noise_covariance)
+        return KalmanUpdate(
+            mean_change=(transposed @ weighted_innovation)[..., 0],
+            covariance_reduction=transposed @ weighted_covariance,
+            density=np.exp(-0.5 * squared_distance) / np.sqrt(np.linalg.det(innovation_covariance)),
+        )
 
     def _noise_covariance(self, jacobian: Array) -> Array:
         """Return the covariance of the misfit vector of a touch whose linear unknowns are known.

@@ -359,8 +359,8 @@ class FilmFollower:
     def _is_unexplained(self) -> bool:
         """Return whether no pretension explains the latest touches.
 
-        Two sums of the squared misfits of these touches are computed: one at the present estimate of the pretension,
-        and one at the estimates at the times of the touches. The smaller sum is compared with a limit.
+        The squared misfits of these touches are added up at the present estimate of the pretension, and at the
+        estimates at the times of the touches. The smaller sum is compared with a limit.
         """
         count = len(self._recent_misfits)
         nearest = self._filter.nearest

@@ -380,7 +380,7 @@ class Viewer:
             self._must_send_playhead = True
 
     def messages(self, now_s: float) -> list[bytes | str]:
-        """Return the messages to send now. There are none while too many messages are unconfirmed.
+        """Return the messages to send now. No messages are returned while too many messages are unconfirmed.
 
         Args:
             now_s: Unix time, s.

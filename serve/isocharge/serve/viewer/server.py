@@ -1,9 +1,9 @@
 """Server of the live page: files and the description of the film over HTTP, samples over WebSocket.
 
 The server is based on the package `websockets`, which answers one HTTP request for each connection. The package limits
-the size of the request line and headers (8 KiB for each line, 128 lines), the time for a request and the size of a
-message, and sends pings to each viewer. This module limits the number of viewers, the rate at which they send data, and
-the time for which they read nothing.
+the size of the request line and headers (8 KiB for each line, 128 lines), the time for a request, and the size of a
+message. The package also sends pings to each viewer. This module limits the number of viewers, the rate at which they
+send data, and the time for which they read nothing.
 
 A browser sends no Authorization header with a WebSocket. The page therefore sends its token as a subprotocol,
 `bearer.TOKEN` in base64url. Other clients send the header. The module `isocharge.serve.network.browser_check` refuses

@@ -71,7 +71,7 @@ class Request(NamedTuple):
 class Schema(NamedTuple):
     """A schema of the OpenAPI document with its name.
 
-    Its content is given directly, or as a type from which it is derived.
+    The content of the schema is given directly, or as a type from which the content is derived.
     """
 
     name: str
