@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.stats import multivariate_normal, norm
 
 from isocharge.common.errors import ConfigError, InputError, OutputExists, TrainingError
 from isocharge.common.progress import listening
@@ -17,6 +18,7 @@ from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fit import fit_identity, train_network
 from isocharge.train.training.losses import (
     STD_EXPONENT,
+    correlation_loss,
     distillation_loss,
     focused_squared_distance,
     likelihood_loss,
@@ -194,6 +196,38 @@ def test_the_weighted_loss_has_the_gradient_of_the_likelihood_times_weights_of_m
     torch.testing.assert_close(weight.mean(dim=0), torch.ones(3, dtype=torch.float64))
     slope = torch.log(weight[1:] / weight[:1]) / (log_std[1:] - log_std[:1])
     torch.testing.assert_close(slope, torch.full_like(slope, 2.0 * STD_EXPONENT))
+
+
+def test_the_loss_of_the_correlations_is_a_likelihood_and_leaves_the_deviations_alone():
+    """Compare with the density of SciPy, whose correlation matrix is the Gram matrix of three unit vectors."""
+    random = torch.Generator().manual_seed(4)
+    angles = (torch.rand(6, 3, generator=random) - 0.5).double()
+    deviation = (0.5 * torch.randn(6, 3, generator=random)).double().requires_grad_()
+    a, b, c = (angles.numpy() + 0.5 * np.pi).T
+    zero = np.zeros(6)
+    rows = [
+        np.stack([zero + 1.0, zero, zero], axis=1),
+        np.stack([np.cos(a), np.sin(a), zero], axis=1),
+        np.stack([np.cos(b), np.sin(b) * np.cos(c), np.sin(b) * np.sin(c)], axis=1),
+    ]
+    factor = np.stack(rows, axis=1)
+    densities = [
+        multivariate_normal(cov=one @ one.T).logpdf(error)
+        for one, error in zip(factor, deviation.detach().numpy(), strict=True)
+    ]
+    standard = norm.logpdf(deviation.detach().numpy()[:, 0])
+    expected = np.mean(standard - np.array(densities) - np.log(2.0 * np.pi))
+    loss = correlation_loss(angles, deviation)
+    assert loss.item() == pytest.approx(expected, rel=1e-9)
+    assert not loss.requires_grad
+
+
+def test_the_loss_of_the_correlations_has_small_gradients_where_errors_are_nearly_proportional():
+    """Opposite errors of five standard deviations under a correlation of nearly one; a square would give 1e7."""
+    angles = torch.tensor([[1.54, 0.0, 0.0]], requires_grad=True)
+    correlation_loss(angles, torch.tensor([[5.0, 5.0, 0.0]])).backward()
+    assert torch.all(torch.isfinite(angles.grad))
+    assert angles.grad.abs().max() < 1e3
 
 
 def test_the_linear_part_of_linear_targets_leaves_a_small_remainder():

@@ -31,6 +31,8 @@ from isocharge.train.training.correlation import with_correlation
 from isocharge.train.training.descent import Descent, TrainingStage
 from isocharge.train.training.fitted import Fitted
 from isocharge.train.training.losses import (
+    CORRELATION_WEIGHT,
+    correlation_loss,
     distillation_loss,
     validation_score,
     warm_up_loss,
@@ -268,15 +270,18 @@ def contact_stage(
         """Return the loss of a random batch with new noise. It is the warm-up loss in the first steps."""
         rows = torch.randint(len(charge), (batch,), generator=random)
         noisy = with_fresh_noise(charge[rows], noise, random)
-        mean, log_std = network.posterior(noisy)
+        mean, log_std, angles = network.posterior_with_angles(noisy)
         is_warm_up = step < warm_up_steps
+        deviation = (target[rows] - mean) * torch.exp(-log_std)
+        angle_loss = CORRELATION_WEIGHT * correlation_loss(angles, deviation)
         if teacher is None:
-            loss_function = warm_up_loss if is_warm_up else weighted_likelihood_loss
-            return loss_function(mean, log_std, target[rows])
+            if is_warm_up:
+                return warm_up_loss(mean, log_std, target[rows])
+            return weighted_likelihood_loss(mean, log_std, target[rows]) + angle_loss
         teacher_mean, teacher_log_std = teacher.posterior(noisy, domain)
         if is_warm_up:
             return warm_up_loss(mean, log_std, teacher_mean)
-        return distillation_loss(mean, log_std, teacher_mean, teacher_log_std)
+        return distillation_loss(mean, log_std, teacher_mean, teacher_log_std) + angle_loss
 
     def score() -> tuple[float, str]:
         """Return the loss on the validation presses, and a text with the errors."""

@@ -15,6 +15,20 @@ WARM_UP_STD_WEIGHT = 0.1
 """Weight of the standard deviations in the warm-up loss."""
 
 
+MIN_SINE = 0.03
+"""Smallest sine of an angle of the correlations in the training of the hidden layers."""
+
+MAX_DEVIATION = 5.0
+"""Largest error, in standard deviations, that the loss of the correlations distinguishes."""
+
+CORRELATION_WEIGHT = 0.3
+"""Weight of the loss of the correlations. A weight of 1 gives the same ellipses, and position errors that are 0.5 %
+larger."""
+
+MAX_NORMAL_DEVIATION = 3.0
+"""Whitened error above which the loss of the correlations grows with its logarithm instead of its square. Where two
+errors are nearly proportional to each other, a square would cause gradients with which a training diverges."""
+
 STD_EXPONENT = 0.75
 """Exponent of the variances by which the squared errors of the mean are weighted: 0 gives the likelihood, 1 gives least
 squares."""
@@ -84,6 +98,36 @@ def weighted_likelihood_loss(mean: Tensor, log_std: Tensor, target: Tensor) -> T
     mean_weight = mean_weight / torch.exp(2.0 * STD_EXPONENT * fixed_log_std).mean(dim=0)
     std_loss = log_std + 0.5 * squares.detach() * torch.exp(-2.0 * log_std)
     return (std_loss + 0.5 * mean_weight * squares).sum(dim=1).mean()
+
+
+def correlation_loss(angles: Tensor, deviation: Tensor) -> Tensor:
+    """Compute the negative logarithm of a likelihood of errors with unit variances, without its constant.
+
+    The likelihood is Gaussian for whitened errors up to `MAX_NORMAL_DEVIATION`, and has longer tails beyond. The angles
+    are those of `isocharge.train.training.correlation` minus a right angle, so that angles of zero give no correlation.
+    The gradient does not reach the errors: mean and standard deviations are trained as without correlations.
+
+    Args:
+        angles: Angles of the correlations minus a right angle, shape (n, 3), rad.
+        deviation: Errors of the unit coordinates over their standard deviations, shape (n, 3).
+    """
+    sin_a, sin_b, sin_c = torch.cos(angles).clamp(min=MIN_SINE).unbind(dim=1)
+    cos_a, cos_b, cos_c = torch.sin(-angles).unbind(dim=1)
+    first, second, third = deviation.detach().clamp(-MAX_DEVIATION, MAX_DEVIATION).unbind(dim=1)
+
+    # The Cholesky factor is inverted row by row: `first` and the two whitened errors have unit covariance.
+    white_second = (second - cos_a * first) / sin_a
+    white_third = (third - cos_b * first - sin_b * cos_c * white_second) / (sin_b * sin_c)
+    squares = _long_tailed_square(white_second) + _long_tailed_square(white_third)
+    return (torch.log(sin_a * sin_b * sin_c) + 0.5 * squares).mean()
+
+
+def _long_tailed_square(values: Tensor) -> Tensor:
+    """Return the squares of values; beyond `MAX_NORMAL_DEVIATION`, a logarithm that continues them smoothly."""
+    squares = values**2
+    limit = MAX_NORMAL_DEVIATION**2
+    tail = limit * (1.0 + torch.log(squares.clamp(min=limit) / limit))
+    return torch.where(squares < limit, squares, tail)
 
 
 def distillation_loss(mean: Tensor, log_std: Tensor, teacher_mean: Tensor, teacher_log_std: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ charges Q are those of a contact. Its length, which ranges from a tenth to thous
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -33,6 +34,12 @@ LARGEST_INT8 = 127
 FIRST_LAYER_SLOPES = (0.5, 3.5)
 """Smallest and largest norm of the initial weights of a unit of a sharpened first layer. The inputs have unit
 variance."""
+
+N_TRAINING_ANGLES = 3
+"""Number of outputs of the contact perceptron for the angles of the correlations, which are not released."""
+
+TRAINING_ANGLES = slice(N_CONTACT_ANSWERS, N_CONTACT_ANSWERS + N_TRAINING_ANGLES)
+"""Outputs of the contact perceptron with these angles, relative to a right angle."""
 
 INITIAL_NONLINEAR_SIZE = 0.2
 """Factor on the initial weights of outputs whose linear part was fitted."""
@@ -156,7 +163,8 @@ class InverseNetwork(nn.Module):
         self.features = features
         n_electrode = features.charge_features.n_electrode
         activation = ACTIVATIONS[config.activation]
-        self.contact = TrainablePerceptron(n_electrode, config.hidden, N_CONTACT_ANSWERS, activation)
+        n_output = N_CONTACT_ANSWERS + N_TRAINING_ANGLES
+        self.contact = TrainablePerceptron(n_electrode, config.hidden, n_output, activation)
         self.contact.sharpen_first_layer()
         self.misfit_vector = TrainablePerceptron(
             n_electrode, config.misfit_widths(n_electrode), n_electrode, activation
@@ -182,8 +190,23 @@ class InverseNetwork(nn.Module):
         Returns:
             Mean and logarithm of the standard deviation, shape (n, 3) each.
         """
+        mean, log_std, _ = self.posterior_with_angles(charge)
+        return mean, log_std
+
+    def posterior_with_angles(self, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Compute the posterior with the angles of its correlations (`isocharge.train.training.correlation`).
+
+        The angles are learned so that the hidden layers represent the correlations. The released angles are fitted to
+        the hidden layers after the training.
+
+        Args:
+            charge: Shape (n, n_electrode), pC.
+
+        Returns:
+            Mean and logarithm of the standard deviation of the unit coordinates, and the angles, shape (n, 3) each.
+        """
         outputs = self.contact(self.inputs(charge))
-        return outputs[:, MEAN], outputs[:, LOG_STD]
+        return outputs[:, MEAN], outputs[:, LOG_STD], outputs[:, TRAINING_ANGLES]
 
     def forward(self, charge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Estimate contacts.
@@ -230,14 +253,14 @@ def fold_network(network: InverseNetwork) -> FoldedNetwork:
     """Fold both perceptrons of a trained network into one."""
     charge_features = network.features.charge_features
     units = answer_units(network.domain, np.eye(3), np.zeros(3), charge_features.n_electrode)
-    perceptrons = [network.contact.to_numpy(), network.misfit_vector.to_numpy()]
+    perceptrons = [_contact_to_numpy(network), network.misfit_vector.to_numpy()]
     return _fold(network, perceptrons, units)
 
 
 def fold_contact_mean(network: InverseNetwork) -> FoldedNetwork:
     """Fold the contact perceptron of a trained network; the only answers are x and y in mm, and ln F."""
     weight = np.vstack([np.diag(network.domain.scale), np.zeros((3, 3))])
-    return _fold(network, [network.contact.to_numpy()], Layer(weight, network.domain.centre))
+    return _fold(network, [_contact_to_numpy(network)], Layer(weight, network.domain.centre))
 
 
 def _fold(network: InverseNetwork, perceptrons: Sequence[Perceptron[Array]], units: Layer[Array]) -> FoldedNetwork:
@@ -245,6 +268,14 @@ def _fold(network: InverseNetwork, perceptrons: Sequence[Perceptron[Array]], uni
     mean = _to_numpy(network.features_mean)
     matrix = _to_numpy(network.whitening)
     return FoldedNetwork(network.features.charge_features, fold(perceptrons, mean, matrix, units))
+
+
+def _contact_to_numpy(network: InverseNetwork) -> Perceptron[Array]:
+    """Return the contact perceptron without the angles."""
+    perceptron = network.contact.to_numpy()
+    weight, bias = perceptron.last
+    last = Layer(weight[:, :N_CONTACT_ANSWERS], bias[:N_CONTACT_ANSWERS])
+    return replace(perceptron, last=last, skip=perceptron.skip[:, :N_CONTACT_ANSWERS])
 
 
 def _to_numpy(tensor: Tensor) -> Array:
