@@ -1,6 +1,7 @@
-"""Errors of a contact by effects of the bench: trapped air, a warm film, static pressure, and a side force.
+"""Errors of a contact that four effects of a bench cause: trapped air, a warm film, static pressure and a side force.
 
-The charges with the effect are interpreted by a linear inverse of the film without it.
+The charges are computed with the effect. The contact is then estimated from the charges by a linear inverse of the film
+without the effect.
 """
 
 from dataclasses import replace
@@ -26,30 +27,47 @@ effects = {
 }
 
 
-def charges(sensor: Sensor, x: float, y: float, force: float, side_share: float = 0.0) -> np.ndarray:
-    """Compute the charges of a press with a side force along x."""
-    side_force = (side_share * force, 0.0)
+def charges(sensor: Sensor, x: float, y: float, force: float, relative_side_force: float = 0.0) -> np.ndarray:
+    """Compute the charges of a press with a side force along x.
+
+    Args:
+        sensor: The sensor.
+        x: Position along x, mm.
+        y: Position along y, mm.
+        force: Force of the press, N.
+        relative_side_force: Ratio of the side force to the force of the press.
+
+    Returns:
+        Charges, shape (n_electrode,), pC.
+    """
+    side_force = (relative_side_force * force, 0.0)
     settings = SolveSettings(accuracy=1e-4)
     return touch_charge(sensor, press(sensor.film, Circle(1.0), (x, y), force, settings, side_force=side_force))
 
 
 figure, axes = plt.subplots(figsize=(8.0, 4.0), layout="constrained")
 for number, (x, y, force) in enumerate(CONTACTS):
-    position_errors = []
+    # Derivatives of the charges with respect to x, y and ln F, by central differences
     expected = charges(sensor, x, y, force)
-    columns = []
-    for dx, dy, dlog in STEPS:
-        above = charges(sensor, x + dx, y + dy, force * np.exp(dlog))
-        below = charges(sensor, x - dx, y - dy, force * np.exp(-dlog))
-        columns.append((above - below) / (2.0 * (dx + dy + dlog)))
+    derivatives = []
+    for x_step, y_step, log_force_step in STEPS:
+        above = charges(sensor, x + x_step, y + y_step, force * np.exp(log_force_step))
+        below = charges(sensor, x - x_step, y - y_step, force * np.exp(-log_force_step))
+        step = x_step + y_step + log_force_step  # only one of them is not zero
+        derivatives.append((above - below) / (2.0 * step))
+
+    # Weighted least squares converts a change of the charges into a change of the contact.
     sigma = noise_model("reference").sigma(expected)
-    inverse = np.linalg.pinv(np.column_stack(columns) / sigma[:, None])
-    for name, (changed, side_share) in effects.items():
-        error_x, error_y, error_log = inverse @ ((charges(changed, x, y, force, side_share) - expected) / sigma)
-        position_errors.append(np.hypot(error_x, error_y))
+    inverse = np.linalg.pinv(np.column_stack(derivatives) / sigma[:, None])
+    position_errors = []
+    for name, (changed_sensor, relative_side_force) in effects.items():
+        changed = charges(changed_sensor, x, y, force, relative_side_force)
+        x_error, y_error, log_force_error = inverse @ ((changed - expected) / sigma)
+        position_error = np.hypot(x_error, y_error)
+        position_errors.append(position_error)
         print(
-            f"{force:.1f} N at ({x:g}, {y:g}) mm, {name}: {np.hypot(error_x, error_y):.2f} mm, "
-            f"{100.0 * error_log:+.1f} % of the force"
+            f"{force:.1f} N at ({x:g}, {y:g}) mm, {name}: {position_error:.2f} mm, "
+            f"{100.0 * log_force_error:+.1f} % of the force"
         )
     axes.barh(np.arange(len(effects)) + 0.27 * number, position_errors, 0.25, label=f"{force:g} N at ({x:g}, {y:g}) mm")
 
@@ -57,6 +75,6 @@ axes.set_yticks(np.arange(len(effects)) + 0.27, list(effects))
 axes.invert_yaxis()
 axes.set_xscale("log")
 axes.set_xlabel("error of the position, mm")
-axes.set_title("Effects of the bench that the model does not contain, at 0.8 MPa")
+axes.set_title("Effects of the bench that the model omits, at a pretension of 0.8 MPa")
 axes.legend()
 plt.show()

@@ -2,8 +2,9 @@
 Where do presses give an electrode the same charge?
 ===================================================
 
-On an isocharge contour. Each electrode's charge puts a press on one contour, and with the force known the contours of
-three electrodes meet in one point: that is where the film is touched.
+All presses of one force that give an electrode the same charge lie on an isocharge contour. If the force of a press is
+known, the charge of each electrode determines one contour. The contours of three electrodes meet at the position of the
+press.
 """
 
 import matplotlib.pyplot as plt

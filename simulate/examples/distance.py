@@ -1,9 +1,10 @@
 """
-How does the charge fall with distance?
-=======================================
+How does the charge depend on the distance?
+===========================================
 
-The nearer the press, the more an electrode collects. At every distance the charge grows with the force to the power of
-2/3, as the stress of a membrane without pretension does, so over the charge at 1 N all forces give one curve.
+An electrode collects more charge if the press is nearer. At every distance, the charge is proportional to the force to
+the power of 2/3, like the stress of a membrane without pretension. The curves for all forces therefore coincide if they
+are divided by the charge at 1 N and by this power of the force.
 """
 
 import matplotlib.pyplot as plt
@@ -13,7 +14,7 @@ from isocharge.simulate import Circle, ForwardMap, load_sensor
 
 sensor = load_sensor("three-25um-biaxial")
 forward_map = ForwardMap.build(sensor, Circle(1.0), radius=9.0, force_range=(0.1, 2.0))
-y = np.linspace(-9.0, 9.0, 181)  # from beside electrode A, whose centre is at (0, -10) mm, across the film
+y = np.linspace(-9.0, 9.0, 181)  # the centre of electrode A lies at (0, -10) mm
 
 figure, (charges, ratios) = plt.subplots(1, 2, figsize=(11.0, 4.4), layout="constrained", sharex=True)
 at_1_N = forward_map.charges(np.column_stack([0.0 * y, y, np.ones_like(y)]))[:, 0]

@@ -1,9 +1,10 @@
 """
-What can a layout tell?
-=======================
+How accurate can a layout be?
+=============================
 
-The Cramer-Rao limit says how well the charges determine a press at best, whatever computes it. Here four squares of
-3 mm, 9 mm from the centre: it is 0.03 mm in the middle and up to 0.17 mm between two squares, 8 mm from the centre.
+The Cramer-Rao limit is the smallest position error that any unbiased method can have. This example computes the limit
+for four squares of 3 mm at 9 mm from the centre. The limit is 0.03 mm in the middle of the film. Between two squares,
+8 mm from the centre, it reaches 0.17 mm.
 """
 
 from dataclasses import replace
@@ -21,7 +22,8 @@ noise = noise_model("reference")
 forward_map = ForwardMap.build(sensor, Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
 
 distance, angle = np.meshgrid(np.linspace(0.0, 8.0, 17), np.linspace(0.0, 2.0 * np.pi, 73))
-x, y = (distance * np.cos(angle)).ravel(), (distance * np.sin(angle)).ravel()
+x = (distance * np.cos(angle)).ravel()
+y = (distance * np.sin(angle)).ravel()
 limits = limits_at(forward_map, np.column_stack([x, y, np.ones_like(x)]), noise)
 for at, position, relative in zip(distance[0, ::2], limits.position[:17:2], limits.force[:17:2], strict=True):
     print(f"{at:.0f} mm from the centre, 1 N: at best {position:.3f} mm, {100 * relative:.2f} % of the force")

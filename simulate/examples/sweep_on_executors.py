@@ -1,4 +1,8 @@
-"""The same dataset from a process pool and from a Dask cluster: both are a `concurrent.futures.Executor`."""
+"""The same dataset computed by a process pool and by a Dask cluster.
+
+A sweep accepts any `concurrent.futures.Executor`. The first argument of the script is a folder, and the optional second
+argument is the address of a Dask scheduler.
+"""
 
 import sys
 from concurrent.futures import ProcessPoolExecutor

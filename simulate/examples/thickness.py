@@ -2,7 +2,8 @@
 How do thickness and pretension change the charges?
 ===================================================
 
-A thicker film is stressed less, and a taut one resists from the first micrometre: both give less charge.
+The stress in a thicker film is smaller. A film with pretension deflects less under the same force. In both cases the
+charges are smaller.
 """
 
 from dataclasses import replace

@@ -1,10 +1,10 @@
 """
-Does a uniaxial film tell more about the direction?
-===================================================
+Do the charges of a uniaxial film depend more on the direction?
+===============================================================
 
-Fig. 12 of the paper (Mirbagheri et al. 2007) says so, and the simulator agrees: on lines in different directions from
-an electrode the charges of a biaxial film are nearly the same, those of a uniaxial film are far apart. All figures of
-the paper are drawn by ``python simulate/examples/paper -o paper``.
+Fig. 12 of the paper (Mirbagheri et al. 2007) shows that they do, and the simulator agrees. On a biaxial film, the
+charge of an electrode is nearly the same for presses in different directions at the same distance. On a uniaxial film,
+the charges differ strongly. The command ``python simulate/examples/paper -o paper`` draws all figures of the paper.
 """
 
 import matplotlib.pyplot as plt

@@ -1,6 +1,7 @@
-"""The paper's figures and numbers, ours beside them: `python simulate/examples/paper -o paper`.
+"""Reproduce the figures and numbers of the paper: `python simulate/examples/paper -o paper`.
 
-Writes paper.md, paper.json, and every figure as PNG and SVG into a new folder; five minutes on two cores.
+The files paper.md and paper.json, and each figure as PNG and SVG, are written into a new folder. This takes five
+minutes on two cores.
 """
 
 import argparse
@@ -27,12 +28,18 @@ from isocharge.simulate.plots.figure import save_picture
 
 
 def write_paper(output: Path, choices: Choices, workers: int) -> None:
-    """Reproduce the paper in a new folder; the result does not depend on the number of worker processes."""
+    """Reproduce the paper in a new folder.
+
+    Args:
+        output: Folder to create.
+        choices: Values that the paper does not state.
+        workers: Number of worker processes, on which the result does not depend.
+    """
     began = time.perf_counter()
     with new_folder(output) as draft, local_workers(workers) as executor:
         solves = solve_all(choices, executor)
         accuracy = Accuracy.of(solves, executor)
-        in_order = (
+        makers = (  # functions that create the entries of the page, in their order
             *(partial(make, solves) for make in (fig_1, fig_2, fig_3)),
             partial(scheme, solves, "Fig. 4", "A", FIG_4_DEG),
             *(partial(make, solves) for make in (fig_5, fig_6)),
@@ -43,12 +50,12 @@ def write_paper(output: Path, choices: Choices, workers: int) -> None:
             *(partial(make, solves, accuracy) for make in (claims, what_choices_change)),
         )
         entries = []
-        for make in track(in_order, "drawing"):
+        for make in track(makers, "drawing"):
             entry = make()
             entries.append(entry)
             if entry.figure is not None:
                 save_picture(entry.figure, draft / f"{entry.slug}.png")
-                entry.figure.set_layout_engine("none")  # as it was laid out, which takes as long as drawing it
+                entry.figure.set_layout_engine("none")  # keep the layout of the PNG, because a new layout takes long
                 save_picture(entry.figure, draft / f"{entry.slug}.svg")
         (draft / "paper.json").write_text(as_json(entries), "utf-8")
         (draft / "paper.md").write_text(page(entries, choices, time.perf_counter() - began), "utf-8")
@@ -56,9 +63,9 @@ def write_paper(output: Path, choices: Choices, workers: int) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to make")
-    parser.add_argument("--quick", action="store_true", help="fewer presses and films, coarser numbers; a minute")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to create")
+    parser.add_argument("--quick", action="store_true", help="use fewer presses and films; takes a minute")
     parser.add_argument("--workers", type=int, default=cores(), help="processes (default: one per core)")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     with shown_progress():
-        write_paper(given.output, QUICK if given.quick else Choices(), given.workers)
+        write_paper(arguments.output, QUICK if arguments.quick else Choices(), arguments.workers)

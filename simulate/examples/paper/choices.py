@@ -1,4 +1,4 @@
-"""What the paper says in numbers, and what it leaves open and we choose."""
+"""Numbers that the paper states, and our choices for values that the paper does not state."""
 
 from dataclasses import dataclass, replace
 
@@ -8,59 +8,59 @@ from isocharge.simulate import Circle, Electrode, Polygon, Probe, Sensor, load_s
 from isocharge.simulate.forward.charge_spline import MAX_KNOT_SPACING
 from isocharge.simulate.sensor.sensor import Readout
 
-# What the paper says
+# Numbers that the paper states
 
 CUBICS = ((126.3, -592.4, 1743.9, 183.0), (52.679, -247.820, 731.498, 90.838), (47.189, -222.109, 656.633, 84.974))
-"""Eq. 4: charge (pC) of A, B, C against force (N), falling powers."""
+"""Eq. 4: coefficients of the charges (pC) of A, B and C as cubic polynomials of the force (N), highest power first."""
 
 ERROR_MM = 0.122
-"""Distance between press and triangulated position ("only 0.122 mm")."""
+"""Distance between the press and the triangulated position ("only 0.122 mm")."""
 
 CONTOUR_PC = 650.0
-"""The example of a contour, Fig. 6, pC."""
+"""Charge of the contour that Fig. 6 shows as an example, pC."""
 
 ELEMENTS = (13_000, 14_000)
-"""Triangles of a mesh, least and most."""
+"""Smallest and largest number of triangles of a mesh."""
 
 LINEAR_N = 0.5
 LINEAR_MPA = 40.0
-"""Force up to which charge is called linear, and stress up to which PVDF is."""
+"""Force up to which the paper calls the charge linear, and stress up to which it calls PVDF linear."""
 
 FIG_8_DEG = (140.0, 240.0)
 """Angles of the uppermost and the lowermost curve of Fig. 8."""
 
-# What it leaves open
+# Values that the paper does not state
 
 TRIANGLE = Polygon.triangle(4.0)
 RECTANGLE = Polygon.rectangle(4.0, 2.0)
 CIRCLE = Circle(1.0)
 
 OTHERS = (Polygon.triangle(2.0), Polygon.triangle(6.0), CIRCLE, RECTANGLE)
-"""Probes to show what the size and the shape change."""
+"""Further probes, which show the influence of the size and the shape."""
 
 
 @dataclass(frozen=True)
 class Choices:
-    """What the paper does not give.
+    """Our choices for values that the paper does not state.
 
     Attributes:
-        triangle: Fig. 5, 6, 9, 10, 12 and eq. 4: "the triangular probe"; its shape is given.
-        rectangle: Fig. 8; its shape is given.
-        circle: Fig. 11; the paper gives its radius, too.
-        readout: The paper's eq. 3.
-        degree: Of the polynomial along a line.
-        length: Of the lines of a mapping scheme, mm.
-        printed_length: Of lines where B sits at 60 degrees, mm: some of them lead away from the centre.
-        spacing: Of the knots that charges are tabled with, mm.
-        radius: Of the working area, mm.
-        presses: How many presses of the working area a distribution is made from.
-        thickness: Of the films that are compared, mm.
-        pretension: Of them, MPa.
-        force: At which they are solved, N.
-        shown: A press to show a triangulation with, mm.
-        probes: Other probes, to show what their size changes.
-        young: Moduli, MPa, to show what they change; and Poisson's ratios.
-        poisson: See `young`.
+        triangle: Probe of Fig. 5, 6, 9, 10, 12 and eq. 4, "the triangular probe". The paper states its shape only.
+        rectangle: Probe of Fig. 8. The paper states its shape only.
+        circle: Probe of Fig. 11. The paper also states its radius.
+        readout: Readout of the electrodes, which is eq. 3 of the paper.
+        degree: Degree of the polynomial along a line.
+        length: Length of the lines of a mapping scheme, mm.
+        printed_length: Length of the lines if B lies at 60 degrees, mm. Some of these lines lead away from the centre.
+        spacing: Distance between the knots of the charge splines, mm.
+        radius: Radius of the working area, mm.
+        presses: Number of presses in the working area for the distribution of the errors.
+        thickness: Thicknesses of the films that are compared, mm.
+        pretension: Pretensions of the films that are compared, MPa.
+        force: Forces at which these films are solved, N.
+        shown: Position of the press whose triangulation is shown, mm.
+        probes: Further probes, which show the influence of the size and the shape.
+        young: Further Young's moduli, which show the influence of the modulus, MPa.
+        poisson: Further Poisson's ratios, which show the influence of the ratio.
     """
 
     triangle: Probe = TRIANGLE
@@ -82,13 +82,19 @@ class Choices:
     poisson: tuple[float, ...] = (0.25, 0.45)
 
     def sensor(self, layout: str, film: str = "biaxial", readout: Readout | None = None) -> Sensor:
-        """A built-in sensor, "three" or "four", with the paper's readout or another."""
+        """Return a built-in sensor with the readout of the paper, or with another readout.
+
+        Args:
+            layout: "three" or "four" electrodes.
+            film: "biaxial" or "uniaxial".
+            readout: The other readout; None for the readout of the paper.
+        """
         return replace(load_sensor(f"{layout}-25um-{film}"), readout=readout or self.readout)
 
     def as_printed(self) -> Sensor:
-        """Three electrodes with B and C at 60 and 120 degrees from x, as the paper's sentence has it, A at -y."""
-        places = [10.0 * np.exp(1j * np.deg2rad(angle)) for angle in (-90.0, 60.0, 120.0)]
-        squares = [Electrode.of_square(name, (z.real, z.imag), 3.0) for name, z in zip("ABC", places, strict=True)]
+        """Return the sensor as the text of the paper describes it, with B and C at 60 and 120 degrees from x."""
+        centres = [10.0 * np.exp(1j * np.deg2rad(angle)) for angle in (-90.0, 60.0, 120.0)]
+        squares = [Electrode.of_square(name, (z.real, z.imag), 3.0) for name, z in zip("ABC", centres, strict=True)]
         return replace(self.sensor("three"), name="B and C at 60 and 120 degrees", electrodes=tuple(squares))
 
 
@@ -105,4 +111,4 @@ QUICK = Choices(
     young=(2000.0,),
     poisson=(0.25,),
 )
-"""Fewer presses and films, shorter lines: every figure and number, most of them coarser."""
+"""Choices with fewer presses and films and shorter lines. All figures and numbers are computed, with less accuracy."""

@@ -1,4 +1,4 @@
-"""The paper's other claims, and what our choices change."""
+"""Claims of the paper that belong to no figure, and the influence of our choices."""
 
 from dataclasses import replace
 
@@ -16,11 +16,12 @@ from isocharge.simulate.solver.equilibrium import principal_stress
 D33 = -30.0
 PYRO = -30.0
 KELVIN = 0.1
-"""d33 (pC/N) and pyroelectric coefficient (pC/(mm^2 K)) of PVDF with d31 > 0, and a step (K) that a finger makes."""
+"""d33 (pC/N) and pyroelectric coefficient (pC/(mm^2 K)) of PVDF with d31 > 0, and the temperature step (K) that a
+finger causes."""
 
 
 def claims(solves: Solves, accuracy: Accuracy) -> Entry:
-    """What the text says without a figure."""
+    """Return the entry with the claims of the text that belong to no figure."""
     edges, of_edges = _edges(solves)
     pressure, of_pressure = _d33(solves)
     sensor = solves.choices.sensor("three")
@@ -51,7 +52,7 @@ def claims(solves: Solves, accuracy: Accuracy) -> Entry:
 
 
 def _edges(solves: Solves) -> tuple[Row, dict[str, object]]:
-    """Edge averages against the whole electrode."""
+    """Compare the charges by edge averages with those of the whole electrodes."""
     edge, area = (
         solves.charges("triangle", solves.choices.sensor("three", readout=readout), solves.places)
         for readout in ("edge", "area")
@@ -71,7 +72,7 @@ def _edges(solves: Solves) -> tuple[Row, dict[str, object]]:
 
 
 def _d33(solves: Solves) -> tuple[Row, dict[str, object]]:
-    """The contact pressure where the probe covers part of B."""
+    """Compute the charges of the contact pressure where the probe covers a part of an electrode."""
     sensor = solves.choices.sensor("three")
     whole = -0.5 * D33 * FORCE
     points = Mapping.lines(sensor, "A", length=solves.choices.length).points.reshape(-1, 2)
@@ -90,7 +91,7 @@ def _d33(solves: Solves) -> tuple[Row, dict[str, object]]:
 
 
 def _fourth(accuracy: Accuracy, degree: int) -> Row:
-    """What a fourth electrode changes."""
+    """Compare the position errors of three and four electrodes."""
     changes = []
     for name, three, four in (
         ("as the paper, no noise", accuracy.drawn["three", degree], accuracy.drawn["four", degree]),
@@ -113,7 +114,7 @@ def _fourth(accuracy: Accuracy, degree: int) -> Row:
 
 
 def _known(accuracy: Accuracy) -> Row:
-    """The probe and the film must be known."""
+    """Return the position errors if a wrong probe or film is assumed."""
     errors_by_name = [
         f"{name}: {errors.percentile(50):.2f} mm, {100 * errors.share_found:.0f} % found"
         for name, errors in accuracy.mistaken.items()
@@ -128,7 +129,7 @@ def _known(accuracy: Accuracy) -> Row:
 
 
 def what_choices_change(solves: Solves, accuracy: Accuracy) -> Entry:
-    """Sizes that the paper does not give."""
+    """Return the entry with the changes of the charges by values that the paper does not state."""
     rows = []
     numbers = {}
     film = solves.choices.sensor("three").film

@@ -1,4 +1,4 @@
-"""Eq. 4 and the thickness of the film: how charge grows with force."""
+"""Eq. 4: the charge as a function of the force, for films of several thicknesses and pretensions."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,52 +19,52 @@ FINE = np.linspace(0.05, 2.0, 391)
 """Forces at which the solved charges are interpolated, N."""
 
 COMPARED = FINE[(FINE >= 0.25) & (FINE <= 2.0)]
-"""Those of the comparison with eq. 4, N."""
+"""Forces at which the charges are compared with eq. 4, N."""
 
 SHOWN_N = (0.1, 0.5, 1.0, 2.0)
 """Forces at which the page gives the local exponent, N."""
 
 LINEAR = 0.05
-"""Largest distance from a straight line that counts as linear, over the charge at the end, dimensionless."""
+"""Largest ratio of the distance from a straight line to the charge at its end that counts as linear, dimensionless."""
 
 
 @dataclass(frozen=True)
 class ChargeForce:
-    """Charge on A against force of one film.
+    """Charge of A as a function of the force for one film.
 
     Attributes:
-        thickness: mm.
-        pretension: MPa.
-        charges: Of all electrodes as they were solved, shape (n_force, 3), pC.
-        logs: Spline of ln Q (pC) of A in ln F (N).
+        thickness: Thickness of the film, mm.
+        pretension: Pretension of the film, MPa.
+        charges: Solved charges of all electrodes, shape (n_force, 3), pC.
+        log_charge: Spline of the logarithm of the charge (pC) of A as a function of the logarithm of the force (N).
     """
 
     thickness: float
     pretension: float
     charges: Array
-    logs: CubicSpline
+    log_charge: CubicSpline
 
     def charge(self, force: Array | float) -> Array:
-        """pC, at forces in N."""
-        return np.exp(self.logs(np.log(force)))
+        """Return the charges (pC) at forces (N)."""
+        return np.exp(self.log_charge(np.log(force)))
 
     def exponent(self, force: float) -> float:
-        """d(ln Q)/d(ln F)."""
-        return float(self.logs(np.log(force), 1))
+        """Return the local exponent d(ln Q)/d(ln F) at a force (N)."""
+        return float(self.log_charge(np.log(force), 1))
 
     @property
     def at_1_N(self) -> float:
-        """pC."""
+        """Charge at 1 N, pC."""
         return float(self.charge(1.0))
 
     @property
     def misfit(self) -> float:
-        """Largest distance from eq. 4's cubic, both over their charge at 1 N."""
+        """Largest difference from the cubic of eq. 4, if both are divided by their charge at 1 N."""
         return float(np.abs(self.charge(COMPARED) / self.at_1_N - normalised(CUBICS[0], COMPARED)).max())
 
     @property
     def bent(self) -> float:
-        """Distance from the best straight line through zero up to LINEAR_N, over the charge there."""
+        """Largest distance from the best straight line through zero up to `LINEAR_N`, over the charge at `LINEAR_N`."""
         forces = FINE[FINE <= LINEAR_N + 1e-9]
         charge = self.charge(forces)
         line = forces * (charge @ forces) / (forces @ forces)
@@ -72,27 +72,27 @@ class ChargeForce:
 
     @property
     def cubic(self) -> Array:
-        """Normalised cubic fitted to the charge, falling powers of the force in N."""
+        """Coefficients of the cubic that fits the charge over its value at 1 N, highest power of the force first."""
         return np.polyfit(COMPARED, self.charge(COMPARED) / self.at_1_N, 3)
 
     @property
     def um(self) -> str:
-        """Thickness for people."""
+        """Thickness as a text."""
         return f"{1e3 * self.thickness:g} um"
 
     @property
     def name(self) -> str:
-        """Thickness and pretension for people."""
+        """Thickness and pretension as a text."""
         return f"{self.um} at {self.pretension:g} MPa"
 
 
 def normalised(cubic: tuple[float, ...], force: Array) -> Array:
-    """A cubic of eq. 4 over its value at 1 N."""
+    """Evaluate a cubic of eq. 4, divided by its value at 1 N."""
     return np.polyval(np.array(cubic) / sum(cubic), force)
 
 
 def eq_4(solves: Solves) -> Entry:
-    """The cubic, which film has it, and where charge is linear."""
+    """Return the entry about eq. 4: which films have its cubic, and where the charge is linear in the force."""
     choices = solves.choices
     films = [
         [
@@ -135,7 +135,7 @@ def eq_4(solves: Solves) -> Entry:
 
 
 def _rows_of_press(solves: Solves, thick: list[ChargeForce]) -> list[Row]:
-    """Where eq. 4's press was, and how large its charges are."""
+    """Return the rows about the position of the press of eq. 4 and the size of its charges."""
     ((x, y), factor), pC = solves.eq_4, [sum(cubic) for cubic in CUBICS]
     thick_pC = thick[0].at_1_N
     most = max(film.at_1_N for film in thick)
@@ -164,7 +164,7 @@ def _rows_of_press(solves: Solves, thick: list[ChargeForce]) -> list[Row]:
 
 
 def _rows_of_cubic(films: list[list[ChargeForce]]) -> list[Row]:
-    """Which film has the shape of eq. 4."""
+    """Return the rows about the films whose charge has the shape of eq. 4."""
     thin = films[0][0]
     thick = films[-1]
     cubic = _coefficients(np.array(CUBICS[0]) / sum(CUBICS[0]))
@@ -196,7 +196,7 @@ def _rows_of_cubic(films: list[list[ChargeForce]]) -> list[Row]:
 
 
 def _rows_of_line(films: list[list[ChargeForce]]) -> list[Row]:
-    """Where charge goes with force."""
+    """Return the rows about the films whose charge is linear in the force."""
     slack = [row[0] for row in films]
     off = "; ".join(f"{film.um} {100 * film.bent:.0f} %" for film in slack)
     exponents = "; ".join(f"{film.um} " + ", ".join(f"{film.exponent(f):.2f}" for f in SHOWN_N) for film in slack)
@@ -227,7 +227,7 @@ def _coefficients(cubic: Array) -> str:
 
 
 def _linear_films(films: list[list[ChargeForce]]) -> str:
-    """Which films are linear up to 0.5 N, the thinnest first."""
+    """List the films whose charge is linear up to 0.5 N, beginning with the thinnest film."""
     linear = [film for row in films for film in row if film.bent <= LINEAR]
     if not linear:
         return f"none within {100 * LINEAR:g} %"
@@ -238,7 +238,7 @@ def _linear_films(films: list[list[ChargeForce]]) -> str:
 
 
 def _draw_curves(axes: Any, films: list[list[ChargeForce]]) -> None:
-    """Eq. 4, and slack films of 25 um, 110 um and 1 mm as far as they were solved."""
+    """Draw eq. 4 and the charges of films of 25 um, 110 um and 1 mm without pretension, if they were solved."""
     for cubic, name, style in zip(CUBICS, "ABC", ("-", "--", ":"), strict=True):
         axes.plot(FINE, normalised(cubic, FINE), style, color=INK, lw=1.2, label=f"eq. 4, {name}")
     papers = normalised(CUBICS[0], FINE)
@@ -264,7 +264,7 @@ def _draw_exponents(axes: Any, films: list[list[ChargeForce]]) -> None:
 
 
 def _draw_grid(axes: Any, films: list[list[ChargeForce]], title: str, values: list[list[float]], digits: int) -> None:
-    """A number for each thickness and pretension."""
+    """Draw a table with one value for each thickness and pretension, with shades for the values."""
     logs = np.log10(values)
     axes.imshow(logs, cmap="viridis_r", aspect="auto")
     for (i, k), log in np.ndenumerate(logs):

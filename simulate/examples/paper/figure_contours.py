@@ -1,4 +1,4 @@
-"""Fig. 9 to 11: triangulation and contours."""
+"""Fig. 9 to 11 of the paper: triangulation and isocharge contours."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -21,15 +21,15 @@ from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_work
 
 LEVELS = 8
 AREA = 11.5
-"""Number of contours of each electrode in Fig. 11, and their largest distance from the centre, mm: the far side of the
-electrodes."""
+"""Number of contours of each electrode in Fig. 11, and their largest distance from the centre, mm. This distance is
+that of the far sides of the electrodes."""
 
 AROUND = 0.6
-"""Half the side of what is shown near the press, mm."""
+"""Half of the side of the square that is shown around the press, mm."""
 
 
 def fig_9(solves: Solves, accuracy: Accuracy) -> Entry:
-    """Contours from the field, under a triangle."""
+    """Return the entry of Fig. 9: contours of a press by a triangle, computed from the charge map."""
     sensor = solves.choices.sensor("three")
     at = solves.choices.shown
     reach = BEYOND * solves.choices.radius
@@ -58,7 +58,7 @@ def fig_9(solves: Solves, accuracy: Accuracy) -> Entry:
 
 
 def fig_10(solves: Solves, accuracy: Accuracy) -> Entry:
-    """The paper's graphical method, and how its 0.122 mm compares."""
+    """Return the entry of Fig. 10: the graphical method of the paper, and its error of 0.122 mm compared with ours."""
     sensor = solves.choices.sensor("three")
     at = solves.choices.shown
     triangulation = DrawnTriangulation(solves.scheme("triangle", sensor), solves.choices.degree)
@@ -106,7 +106,10 @@ def fig_10(solves: Solves, accuracy: Accuracy) -> Entry:
 
 
 def _row_of_percentile(accuracy: Accuracy, degree: int) -> Row:
-    """Where the paper's error lies among those over the working area, for our degree and for others."""
+    """Return the row with the percentile of the error of the paper among our errors over the working area.
+
+    The percentile is stated for our degree of the polynomials and for other degrees.
+    """
     errors = accuracy.drawn["three", degree]
     others = ", ".join(
         f"degree {other}: median {its.percentile(50):.2f} mm, 0.122 mm at {its.share_below(ERROR_MM):.0f} %"
@@ -124,7 +127,14 @@ def _row_of_percentile(accuracy: Accuracy, degree: int) -> Row:
 
 
 def _zoom(axes: Any, drawn: list[DrawnContour], at: Array, mean: Array) -> None:
-    """The crossings next to the press, and their mean."""
+    """Draw the crossings of contours next to the press, and their mean.
+
+    Args:
+        axes: Axes of matplotlib.
+        drawn: The contours.
+        at: Position (x, y) of the press, shape (2,), mm.
+        mean: Mean of the crossings, shape (2,), mm.
+    """
     crossings = (one.crossings(other) for one, other in combinations(drawn, 2))
     nearest = [points[np.argmin(np.linalg.norm(points - at, axis=1))] for points in crossings if len(points)]
     axes.plot(*np.reshape(nearest, (-1, 2)).T, "o", mfc="none", color=INK, ms=8, label="crossings")
@@ -142,7 +152,7 @@ def _zoom(axes: Any, drawn: list[DrawnContour], at: Array, mean: Array) -> None:
 
 
 def _distributions(axes: Any, accuracy: Accuracy, degree: int) -> None:
-    """The share of presses found within an error."""
+    """Draw the distributions of the position errors over the working area."""
     for errors, label, colour, style in (
         (accuracy.drawn["three", degree], "three, as the paper", COLOURS[0], "-"),
         (accuracy.drawn["four", degree], "four, as the paper", COLOURS[1], "-"),
@@ -158,7 +168,7 @@ def _distributions(axes: Any, accuracy: Accuracy, degree: int) -> None:
 
 
 def fig_11(solves: Solves) -> Entry:
-    """Contours of all four electrodes under a circle."""
+    """Return the entry of Fig. 11: contours of all four electrodes under a circle."""
     sensor = solves.choices.sensor("four")
     field = ContourField(ChargeSpline.of(solves.forward_map("circle", sensor), AREA, solves.choices.spacing), FORCE)
     reached_pC = {name: list(field.charge_range(name)) for name in sensor.electrode_names}
@@ -189,7 +199,8 @@ def fig_11(solves: Solves) -> Entry:
 
 
 def _draw_fig_11(choices: Choices, sensor: Sensor, field: ContourField) -> Figure:
-    """On the left the contours of all electrodes, on the right those of the first with their charges."""
+    """Draw the contours of all electrodes on the left, and those of the first electrode with their charges on the
+    right."""
     figure, (left, right) = new_axes(12.6, 6.6, columns=2)
     for name, colour in zip(sensor.electrode_names, COLOURS, strict=False):
         levels = field.even_charges(name, LEVELS)
@@ -211,13 +222,21 @@ def _draw_fig_11(choices: Choices, sensor: Sensor, field: ContourField) -> Figur
 
 
 def _label_end(axes: Any, points: Array, text: str) -> None:
-    """Text beyond the upper end of a contour."""
+    """Write a text beyond the upper end of a contour."""
     end = points[-1 if points[-1, 1] > points[0, 1] else 0]
     beyond = tuple(9.0 * end / np.linalg.norm(end))
     axes.annotate(text, end, xytext=beyond, textcoords="offset points", fontsize=7, ha="center", va="center")
 
 
 def draw_contours(axes: Any, contours: Sequence[Array], colour: str, label: str = "", width: float = 1.2) -> None:
-    """Pieces of contours, shape (n, 2) each, mm; the first one labelled for the legend."""
+    """Draw pieces of contours. Only the first piece gets a label, so that the legend has one entry.
+
+    Args:
+        axes: Axes of matplotlib.
+        contours: Points (x, y) of the pieces, each of shape (n, 2), mm.
+        colour: Colour of the lines.
+        label: Label in the legend.
+        width: Width of the lines, points.
+    """
     for number, points in enumerate(contours):
         axes.plot(*points.T, color=colour, lw=width, label=label if number == 0 else None)

@@ -1,4 +1,4 @@
-"""Fig. 6, 8 and 12: charge against distance."""
+"""Fig. 6, 8 and 12 of the paper: the charge as a function of the distance."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -32,7 +32,16 @@ Extreme = Callable[..., Any]
 def curves_of(
     solves: Solves, probe: str, sensor: Sensor, name: str, degrees: tuple[float, float], length: float | None = None
 ) -> tuple[Curves, Curves]:
-    """Curves at the scheme's presses, and finely along the same lines."""
+    """Return the charges at the presses of a mapping scheme, and at many presses along the same lines.
+
+    Args:
+        solves: Results of the solves.
+        probe: Name of the probe; see `Solves.forward_map`.
+        sensor: The sensor.
+        name: Name of the electrode at which the lines start.
+        degrees: First and last angle of the lines, degrees.
+        length: Length of the lines, mm; None for our choice.
+    """
     first, last = np.deg2rad(degrees)
     mapping = Mapping.lines(sensor, name, (first, last), length=length or solves.choices.length)
     forward_map = solves.forward_map(probe, sensor)
@@ -40,7 +49,7 @@ def curves_of(
 
 
 def curve_numbers(curves: Curves) -> dict[str, object]:
-    """A set of curves for JSON."""
+    """Return curves as numbers for JSON."""
     return {
         "angle_deg": np.rad2deg(curves.mapping.angle).tolist(),
         "distance_mm": curves.mapping.distance.tolist(),
@@ -49,7 +58,7 @@ def curve_numbers(curves: Curves) -> dict[str, object]:
 
 
 def fig_6(solves: Solves) -> Entry:
-    """Triangle, biaxial, from A; three electrodes as in the paper, and four."""
+    """Return the entry of Fig. 6: a triangle on a biaxial film, on lines from A, with three and four electrodes."""
     figure, pair = new_axes(12.6, 5.2, columns=2)
     sensors = {layout: solves.choices.sensor(layout) for layout in FROM_A_DEG}
     both = {name: curves_of(solves, "triangle", sensors[name], "A", degrees) for name, degrees in FROM_A_DEG.items()}
@@ -90,7 +99,7 @@ def fig_6(solves: Solves) -> Entry:
 
 
 def _example(solves: Solves, at: Curves, smooth: Curves) -> tuple[Row, Array]:
-    """The paper's example of a contour: distances (mm) at which the lines have 650 pC."""
+    """Return the row about the contour of 650 pC, and the distances (mm) at which the lines have this charge."""
     contour = draw_contour(at, CONTOUR_PC, solves.choices.degree)
     knots = np.empty((0, 2)) if contour is None else contour.knots
     distance = np.linalg.norm(knots - at.mapping.origin, axis=1)
@@ -109,12 +118,12 @@ def _at_distances(curves: Curves, percent: Array) -> str:
 
 
 def _spread(curves: Curves) -> Array:
-    """Largest less smallest charge of the lines over their mean, at each distance."""
+    """Return the difference of the largest and the smallest charge of the lines over their mean, at each distance."""
     return np.ptp(curves.own_charge, axis=0) / curves.own_charge.mean(axis=0)
 
 
 def fig_8(solves: Solves) -> Entry:
-    """Rectangle, biaxial, from B; which line is uppermost."""
+    """Return the entry of Fig. 8: a rectangle on a biaxial film, on lines from B, and which line is uppermost."""
     sensor = solves.choices.sensor("three")
     printed_length = solves.choices.printed_length
     curves, smooth = curves_of(solves, "rectangle", sensor, "B", FIG_8_DEG)
@@ -162,7 +171,10 @@ def fig_8(solves: Solves) -> Entry:
 
 
 def _draw_fig_8(curves: Curves, smooth: Curves) -> Figure:
-    """The curves, and each over the mean of all; the two lines that the paper names stand out."""
+    """Draw the curves on the left, and the ratio of each curve to the mean of all curves on the right.
+
+    The two lines that the paper names are highlighted.
+    """
     figure, (left, right) = new_axes(12.0, 5.2, columns=2)
     draw_curves(left, curves, smooth)
     left.set_title("Fig. 8: rectangular probe, biaxial film, 1 N")
@@ -195,7 +207,7 @@ def _extremes(curves: Curves) -> str:
 
 
 def _best_ratio(solves: Solves) -> tuple[float, float]:
-    """d32 over d31 with which the order of Fig. 8 holds at most distances, and the share of them."""
+    """Return the ratio d32 / d31 with which the order of Fig. 8 holds at most distances, and the share of them."""
     sensor = solves.choices.sensor("three")
     by_d31, by_d32 = (
         curves_of(solves, "rectangle", replace(sensor, piezo=piezo), "B", FIG_8_DEG)[0].own_charge
@@ -210,7 +222,7 @@ def _best_ratio(solves: Solves) -> tuple[float, float]:
 
 
 def fig_12(solves: Solves) -> Entry:
-    """Triangle, uniaxial, from A, beside biaxial."""
+    """Return the entry of Fig. 12: a triangle on a uniaxial film, on lines from A, compared with a biaxial film."""
     figure, pair = new_axes(12.0, 5.2, columns=2)
     numbers = {}
     rows = []
@@ -235,7 +247,13 @@ def fig_12(solves: Solves) -> Entry:
 
 
 def draw_curves(axes: Any, points: Curves, lines: Curves) -> None:
-    """Charge against distance on each line of a mapping: marks where the scheme presses, lines between them."""
+    """Draw the charge against the distance on each line of a mapping.
+
+    Args:
+        axes: Axes of matplotlib.
+        points: Charges at the presses of the scheme, which are drawn as marks.
+        lines: Charges at many presses along the same lines, which are drawn as lines.
+    """
     colours = shades(points.mapping.angle.size)
     for angle, colour, marks, line in zip(
         points.mapping.angle, colours, points.own_charge, lines.own_charge, strict=True

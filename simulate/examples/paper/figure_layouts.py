@@ -1,4 +1,4 @@
-"""Fig. 1 to 5 and 7: the principle, the mapping schemes, the layout, the mesh."""
+"""Fig. 1 to 5 and 7 of the paper: the principle, the mapping schemes, the layout and the mesh."""
 
 from dataclasses import replace
 from typing import Any
@@ -18,14 +18,14 @@ from isocharge.simulate.plots.figure import COLOURS, FELT, INK, PRESSED, finish_
 from isocharge.simulate.plots.film import draw_electrodes, draw_probe, draw_working_area, frame_film
 
 FIG_4_DEG = (35.0, 145.0)
-"""Lines from A, the half that Fig. 6 shows and its mirror image."""
+"""First and last angle of the lines from A: the half that Fig. 6 shows, and its mirror image."""
 
 TOUCHED = 1e-3
-"""Share of the probe that must lie on an electrode to count: less is the round-off of areas."""
+"""Smallest share of the probe that counts as lying on an electrode. Smaller shares are rounding errors of areas."""
 
 
 def fig_1(solves: Solves) -> Entry:
-    """The principle: three distances."""
+    """Return the entry of Fig. 1: three distances determine a position."""
     sensor = solves.choices.sensor("three")
     at = np.array(solves.choices.shown)
     centres = np.array([e.centre for e in sensor.electrodes])
@@ -59,14 +59,23 @@ def fig_1(solves: Solves) -> Entry:
 
 
 def trilaterate(centres: Array, distance: Array) -> Array:
-    """Eq. 1 for three circles, shape (2,): each difference of two of them is linear in the position."""
+    """Solve eq. 1, the equations of three circles. The difference of two of these equations is linear in the position.
+
+    Args:
+        centres: Centres (x, y) of the circles, shape (3, 2), mm.
+        distance: Radii of the circles, shape (3,), mm.
+
+    Returns:
+        Position (x, y), shape (2,), mm.
+    """
     matrix = 2.0 * (centres[1:] - centres[0])
-    right = distance[0] ** 2 - distance[1:] ** 2 + np.sum(centres[1:] ** 2, axis=1) - np.sum(centres[0] ** 2)
-    return np.linalg.lstsq(matrix, right, rcond=None)[0]
+    squared_norm = np.sum(centres**2, axis=1)
+    right_side = distance[0] ** 2 - distance[1:] ** 2 + squared_norm[1:] - squared_norm[0]
+    return np.linalg.lstsq(matrix, right_side, rcond=None)[0]
 
 
 def fig_2(solves: Solves) -> Entry:
-    """The mapping scheme about one electrode."""
+    """Return the entry of Fig. 2: the mapping scheme about one electrode."""
     sensor = solves.choices.sensor("three")
     mapping = Mapping.lines(sensor, "A", (0.0, 2.0 * np.pi - np.deg2rad(10.0)), length=solves.choices.length)
     figure, axes = new_axes(6.4, 6.2)
@@ -89,7 +98,7 @@ def fig_2(solves: Solves) -> Entry:
 
 
 def fig_3(solves: Solves) -> Entry:
-    """The layout with three sensing elements, and as the text has it."""
+    """Return the entry of Fig. 3: the layout with three electrodes, and the layout that the text describes."""
     sensor = solves.choices.sensor("three")
     printed = solves.choices.as_printed()
     figure, (left, right) = new_axes(11.0, 5.6, columns=2)
@@ -117,7 +126,11 @@ def fig_3(solves: Solves) -> Entry:
 
 
 def _triangle(sensor: Sensor) -> tuple[list[float], str, str]:
-    """Sides AB, BC, CA, mm, the same for people, and the directions from A to B and C for people."""
+    """Return the sides AB, BC and CA of the triangle of the centres.
+
+    Returns:
+        The sides in mm, the sides as a text, and the directions from A to B and C as a text.
+    """
     a, b, c = (complex(*e.centre) for e in sensor.electrodes)
     sides = [abs(b - a), abs(c - b), abs(a - c)]
     directions = ", ".join(f"{np.rad2deg(np.angle(z - a)):.0f}°" for z in (b, c))
@@ -125,7 +138,14 @@ def _triangle(sensor: Sensor) -> tuple[list[float], str, str]:
 
 
 def scheme(solves: Solves, heading: str, electrode: str, degrees: tuple[float, float]) -> Entry:
-    """Figs. 4 and 7: the lines from an electrode between two angles."""
+    """Return the entry of Fig. 4 or 7: the lines from an electrode between two angles.
+
+    Args:
+        solves: Results of the solves.
+        heading: Heading of the entry.
+        electrode: Name of the electrode.
+        degrees: First and last angle of the lines, degrees.
+    """
     sensor = solves.choices.sensor("three")
     first, last = np.deg2rad(degrees)
     mapping = Mapping.lines(sensor, electrode, (first, last), length=solves.choices.length)
@@ -151,13 +171,23 @@ def scheme(solves: Solves, heading: str, electrode: str, degrees: tuple[float, f
 
 
 def contact_charges(solves: Solves, sensor: Sensor, points: Array, d33: float) -> Array:
-    """Charges by the pressure of a triangle at (x, y), shape (n, 2), with d33 in pC/N: (n, n_electrode), pC."""
-    pressed = replace(sensor, piezo=replace(sensor.piezo, d33=d33))
-    return np.array([contact_charge(pressed, solves.choices.triangle, (x, y), FORCE) for x, y in points])
+    """Compute the charges of the contact pressure of a triangle.
+
+    Args:
+        solves: Results of the solves.
+        sensor: The sensor.
+        points: Positions (x, y) of the presses, shape (n, 2), mm.
+        d33: Coefficient d33, pC/N.
+
+    Returns:
+        Charges, shape (n, n_electrode), pC.
+    """
+    sensor_with_d33 = replace(sensor, piezo=replace(sensor.piezo, d33=d33))
+    return np.array([contact_charge(sensor_with_d33, solves.choices.triangle, (x, y), FORCE) for x, y in points])
 
 
 def fig_5(solves: Solves) -> Entry:
-    """The mesh, and what its fineness is worth."""
+    """Return the entry of Fig. 5: the mesh, and the error as a function of its fineness."""
     (*charges, finest), (*unknowns, _), (*seconds, _) = zip(*solves.meshes, strict=True)
     error = np.abs(np.array(charges) / finest - 1.0).max(axis=1)
     figure, (whole, near, errors) = new_axes(15.0, 5.0, columns=3)
@@ -215,7 +245,7 @@ def fig_5(solves: Solves) -> Entry:
 
 
 def _draw_mesh(axes: Any, shown: Equilibrium) -> None:
-    """Edges of the elements, and the probe."""
+    """Draw the edges of the elements and the probe."""
     along = np.linspace(-1.0, 1.0, 13)
     one = np.ones(13)
     xi = np.concatenate([along, one, -along, -one])
@@ -227,7 +257,7 @@ def _draw_mesh(axes: Any, shown: Equilibrium) -> None:
 
 
 def draw_mapping(axes: Any, mapping: Mapping) -> None:
-    """Lines and circles of a mapping scheme, and its presses."""
+    """Draw the lines and circles of a mapping scheme, and its presses."""
     points = np.concatenate([np.broadcast_to(mapping.origin, (mapping.angle.size, 1, 2)), mapping.points], axis=1)
     for angle, line in zip(mapping.angle, points, strict=True):
         axes.plot(*line.T, color=PRESSED, lw=0.8)

@@ -1,4 +1,4 @@
-"""What each figure gives to the page, and the page: paper.md and paper.json."""
+"""Entries of the page about the paper, and the files paper.md and paper.json."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -15,18 +15,25 @@ INTRODUCTION = """# Mirbagheri et al. (2007), reproduced
 A. Mirbagheri, S. Najarian, J. Dargahi, F. Tabatabai Ghomshe: Mathematical Modeling of a Tactile Sensor with
 Applications in Minimally Invasive Surgery. American Journal of Applied Sciences 4 (10), 779-785.
 
-Every figure and number of the paper, ours beside it, and what explains the difference. The figures are drawn from our
-own film; where the paper gives no size the choice is ours ([what that changes](#what-the-paper-does-not-give)). The
-same numbers are in `paper.json`.
+This page compares every figure and number of the paper with ours, and explains the differences. Our figures are
+computed for our own film. Where the paper does not state a value, we have chosen one
+([influence of these choices](#what-the-paper-does-not-give)). The file `paper.json` contains the same numbers.
 """
 
 
 HEADS = ("what", "paper", "ours", "what explains it")
-"""Heads of the columns of a table of rows."""
+"""Headers of the columns of a table of rows."""
 
 
 class Row(NamedTuple):
-    """One number or claim: what, the paper's value, ours, and what explains the difference."""
+    """One number or claim of the paper.
+
+    Attributes:
+        what: Name of the number, or the claim.
+        paper: Value in the paper.
+        ours: Our value.
+        why: Explanation of the difference.
+    """
 
     what: str
     paper: str
@@ -39,11 +46,11 @@ class Entry:
     """One figure or section of the page.
 
     Attributes:
-        heading: "Fig. 6", "Eq. 4", ...
-        caption: What the figure shows.
-        figure: The picture.
+        heading: Heading of the section, such as "Fig. 6" or "Eq. 4".
+        caption: Caption of the figure.
+        figure: The picture; None if the section has no picture.
         rows: Numbers and claims.
-        numbers: For programs, units in the keys.
+        numbers: Numbers for programs, with the units in the keys.
     """
 
     heading: str
@@ -60,7 +67,13 @@ class Entry:
 
 
 def page(entries: Sequence[Entry], choices: Choices, seconds: float) -> str:
-    """The whole page as Markdown."""
+    """Return the whole page as Markdown.
+
+    Args:
+        entries: Figures and sections of the page.
+        choices: Values that the paper does not state.
+        seconds: Duration of the computation, s.
+    """
     film = choices.sensor("three").film
     probes = ", ".join(probe.notation for probe in (choices.triangle, choices.rectangle, choices.circle))
     settings = (
@@ -82,11 +95,12 @@ def page(entries: Sequence[Entry], choices: Choices, seconds: float) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[tuple[str, ...]]) -> str:
+    """Return a table in Markdown from the headers of its columns and its rows."""
     lines = ["| " + " | ".join(cells) + " |" for cells in (heads, *rows)]
     return "\n".join([lines[0], "|---" * len(heads) + "|", *lines[1:]])
 
 
 def as_json(entries: Sequence[Entry]) -> str:
-    """The numbers by heading, rows included, as JSON; NaN becomes null."""
+    """Return the numbers and the rows of all entries by their headings, as JSON. NaN becomes null."""
     numbers = {entry.heading: {**entry.numbers, "rows": [row._asdict() for row in entry.rows]} for entry in entries}
     return json.dumps(plain_values(numbers), indent=1, allow_nan=False) + "\n"

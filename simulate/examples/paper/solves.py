@@ -1,4 +1,4 @@
-"""Everything that is solved for the page, once: forward maps and single presses, on all workers."""
+"""All solves for the page: forward maps and single presses, which are distributed over the workers."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -34,21 +34,23 @@ FORCE = 1.0
 """Force of the paper's presses, N."""
 
 SLACK = 1.0 + 1e-6
-"""Factor on the reach of a scheme, dimensionless: its outermost press then lies inside the forward map."""
+"""Factor by which a forward map extends beyond the outermost press of a scheme, because of rounding, dimensionless."""
 
 MESHES = ((2, 6, 3, 1), (3, 8, 4, 1), (4, 8, 5, 1), (5, 8, 5, 1), (6, 8, 6, 1))
 
 FINEST = (8, 12, 7, 2)
-"""Order, around, rings and rim of the mesh that MESHES, whose entries have the same meaning, are compared with."""
+"""Mesh with which `MESHES` are compared: order, number of elements around the circle, rings and thin rings. The entries
+of `MESHES` have the same meaning."""
 
 CHAIN_ACCURACY = 2e-3
-"""Relative error of a charge in the comparison of thicknesses, where some tenths of a percent cannot be seen."""
+"""Relative error of a charge in the comparison of thicknesses. An error of a few tenths of a percent is not visible in
+the figure."""
 
 TAUT = 0.5
-"""Pretension of the film that the contours assume to be slack, MPa."""
+"""Pretension of a film for which the contours assume no pretension, MPa."""
 
 UNSUSPECTED = 24
-"""Number of presses with each probe or film that the contours do not assume."""
+"""Number of presses with each probe or film that differs from the assumption of the contours."""
 
 Places = Sequence[tuple[float, float]]
 
@@ -56,19 +58,36 @@ Job = Callable[[], Any]
 
 
 def call(job: Job) -> Any:
-    """Run a job, which a worker process can receive."""
+    """Call a job. Worker processes can import this function."""
     return job()
 
 
 def run_all(jobs: Sequence[Job], title: str, executor: Executor | None) -> list[Any]:
-    """Results of jobs, in their order."""
+    """Run jobs, and return their results in the order of the jobs.
+
+    Args:
+        jobs: The jobs.
+        title: Title of the progress bar.
+        executor: Executor that runs the jobs; this process if None.
+    """
     return list(track(in_order(executor, call, jobs), title, len(jobs)))
 
 
 def solve_presses(
     sensor: Sensor, probe: Probe, places: Places, forces: Sequence[float], accuracy: float = 1e-3
 ) -> Array:
-    """Touch charges at (x, y), mm, under forces, N; each is started from the one before; (n_press, n_electrode), pC."""
+    """Compute the touch charges of presses, each of which is solved from the equilibrium of the previous press.
+
+    Args:
+        sensor: The sensor.
+        probe: The probe.
+        places: Positions (x, y) of the presses, mm.
+        forces: Forces of the presses, N.
+        accuracy: Relative error of the charges.
+
+    Returns:
+        Charges, shape (n_press, n_electrode), pC.
+    """
     start: Equilibrium | None = None
     charge = []
     for at, force in zip(places, forces, strict=True):
@@ -80,7 +99,7 @@ def solve_presses(
 def solve_mesh(
     sensor: Sensor, probe: Probe, at: tuple[float, float], mesh: tuple[int, int, int, int]
 ) -> tuple[Array, int, float]:
-    """One press on one mesh: charges, unknowns and CPU seconds."""
+    """Solve one press on one mesh, and return the charges (pC), the number of unknowns and the CPU time (s)."""
     began = process_time()
     theory = Theory(stretching=True, bending=True, pretensioned=False)
     solved = press(sensor.film, probe, at, FORCE, SolveSettings(theory=theory, resolution=Resolution(*mesh)))
@@ -89,17 +108,18 @@ def solve_mesh(
 
 @dataclass(frozen=True)
 class Solves:
-    """All that was solved for the page.
+    """Results of all solves for the page.
 
     Attributes:
-        choices: What the paper leaves open.
-        maps: Forward maps at 1 N by probe ("triangle", "rectangle", "circle"); any layout, film direction and readout
-            shares them, since they hold the film's stress.
+        choices: Values that the paper does not state.
+        maps: Forward maps at 1 N by probe ("triangle", "rectangle", "circle"). All layouts, piezoelectric coefficients
+            and readouts share them, because they contain the stress of the film.
         eq_4: Position (x, y) of eq. 4's press, mm, and the ratio of our charges to the paper's at this position.
         chains: Charges of the films of `choices`, shape (n_thickness, n_pretension, n_force, 3), pC.
-        meshes: Of MESHES and FINEST: charges, unknowns, CPU seconds.
-        variants: Charges with other probes and films than our choice, by name, at `sample`, shape (n, 3), pC.
-        shown: The film under one triangular press, for its mesh and stress.
+        meshes: Charges, number of unknowns and CPU time on each of `MESHES` and on `FINEST`.
+        variants: Charges with other probes and films than our choice, by name, for the presses of `sample`, shape
+            (n, 3), pC.
+        shown: Equilibrium of one press by the triangle, whose mesh and stress are shown.
     """
 
     choices: Choices
@@ -111,43 +131,59 @@ class Solves:
     shown: Equilibrium
 
     def forward_map(self, probe: str, sensor: Sensor) -> ForwardMap:
-        """The forward map of a probe for any sensor with the same film."""
+        """Return the forward map of a probe ("triangle", "rectangle" or "circle") for a sensor with the same film."""
         return replace(self.maps[probe], sensor=sensor)
 
     def scheme(self, probe: str, sensor: Sensor) -> tuple[Curves, ...]:
-        """Charge curves from every electrode, as far to both sides of the centre as contours need."""
+        """Return the charge curves along the lines from every electrode; see `forward_map` for the arguments."""
         forward_map = self.forward_map(probe, sensor)
         lines = (Mapping.lines(sensor, name, length=self.choices.length) for name in sensor.electrode_names)
         return tuple(Curves.of(forward_map, mapping, FORCE) for mapping in lines)
 
     def charges(self, probe: str, sensor: Sensor, at: Array) -> Array:
-        """Touch charges of presses of 1 N at (x, y), shape (n, 2), mm; (n, n_electrode), pC."""
+        """Return the touch charges of presses of 1 N, shape (n, n_electrode), pC.
+
+        Args:
+            probe: Name of the probe; see `forward_map`.
+            sensor: The sensor.
+            at: Positions (x, y) of the presses, shape (n, 2), mm.
+        """
         return self.forward_map(probe, sensor).charges(np.column_stack([at, np.full(len(at), FORCE)]))
 
     @property
     def places(self) -> Array:
-        """Presses spread over the working area, shape (n, 2), mm."""
+        """Positions of presses that are distributed over the working area, shape (n, 2), mm."""
         return spread(self.choices.radius, self.choices.presses)
 
     def changes(self, name: str) -> Array:
-        """Relative changes of the charges that a variation makes, over the presses of the variations, shape (n, 3)."""
+        """Return the relative changes of the charges by a variation, for the presses of `sample`, shape (n, 3)."""
         charge = self.charges("triangle", self.choices.sensor("three"), sample(self.choices))
         return self.variants[name] / charge - 1.0
 
 
 def spread(radius: float, most: int) -> Array:
-    """Places of a lattice off the lines of symmetry, shape (n, 2), mm."""
+    """Return positions of a lattice that is rotated away from the lines of symmetry, shape (n, 2), mm.
+
+    Args:
+        radius: Largest distance from the centre, mm.
+        most: Largest number of positions.
+    """
     z = radius * lattice(most) * np.exp(0.1j)
     return np.stack([z.real, z.imag], axis=1)
 
 
 def sample(choices: Choices) -> Array:
-    """Positions of the presses of the variations, shape (n, 2), mm."""
+    """Return the positions of the presses for which the variations are solved, shape (n, 2), mm."""
     return spread(0.9 * choices.radius, min(UNSUSPECTED, choices.presses))
 
 
 def solve_all(choices: Choices, executor: Executor | None) -> Solves:
-    """Solve everything."""
+    """Solve all maps and presses.
+
+    Args:
+        choices: Values that the paper does not state.
+        executor: Executor that runs the solves; this process if None.
+    """
     sensor = choices.sensor("three")
     maps = _map_jobs(choices)
     variants = _variant_jobs(choices)
@@ -173,7 +209,7 @@ def solve_all(choices: Choices, executor: Executor | None) -> Solves:
 
 
 def _map_jobs(choices: Choices) -> dict[str, Job]:
-    """Forward maps as far out as the schemes press."""
+    """Return the jobs that solve the forward map of each probe, up to the outermost press of the mapping schemes."""
     sensor = choices.sensor("three")
     lines = [
         Mapping.lines(layout, name, length=choices.length)
@@ -194,7 +230,7 @@ def _map_jobs(choices: Choices) -> dict[str, Job]:
 
 
 def _variant_jobs(choices: Choices) -> dict[str, Job]:
-    """Presses with another probe or film than our choice, by name; at the same places, 1 N, paper's readout."""
+    """Return the jobs that solve presses of 1 N with another probe or film than our choice, by name."""
     sensor = choices.sensor("three")
     places = [(float(x), float(y)) for x, y in sample(choices)]
 
@@ -211,14 +247,28 @@ def _variant_jobs(choices: Choices) -> dict[str, Job]:
 
 
 def find_eq_4(forward_map: ForwardMap, choices: Choices) -> tuple[tuple[float, float], float]:
-    """Position (x, y) of eq. 4's press, mm, from the ratios of its charges at 1 N; our charges over the paper's."""
-    table = ChargeSpline.of(forward_map, 1.2 * choices.radius, choices.spacing)
-    papers = np.array([sum(cubic) for cubic in CUBICS])
+    """Find the position of the press of eq. 4 from the ratios of its charges at 1 N.
 
-    def log_ratio_residuals(at: Array) -> Array:
-        charge = table.first_order(at[None], FORCE)[0][0]
-        return np.log(charge[1:] / charge[0]) - np.log(papers[1:] / papers[0])
+    Args:
+        forward_map: Forward map of the triangular probe.
+        choices: Values that the paper does not state.
+
+    Returns:
+        Position (x, y), mm, and the mean ratio of our charges at this position to those of the paper.
+    """
+    spline = ChargeSpline.of(forward_map, 1.2 * choices.radius, choices.spacing)
+    paper_charge = np.array([sum(cubic) for cubic in CUBICS])  # the cubics at 1 N
+
+    def charge_at(position: Array) -> Array:
+        """Return our charges of a press of 1 N, shape (3,), pC."""
+        charge, _, _ = spline.first_order(position[None], FORCE)
+        return charge[0]
+
+    def log_ratio_residuals(position: Array) -> Array:
+        """Return the differences of the logarithms of B / A and C / A between our charges and the paper's."""
+        charge = charge_at(position)
+        return np.log(charge[1:] / charge[0]) - np.log(paper_charge[1:] / paper_charge[0])
 
     position = least_squares(log_ratio_residuals, np.array([0.0, -4.0])).x
-    factor = table.first_order(position[None], FORCE)[0][0] / papers
-    return (float(position[0]), float(position[1])), float(np.mean(factor))
+    charge_ratio = charge_at(position) / paper_charge
+    return (float(position[0]), float(position[1])), float(np.mean(charge_ratio))

@@ -1,4 +1,4 @@
-"""Position errors of triangulation over the working area: by the graphical method and from the field."""
+"""Position errors of triangulation over the working area, by the graphical method and from the charge map."""
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
@@ -19,8 +19,8 @@ LAYOUTS = ("three", "four")
 DEGREES = (2, 3, 4)
 
 BEYOND = 1.15
-"""Radius within which contours are followed over that of the working area, dimensionless: contours of a press on its
-edge meet too."""
+"""Ratio of the radius within which contours are traced to the radius of the working area, dimensionless. It is larger
+than one, so that the contours of a press on the edge of the working area meet as well."""
 
 SEED = 0
 
@@ -57,7 +57,7 @@ class Errors:
         return float(100.0 * np.mean(self.found_mm <= error_mm)) if self.found_mm.size else float("nan")
 
     def numbers(self) -> dict[str, object]:
-        """For programs."""
+        """Return the statistics of the errors for programs."""
         return {
             "presses": len(self.at),
             **{meeting.name: int(np.sum(self.fix.status == meeting)) for meeting in Meeting},
@@ -68,14 +68,15 @@ class Errors:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Errors over the working area, 1 N, triangular probe, the force known.
+    """Errors of presses of 1 N by the triangular probe over the working area, for a known force.
 
     Attributes:
-        drawn: Graphical method without noise, by layout and degree of the polynomials.
-        field: From the field without noise, by layout.
-        noisy: From the field with the reference noise, by layout.
-        drawn_noisy: Graphical method with the reference noise, by layout.
-        mistaken: From the field, presses with another probe or film than the contours assume, by variation.
+        drawn: Errors of the graphical method without noise, by layout and degree of the polynomials.
+        field: Errors of contours from the charge map without noise, by layout.
+        noisy: Errors of contours from the charge map with the reference noise, by layout.
+        drawn_noisy: Errors of the graphical method with the reference noise, by layout.
+        mistaken: Errors of contours from the charge map, for presses with another probe or film than the contours
+            assume, by variation.
     """
 
     drawn: Mapping[tuple[str, int], Errors]
@@ -86,7 +87,12 @@ class Accuracy:
 
     @classmethod
     def of(cls, solves: Solves, executor: Executor | None) -> "Accuracy":
-        """Triangulate."""
+        """Triangulate all presses.
+
+        Args:
+            solves: Solved presses and maps.
+            executor: Executor that runs the triangulations; this process if None.
+        """
         choices = solves.choices
         places = solves.places
         noise = noise_model("reference")

@@ -1,7 +1,7 @@
 """Solves of the derivatives of the stress field, such as those with respect to a side force or the pretension.
 
-Derivatives are needed with less accuracy than the stress itself. They are therefore solved at fewer presses than those
-of a forward map.
+Derivatives are small corrections and need less accuracy than the stress itself. They are therefore solved at fewer
+presses than the stress of a forward map.
 """
 
 from concurrent.futures import Executor

@@ -31,6 +31,30 @@ ROTATIONS = 7
 probe, so that the stress depends on the orientation through a few harmonics only."""
 
 
+class NodeCount(NamedTuple):
+    """Number of nodes of a family.
+
+    Attributes:
+        distances: Number of distances.
+        forces: Number of forces.
+        min_orientations: Smallest number of orientations.
+    """
+
+    distances: int
+    forces: int
+    min_orientations: int
+
+
+NODE_COUNTS = (
+    NodeCount(5, 3, ROTATIONS),
+    NodeCount(8, 5, 2 * ROTATIONS),
+    NodeCount(10, 7, 3 * ROTATIONS),
+    NodeCount(13, 12, 3 * ROTATIONS),
+)
+"""Numbers of nodes that are tried one after the other. The last entry is for films with a large pretension, whose
+charges change from one power of the force to another and pass through zero."""
+
+
 @dataclass(frozen=True)
 class Family:
     """Nodes at which a family of presses is solved.

@@ -1,18 +1,17 @@
 """The forward map: the charges of many presses, computed from a few solves.
 
-The presses of one probe form a family with the coordinates distance from the centre, force and, unless the probe is
-axisymmetric, orientation. The direction of the position is a rotation of the whole film. In a frame that moves with the
-probe, the stress at the nodes of the template is a smooth function of these coordinates. The press is solved at
-Chebyshev nodes in the distance and in the logarithm of the force, and at evenly spaced orientations. For every other
-press, the stress field is interpolated, and the charges are integrated from the interpolated field. The position of the
-electrodes is therefore exact, also if the probe lies on an electrode. When a map is built, it is compared with direct
-solves.
+The presses of one probe form a family with three coordinates: the distance from the centre, the force and, unless the
+probe is axisymmetric, the orientation. Presses in other directions from the centre follow by a rotation of the film. In
+a frame that moves with the probe, the stress at the nodes of the mesh is a smooth function of the coordinates. The
+press is solved at Chebyshev nodes in the distance and in the logarithm of the force, and at evenly spaced orientations.
+For every other press, the stress field is interpolated, and the charges are integrated from the interpolated field. The
+electrodes therefore do not affect the interpolation, even if the probe lies on an electrode. When a map is built, its
+charges are compared with those of direct solves.
 """
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from isocharge.common.errors import SolveError
 from isocharge.simulate.execution.blas import single_threaded_blas
 from isocharge.simulate.execution.workers import in_order
 from isocharge.simulate.forward.charge_map import Domain, as_contacts, differences
-from isocharge.simulate.forward.family import ROTATIONS, CheckPress, Family, check_family, check_presses
+from isocharge.simulate.forward.family import NODE_COUNTS, CheckPress, Family, check_family, check_presses
 from isocharge.simulate.forward.press_chunk import PressChunk
 from isocharge.simulate.forward.readout import (
     COARSE,
@@ -45,51 +44,28 @@ from isocharge.simulate.solver.load_case import SolveSettings, layer_for
 from isocharge.simulate.solver.press import needed_resolution, press
 
 CHUNK_SIZE = 256
-"""Number of presses that are evaluated at once. It limits the working arrays to about 100 MB."""
+"""Number of presses that are evaluated at once, which limits the size of the working arrays to about 100 MB."""
 
 INTERPOLATION_ERROR = 5e-4
 """Largest relative error of a charge with respect to direct solves that a forward map may have."""
 
 CHARGE_FLOOR = 0.1
-"""Smallest charge to which an error is relative, as a share of the largest charge of the press, dimensionless."""
+"""Smallest charge to which an error is relative, in units of the largest charge of the press, dimensionless."""
 
 EVEN_FIELD = np.zeros(1, dtype=bool)
 """Parity of the stress field under a press on an isotropic round film: one field, which is even."""
 
 SKIP_RATIO = 10.0
-"""Ratio of the error to `INTERPOLATION_ERROR` above which the next numbers of nodes would not suffice either and are
-skipped, dimensionless."""
+"""Ratio of the error to `INTERPOLATION_ERROR` above which the next entry of `NODE_COUNTS` is skipped, because it would
+not be sufficient either, dimensionless."""
 
 MAX_RING_RATIO = 2.0
-"""Largest ratio of the radii of successive rings of the mesh for which the stress is smooth enough across an electrode
-that the rule for far electrodes can be used, dimensionless. Meshes that are chosen automatically have about 1.9."""
+"""Largest ratio of the radii of successive rings of the mesh at which the integration rule for far electrodes is used,
+dimensionless. On coarser meshes the stress is not smooth enough across an electrode. Meshes that are chosen
+automatically have a ratio of about 1.9."""
 
 CHECK_COUNT = 10
 """Number of direct solves with which a forward map is compared."""
-
-
-class NodeCount(NamedTuple):
-    """Number of nodes of a family.
-
-    Attributes:
-        distances: Number of distances.
-        forces: Number of forces.
-        min_orientations: Smallest number of orientations.
-    """
-
-    distances: int
-    forces: int
-    min_orientations: int
-
-
-NODE_COUNTS = (
-    NodeCount(5, 3, ROTATIONS),
-    NodeCount(8, 5, 2 * ROTATIONS),
-    NodeCount(10, 7, 3 * ROTATIONS),
-    NodeCount(13, 12, 3 * ROTATIONS),
-)
-"""Numbers of nodes that are tried in turn. The last one is for taut films, whose charges change from one power of the
-force to another and pass through zero."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +123,10 @@ class ForwardMap:
         film = sensor.film
         domain = Domain(radius, force_range)
         check_family(sensor.coated_film, probe, domain)
-        middle_force = float(np.sqrt(force_range[0] * force_range[1]))
+
+        # Settings that all presses of the family share
+        min_force, max_force = force_range
+        middle_force = float(np.sqrt(min_force * max_force))
         theory = settings.theory
         if theory == "auto":
             theory = theory_for(sensor, probe, force_range, settings.accuracy)
@@ -157,6 +136,8 @@ class ForwardMap:
         template = template_for(probe, resolution)
         layer = min(layer, widest_smooth_layer(template, probe, radius, film.radius))
         settings = replace(settings, resolution=resolution, layer=layer)
+
+        # Increase the number of nodes until the charges of the check presses are sufficiently accurate.
         checks = check_presses(domain, CHECK_COUNT)
         check_charges: list[Array] = []
         error = np.inf
@@ -187,8 +168,10 @@ class ForwardMap:
 
     @property
     def settings(self) -> SolveSettings:
-        """Theory and mesh of the solves, for single presses or another map. The width of the thin rings remains
-        "auto"."""
+        """Theory and mesh of the solves, for the solve of a single press or of another map.
+
+        The width of the thin rings remains "auto".
+        """
         return SolveSettings(theory=self.theory, resolution=self.resolution)
 
     @property
@@ -215,19 +198,20 @@ class ForwardMap:
             SceneError: If a press lies outside the domain.
         """
         contact = as_contacts(contact, "forward map")
-        untouched = contact[:, 2] == 0.0
-        valid_contact = (0.0, 0.0, self.domain.force_range[0])
-        self.domain.check(np.where(untouched[:, None], valid_contact, contact), "forward map")
+        has_no_force = contact[:, 2] == 0.0
+        min_force, _ = self.domain.force_range
+        valid_contact = (0.0, 0.0, min_force)  # replaces contacts without a force in the check
+        self.domain.check(np.where(has_no_force[:, None], valid_contact, contact), "forward map")
         orientation = np.broadcast_to(orientation, len(contact))
         charge = np.zeros((len(contact), len(self.electrodes)))
-        touched = np.flatnonzero(~untouched)
-        charge[touched] = self._unchecked_charges(contact[touched], orientation[touched])
+        pressed = np.flatnonzero(~has_no_force)
+        charge[pressed] = self._unchecked_charges(contact[pressed], orientation[pressed])
         return charge
 
     def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F by central differences.
 
-        The differences also use presses a little outside the domain.
+        The differences also use presses that lie slightly outside the domain.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -242,18 +226,20 @@ class ForwardMap:
         return differences(lambda moved: self._unchecked_charges(moved, np.zeros(len(moved))), contact)
 
     def relative_error(self, check: CheckPress, direct: Array) -> float:
-        """Compute the largest error of a charge of one press with respect to a direct solve.
+        """Compute the largest relative error of the charges of one press with respect to a direct solve.
 
-        The error is relative to the charge, or to `CHARGE_FLOOR` times the largest charge of the press if that is
-        larger.
+        The error of a charge is divided by the charge, or by `CHARGE_FLOOR` times the largest charge of the press if
+        this product is larger.
 
         Args:
             check: The press.
             direct: Charges of the direct solve, shape (n_electrode,), pC.
         """
-        mapped = self.charges(np.array([[*check.position, check.force]]), check.rotation)[0]
+        x, y = check.position
+        contact = np.array([[x, y, check.force]])
+        (interpolated,) = self.charges(contact, check.rotation)
         scale = np.maximum(np.abs(direct), CHARGE_FLOOR * np.abs(direct).max())
-        return float((np.abs(mapped - direct) / scale).max())
+        return float((np.abs(interpolated - direct) / scale).max())
 
     def field_charges(self, contact: Array, is_odd: Booleans, readout: ReadoutPoints | None = None) -> Array:
         """Compute the charges of several stress fields that the table contains, under a circular probe.
@@ -263,23 +249,24 @@ class ForwardMap:
 
         Args:
             contact: Presses (x, y, F) in the domain, shape (n, 3), mm and N.
-            is_odd: Whether each field is odd about the direction of the press, shape (n_field,). The table holds the
-                values of all fields at one node, then those at the next node.
+            is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
+                (n_field,). The table contains the values of all fields at one node, then those at the next node.
             readout: Integration points of the charges; None for those of the electrodes.
 
         Returns:
             Shape (n, n_electrode, n_field), pC.
         """
-        at = contact[:, 0] + 1j * contact[:, 1]
+        x, y, force = contact.T
+        position = x + 1j * y
         readout = readout or self._coarse_readout
-        every_electrode = np.ones((at.size, len(readout.count)), dtype=bool)
-        parts = []
+        all_pairs = np.ones((position.size, len(readout.count)), dtype=bool)
+        charges = []
         with single_threaded_blas():
-            for start in range(0, at.size, CHUNK_SIZE):
+            for start in range(0, position.size, CHUNK_SIZE):
                 chunk = slice(start, start + CHUNK_SIZE)
-                rules = ((readout, every_electrode[chunk]),)
-                parts.append(self._integrate_fields(at[chunk], contact[chunk, 2], np.zeros(1), is_odd, rules))
-        return np.concatenate(parts)
+                rules = ((readout, all_pairs[chunk]),)
+                charges.append(self._integrate_fields(position[chunk], force[chunk], np.zeros(1), is_odd, rules))
+        return np.concatenate(charges)
 
     def stress_charges_by_force(self, position: Array, is_needed: Booleans) -> Array:
         """Compute the charges that the stress causes, for all forces of the family at once.
@@ -293,21 +280,23 @@ class ForwardMap:
         Returns:
             Shape (n, n_force, n_electrode), pC. Charges that are not needed are zero.
         """
-        at = position[:, 0] + 1j * position[:, 1]
-        stacked = self._stacked_forces
-        unit_force = stacked.family.force[0]
-        even_fields = np.zeros(self.family.force.size, dtype=bool)
-        chunk_size = max(1, CHUNK_SIZE // even_fields.size)
-        parts = []
+        complex_position = position[:, 0] + 1j * position[:, 1]
+        stacked_map = self._stacked_forces  # has one even field for each force
+        first_force = stacked_map.family.force[0]
+        is_odd = np.zeros(self.family.force.size, dtype=bool)
+        chunk_size = max(1, CHUNK_SIZE // self.family.force.size)
+        charges = []
         with single_threaded_blas():
-            for start in range(0, at.size, chunk_size):
-                chunk = at[start : start + chunk_size]
+            for start in range(0, complex_position.size, chunk_size):
+                chunk = complex_position[start : start + chunk_size]
                 rules = tuple((readout, pairs & is_needed) for readout, pairs in self._rules(chunk))
-                force = np.full(chunk.size, unit_force)
-                parts.append(stacked._integrate_fields(chunk, force, np.zeros(1), even_fields, rules))
-        stress_unit = amplitude_squared(self.sensor.film, self.family.force)
-        scale = stress_unit / amplitude_squared(self.sensor.film, unit_force)
-        return np.asarray(np.concatenate(parts).swapaxes(1, 2) * scale[:, None])
+                force = np.full(chunk.size, first_force)
+                charges.append(stacked_map._integrate_fields(chunk, force, np.zeros(1), is_odd, rules))
+
+        # All fields were multiplied by the stress unit of the first force. Replace it by the unit of each force.
+        film = self.sensor.film
+        unit_ratio = amplitude_squared(film, self.family.force) / amplitude_squared(film, first_force)
+        return np.asarray(np.concatenate(charges).swapaxes(1, 2) * unit_ratio[:, None])
 
     def pressure_charges(self, position: Array) -> Array:
         """Compute the charges of the pressure on the electrodes per force, without crosstalk.
@@ -322,15 +311,21 @@ class ForwardMap:
 
     @cached_property
     def _stacked_forces(self) -> "ForwardMap":
-        """Map of a single force, in which the stress fields of all forces are separate fields, in single precision."""
-        force_count = self.family.force.size
+        """Map for a single force, whose table contains the stress of every force as a separate field.
+
+        The table has single precision.
+        """
+        n_distance = self.family.distance.size
+        n_force = self.family.force.size
+        n_rotation = self.family.rotation.size
+        stress = self.table.reshape(n_distance, n_force, n_rotation, -1, 3)
+        force_as_field = np.moveaxis(stress, 1, 3)  # shape (n_distance, n_rotation, n_node, n_force, 3)
+        table = force_as_field.reshape(n_distance * n_rotation, -1)
         family = replace(self.family, force=self.family.force[:1])
-        rows = self.table.reshape(self.family.distance.size, force_count, self.family.rotation.size, -1, 3)
-        stacked = np.moveaxis(rows, 1, 3).reshape(family.distance.size * family.rotation.size, -1)
-        return replace(self, family=family, table=stacked.astype(np.float32))
+        return replace(self, family=family, table=table.astype(np.float32))
 
     def _unchecked_charges(self, contact: Array, orientation: Array) -> Array:
-        """Compute the charges of presses in the domain or a little outside, in chunks that fit into the memory.
+        """Compute the charges of presses in the domain or slightly outside, in chunks that limit the memory.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -347,42 +342,47 @@ class ForwardMap:
                 charge[chunk] = self._chunk_charges(position[chunk], contact[chunk, 2], orientation[chunk])
         return charge
 
-    def _chunk_charges(self, at: Complexes, force: Array, orientation: Array) -> Array:
+    def _chunk_charges(self, position: Complexes, force: Array, orientation: Array) -> Array:
         """Compute the charges of one chunk of presses.
 
         Args:
-            at: Positions x + iy, shape (n,), mm.
+            position: Positions x + iy, shape (n,), mm.
             force: Forces, shape (n,), N.
             orientation: Further rotation of the probe, shape (n,), rad.
 
         Returns:
             Shape (n, n_electrode), pC.
         """
-        rules = self._rules(at)
-        charge: Array = self._integrate_fields(at, force, orientation, EVEN_FIELD, rules)[..., 0]
-        charge += force[:, None] * self._pressure_charges(at, orientation)
+        rules = self._rules(position)
+        charge: Array = self._integrate_fields(position, force, orientation, EVEN_FIELD, rules)[..., 0]
+        charge += force[:, None] * self._pressure_charges(position, orientation)
         return self.sensor.calibration.read(charge)
 
-    def _pressure_charges(self, at: Complexes, orientation: Array) -> Array:
+    def _pressure_charges(self, position: Complexes, orientation: Array) -> Array:
         """Compute the charges of the pressure on the electrodes per force, without crosstalk.
 
         Args:
-            at: Positions x + iy, shape (n,), mm.
+            position: Positions x + iy, shape (n,), mm.
             orientation: Further rotation of the probe, shape (n,), rad.
 
         Returns:
             Shape (n, n_electrode), pC/N.
         """
-        charge = np.zeros((at.size, len(self.electrodes)))
-        if self.sensor.piezo.d33 != 0.0:
-            for i in np.flatnonzero(self._is_near(at).any(axis=1)):
-                probe = self.probe.rotated(float(orientation[i]))
-                charge[i] = contact_charge(self.sensor, probe, (at[i].real, at[i].imag), 1.0)
+        charge = np.zeros((position.size, len(self.electrodes)))
+        if self.sensor.piezo.d33 == 0.0:
+            return charge
+        presses_near_electrodes = np.flatnonzero(self._is_near(position).any(axis=1))
+        for press_index in presses_near_electrodes:
+            probe = self.probe.rotated(float(orientation[press_index]))
+            press_position = position[press_index]
+            charge[press_index] = contact_charge(
+                self.sensor, probe, (press_position.real, press_position.imag), force=1.0
+            )
         return charge
 
     def _integrate_fields(
         self,
-        at: Complexes,
+        position: Complexes,
         force: Array,
         orientation: Array,
         is_odd: Booleans,
@@ -391,29 +391,35 @@ class ForwardMap:
         """Interpolate the stress fields of one chunk of presses, and integrate their charges.
 
         Args:
-            at: Positions x + iy, shape (n,), mm.
+            position: Positions x + iy, shape (n,), mm.
             force: Forces, shape (n,), N.
             orientation: Further rotation of the probe, shape (n,) or (1,), rad.
-            is_odd: Whether each field of the table is odd about the direction of the press, shape (n_field,).
+            is_odd: Whether each field of the table is odd with respect to a reflection in the direction of the press,
+                shape (n_field,).
             rules: Integration rules, each with the pairs of press and electrode that use it, shape (n, n_electrode).
 
         Returns:
             Shape (n, n_electrode, n_field), pC.
         """
-        rotation = orientation - np.angle(at)
-        field = self.family.weights(np.abs(at), force, rotation).astype(self.table.dtype) @ self.table
+        film = self.sensor.film
+        distance = np.abs(position)
+        direction = np.angle(position)
+        rotation = orientation - direction  # of the probe relative to the direction of the press
+        field = self.family.weights(distance, force, rotation).astype(self.table.dtype) @ self.table
         mesh = template_for(self.probe, self.resolution)
-        placement = Placement.of(mesh, self.probe, np.abs(at), self.sensor.film.radius, self.layer, rotation)
-        presses = PressChunk(mesh, placement, field, np.angle(at), rotation + self.probe.angle)
+        placement = Placement.of(mesh, self.probe, distance, film.radius, self.layer, rotation)
+        presses = PressChunk(mesh, placement, field, direction, rotation + self.probe.angle)
+
+        # Each rule has electrodes with different numbers of points, which are integrated separately.
         _, first_pairs = rules[0]
         charge = np.zeros((*first_pairs.shape, is_odd.size))
         for readout, uses_rule in rules:
-            for count in np.unique(readout.count):
-                press_index, electrode = np.nonzero(uses_rule & (readout.count == count))
-                points = readout.points[electrode, :count] @ np.array([1.0, 1j]) / self.sensor.film.radius
-                weights = readout.weights[electrode, :count]
+            for n_point in np.unique(readout.count):
+                press_index, electrode = np.nonzero(uses_rule & (readout.count == n_point))
+                points = readout.points[electrode, :n_point] @ np.array([1.0, 1j]) / film.radius
+                weights = readout.weights[electrode, :n_point]
                 charge[press_index, electrode] = presses.scaled_charges(press_index, points, weights, is_odd)
-        stress_unit = self.sensor.film.young * amplitude_squared(self.sensor.film, force)
+        stress_unit = film.young * amplitude_squared(film, force)
         return np.asarray(charge * stress_unit[:, None, None])
 
     @cached_property
@@ -431,13 +437,24 @@ class ForwardMap:
         """Integration rule for electrodes far from the probe."""
         return ReadoutPoints.of(self.sensor, FAR)
 
-    def _rules(self, at: Complexes) -> tuple[tuple[ReadoutPoints, Booleans], ...]:
-        """Return the integration rules for presses at positions x + iy (mm), each with the pairs of press and electrode
-        that use it, shape (n, n_electrode)."""
-        near = self._is_near(at)
-        parts = [(np.abs(at[:, None] - centre) / radius).min(axis=1) for centre, radius in self.sensor.part_circles]
-        far = ~near & (np.stack(parts, axis=1) > FAR_DISTANCE) & self._has_smooth_far_field
-        return (self._fine_readout, near), (self._coarse_readout, ~near & ~far), (self._far_readout, far)
+    def _rules(self, position: Complexes) -> tuple[tuple[ReadoutPoints, Booleans], ...]:
+        """Return the integration rules for presses, each with the pairs of press and electrode that use the rule.
+
+        Args:
+            position: Positions x + iy, shape (n,), mm.
+
+        Returns:
+            Integration points and pairs of each rule. The pairs have the shape (n, n_electrode).
+        """
+        is_near = self._is_near(position)
+        relative_distances = []  # from the nearest part of each electrode, in radii of the part
+        for part_centres, part_radii in self.sensor.part_circles:
+            distance_of_parts = np.abs(position[:, None] - part_centres) / part_radii
+            relative_distances.append(distance_of_parts.min(axis=1))
+        is_distant = np.stack(relative_distances, axis=1) > FAR_DISTANCE
+        is_far = ~is_near & is_distant & self._has_smooth_far_field
+        is_between = ~is_near & ~is_far
+        return (self._fine_readout, is_near), (self._coarse_readout, is_between), (self._far_readout, is_far)
 
     @cached_property
     def _has_smooth_far_field(self) -> bool:
@@ -445,11 +462,20 @@ class ForwardMap:
         ring_ratio = (self.sensor.film.radius / self.probe.reach) ** (1.0 / self.resolution.rings)
         return bool(ring_ratio <= MAX_RING_RATIO)
 
-    def _is_near(self, at: Complexes) -> Booleans:
-        """Return whether each electrode is so near to each press that it needs the fine rule, shape (n,
-        n_electrode)."""
-        gap = [(np.abs(at[:, None] - centre) - radius).min(axis=1) for centre, radius in self.sensor.part_circles]
-        return np.asarray(np.stack(gap, axis=1) < self.probe.reach + NEAR)
+    def _is_near(self, position: Complexes) -> Booleans:
+        """Return for which presses an electrode is so close that it needs the fine rule.
+
+        Args:
+            position: Positions x + iy, shape (n,), mm.
+
+        Returns:
+            Shape (n, n_electrode).
+        """
+        gaps = []  # between the press and the nearest part of each electrode, mm
+        for part_centres, part_radii in self.sensor.part_circles:
+            gap_of_parts = np.abs(position[:, None] - part_centres) - part_radii
+            gaps.append(gap_of_parts.min(axis=1))
+        return np.asarray(np.stack(gaps, axis=1) < self.probe.reach + NEAR)
 
 
 def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check: CheckPress) -> Array:
@@ -464,6 +490,6 @@ def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check:
     Returns:
         Shape (n_electrode,), pC.
     """
-    at = check.position
-    rotated = probe.rotated(check.rotation)
-    return touch_charge(sensor, press(sensor.film, rotated, at, check.force, settings))
+    rotated_probe = probe.rotated(check.rotation)
+    equilibrium = press(sensor.film, rotated_probe, check.position, check.force, settings)
+    return touch_charge(sensor, equilibrium)

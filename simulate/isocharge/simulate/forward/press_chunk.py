@@ -1,4 +1,4 @@
-"""Integration of the charges of some presses over the electrodes, from their interpolated stress fields."""
+"""Integration of the interpolated stress fields of several presses over the electrodes, which gives the charges."""
 
 from dataclasses import dataclass
 
@@ -21,8 +21,8 @@ class PressChunk:
         placement: Position of the template under each press, with the press rotated onto the x axis.
         field: Scaled stress of all fields at the nodes of every element, shape (n, n_element * n_local * 3 * n_field).
         direction: Direction of each press from the centre of the film, shape (n,), rad.
-        probe_angle: Angle of the probe relative to the direction of the press, shape (n,) rad. The stress fields of
-            probes that are not axisymmetric are in a frame with this angle.
+        probe_angle: Angle of the probe relative to the direction of the press, shape (n,), rad. If the probe is not
+            axisymmetric, the frame of its stress fields is rotated by this angle.
     """
 
     mesh: Template
@@ -54,8 +54,8 @@ class PressChunk:
         n_component = 3 * is_odd.size
         basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel()).astype(self.field.dtype)
         field_by_element = self.field.reshape(len(self.field), mesh.n_element, -1, n_component)
-        nodal = field_by_element[press_index[:, None], element].reshape(*basis_values.shape, n_component)
-        stress = np.matmul(basis_values[:, None, :], nodal).reshape(*position.shape, n_component)
+        nodal_stress = field_by_element[press_index[:, None], element].reshape(*basis_values.shape, n_component)
+        stress = np.matmul(basis_values[:, None, :], nodal_stress).reshape(*position.shape, n_component)
 
         frame_angle = direction if mesh.half else direction + self.probe_angle[press_index]
         charge = np.empty((len(stress), is_odd.size))
@@ -65,6 +65,6 @@ class PressChunk:
             sign_changes = slice(0, 2) if odd else slice(2, 3)
             field_stress[is_mirrored, sign_changes] *= -1.0
             film_stress = rotate_stress(field_stress, frame_angle[:, None])
-            # sum over the points p and the stress components c of each pair k
+            # Sum over the points p and the stress components c of each pair k
             charge[:, field_index] = np.einsum("kpc,kpc->k", film_stress, weights)
         return charge

@@ -5,8 +5,8 @@ A side force (Fx, Fy) of the probe on the film changes the charges to first orde
     dQ = jacobian @ (Fx, Fy).
 
 The stress fields of a side force along and across the direction of the press are solved with the tangent of the
-equilibrium (`solver.sensitivity`) at a few distances and forces, and interpolated as in a forward map. The terms of
-second order are small: for side forces up to 0.2 of the force, they are below 1 % of dQ.
+equilibrium (`solver.sensitivity`) at a few distances and forces, and interpolated as in a forward map. For side forces
+up to 0.2 of the force, the terms of second order are smaller than 1 % of dQ.
 
 Example:
 
@@ -41,9 +41,9 @@ class SideForceMap:
     Attributes:
         film: Forward map of the film without side forces.
         fields: Map whose table contains the two stress fields of a side force.
-        holding: Side force along the direction of the press that prevents the slip of the film under a probe on a
-            vertical stage, over the force of the press, at the nodes of the family, shape (n_distance * n_force,).
-            Negative values point to the centre of the film.
+        holding: Ratio of the holding force to the force of the press at the nodes of the family, shape (n_distance *
+            n_force,). The holding force is the side force along the direction of the press that prevents the slip of
+            the film under a probe on a vertical stage. It is negative if it points to the centre of the film.
     """
 
     film: ForwardMap
@@ -68,8 +68,8 @@ class SideForceMap:
                 "or `isocharge simulate point --side-force` for other probes"
             )
         solved = solve_derivatives(film, _read_side_force, executor)
-        table, holding = np.split(solved.table, [-1], axis=1)
-        return cls(film, replace(solved, table=table), holding.ravel())
+        stress_table, holding = np.split(solved.table, [-1], axis=1)  # the last column is the holding force
+        return cls(film, replace(solved, table=stress_table), holding.ravel())
 
     def jacobian(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to the side force (Fx, Fy) of the probe on the film.
@@ -114,11 +114,10 @@ class SideForceMap:
         contact = self.film.domain.check(contact, "side forces")
         distance = np.hypot(contact[:, 0], contact[:, 1])
         force = contact[:, 2]
-        # The side force that prevents slip points along the radius, and friction limits its size.
-        holding_share = self.fields.family.weights(distance, force, np.zeros(1)) @ self.holding
+        relative_holding_force = self.fields.family.weights(distance, force, np.zeros(1)) @ self.holding
         direction = contact[:, :2] / np.maximum(distance, 1e-12)[:, None]
-        force_without_slip = (holding_share * force)[:, None] * direction
-        return limited(force_without_slip, coefficient * force)
+        holding_force = (relative_holding_force * force)[:, None] * direction
+        return limited(holding_force, coefficient * force)
 
     def friction_charges(self, contact: Array, coefficient: float) -> Array:
         """Compute the change of the charges by the friction of a probe on a vertical stage, to first order.
@@ -138,7 +137,7 @@ class SideForceMap:
 
     @cached_property
     def _readout(self) -> ReadoutPoints:
-        """Integration rule for the electrodes, which is fine because the fields are steep near the probe."""
+        """Integration rule for the electrodes. The rule is fine, because the fields change rapidly near the probe."""
         return ReadoutPoints.of(self.film.sensor, FINE)
 
 
@@ -150,8 +149,8 @@ def _read_side_force(solved: Equilibrium, surface: Surface) -> Array:
         surface: Surface in the thickness at which the stress is read.
 
     Returns:
-        The values of `side_force_stress`, followed by the holding force along the direction of the press over the
-        force, shape (n_value + 1,).
+        The values of `side_force_stress`, followed by the ratio of the holding force to the force, shape
+        (n_value + 1,). The holding force is positive in the direction away from the centre.
     """
     outward_force, _ = holding_force(solved)
     return np.append(side_force_stress(solved, surface), outward_force / solved.force)

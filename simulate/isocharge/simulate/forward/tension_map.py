@@ -5,8 +5,8 @@ A change of the pretension by (T11, T22, T12) changes the charges to first order
     dQ = tension_jacobian @ (T11, T22, T12).
 
 The stress fields are solved with the tangent of the equilibrium (`solver.sensitivity`) at a few distances and forces,
-and interpolated as in a forward map. If the film becomes warmer than its ring, its pretension changes by
-`mechanics.film_temperature`.
+and interpolated as in a forward map. If the film becomes warmer than its ring, its pretension changes. The module
+`mechanics.film_temperature` computes this change.
 
 Example:
 
@@ -74,23 +74,27 @@ class TensionMap:
         film = self.film.sensor.film
         field_charge = self.fields.field_charges(contact, TENSION_IS_ODD)
         tension_unit = film.young * amplitude_squared(film, contact[:, 2]) + film.pretension
-        by_mean, by_difference, by_shear = np.moveaxis(field_charge / tension_unit[:, None, None], 2, 0)
+        derivatives = np.moveaxis(field_charge / tension_unit[:, None, None], 2, 0)
+        mean_derivative, press_difference_derivative, press_shear_derivative = derivatives
 
-        # The difference and the shear of the tension in axes that are rotated to the direction of the press
+        # Rotate the derivatives with respect to the difference and the shear from the axes of the press to x and y.
         twice_angle = 2.0 * np.arctan2(contact[:, 1], contact[:, 0])[:, None]
         cosine = np.cos(twice_angle)
         sine = np.sin(twice_angle)
-        by_film_difference = cosine * by_difference - sine * by_shear
-        by_film_shear = sine * by_difference + cosine * by_shear
-        by_t11 = 0.5 * (by_mean + by_film_difference)
-        by_t22 = 0.5 * (by_mean - by_film_difference)
+        difference_derivative = cosine * press_difference_derivative - sine * press_shear_derivative
+        t12_derivative = sine * press_difference_derivative + cosine * press_shear_derivative
+
+        # T11 and T22 contribute to the mean and to the difference.
+        t11_derivative = 0.5 * (mean_derivative + difference_derivative)
+        t22_derivative = 0.5 * (mean_derivative - difference_derivative)
         calibration = self.film.sensor.calibration
-        return np.stack([calibration.read(charge) for charge in (by_t11, by_t22, by_film_shear)], axis=2)
+        components = (t11_derivative, t22_derivative, t12_derivative)
+        return np.stack([calibration.read(derivative) for derivative in components], axis=2)
 
     def temperature_jacobian(self, contact: Array) -> Array:
-        """Compute the change of the touch charges per kelvin that the film is warmer than its ring.
+        """Compute the change of the touch charges per kelvin by which the film is warmer than its ring.
 
-        The pyroelectric charge is not included.
+        The change does not include the pyroelectric charge.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.

@@ -1,6 +1,6 @@
 """Pairs of distant contacts that have the same charges.
 
-A charge map without folds may still give two distant contacts the same charges. The search for such pairs covers the
+Even if a charge map has no folds, two distant contacts may have the same charges. The search for such pairs covers the
 whole domain of the map.
 """
 
@@ -26,15 +26,15 @@ MIN_DISTANCE = 1.0
 """Smallest distance between the contacts of an ambiguous pair, mm."""
 
 MIN_DISTANCE_SIGMAS = 6.0
-"""Smallest distance between the contacts of an ambiguous pair, in standard deviations of the position. Two nearer
-contacts count as a single contact with a large uncertainty."""
+"""Smallest distance between the contacts of an ambiguous pair, in standard deviations of the position. If the distance
+is smaller, the two contacts count as a single contact with a large uncertainty."""
 
 FORCES = 8
 """Number of forces at which the charges of the second contact are tabulated."""
 
 EXPONENT = 2.0 / 3.0
-"""Exponent of the force in the charge of a slack membrane, dimensionless. The ratio of the charge to this power of the
-force is tabulated, because it varies little with the force."""
+"""Exponent of the force in the charge of a membrane without pretension, dimensionless. The ratio of the charge to this
+power of the force is tabulated, because the ratio depends only weakly on the force."""
 
 NEIGHBOURS = 9
 """Number of lattice points, including the point itself, among which a candidate must have the smallest difference."""
@@ -45,7 +45,9 @@ MAX_CANDIDATES = 2
 
 @dataclass(frozen=True)
 class AmbiguousPairs:
-    """Pairs of contacts with the same charges, ordered by the distance of the outer contact from the centre.
+    """Pairs of contacts with the same charges. The outer contact of a pair is farther from the centre than the other.
+
+    The pairs are ordered by the distance of the outer contact from the centre.
 
     Attributes:
         first: First contact (x, y, F) of each pair, shape (n, 3), mm and N.
@@ -79,23 +81,24 @@ class AmbiguousPairs:
 
     @property
     def summary(self) -> str:
-        """Sentence about the pair nearest to the centre; empty without pairs."""
+        """Sentence about the pair whose outer contact is nearest to the centre; empty without pairs."""
         if not len(self):
             return ""
         x, y, force = self.first[0]
         other_x, other_y, other_force = self.second[0]
         return (
-            f"Contacts far apart can have the same charges: {force:.3g} N at ({x:.1f}, {y:.1f}) mm and "
-            f"{other_force:.3g} N at ({other_x:.1f}, {other_y:.1f}) mm are alike within "
-            f"{self.distance[0]:.1f} standard deviations."
+            f"Contacts far apart can have the same charges: the charges of {force:.3g} N at ({x:.1f}, {y:.1f}) mm and "
+            f"of {other_force:.3g} N at ({other_x:.1f}, {other_y:.1f}) mm differ by {self.distance[0]:.1f} standard "
+            "deviations."
         )
 
 
 def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
     """Find pairs of distant contacts whose charges differ by less than the noise.
 
-    For each position of a square lattice, pressed with `force`, all other positions are compared with the force that
-    fits best. The best candidates are then improved by least squares.
+    The first contacts are presses with the force `force` at the positions of a square lattice. For each first contact,
+    the candidates for the second contact are all other positions of the lattice, each with the force that fits best.
+    The best candidates are then improved by least squares.
 
     Args:
         charge_map: Charges as a function of the contact.
@@ -139,17 +142,18 @@ def _candidates(
         min_distance: Smallest distance of the second contact from each first contact, shape (n,), mm.
 
     Returns:
-        Numbers of the first contacts, shape (m,), and a candidate (x, y, F) for each, shape (m, 3), mm and N.
+        Indices of first contacts, shape (m,), and a candidate (x, y, F) for each, shape (m, 3), mm and N. A first
+        contact with two candidates occurs twice.
     """
-    profile, force_coefficients = _tabulate(charge_map, position)
-    neighbours = cKDTree(position).query(position, min(NEIGHBOURS, len(position)))[1]
+    profile, terms = _tabulate(charge_map, position)
+    _, neighbours = cKDTree(position).query(position, min(NEIGHBOURS, len(position)))
     first_indices = []
     second_contacts = []
     for first_index, first_charge in enumerate(charge):
-        # Press every position of the lattice with the force that explains the charges of the first contact best.
+        # At every position of the lattice, find the force that explains the charges of the first contact best.
         observed = np.broadcast_to(first_charge, charge.shape)
-        log_force = profile.best(force_coefficients, observed, noise)
-        predicted = profile.charge(log_force, force_coefficients)
+        log_force = profile.best(terms, observed, noise)
+        predicted = profile.charge(log_force, terms)
         chi2 = ((observed - predicted) ** 2 / noise.variance(predicted)).sum(axis=1)
 
         is_local_minimum = chi2 <= chi2[neighbours].min(axis=1)
@@ -164,7 +168,7 @@ def _candidates(
 def _tabulate(charge_map: ChargeMap, position: Array) -> tuple[ForceProfile, Array]:
     """Tabulate the charges at every position as a function of the force.
 
-    The ratio Q / F^EXPONENT is interpolated by a polynomial in ln F, because it varies slowly with the force.
+    The ratio Q / F^EXPONENT is interpolated by a polynomial in ln F, because the ratio depends only weakly on F.
 
     Args:
         charge_map: Charges as a function of the contact.

@@ -1,4 +1,4 @@
-"""Design of a layout: table of charges, search, refinement, and rejection of ambiguous layouts."""
+"""Design of a layout: search of the electrode positions, and rejection of layouts with ambiguous charges."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -55,6 +55,7 @@ class ErrorMap:
         }
 
     def _statistics(self, errors: Array) -> dict[str, Any]:
+        """Return the largest error, its root mean square and the position of the largest error, for JSON."""
         return {
             "worst_mm": float(errors.max()),
             "rms_mm": float(np.sqrt(np.mean(errors**2))),
@@ -94,7 +95,9 @@ class Design:
         return {
             "case": self.case.to_dict(),
             "sensor": self.sensor.name,
-            "electrodes_mm": {e.name: np.round(e.centre, DECIMALS).tolist() for e in self.sensor.electrodes},
+            "electrodes_mm": {
+                electrode.name: np.round(electrode.centre, DECIMALS).tolist() for electrode in self.sensor.electrodes
+            },
             "before": self.before.to_dict() if self.before else None,
             "after": self.after.to_dict(),
             "unambiguous": self.unambiguous,
@@ -106,7 +109,7 @@ class Design:
 def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     """Find the layout with the smallest position errors that has neither folds nor ambiguous pairs.
 
-    If all refined layouts are ambiguous, the one with the smallest error is returned.
+    If all refined layouts are ambiguous, the layout with the smallest error is returned.
 
     Args:
         case: Design case.
@@ -127,7 +130,7 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     refined_layouts = list(track(in_order(executor, search.refine, optima), "refining", len(optima)))
     refined_layouts.sort(key=lambda layout: layout[0])
 
-    # Check the layouts in the order of their errors, up to the first one that is not ambiguous.
+    # Check the layouts in the order of their errors, up to the first layout that is not ambiguous.
     forward_map = _solve_forward_map(case, executor)
     candidates: list[tuple[Sensor, float, str]] = []
     for error, *coordinates in track(refined_layouts, "looking for folds and ambiguous pairs"):
@@ -167,7 +170,9 @@ def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMa
 
 
 def ambiguities(case: DesignCase, charges: ChargeMap) -> str:
-    """Search folds and ambiguous pairs of a layout over the range of forces of its charge map, and summarise them.
+    """Search for folds and ambiguous pairs of a layout, and summarise them in a sentence.
+
+    The search covers the smallest and the largest force of the charge map, and the force of the case.
 
     Args:
         case: Design case.

@@ -1,12 +1,12 @@
 """The unknown parameters of a real film, and their prior distribution about the description in a sensor file.
 
 Before anything is measured, the properties of the film, its coefficients and the gains are uncertain by a few percent,
-and the positions of the electrodes by tenths of a millimetre. The pretension is almost unknown. A calibration starts
-from this prior distribution, a virtual film is drawn from it, and a network for all films is trained over it.
+and the positions of the electrodes by tenths of a millimetre. The pretension is almost unknown. Calibrations start from
+this prior distribution, virtual films are drawn from it, and networks for all films are trained with films from it.
 
-`PARAMETERS` declares each parameter once. One gain for each electrode follows these parameters. Each parameter is a
-deviation from the sensor file, so the described film has the value zero. The only exception is the pretension, which is
-the pretension itself.
+`PARAMETERS` declares each parameter that all films have. The parameter vector also contains one gain for each
+electrode. Each parameter is a deviation from the sensor file, so it is zero for the described film. Only the parameter
+of the pretension is the pretension itself.
 """
 
 from collections.abc import Mapping
@@ -25,13 +25,13 @@ MAX_DEVIATION = 2.5
 """Largest deviation of a parameter other than the pretension, in standard deviations."""
 
 MAX_PRETENSION_FACTOR = 4.0 / 3.0
-"""Largest pretension that a calibration may find, over the largest pretension of the prior distribution."""
+"""Ratio of the largest pretension that a calibration may find to the largest pretension of the prior distribution."""
 
 MIN_PROBE_RADIUS_FACTOR = 0.5
-"""Smallest probe radius that a calibration may find, over the described radius."""
+"""Ratio of the smallest probe radius that a calibration may find to the described radius."""
 
 MAX_PROBE_RADIUS_FACTOR = 1.5
-"""Largest probe radius that a calibration may find, over the described radius."""
+"""Ratio of the largest probe radius that a calibration may find to the described radius."""
 
 MAX_SHOWN_CENTRES = 8
 """Number of electrodes whose centres an error message shows."""
@@ -42,7 +42,7 @@ class FilmSpread:
     """Widths of the prior distribution: the largest pretension, and the standard deviations of all other parameters.
 
     Attributes:
-        pretension: Largest pretension, MPa. All values from zero to this one are equally likely.
+        pretension: Largest pretension, MPa. All values from zero to the largest pretension are equally likely.
         young: Standard deviation of the logarithm of Young's modulus, dimensionless.
         thickness: Standard deviation of the logarithm of the thickness, dimensionless.
         d31: Standard deviation of the logarithm of d31, dimensionless.
@@ -117,7 +117,11 @@ class FilmParameter:
         return self.mean(prior) - max_deviation, self.mean(prior) + max_deviation
 
     def described(self, components: Components) -> float:
-        """Return the physical value that a sensor or a probe has. A missing gain is 1."""
+        """Return the physical value of the parameter for a sensor and a probe. A missing gain is 1.
+
+        Args:
+            components: Objects of the sensor, and the probe.
+        """
         value = getattr(components[self.component], self.attribute)
         if isinstance(value, Mapping):
             return float(value.get(self.item, 1.0))
@@ -278,8 +282,10 @@ class FilmPrior:
 
     @cached_property
     def mean(self) -> Array:
-        """Means of the parameters, shape (n_parameter,). They are those of the described film with half of the largest
-        pretension."""
+        """Means of the parameters, shape (n_parameter,).
+
+        These are the parameters of the described film with half of the largest pretension.
+        """
         return np.array([parameter.mean(self) for parameter in self.parameters])
 
     @cached_property
@@ -310,9 +316,7 @@ class FilmPrior:
         return self.parameters_of(self.sensor, self.probe)
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Draw films from the prior distribution.
-
-        Values outside the bounds are drawn again.
+        """Draw films from the prior distribution. Values outside the bounds are drawn again.
 
         Args:
             rng: Random number generator.
@@ -321,10 +325,15 @@ class FilmPrior:
         Returns:
             Parameters, shape (count, n_parameter).
         """
+        lower_bounds, upper_bounds = self.bounds
         drawn = self.mean + self.std * rng.standard_normal((count, len(self.names)))
-        while (outside := (drawn < self.bounds[0]) | (drawn > self.bounds[1])).any():
+        is_outside = (drawn < lower_bounds) | (drawn > upper_bounds)
+        while is_outside.any():
             replacement = self.mean + self.std * rng.standard_normal(drawn.shape)
-            drawn = np.where(outside, replacement, drawn)
+            drawn = np.where(is_outside, replacement, drawn)
+            is_outside = (drawn < lower_bounds) | (drawn > upper_bounds)
+
+        # The pretension is distributed uniformly, and all other parameters normally.
         drawn[:, self.index("pretension")] = self.spread.pretension * rng.random(count)
         return drawn
 
@@ -340,6 +349,7 @@ class FilmPrior:
         Raises:
             SensorError: If no such sensor can exist, because electrodes lie off the film or the pretension is invalid.
         """
+        # Changed attributes of each component. The changes of tuples and mappings are collected by index or key.
         changes: dict[str, dict[str, Any]] = {component: {} for component in self._components}
         factors = np.exp(parameters)
         for declaration, described, parameter, factor in zip(
@@ -351,10 +361,10 @@ class FilmPrior:
                 attributes[declaration.attribute] = value
             else:
                 attributes.setdefault(declaration.attribute, {})[declaration.item] = value
+
         calibration = changes["calibration"]
-        shift_x = calibration["shift"][0]
-        shift_y = calibration["shift"][1]
-        calibration["shift"] = (shift_x, shift_y)
+        shift = calibration["shift"]
+        calibration["shift"] = (shift[0], shift[1])
         sensor = replace(
             self.sensor,
             film=replace(self.sensor.film, **changes["film"]),
@@ -387,7 +397,7 @@ class FilmPrior:
                 f"{sensor.name}: expected the electrodes of {described.name} ({_centres(described)}), got others "
                 f"({_centres(sensor)})"
             )
-        for what, value, expected in (
+        for what, value, expected in (  # properties that are not parameters must be equal
             ("readout", (sensor.readout, sensor.surface), (described.readout, described.surface)),
             ("film radius (mm)", round(sensor.film.radius, 6), round(described.film.radius, 6)),
             ("film poisson", round(sensor.film.poisson, 9), round(described.film.poisson, 9)),
@@ -427,7 +437,7 @@ def _rounded_corners(sensor: Sensor) -> dict[str, list[tuple[float, float]]]:
 
 
 def _centres(sensor: Sensor) -> str:
-    """Return the centres of the first electrodes as text for an error message."""
+    """List the centres of the first `MAX_SHOWN_CENTRES` electrodes for an error message."""
     centres = []
     for electrode in sensor.electrodes[:MAX_SHOWN_CENTRES]:
         x, y = electrode.centre

@@ -27,14 +27,15 @@ MAX_CORNERS = 256
 """Largest number of corners of a polygon."""
 
 MAX_ELECTRODE_CORNERS = 2048
-"""Largest number of corners of all polygons of an electrode, because intersections are searched for in all pairs."""
+"""Largest number of corners of all polygons of an electrode. The number is limited because all pairs of edges are
+searched for intersections."""
 
 MIN_EXTENT = 0.02
 """Smallest accepted value of the larger extent of an electrode along x and y, mm. Smaller values are probably in
 metres."""
 
 MAX_PART_SIDE = 3.0
-"""Longest side of the parts into which an electrode that is not convex is cut, mm."""
+"""Longest side of the parts of an electrode that is not convex, mm."""
 
 MAX_CROSSTALK = 0.2
 """Largest accepted crosstalk, dimensionless."""
@@ -50,7 +51,7 @@ RESERVED_NAMES = (
 """Names that an electrode cannot have: keys of the sensor file, columns of presses and fields of a frame."""
 
 MAX_ELECTRODES = 64
-"""Largest number of electrodes on a film, because each electrode is compared with all others."""
+"""Largest number of electrodes on a film. The number is limited because each electrode is compared with all others."""
 
 
 Corners = tuple[tuple[float, float], ...]
@@ -143,8 +144,8 @@ class Electrode:
     def parts(self) -> tuple[Array, ...]:
         """The collecting area as convex parts that do not overlap, each of shape (n, 2), mm.
 
-        A convex electrode is one part. Others are cut into quadrilaterals and triangles with sides of at most
-        `MAX_PART_SIDE`.
+        A convex electrode is one part. All other electrodes are cut into quadrilaterals and triangles with sides of at
+        most `MAX_PART_SIDE`.
         """
         if self._is_convex:
             return self.collecting_polygons
@@ -185,9 +186,9 @@ class Electrode:
         """
         low, high = self.boxes
         other_low, other_high = other.boxes
-        near = (low[:, None] <= other_high + within) & (other_low - within <= high[:, None])
-        close_pairs = np.argwhere(near.all(axis=2))  # parts whose bounding boxes overlap
-        return any(overlap(self.metal[i], other.metal[j], within) for i, j in close_pairs)
+        are_near_along_axis = (low[:, None] <= other_high + within) & (other_low - within <= high[:, None])
+        pairs_of_near_boxes = np.argwhere(are_near_along_axis.all(axis=2))
+        return any(overlap(self.metal[i], other.metal[j], within) for i, j in pairs_of_near_boxes)
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -198,7 +199,7 @@ class Electrode:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Gains and positions of the electrodes, as measured on a real film.
+    """Measured gains and positions of the electrodes of a real film.
 
     Attributes:
         gain: Ratio of the charge that is read to the charge that is collected, by electrode name. A missing gain is 1.
@@ -306,17 +307,19 @@ class Sensor:
 
     @cached_property
     def coated_film(self) -> Film:
-        """The film with the metal of the electrodes, which is the film without electrodes if `coating` is zero."""
+        """The film with the metal of the electrodes. If `coating` is zero, this is the film without electrodes."""
         if self.coating == 0.0:
             return self.film
-        on_either_side = [
+        # The first layer is metal on the front or on the back. The second layer is metal on both sides, which is the
+        # collecting area of electrodes with metal on the back.
+        electrodes_of_all_metal = [
             replace(electrode, more=(*electrode.more, *electrode.back), back=(), square=False)
             for electrode in self.electrodes
         ]
-        on_both_sides = [electrode for electrode in self.electrodes if electrode.back]
-        layers = [self._placed_parts(on_either_side)]
-        if on_both_sides:
-            layers.append(self._placed_parts(on_both_sides))
+        electrodes_with_back = [electrode for electrode in self.electrodes if electrode.back]
+        layers = [self._placed_parts(electrodes_of_all_metal)]
+        if electrodes_with_back:
+            layers.append(self._placed_parts(electrodes_with_back))
         return replace(self.film, coat=Coat(self.coating, tuple(layers)))
 
     def _placed_parts(self, electrodes: list[Electrode]) -> tuple[Corners, ...]:
@@ -326,16 +329,18 @@ class Sensor:
 
     @cached_property
     def part_circles(self) -> tuple[tuple[Complexes, Array], ...]:
-        """Circles round the parts of each electrode, at their calibrated positions.
+        """Circles that enclose the parts of each electrode, at their calibrated positions.
 
         Returns:
-            For each electrode the centres x + iy and the radii, each of shape (n_part,), mm.
+            Centres x + iy and radii of the circles of each electrode, each of shape (n_part,), mm.
         """
         circles = []
         for electrode in self.electrodes:
             parts = [self.calibration.place(part) for part in electrode.parts]
             centres = np.array([part.mean(axis=0) for part in parts])
-            radii = [np.linalg.norm(part - centre, axis=1).max() for part, centre in zip(parts, centres, strict=True)]
+            radii = []
+            for part, centre in zip(parts, centres, strict=True):
+                radii.append(np.linalg.norm(part - centre, axis=1).max())
             circles.append((to_complex(centres), np.array(radii)))
         return tuple(circles)
 
@@ -357,7 +362,7 @@ def electrode_index(sensor: Sensor, name: str) -> int:
 
 
 def _as_tuples(value: object) -> object:
-    """Convert nested lists and arrays into nested tuples, which can be compared. Return other values unchanged."""
+    """Convert nested lists and arrays into nested tuples, which can be compared. All other values remain unchanged."""
     if isinstance(value, list | tuple | np.ndarray):
         return tuple(_as_tuples(item) for item in value)
     return value
@@ -368,7 +373,7 @@ def _check_name(name: str) -> None:
 
     Raises:
         SensorError: If the name is empty, too long or reserved, or contains a comma or characters that are not
-        printable.
+            printable.
     """
     has_valid_length = 0 < len(name) <= MAX_NAME_LENGTH
     if not (has_valid_length and is_printable(name) and name == name.strip() and "," not in name):
@@ -384,7 +389,7 @@ def _check_name(name: str) -> None:
 
 @lru_cache(maxsize=64)
 def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
-    """Raise an error if electrodes cannot exist on any film. The result for a layout is cached.
+    """Raise an error if electrodes cannot exist on any film. The result is cached, because many films share a layout.
 
     Raises:
         SensorError: If a polygon crosses itself, an electrode collects no charge or is too small, a square has other
@@ -396,10 +401,11 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
             raise SensorError(f"{name}: its front and its back have no area in common, so nothing collects; move one")
         corners = np.array(electrode.corners)
         check_length(name, float(np.ptp(corners, axis=0).max()), MIN_EXTENT, SensorError)
-        side = float(corners[1, 0] - corners[0, 0])
-        square = Electrode.of_square(electrode.name, electrode.centre, side).corners
+        lower_left, lower_right, *_ = corners
+        side = float(lower_right[0] - lower_left[0])
+        expected_corners = Electrode.of_square(electrode.name, electrode.centre, side).corners
         is_pad_only = not (electrode.more or electrode.back)
-        is_square = len(corners) == 4 and np.allclose(corners, square, rtol=0.0, atol=1e-9 * side)
+        is_square = len(corners) == 4 and np.allclose(corners, expected_corners, rtol=0.0, atol=1e-9 * side)
         if electrode.square and not (is_pad_only and is_square):
             raise SensorError(
                 f"{name}: expected the corners of a square along the axes, got {corners.tolist()} mm; make squares "
@@ -453,7 +459,8 @@ def check_polygon(where: str, polygon: Corners) -> None:
     corners = np.array(polygon)
     if corners.ndim != 2 or not 3 <= len(corners) <= MAX_CORNERS or corners.shape[1] != 2:
         raise SensorError(f"{where}: expected 3 to {MAX_CORNERS} corners (x, y), got {shown(corners.tolist())}")
-    if not (np.isfinite(corners).all() and (is_convex(corners) or is_simple(to_complex(corners)))):
+    is_finite = np.isfinite(corners).all()
+    if not (is_finite and (is_convex(corners) or is_simple(to_complex(corners)))):
         raise SensorError(
             f"{where}: expected a polygon that does not cross itself, with its corners anticlockwise, got "
             f"{shown(corners.tolist())} mm"

@@ -1,4 +1,7 @@
-"""Reader and writer of sensor files: TOML with the units in the keys. Unknown and missing keys are errors."""
+"""Reader and writer of sensor files. The files are TOML, and the names of the keys contain the units.
+
+Unknown and missing keys are errors.
+"""
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
@@ -79,7 +82,8 @@ class PiezoTable(Settings, frozen=True):
 class PolygonTable(Settings, frozen=True):
     """Description of an electrode that is not a square.
 
-    It has a pad, further polygons and a trace on the front, and polygons on the back.
+    The electrode consists of a pad on the front, and optionally of further polygons and a trace on the front, and of
+    polygons on the back.
     """
 
     polygon_mm: tuple[Point, ...]
@@ -99,10 +103,11 @@ class CalibrationTable(Settings, frozen=True):
 
 
 class SensorTable(Settings, frozen=True):
-    """A sensor file.
+    """Content of a sensor file.
 
-    The section `electrodes` contains, by name, the centres of square electrodes and the tables of other electrodes. It
-    also contains the side of the squares and the stiffness of the coating.
+    The keys of the section `electrodes` are the names of the electrodes. The value of a square electrode is its centre,
+    and the value of any other electrode is a table. The section also contains the side of the squares and the stiffness
+    of the coating.
     """
 
     name: Text
@@ -114,7 +119,7 @@ class SensorTable(Settings, frozen=True):
     calibration: CalibrationTable = CalibrationTable()
 
     def __post_init__(self) -> None:
-        """Check the section `electrodes`, whose keys the format does not declare.
+        """Check the section `electrodes`. Its keys are not declared, because they are the names of the electrodes.
 
         Raises:
             WrongKey: If a value has the wrong type, or a key is missing.
@@ -202,7 +207,10 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
 def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
     """Return the tables of the file of a sensor, which can be written as JSON or TOML.
 
-    `sensor_from_dict` returns the same sensor from these tables, except for round-off.
+    If `sensor_from_dict` reads these tables, the result is the same sensor, except for rounding errors.
+
+    Args:
+        sensor: The sensor.
 
     Raises:
         SensorError: If no file can describe the sensor.
@@ -234,14 +242,16 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
 def film_to_dict(film: Film) -> dict[str, Any]:
     """Return the section `film` of a sensor file. This is the inverse of `_film`.
 
-    Young's modulus and the pretension are one number if they do not depend on the direction, and lists otherwise.
+    Young's modulus and the pretension are single numbers if they do not depend on the direction, and lists otherwise.
     """
     half_difference, shear_tension = film.deviator
     mean_tension = film.pretension
     tension_components = (mean_tension + half_difference, mean_tension - half_difference, shear_tension)
     tension_MPa = [tidy(component) for component in tension_components]
-    root = np.sqrt(film.young_ratio)
-    young_GPa = [tidy(film.young * 1e-3 * root), tidy(film.young * 1e-3 / root)]
+    root_of_ratio = np.sqrt(film.young_ratio)
+    young_GPa = [tidy(film.young * 1e-3 * root_of_ratio), tidy(film.young * 1e-3 / root_of_ratio)]
+
+    # Optional keys are omitted if their value is zero or None.
     optional: dict[str, Any] = {
         "shear_GPa": None if film.shear is None else tidy(film.shear * 1e-3),
         "axis_deg": tidy(float(np.rad2deg(film.axis))),
@@ -264,7 +274,9 @@ def film_to_dict(film: Film) -> dict[str, Any]:
 
 
 def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
-    """Return the text of the file of a sensor, from which `load_sensor` reads the same sensor except for round-off.
+    """Return the text of the file of a sensor.
+
+    If `load_sensor` reads this text, the result is the same sensor, except for rounding errors.
 
     Args:
         sensor: The sensor.
@@ -302,7 +314,8 @@ def write_sensor(sensor: Sensor, path: Path, comment: Iterable[str] = ()) -> Non
 def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
     """Return the section `electrodes` of a sensor file.
 
-    All squares of a file have the same side. Squares with another side than the first one become polygons.
+    All squares of a file have the same side. A square whose side differs from that of the first square is described as
+    a polygon.
 
     Raises:
         SensorError: If the readout needs squares, and their sides differ.
@@ -343,16 +356,16 @@ def _corners(polygon: Corners) -> list[list[float]]:
 
 
 def _film(table: FilmTable) -> Film:
-    """Create the film from the section `film` of a sensor file, in mm and MPa.
+    """Create the film from the section `film` of a sensor file.
 
-    The section contains one Young's modulus or both moduli (E1, E2), and one pretension or the components (T11, T22,
-    T12).
+    The section contains either one Young's modulus or the moduli (E1, E2), and either one pretension or the components
+    (T11, T22, T12).
     """
     if isinstance(table.young_GPa, list):
         young_1, young_2 = table.young_GPa
     else:
         young_1 = young_2 = table.young_GPa
-    # The mean of equal values is not computed, so that it has no round-off.
+    # The mean of equal values is not computed, because it would have rounding errors.
     mean_young = young_1 if young_1 == young_2 else float(np.sqrt(young_1 * young_2))
 
     if isinstance(table.pretension_MPa, list):
