@@ -104,20 +104,20 @@ def listen(
         PortError: If the port cannot be opened.
     """
     if request is not None and not request.echo:
-        received = _listen(url, bauds[0], ECHO_S, request, wait)
+        received = _listen_at_baud(url, bauds[0], ECHO_S, request, wait)
         request = replace(request, echo=received.echo_share >= ECHO_SHARE)
 
     chosen_baud = bauds[0]
     if has_speed(url) and len(bauds) > 1:
         for baud in bauds:
-            received = _listen(url, baud, TRY_S, request, wait)
+            received = _listen_at_baud(url, baud, TRY_S, request, wait)
             if not received.chunks or has_frames(received):
                 chosen_baud = baud
                 break
-    return _listen(url, chosen_baud, seconds, request, wait)
+    return _listen_at_baud(url, chosen_baud, seconds, request, wait)
 
 
-def _listen(url: str, baud: int, seconds: float, request: Request | None, wait: float) -> ReceivedData:
+def _listen_at_baud(url: str, baud: int, seconds: float, request: Request | None, wait: float) -> ReceivedData:
     """Listen to a port at one baud rate, and return the received bytes.
 
     Args:

@@ -165,13 +165,13 @@ def _json(text: str) -> Line:
         raise ValueError("nested too deeply") from error
     if isinstance(content, list) and content and all(isinstance(number, float) for number in content):
         return Line(Notation.csv, (), tuple(content))
-    numbers = dict(_numbers("", content))
+    numbers = dict(_json_numbers("", content))
     if not numbers:
         raise ValueError(f"expected numbers, got {text!r}")
     return Line(Notation.json, tuple(numbers), tuple(numbers.values()))
 
 
-def _numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, float]]:
+def _json_numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, float]]:
     """Return every number of a JSON value with the path to it, such as `charge.A` or `charge.0.re`.
 
     The function ignores numbers that are more than `MAX_JSON_LEVEL` levels deep.
@@ -194,11 +194,11 @@ def _numbers(path: str, content: Any, level: int = 0) -> list[tuple[str, float]]
 
     numbers = []
     for key, value in items:
-        numbers += _numbers(f"{path}.{key}" if level else key, value, level + 1)
+        numbers += _json_numbers(f"{path}.{key}" if level else key, value, level + 1)
     return numbers
 
 
-def _fields(frame: Frame) -> list[tuple[str, str]]:
+def _named_values(frame: Frame) -> list[tuple[str, str]]:
     """Return the names and the values of the frame counter, the clock and the channels, as text.
 
     Channels without names are called A, B, C, and so on.
@@ -219,16 +219,16 @@ def _write_csv(frame: Frame) -> str:
 
 
 def _write_pairs(frame: Frame) -> str:
-    return ",".join(f"{name}:{value}" for name, value in _fields(frame))
+    return ",".join(f"{name}:{value}" for name, value in _named_values(frame))
 
 
 def _write_teleplot(frame: Frame) -> str:
     time = "" if frame.t_us is None else f"{frame.t_us / 1e3:.3f}:"
-    return "\n".join(f">{name}:{time}{value}" for name, value in _fields(frame) if name not in TIMES_US)
+    return "\n".join(f">{name}:{time}{value}" for name, value in _named_values(frame) if name not in TIMES_US)
 
 
 def _write_json(frame: Frame) -> str:
-    fields = ", ".join(f"{json.dumps(name)}: {value}" for name, value in _fields(frame))
+    fields = ", ".join(f"{json.dumps(name)}: {value}" for name, value in _named_values(frame))
     return "{" + fields + "}"
 
 

@@ -143,12 +143,12 @@ def parts_of(rows: Bytes, order: ByteOrder, rate_Hz: float, weights: Weights) ->
                 number_bytes = rows[:, span][:, lowest_byte_first]
                 number_is_constant = is_constant[span][lowest_byte_first]
                 number_is_zero = is_zero[span][lowest_byte_first]
-                parts += _numbers(number_bytes, number_is_constant, number_is_zero, kind, rate_Hz, weights)
+                parts += _number_parts(number_bytes, number_is_constant, number_is_zero, kind, rate_Hz, weights)
         parts_at.append(parts)
     return parts_at
 
 
-def _numbers(
+def _number_parts(
     number_bytes: Bytes, is_constant: Booleans, is_zero: Booleans, kind: str, rate_Hz: float, weights: Weights
 ) -> Iterator[Part]:
     """Yield the possible meanings of bytes as a number of one type: frame counter or clock, and channel.
@@ -215,7 +215,7 @@ def split_frame(
     """
 
     @cache
-    def lowest(position: int, row: str) -> tuple[float, tuple[Part, ...]]:
+    def best_division(position: int, row: str) -> tuple[float, tuple[Part, ...]]:
         """Return the lowest score of all bytes from a position to the end, and the parts with this score.
 
         Args:
@@ -234,7 +234,7 @@ def split_frame(
             begins_row = is_channel and part.row != row
             if begins_row and part.is_constant:
                 continue
-            rest_score, rest_parts = lowest(position + part.size, part.row)
+            rest_score, rest_parts = best_division(position + part.size, part.row)
             score = part.score + rest_score
             if begins_row:
                 score = part.score + weights.row + rest_score
@@ -245,12 +245,12 @@ def split_frame(
 
     scored_syncs = []
     for sync_length in syncs:
-        score, _ = lowest(sync_length, "")
+        score, _ = best_division(sync_length, "")
         if sync_length == 1:  # a sync of a single byte is rare
             score += weights.constant
         scored_syncs.append((score, sync_length))
     lowest_score, best_sync_length = min(scored_syncs)
-    _, best_parts = lowest(best_sync_length, "")
+    _, best_parts = best_division(best_sync_length, "")
     return lowest_score, best_sync_length, best_parts
 
 

@@ -108,10 +108,12 @@ def _scored_tables(windows: Windows, seconds: float, weights: Weights) -> Iterat
             if any(part.role == "channel" for part in parts):
                 sync = np.roll(usual, -start)[:sync_length].tobytes()
                 bits_per_byte = covered_share * score / length + (1.0 - covered_share) * weights.noise
-                yield bits_per_byte, _table(windows, sync, check, order, parts)
+                yield bits_per_byte, _frames_section(windows, sync, check, order, parts)
 
 
-def _table(windows: Windows, sync: bytes, check: Check, order: ByteOrder, parts: Sequence[Part]) -> dict[str, Any]:
+def _frames_section(
+    windows: Windows, sync: bytes, check: Check, order: ByteOrder, parts: Sequence[Part]
+) -> dict[str, Any]:
     """Return the section `[frames]` of a device file for a description of the frames.
 
     Args:
@@ -131,11 +133,11 @@ def _table(windows: Windows, sync: bytes, check: Check, order: ByteOrder, parts:
     table |= check.keys
     if check.size > 1 and check.order != order:
         table["checksum_order"] = check.order
-    table["fields"] = _fields(parts)
+    table["fields"] = _field_tables(parts)
     return table
 
 
-def _fields(parts: Sequence[Part]) -> list[dict[str, Any]]:
+def _field_tables(parts: Sequence[Part]) -> list[dict[str, Any]]:
     """Return the list `fields` of a device file for the parts of a frame.
 
     A second counter or clock becomes padding, and adjacent padding is joined.
@@ -174,14 +176,14 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
         seconds: Time in which they arrived, s.
         are_datagrams: Whether each chunk is a datagram.
     """
-    binary_frames, binary_share = _read(BinaryParser(), chunks)
+    binary_frames, binary_share = _parse_all(BinaryParser(), chunks)
     if len(binary_frames) >= MIN_FRAMES and binary_share > CLEAR_SHARE:
         return {"format": "binary"}
 
     # If most of the bytes are not lines of one layout, the board may send binary frames that resemble text in places.
     text_table = None
     text_parser = TextParser()
-    all_text_frames, text_share = _read(text_parser, chunks)
+    all_text_frames, text_share = _parse_all(text_parser, chunks)
     text_frames = [frame for frame in all_text_frames if len(frame.values) == len(all_text_frames[-1].values)]
     if text_parser.layout is not None and len(text_frames) >= MIN_FRAMES:
         rate_Hz = len(text_frames) / seconds
@@ -191,7 +193,7 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     return described_frames(chunks, seconds, are_datagrams=are_datagrams) or text_table
 
 
-def _read(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], float]:
+def _parse_all(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], float]:
     """Return the frames that a parser finds, and the share of the bytes that lie in these frames."""
     frames = [frame for chunk in chunks for frame in parser.feed(chunk)]
     byte_count = sum(len(chunk) for chunk in chunks)

@@ -51,17 +51,17 @@ class Field(NamedTuple):
 
 def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """Return the fields of a struct in the order of their declaration."""
-    return tuple(_fields(struct))
+    return tuple(_flat_fields(struct))
 
 
-def _fields(struct: type[Struct]) -> Iterator[Field]:
+def _flat_fields(struct: type[Struct]) -> Iterator[Field]:
     """Yield the fields of a struct. The fields of a nested struct with `is_flattened` take the place of the struct."""
     hints = get_type_hints(struct, include_extras=True)
     for name in struct.__struct_fields__:
         declared_type, meaning = _type_and_meaning(hints[name], f"{struct.__name__}.{name}")
         value_type, may_be_null = _without_none(declared_type)
         if meaning.is_flattened:
-            for field in _fields(value_type):
+            for field in _flat_fields(value_type):
                 yield field._replace(group=name)
         elif isinstance(value_type, type) and issubclass(value_type, Struct):
             yield Field(name, "object", meaning, may_be_null, fields_of(value_type), group=name)

@@ -383,7 +383,6 @@ class FilmFilter:
         """
         misfit, jacobian = self._linearise(charge_pC, log_changes)
         noise_covariance = self._noise_covariance(jacobian)
-
         kalman = self._kalman_update(misfit, jacobian, noise_covariance)
 
         # The update is weighted by the probability that the touch is not an outlier.
@@ -486,7 +485,7 @@ class FilmFilter:
 
         Args:
             misfit: Misfit vectors, as `_linearise` returns them.
-            jacobian: Their Jacobian, as `_linearise` returns it.
+            jacobian: Jacobian of the misfit vectors, as `_linearise` returns it.
             noise_covariance: Covariance of the misfit vectors, as `_noise_covariance` returns it.
         """
         level = self._likeliest_level

@@ -413,6 +413,7 @@ class Viewer:
             now_s: Unix time, s.
         """
         tape = self._hub.tape
+        self._begin_anew_after_jump()
         stop = self._first_hidden_sample()
         start = max(self._next_sample, tape.oldest)
         begins_anew = self._begins_anew
@@ -426,23 +427,28 @@ class Viewer:
         samples = coalesce(tape.samples(start, stop), limit)
         return samples_message(self._sent_messages, now_s, samples, self._missed_samples, begin_anew=begins_anew)
 
+    def _begin_anew_after_jump(self) -> None:
+        """Let the next message begin with the samples before the new position if the viewer has selected a position."""
+        playhead = self._playhead
+        tape = self._hub.tape
+        if playhead is None or not playhead.has_jumped or not tape.total:
+            return
+        playhead.has_jumped = False
+        self._begins_anew = True
+        start_s, _ = tape.span()
+        self._next_sample = tape.index(start_s + playhead.at_s - HISTORY_S)
+
     def _first_hidden_sample(self) -> int:
         """Return the number of the first sample that the viewer must not receive yet.
 
         In a recording, this is the first sample after the position. In a live stream, it is the number of the next
-        sample that will arrive. After a jump, the next message begins with the samples before the new position.
+        sample that will arrive.
         """
         tape = self._hub.tape
-        playhead = self._playhead
-        if playhead is None or not tape.total:
+        if self._playhead is None or not tape.total:
             return tape.total
         start_s, _ = tape.span()
-        position_s = start_s + playhead.at_s
-        if playhead.has_jumped:
-            playhead.has_jumped = False
-            self._begins_anew = True
-            self._next_sample = tape.index(position_s - HISTORY_S)
-        return tape.index(position_s)
+        return tape.index(start_s + self._playhead.at_s)
 
     def _advance(self, playhead: Playhead, now_s: float) -> None:
         """Advance the position in the recording by the time since the latest call.

@@ -225,7 +225,7 @@ class PageServer:
             self._serve_viewer,
             sock=listening,
             ssl=tls_context,
-            process_request=self._answer,
+            process_request=self._http_response,
             select_subprotocol=_select_subprotocol,
             compression=None,
             server_header=None,
@@ -239,7 +239,7 @@ class PageServer:
         ):
             yield
 
-    def _answer(self, _connection: ServerConnection, request: http11.Request) -> http11.Response | None:
+    def _http_response(self, _connection: ServerConnection, request: http11.Request) -> http11.Response | None:
         """Return the response to an HTTP request; None if the request opens a WebSocket.
 
         The files of the page need no token.

@@ -379,11 +379,11 @@ class Connection(asyncio.Protocol):
 
         The connection has no deadline until the response is sent.
         """
-        self._answering = self._loop.create_task(self._answer_later(head, body))
+        self._answering = self._loop.create_task(self._answer_in_order(head, body))
         self._timed_phase = Phase.IDLE
         self.deadline = math.inf
 
-    async def _answer_later(self, head: Head, body: bytes) -> None:
+    async def _answer_in_order(self, head: Head, body: bytes) -> None:
         """Answer a request in another thread, and afterwards the requests that have arrived in the meantime.
 
         If one of the later requests also needs another thread, the remaining requests wait for its answer.

@@ -123,7 +123,7 @@ class Handler:
         start_ns = time.perf_counter_ns()
         match = match_path(path)
         try:
-            response = self._answer(method, path, match, dict(headers), body)
+            response = self._check_and_answer(method, path, match, dict(headers), body)
         except Exception as error:  # every error becomes a response here
             response = error_response(error)
         self.traffic.count("http", match.label, response.status)
@@ -148,7 +148,9 @@ class Handler:
         size = len(response.body)
         self.traffic.note(Exchange("http", "none", response.status, None, response.error, 0, 0, size, client))
 
-    def _answer(self, method: str, path: str, match: Match, fields: dict[bytes, bytes], body: bytes) -> Response:
+    def _check_and_answer(
+        self, method: str, path: str, match: Match, fields: dict[bytes, bytes], body: bytes
+    ) -> Response:
         """Check a request, answer it, and return the response.
 
         Args:
