@@ -154,8 +154,8 @@ def search(
     candidate_contacts = charge_map.domain.to_contact(INNER_RADIUS * unit_candidates)
     candidate_contacts[:, 2] = np.clip(candidate_contacts[:, 2], *charge_map.domain.force_range)
     candidate_charges = charge_map.charges(candidate_contacts)
-    difference = unit_candidates[:, None, :2] - unit_candidates[:, :2]
-    is_neighbour = np.hypot(difference[..., 0], difference[..., 1]) < START_SEPARATION
+    positions = unit_candidates[:, :2]
+    is_neighbour = scipy.spatial.distance.cdist(positions, positions) < START_SEPARATION
     start_rows = []
     for first in range(0, max(len(charge), 1), CHUNK):
         chunk = slice(first, first + CHUNK)
