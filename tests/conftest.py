@@ -18,7 +18,7 @@ from isocharge.common.extras import PACKAGES
 
 ROOT = Path(__file__).parents[1]
 
-LONGEST = ("tests/train", "tests/cli", "tests/test_pages", "tests/test_examples")
+LONGEST = ("tests/train", "tests/cli", "tests/test_pages", "tests/test_examples", "tests/test_flags", "tests/test_pip")
 
 settings.register_profile("patient", deadline=None)  # a busy machine is no fault of an example
 settings.load_profile("patient")

@@ -1,7 +1,7 @@
 """What the simulator's tests share: films, meshes, random fields, forward maps."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +15,13 @@ from isocharge.simulate import (
     Polygon,
     Probe,
     Resolution,
+    Sensor,
     Sweep,
     Theory,
     load_sensor,
 )
 from isocharge.simulate.dataset.sweep import write_sweep
+from isocharge.simulate.forward.side_force import SideForceMap
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.placed_mesh import Geometry, place
 from isocharge.simulate.mesh.placement import Placement
@@ -144,6 +146,17 @@ def made_up() -> Callable[..., Equilibrium]:
 def three_map() -> ForwardMap:
     """The forward map of the released model's sensor."""
     return kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0))
+
+
+@pytest.fixture(scope="session")
+def side_force_map() -> SideForceMap:
+    """Derivatives of the charges for side forces on a film of 0.8 MPa with four electrodes."""
+    sensor = load_sensor("four-25um-biaxial")
+    return kept(solve_side_forces, replace(sensor, film=replace(sensor.film, pretension=0.8)))
+
+
+def solve_side_forces(sensor: Sensor) -> SideForceMap:
+    return SideForceMap.build(ForwardMap.build(sensor, Circle(1.0), 8.0, (0.1, 1.0)))
 
 
 @pytest.fixture(scope="session")

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate import Circle, ForwardMap, Polygon, SolveSettings, Theory, deflection, load_sensor, press
+from isocharge.simulate import Circle, Polygon, SolveSettings, Theory, deflection, load_sensor, press
 from isocharge.simulate import touch_charge as charge_of
 from isocharge.simulate.forward.side_force import SideForceMap
 from isocharge.simulate.solver.equilibrium import Equilibrium
 from isocharge.simulate.solver.friction import friction_force, holding_force
-from kept import kept
 
 PROBE = Circle(1.0)
 FULL = SolveSettings(theory=Theory(stretching=True, bending=True, pretensioned=True))
@@ -21,16 +20,6 @@ def taut(name: str, pretension: float):
     """Return a built-in sensor with a pretension, MPa."""
     sensor = load_sensor(name)
     return replace(sensor, film=replace(sensor.film, pretension=pretension))
-
-
-@pytest.fixture(scope="module")
-def side_force_map() -> SideForceMap:
-    """Side forces on a biaxial film with four electrodes."""
-    return kept(side_force_map_of, taut("four-25um-biaxial", 0.8))
-
-
-def side_force_map_of(sensor) -> SideForceMap:
-    return SideForceMap.build(ForwardMap.build(sensor, PROBE, 8.0, (0.1, 1.0)))
 
 
 @pytest.mark.parametrize("contact", [(3.0, -2.0, 0.5), (-5.0, 4.0, 0.1), (7.5, -0.3, 0.9)])

@@ -8,11 +8,9 @@ import pytest
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, ForwardMap, Polygon, TensionMap, load_sensor, press, touch_charge
 from isocharge.simulate.mechanics.film_temperature import warmed
-from isocharge.simulate.solver.load_case import SolveSettings
 from kept import kept
 
 PROBE = Circle(1.0)
-ACCURATE = SolveSettings(accuracy=1e-4)
 
 
 def drawn_sensor():
@@ -44,7 +42,7 @@ def test_tension_jacobian_equals_differences_of_direct_solves(tension_map, conta
                 pretension=0.8 + sign * pretension,
                 deviator=(sign * deviator[0], sign * deviator[1]),
             )
-            solved = press(film, PROBE, (x, y), force, ACCURATE)
+            solved = press(film, PROBE, (x, y), force)
             charges.append(touch_charge(replace(sensor, film=film), solved))
         expected.append((charges[0] - charges[1]) / (2.0 * step))
     jacobian = tension_map.tension_jacobian(np.array([contact]))[0]
@@ -56,7 +54,7 @@ def test_temperature_jacobian_equals_the_difference_of_warmed_films(tension_map)
     charges = []
     for kelvin in (0.05, -0.05):
         warm_sensor = warmed(sensor, kelvin)
-        solved = press(warm_sensor.film, PROBE, (3.0, -2.0), 0.5, ACCURATE)
+        solved = press(warm_sensor.film, PROBE, (3.0, -2.0), 0.5)
         charges.append(touch_charge(warm_sensor, solved))
     warm, cold = charges
     jacobian = tension_map.temperature_jacobian(np.array([[3.0, -2.0, 0.5]]))[0]

@@ -28,6 +28,7 @@ def position_limit(sensor, x: float, y: float, force: float) -> float:
     return float(cramer_rao(charge()[None], jacobian[None], noise_model("reference")).position[0])
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(
     ("name", "radius", "expected"),
     [

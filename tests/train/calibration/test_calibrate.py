@@ -22,6 +22,8 @@ from isocharge.train.calibration.film_fit import fit_film
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.data.presses import draw_contacts
 
+pytestmark = pytest.mark.usefixtures("no_closed_backs")
+
 
 def data_of(problem, presses) -> PressData:
     return PressData.of(presses, problem.noise, problem.charges.domain)

@@ -17,6 +17,8 @@ from isocharge.train.calibration.calibration_file import film_table, read_film
 from isocharge.train.calibration.folder import result_table
 from isocharge.train.calibration.problem import Warming
 
+pytestmark = pytest.mark.usefixtures("no_closed_backs")
+
 
 @pytest.fixture(scope="module")
 def imperfect(film_with_discrepancy):

@@ -14,6 +14,8 @@ from isocharge.train.calibration.cross_validation import FEWEST_MEASURED, FOLD_C
 from isocharge.train.data.presses import folds_by_place
 from isocharge.train.model_release.evaluate import evaluate
 
+pytestmark = pytest.mark.usefixtures("no_closed_backs")
+
 PRESS_COUNT = 60
 
 

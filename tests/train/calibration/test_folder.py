@@ -16,6 +16,8 @@ from isocharge.train.calibration.folder import calibration_folder
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
 
+pytestmark = pytest.mark.usefixtures("no_closed_backs")
+
 CALIBRATE = ("train", "calibrate", "--sensor", "four-25um-biaxial")
 
 

@@ -38,6 +38,8 @@ from isocharge.train.calibration.result import film_without_presses
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
 
+pytestmark = pytest.mark.usefixtures("no_closed_backs")
+
 DEGREE_MPa = 0.35
 """What a degree of the room does on a ring of aluminium."""
 

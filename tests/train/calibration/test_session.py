@@ -6,8 +6,11 @@ from tests.train.calibration.conftest import presses_of
 
 from isocharge.common.errors import PressError
 from isocharge.serve import MeasuredPresses
-from isocharge.train import PressSession, next_presses
+from isocharge.train import PressSession, calibrate, next_presses
+from isocharge.train.calibration import session as session_module
 from isocharge.train.calibration.session import read_answer
+
+pytestmark = pytest.mark.usefixtures("no_closed_backs")
 
 
 class SimulatedRig:
@@ -40,6 +43,22 @@ class SimulatedRig:
         for _ in range(count):
             contact = self.session.proposed.contact
             self.session.take(self.charge(contact), contact)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def equal_presses_are_calibrated_once():
+    """Calibrate the same presses once for all sessions, because most sessions begin with the same presses."""
+    results = {}
+
+    def calibrate_once(presses, problem):
+        key = (id(problem), presses.contact.tobytes(), presses.charge_pC.tobytes(), presses.lines)
+        if key not in results:
+            results[key] = calibrate(presses, problem)
+        return results[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session_module, "calibrate", calibrate_once)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,8 @@ from isocharge.train.calibration.problem import CREEP, DRIFT
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
 
+pytestmark = pytest.mark.usefixtures("no_closed_backs")
+
 TENSION_LOSS_PER_K = 3000.0 * 7.7e-5 / (1.0 - 0.34)
 """Decrease of the pretension per kelvin, E da / (1 - nu), of a film that expands by 7.7e-5 per kelvin more than its
 ring, MPa/K."""

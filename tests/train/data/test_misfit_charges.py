@@ -1,6 +1,7 @@
 """Charges for the training of the misfit network: pairs of presses, and presses outside the working area."""
 
 import numpy as np
+import pytest
 
 from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 from isocharge.train.data.misfit_charges import PAIR_EXPONENTS, combined_charge, draw_outside_examples
@@ -32,15 +33,16 @@ def test_two_presses_at_one_place_are_a_press_with_the_sum_of_the_forces():
     np.testing.assert_allclose(combined_charge(first, second, 1.0), first + second)
 
 
-def test_charges_of_pairs_lie_between_those_of_the_two_exponents():
+@pytest.mark.first_cases(1)
+@pytest.mark.parametrize("pair", PAIRS, ids=["apart", "near the edge"])
+def test_charges_of_pairs_lie_between_those_of_the_two_exponents(pair):
     """The pairs are solved with both loads at once by an independent solver."""
     smallest_exponent, largest_exponent = PAIR_EXPONENTS
-    for pair in PAIRS:
-        first, second = (solved_charges([touch])[None] for touch in pair)
-        both = solved_charges(pair)[None]
-        assert (both < 0.95 * combined_charge(first, second, smallest_exponent)).all()
-        assert (both > 0.98 * combined_charge(first, second, largest_exponent)).all()
-        np.testing.assert_allclose(combined_charge(first, second, 1.5), both, rtol=0.1)
+    first, second = (solved_charges([touch])[None] for touch in pair)
+    both = solved_charges(pair)[None]
+    assert (both < 0.95 * combined_charge(first, second, smallest_exponent)).all()
+    assert (both > 0.98 * combined_charge(first, second, largest_exponent)).all()
+    np.testing.assert_allclose(combined_charge(first, second, 1.5), both, rtol=0.1)
 
 
 def test_the_independent_solver_agrees_with_the_simulator_for_one_touch():

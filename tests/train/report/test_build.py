@@ -9,7 +9,7 @@ import pytest
 
 from isocharge.cli.train import report as report_module
 from isocharge.common.errors import DatasetError, ModelError, OutputExists
-from isocharge.serve import find_model
+from isocharge.serve import benchmark, find_model
 from isocharge.simulate import Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train.report import QUICK, case, evaluation, write_report
@@ -61,6 +61,8 @@ def report(dataset, film, spline, tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "fit_all", interrupt_first_fit)
+        patch.setattr(benchmark, "ROUNDS", 2)
+        patch.setattr(benchmark, "MIN_CALLS", 1)
         patch.setattr(case, "solve_maps", lambda *_, **__: (film,))
         patch.setattr(evaluation.ChargeSpline, "of", lambda _: spline)
         with pytest.raises(KeyboardInterrupt):
