@@ -16,6 +16,7 @@ from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.measured_presses import MAX_TEMPERATURE_C, MIN_TEMPERATURE_C
 from isocharge.serve import MeasuredPresses
 from isocharge.simulate import load_sensor, parse_probe
+from isocharge.simulate.solver.friction import MAX_FRICTION
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
 from isocharge.train.calibration.folder import (
     calibration_folder,
@@ -24,6 +25,7 @@ from isocharge.train.calibration.folder import (
     result_table,
     write_calibration,
 )
+from isocharge.train.calibration.side_forces import MAX_SIDE_FORCE
 
 
 def calibrate_command(
@@ -76,6 +78,28 @@ def calibrate_command(
             "presses, the film of --from is written as it is at this temperature. (default: unknown)",
         ),
     ] = None,
+    friction: Annotated[
+        float,
+        typer.Option(
+            "--friction",
+            metavar="COEFFICIENT",
+            min=0.0,
+            max=MAX_FRICTION,
+            help="Expected coefficient of friction between tip and film, such as 0.2, for presses on a vertical stage. "
+            "The calibration estimates it.",
+        ),
+    ] = 0.0,
+    side_force: Annotated[
+        float,
+        typer.Option(
+            "--side-force",
+            metavar="SHARE",
+            min=0.0,
+            max=MAX_SIDE_FORCE,
+            help="Largest side force of later contacts over their force, such as 0.1. It is added to the standard "
+            "deviations of the model.",
+        ),
+    ] = 0.0,
     models: ModelsOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -91,7 +115,9 @@ def calibrate_command(
     """
     is_moved = file is None and earlier is not None and temperature_C is not None
     _check_usage(file, output, next_count, temperature_C, is_moved=is_moved)
-    problem = replace(CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models), stress_limit=stress_limit)
+    _check_side_forces(file, friction, side_force, is_moved=is_moved)
+    problem = CalibrationProblem.of(load_sensor(sensor), parse_probe(probe), models)
+    problem = replace(problem, stress_limit=stress_limit, friction=friction, side_force=side_force)
     result: CalibrationResult | None = None
     with calibration_folder(output, problem) if output is not None else nullcontext():
         presses = None
@@ -201,5 +227,25 @@ def _check_usage(
             "--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out": (
                 is_nothing_calibrated and output is not None
             ),
+        }
+    )
+
+
+def _check_side_forces(file: Path | None, friction: float, side_force: float, *, is_moved: bool) -> None:
+    """Refuse side forces if nothing that they concern is given.
+
+    Args:
+        file: File of presses.
+        friction: Expected coefficient of friction of the presses.
+        side_force: Largest side force of later contacts over their force.
+        is_moved: Whether an earlier calibration is moved to another temperature, without presses.
+    """
+    refuse(
+        {
+            f"--friction {friction:g}: expected PRESSES.csv that were made with this friction, got none": (
+                friction > 0.0 and file is None
+            ),
+            f"--side-force {side_force:g}: expected PRESSES.csv, or --from FOLDER with --temperature C, for a model "
+            "with larger standard deviations, got neither": side_force > 0.0 and file is None and not is_moved,
         }
     )

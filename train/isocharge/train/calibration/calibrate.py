@@ -9,6 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from isocharge.common.errors import PressError
 from isocharge.common.measured_presses import MeasuredPresses, row_words
+from isocharge.simulate import SideForceMap
 from isocharge.train.calibration.closed_back import CLOSED_BACK_CAUTION, has_closed_back, refuse_closed_back
 from isocharge.train.calibration.diagnosis import (
     FAR_FROM_ALL_FILMS,
@@ -21,10 +22,11 @@ from isocharge.train.calibration.diagnosis import (
     unexplained_error,
 )
 from isocharge.train.calibration.film_fit import MISTAKE_PROBABILITY, PROBABLE, FilmPosterior, fit_film
-from isocharge.train.calibration.nuisances import NUISANCES
+from isocharge.train.calibration.nuisances import FRICTION, NUISANCES
 from isocharge.train.calibration.press_data import PressData, temperatures
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.result import CalibrationResult
+from isocharge.train.calibration.side_forces import solve_side_forces, with_friction
 
 UNEXPLAINED_PROBABILITY = 1e-6
 """Probability of the residuals for presses of a possible film, below which no film explains the presses, provided that
@@ -51,6 +53,12 @@ FEW = 3
 
 BOUND_DISTANCE = 0.1
 """Distance from its bound within which a parameter counts as limited by the bound, in prior standard deviations."""
+
+MAX_FRICTION_ROUNDS = 3
+"""Largest number of fits of presses with friction, each with the effect of friction on the film of the one before."""
+
+MAX_FRICTION_STEP = 0.25
+"""Largest change of a parameter, in standard deviations of its prior, after which the effect of friction is kept."""
 
 CLOSE_MM = 1.0
 """Distance within which all presses lie too close to each other to determine the positions of the electrodes, mm."""
@@ -84,11 +92,40 @@ def calibrate(presses: MeasuredPresses, problem: CalibrationProblem) -> Calibrat
     data = PressData.of(presses, problem.noise, problem.charges.domain)
     with threadpool_limits(1):  # many small matrices: a second thread only waits
         posterior = fit_film(problem.charges, data, problem.before, at_C)
+        side_force_map = None
+        if problem.friction > 0.0:
+            posterior, side_force_map = _fit_with_friction(problem, data, posterior, at_C)
+        elif problem.side_force > 0.0:
+            side_force_map = solve_side_forces(problem.charges, posterior.parameters)
     _refuse_unexplained(presses, problem, posterior)
     posterior, scatter_cautions = _scaled_by_scatter(posterior)
     posterior = _with_unseen_mistakes(posterior, problem.before)
     cautions = (*domain_cautions, *scatter_cautions, *_cautions(presses, problem, posterior))
-    return CalibrationResult(problem, presses, posterior, cautions)
+    return CalibrationResult(problem, presses, posterior, cautions, side_force_map=side_force_map)
+
+
+def _fit_with_friction(
+    problem: CalibrationProblem, data: PressData, posterior: FilmPosterior, at_C: float | None
+) -> tuple[FilmPosterior, SideForceMap]:
+    """Return the estimate of a film from presses with friction, and the effect of side forces on this film.
+
+    Args:
+        problem: The films, and the expected coefficient of friction.
+        data: The presses.
+        posterior: Estimate of the film if the presses have no friction.
+        at_C: Temperature of the film, degrees Celsius; None if temperatures were not measured.
+    """
+    coefficient = problem.friction
+    for _ in range(MAX_FRICTION_ROUNDS):
+        side_force_map = solve_side_forces(problem.charges, posterior.parameters)
+        data_with_friction = with_friction(data, problem.charges, side_force_map, posterior.contact, coefficient)
+        fitted = fit_film(problem.charges, data_with_friction, problem.before, at_C, friction=problem.friction)
+        change = np.abs(fitted.parameters - posterior.parameters) / problem.prior.std
+        posterior = fitted
+        coefficient = posterior.nuisances[FRICTION.name].value
+        if change.max() < MAX_FRICTION_STEP:
+            break
+    return posterior, side_force_map
 
 
 def _within_domain(presses: MeasuredPresses, problem: CalibrationProblem) -> tuple[MeasuredPresses, list[str]]:

@@ -37,10 +37,8 @@ N_CANDIDATE_POSITIONS = 80
 CANDIDATE_FORCES = (0.15, 0.45, 0.95)
 """Forces that are compared for the next press: positions in the logarithm of the force range, from 0 to 1."""
 
-GOLDEN_RATIO_INVERSE = 0.6180339887
-"""Step of the logarithm of the force from one contact to the next, relative to the force range.
-
-The inverse of the golden ratio gives neighbouring contacts different forces."""
+FORCE_ORDER_SEED = 0
+"""Seed of the random order of the forces of contacts that are spread over a domain."""
 
 POSITION_GRID_MM = 0.5
 """Grid to which the coordinates of proposed presses are rounded, mm, so that a person can set them."""
@@ -94,6 +92,8 @@ class ContactSensitivity:
             shape (n, n_electrode, n_unknown), in units of the noise.
         log_charge_jacobian: Derivatives of ln Q at fixed contacts with respect to the unknowns, shape
             (n, n_electrode, n_unknown).
+        charge_gain: Derivatives of the estimated (x, y, ln F) with respect to the charges, shape (n, 3, n_electrode),
+            mm/pC, mm/pC and 1/pC.
     """
 
     contact: Array
@@ -101,6 +101,7 @@ class ContactSensitivity:
     noise_covariance: Array
     misfit_jacobian: Array
     log_charge_jacobian: Array
+    charge_gain: Array
 
     @classmethod
     def at(cls, problem: CalibrationProblem, parameters: Array) -> "ContactSensitivity":
@@ -111,7 +112,7 @@ class ContactSensitivity:
             parameters: The film at which the charges are linearised, as `FilmCharges.film` takes it.
         """
         domain = problem.domain
-        contact = _contacts_over_domain(domain)
+        contact = spread_contacts(domain, N_CONTACTS)
         contact_slopes, film_slopes = _whitened_slopes(problem, parameters, contact)
 
         # Covariance of a contact by noise, from the information of the charges and of the prior
@@ -122,13 +123,15 @@ class ContactSensitivity:
         noise_covariance = np.linalg.inv(charge_information + np.diag(prior_std**-2))
 
         charge = problem.charges.charges(parameters, contact)
-        relative_noise = problem.noise.sigma(charge) / charge
+        sigma = problem.noise.sigma(charge)
+        whitened_gain = noise_covariance @ contact_slopes.swapaxes(1, 2)
         return cls(
             contact=contact,
-            contact_jacobian=-np.einsum("nij,nkj,nkp->nip", noise_covariance, contact_slopes, film_slopes),
+            contact_jacobian=-(whitened_gain @ film_slopes),
             noise_covariance=noise_covariance,
             misfit_jacobian=derivatives_with_adjusted_contacts(film_slopes, contact_slopes),
-            log_charge_jacobian=film_slopes * relative_noise[:, :, None],
+            log_charge_jacobian=film_slopes * (sigma / charge)[:, :, None],
+            charge_gain=whitened_gain / sigma[:, None, :],
         )
 
     def contact_error(self, covariance: Array) -> ContactError:
@@ -159,13 +162,22 @@ class ContactSensitivity:
         return np.asarray(np.einsum("nip,niq->pq", scaled_jacobian, scaled_jacobian) / len(scaled_jacobian))
 
 
-def _contacts_over_domain(domain: Domain) -> Array:
-    """Return contacts (x, y, F) that cover the domain evenly, shape (N_CONTACTS, 3), mm and N."""
-    position = domain.radius * sunflower(N_CONTACTS)
-    min_force, max_force = domain.force_range
-    relative_log_force = (0.5 + np.arange(N_CONTACTS)) * GOLDEN_RATIO_INVERSE % 1.0
-    force = min_force * (max_force / min_force) ** relative_log_force
-    return np.column_stack([position.real, position.imag, force])
+def spread_contacts(domain: Domain, count: int) -> Array:
+    """Return contacts that are spread evenly over the positions and the logarithms of the forces of a domain.
+
+    The order of the forces is random, so that the force does not depend on the position.
+
+    Args:
+        domain: The domain.
+        count: Number of contacts.
+
+    Returns:
+        Contacts (x, y, F), shape (count, 3), mm and N.
+    """
+    position = sunflower(count)
+    force_rank = np.random.default_rng(FORCE_ORDER_SEED).permutation(count)
+    unit_log_force = 2.0 * (force_rank + 0.5) / count - 1.0
+    return domain.to_contact(np.column_stack([position.real, position.imag, unit_log_force]))
 
 
 def _whitened_slopes(problem: CalibrationProblem, parameters: Array, contact: Array) -> tuple[Array, Array]:

@@ -52,6 +52,7 @@ class HeldOutAnswers:
 def cross_validate(
     problem: CalibrationProblem,
     presses: MeasuredPresses,
+    data: PressData,
     posterior: FilmPosterior,
     network_of: Callable[[FilmPosterior], Fitted],
     at_C: float | None = None,
@@ -61,6 +62,7 @@ def cross_validate(
     Args:
         problem: Films that the sensor may have.
         presses: The presses to which the film was fitted.
+        data: The same presses, with the effect of friction on their charges.
         posterior: Estimate of the film from these presses. Presses that were left out as bad are not used here either.
         network_of: Function that returns the network of a film.
         at_C: Temperature of the film, degrees Celsius; None if the temperatures of the presses are unknown.
@@ -74,7 +76,6 @@ def cross_validate(
         return None
     fold = np.full(len(presses), -1)
     fold[is_judged] = folds_by_place(presses.contact[is_judged], FOLD_COUNT)
-    data = PressData.of(presses, problem.noise, problem.charges.domain)
 
     contact = np.empty((len(presses), 3))
     std = np.empty((len(presses), 3))
@@ -83,7 +84,9 @@ def cross_validate(
         is_held_out = fold == number
         is_fitted = _thinned(~is_held_out & ~posterior.bad)
         with threadpool_limits(1):  # many small matrices, for which a second thread only waits
-            film = refit_film(problem.charges, data[is_fitted], problem.before, posterior, at_C)
+            film = refit_film(
+                problem.charges, data[is_fitted], problem.before, posterior, at_C, friction=problem.friction
+            )
         answers = network_of(film).predict(presses.charge_pC[is_held_out])
         contact[is_held_out], std[is_held_out], misfit[is_held_out] = answers
     force_std_N = presses.force_std * presses.contact[:, 2]

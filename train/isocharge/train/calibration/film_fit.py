@@ -119,7 +119,14 @@ class FilmPosterior(FilmEstimate):
         return parameters_only.drifted(prior, knows_temperature=knows_temperature)
 
 
-def fit_film(charges: FilmCharges, data: PressData, initial: FilmEstimate, at_C: float | None = None) -> FilmPosterior:
+def fit_film(
+    charges: FilmCharges,
+    data: PressData,
+    initial: FilmEstimate,
+    at_C: float | None = None,
+    *,
+    friction: float = 0.0,
+) -> FilmPosterior:
     """Estimate the film from presses, of which some may be bad.
 
     Args:
@@ -128,8 +135,9 @@ def fit_film(charges: FilmCharges, data: PressData, initial: FilmEstimate, at_C:
         initial: Estimate of the film before the presses.
         at_C: Temperature for which the initial estimate and the result hold, degrees Celsius; None if temperatures were
             not measured.
+        friction: Expected coefficient of friction of the presses; 0 for presses without friction.
     """
-    problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None)
+    problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None, friction=friction)
     degrees_of_freedom = _degrees_of_freedom(data)
     every_press = np.ones(len(data), dtype=bool)
     is_kept = every_press
@@ -152,7 +160,13 @@ def fit_film(charges: FilmCharges, data: PressData, initial: FilmEstimate, at_C:
 
 
 def refit_film(
-    charges: FilmCharges, data: PressData, initial: FilmEstimate, previous: FilmPosterior, at_C: float | None = None
+    charges: FilmCharges,
+    data: PressData,
+    initial: FilmEstimate,
+    previous: FilmPosterior,
+    at_C: float | None = None,
+    *,
+    friction: float = 0.0,
 ) -> FilmPosterior:
     """Estimate the film from presses again, starting from a previous estimate from similar presses.
 
@@ -165,8 +179,9 @@ def refit_film(
         initial: Estimate of the film before the presses.
         previous: Previous estimate, which explains most of these presses.
         at_C: Temperature for which all estimates hold, degrees Celsius; None if temperatures were not measured.
+        friction: Expected coefficient of friction of the presses; 0 for presses without friction.
     """
-    problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None)
+    problem = FitProblem.of(charges, initial, knows_temperature=at_C is not None, friction=friction)
     layout = problem.layout
     start = np.zeros(layout.count)
     start[layout.parameters] = previous.parameters / charges.prior.std

@@ -35,6 +35,7 @@ from isocharge.train.calibration.hypotheses import (
     mix_hypotheses,
 )
 from isocharge.train.calibration.nuisances import (
+    FRICTION,
     NUISANCES,
     PRETENSION_PER_KELVIN,
     NuisanceEstimate,
@@ -119,7 +120,9 @@ class FitProblem:
     covariance: Array
 
     @classmethod
-    def of(cls, charges: FilmCharges, initial: FilmEstimate, *, knows_temperature: bool) -> "FitProblem":
+    def of(
+        cls, charges: FilmCharges, initial: FilmEstimate, *, knows_temperature: bool, friction: float = 0.0
+    ) -> "FitProblem":
         """Return the problem of a film.
 
         Args:
@@ -127,6 +130,7 @@ class FitProblem:
             initial: Estimate of the film before the presses. Coefficients that it does not have are zero.
             knows_temperature: Whether the temperatures of the presses are known, so that the nuisances of temperature
                 are unknowns.
+            friction: Expected coefficient of friction, and its standard deviation; 0 for presses without friction.
         """
         layout = charges.layout
         mean = np.zeros(layout.count)
@@ -146,6 +150,9 @@ class FitProblem:
             covariance[place, place] = initial.warming.std**2
             covariance[estimated, place] = initial.warming.covariance
             covariance[place, estimated] = initial.warming.covariance
+        place = layout.nuisance(FRICTION.name)
+        mean[place] = friction
+        covariance[place, place] = friction**2
         return cls(charges, mean, covariance)
 
     @property

@@ -181,6 +181,8 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
         "probe": result.problem.prior.probe.notation,
         "presses": len(result.presses),
         "left_out_lines": list(result.bad_lines),
+        "friction": friction_table(result),
+        "side_force": result.problem.side_force,
         "reduced_chi2": result.reduced_chi2,
         "error_left": error_table(result.error_left),
         "error_left_before": error_table(result.error_left_before),
@@ -190,6 +192,13 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
         **film,
         "words": list(result.summary),
     }
+
+
+def friction_table(result: CalibrationResult) -> dict[str, float] | None:
+    """Return the coefficient of friction of the presses for JSON; None if friction is not an unknown."""
+    if result.side_forces is None or result.problem.friction == 0.0:
+        return None
+    return result.side_forces.friction._asdict()
 
 
 def held_out_table(result: CalibrationResult) -> dict[str, float] | None:

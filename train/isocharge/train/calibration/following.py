@@ -107,7 +107,8 @@ def _typical_misfit(pretensions: Pretensions, result: CalibrationResult) -> floa
     problem = result.problem
     rng = np.random.default_rng(SEED)
     touches = draw_contacts(rng, problem.domain, N_TOUCHES)
-    exact_charge = problem.charges.charges(result.posterior.unknowns, touches)
+    film = problem.charges.forward_map(result.posterior.parameters)
+    exact_charge = film.charges(touches) * result.charge_factor(result.posterior.unknowns, touches)
     charge = problem.noise.add(exact_charge, rng)
     calibrated_MPa = np.array([pretensions.calibrated_MPa])
     misfits = [pretensions.misfits(touch_charge, calibrated_MPa) for touch_charge in charge]

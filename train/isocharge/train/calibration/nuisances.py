@@ -113,6 +113,14 @@ class ChargeDrift(Nuisance):
         )
 
 
+class Friction(Nuisance):
+    """Coefficient of friction of the tip, if the presses were made on a vertical stage; see `side_forces`."""
+
+    def charge_error(self, data: PressData, value: float) -> Array:
+        """Return the charges that friction adds."""
+        return value * data.friction_charge
+
+
 PRETENSION_PER_KELVIN = PretensionPerKelvin("pretension_per_K", "MPa/K", std_with_temperatures=0.4)
 """Change of the pretension with temperature. Its standard deviation before the presses is E da / (1 - nu), which is
 0.3 to 0.44 MPa/K on aluminium."""
@@ -121,11 +129,16 @@ PRETENSION_PER_FILM_EXCESS = PretensionPerFilmExcess("pretension_per_film_K", "M
 """Change of the pretension per kelvin of the film above its ring. Its standard deviation before the presses exceeds
 E a / (1 - nu), which is 0.4 to 0.55 MPa/K."""
 
+FRICTION = Friction("friction", "1")
+"""Coefficient of friction of the tip. It is zero unless the calibration states an expected coefficient
+(`CalibrationProblem.friction`), which is then also its standard deviation before the presses."""
+
 NUISANCES: tuple[Nuisance, ...] = (
     PRETENSION_PER_KELVIN,
     PRETENSION_PER_FILM_EXCESS,
     ChargeOffset("offset", "pC", ((0.0, 0.9), (30.0, 0.1))),
     ChargeDrift("drift", "1", ((0.0, 0.95), (0.15, 0.05))),
+    FRICTION,
 )
 """All nuisances, in the order of their unknowns."""
 

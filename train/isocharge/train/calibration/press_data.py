@@ -34,6 +34,8 @@ class PressData:
         film_excess_K: Temperature of the film above that of its ring during each press, less the mean of this
             difference, shape (n,), K; zero if the temperature of the film was not measured.
         tension_change: Pretension during each press less that of the film, shape (n,), MPa.
+        friction_charge: Charges by friction over the coefficient of friction, shape (n, n_electrode), pC; zero for
+            presses without friction.
     """
 
     charge: Array
@@ -45,6 +47,7 @@ class PressData:
     warming_K: Array
     film_excess_K: Array
     tension_change: Array
+    friction_charge: Array
 
     @classmethod
     def of(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
@@ -72,6 +75,7 @@ class PressData:
             warming_K=temperature_C - temperature_C.mean(),
             film_excess_K=_film_excess(presses),
             tension_change=np.zeros(len(presses)),
+            friction_charge=np.zeros_like(charge),
         )
 
     def __getitem__(self, rows: Integers | Booleans) -> "PressData":

@@ -190,6 +190,9 @@ class CalibrationProblem:
         earlier: Estimate of the film from an earlier calibration, as `read_earlier` returns it; None for the sensor as
             described.
         stress_limit: Largest stress of the film in a proposed press, MPa.
+        friction: Expected coefficient of friction between tip and film, for presses on a vertical stage; 0 if the
+            presses have no friction.
+        side_force: Largest side force over the force that contacts of the calibrated model may have in any direction.
 
     Example:
         >>> problem = CalibrationProblem.of(load_sensor("four-25um-biaxial"), Circle(1.0))  # doctest: +SKIP
@@ -202,6 +205,8 @@ class CalibrationProblem:
     films: FilmsModel
     earlier: FilmEstimate | None = None
     stress_limit: float = DEFAULT_STRESS_LIMIT
+    friction: float = 0.0
+    side_force: float = 0.0
 
     @classmethod
     def of(cls, sensor: Sensor, probe: Probe, models: Path | None = None) -> "CalibrationProblem":

@@ -9,15 +9,16 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.measured_presses import MeasuredPresses
 from isocharge.common.statistics import rms
-from isocharge.simulate import Circle, Sensor
+from isocharge.simulate import Circle, Sensor, SideForceMap
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity, next_presses
 from isocharge.train.calibration.cross_validation import HeldOutAnswers, cross_validate
 from isocharge.train.calibration.film_fit import PROBABLE, FilmPosterior
 from isocharge.train.calibration.hypotheses import Hypothesis
-from isocharge.train.calibration.nuisances import NUISANCES, NuisanceEstimate, film_warming_sentences
-from isocharge.train.calibration.press_data import no_presses
+from isocharge.train.calibration.nuisances import FRICTION, NUISANCES, NuisanceEstimate, film_warming_sentences
+from isocharge.train.calibration.press_data import PressData, no_presses
 from isocharge.train.calibration.problem import CalibrationProblem, FilmEstimate
 from isocharge.train.calibration.quantities import Quantity, quantities, summarise
+from isocharge.train.calibration.side_forces import SideForces, solve_side_forces, with_friction
 from isocharge.train.films.films_model import AddedVariance
 from isocharge.train.training.fitted import Fitted
 
@@ -38,6 +39,8 @@ class CalibrationResult:
         posterior: Best parameters, covariance, residuals.
         cautions: Warnings for the user, a sentence each.
         moved: How an earlier calibration was moved to another temperature, without presses; empty with presses.
+        side_force_map: Effect of side forces on the charges of the film; None if neither the presses have friction nor
+            the contacts a declared side force.
     """
 
     problem: CalibrationProblem
@@ -45,6 +48,7 @@ class CalibrationResult:
     posterior: FilmPosterior
     cautions: tuple[str, ...] = ()
     moved: str = ""
+    side_force_map: SideForceMap | None = None
 
     @cached_property
     def film(self) -> tuple[Sensor, Circle]:
@@ -107,7 +111,38 @@ class CalibrationResult:
         def network_of(film: FilmPosterior) -> Fitted:
             return self._network_of(film.unknowns, film.joint)
 
-        return cross_validate(self.problem, self.presses, self.posterior, network_of, at_C)
+        data = PressData.of(self.presses, self.problem.noise, self.problem.charges.domain)
+        if self.side_force_map is not None and self.problem.friction > 0.0:
+            coefficient = self.posterior.nuisances[FRICTION.name].value
+            data = with_friction(data, self.problem.charges, self.side_force_map, self.posterior.contact, coefficient)
+        return cross_validate(self.problem, self.presses, data, self.posterior, network_of, at_C)
+
+    @cached_property
+    def side_forces(self) -> SideForces | None:
+        """Side forces that contacts may have; None if none are expected."""
+        if self.side_force_map is None:
+            return None
+        return SideForces(
+            self.side_force_map,
+            self.problem.domain,
+            self.posterior.nuisances[FRICTION.name],
+            self.problem.side_force,
+        )
+
+    def charge_factor(self, unknowns: Array, contact: Array) -> Array:
+        """Compute the factors by which imperfections, the discrepancy and friction change the charges of a film.
+
+        Args:
+            unknowns: Parameters and coefficients of a film near this one.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Shape (n, n_electrode), dimensionless. They contain half of the friction of the presses; see `SideForces`.
+        """
+        factor = self.problem.charges.factor(unknowns, contact)
+        if self.side_forces is None:
+            return factor
+        return factor * self.side_forces.charge_factor(contact)
 
     def fitted_film(self, parameters: Array, *, release: bool = False) -> Fitted:
         """Return the network of a film near this one, with the same coefficients and the same uncertainty.
@@ -125,9 +160,11 @@ class CalibrationResult:
         The variances are linearised at the calibrated film.
         """
         contact_covariance = self.sensitivity.contact_covariance(covariance)
+        if self.side_forces is not None:
+            contact_covariance = contact_covariance + self.side_forces.contact_covariance(self.sensitivity)
         added_variance = AddedVariance(self.sensitivity.contact, np.einsum("nii->ni", contact_covariance))
         parameters = unknowns[self.problem.charges.layout.parameters]
-        factor = partial(self.problem.charges.factor, unknowns)
+        factor = partial(self.charge_factor, unknowns)
         return self.problem.fitted(parameters, added_variance, factor, release=release)
 
     @property
@@ -169,6 +206,7 @@ class CalibrationResult:
             *film_quantities,
             *self._temperature_sentences(),
             *film_warming_sentences(self.posterior.nuisances),
+            *self._side_force_sentences(),
             rig_errors,
             *self._discrepancy_sentences(),
             *self.cautions,
@@ -199,6 +237,27 @@ class CalibrationResult:
         yield (
             f"The pretension changes by {warming.MPa_per_K:.3g} +- {warming.std:.2g} MPa per kelvin. The result holds "
             f"at {warming.at_C:.1f} C; --from with --temperature computes the film at another temperature."
+        )
+
+    def _side_force_sentences(self) -> Iterator[str]:
+        """Yield sentences on the friction of the presses and the side forces of contacts, if there are any."""
+        if self.side_forces is None:
+            return
+        error = ContactError.of(self.side_forces.contact_covariance(self.sensitivity))
+        if self.problem.friction > 0.0:
+            friction = self.side_forces.friction
+            yield (
+                f"The coefficient of friction of the tip is {friction.value:.2g} +- {friction.std:.2g}. The model "
+                "answers for half of this friction, because later contacts may have it or not."
+            )
+        if self.problem.side_force > 0.0:
+            yield (
+                f"The standard deviations of the model include a side force of {self.problem.side_force:g} times the "
+                "force in any direction."
+            )
+        yield (
+            f"These side forces cause errors of {error.position_mm:.2g} mm and {error.force_percent:.2g} % of the "
+            "force (root mean square)."
         )
 
     def _discrepancy_sentences(self) -> Iterator[str]:
@@ -254,4 +313,8 @@ def film_without_presses(problem: CalibrationProblem, film: FilmEstimate, moved:
         force_scatter=0.0,
         probabilities={Hypothesis(modes=float(has_coefficients)): 1.0},
     )
-    return CalibrationResult(problem, no_presses(problem.electrodes), posterior, moved=moved)
+    side_force_map = None
+    if problem.side_force > 0.0:
+        side_force_map = solve_side_forces(problem.charges, film.parameters)
+    no_press = no_presses(problem.electrodes)
+    return CalibrationResult(problem, no_press, posterior, moved=moved, side_force_map=side_force_map)
