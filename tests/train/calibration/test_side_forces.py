@@ -108,7 +108,9 @@ def test_negative_coefficient_of_friction_counts_as_none():
 
 
 def test_side_force_above_the_limit_is_refused():
-    with pytest.raises(SceneError, match="side force: expected a share of the force from 0 to 0.5, such as 0.1, got 2"):
+    with pytest.raises(
+        SceneError, match=r"side force: expected a share of the force from 0 to 0\.5, such as 0\.1, got 2"
+    ):
         SideForces(LinearSideForces(), DOMAIN, NuisanceEstimate(0.0, 0.0), share=2.0)
 
 
