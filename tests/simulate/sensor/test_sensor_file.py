@@ -192,6 +192,9 @@ def test_error_message_names_the_key_of_the_wrong_type(path):
         (("calibration", "gain"), {"Z": 1.0}, "calibration gain: no electrode named"),
         (("surface",), "inside", r"surface: expected one of middle, top, bottom, got 'inside'"),
         (("name",), "", "name: expected a text"),
+        (("roles",), {"A": "watcher"}, "roles.A: expected one of position, guard, got 'watcher'"),
+        (("roles",), {"Z": "guard"}, "roles.Z: expected the name of an electrode of the section `electrodes`, got 'Z'"),
+        (("roles",), {"side_mm": "guard"}, "roles.side_mm: expected the name of an electrode"),
         (
             ("electrodes", "A"),
             {"polygon_mm": [3]},
@@ -256,6 +259,17 @@ def test_written_sensor_file_reads_as_the_designed_sensor():
     ]
     assert sections[3].splitlines()[1:] == ["side_mm = 3.0", "A = [0.0, -10.0]", "B = [8.660254, 5.0]"]
     assert "gain = {A = 1.02}" in sections[4]
+
+
+def test_the_role_of_a_guard_electrode_is_read_and_written():
+    guarded = sensor_from_dict(whole() | {"roles": {"B": "guard"}})
+    assert guarded.guard_names == ("B",)
+    assert [electrode.role for electrode in guarded.electrodes] == ["position", "guard"]
+    assert '[roles]\nB = "guard"\n' in sensor_to_toml(guarded)
+    assert sensor_from_dict(sensor_to_dict(guarded)) == guarded
+    without_roles = sensor_from_dict(whole())
+    assert without_roles.guard_names == ()
+    assert "roles" not in sensor_to_dict(without_roles)
 
 
 @pytest.mark.parametrize("name", built_in_sensors())

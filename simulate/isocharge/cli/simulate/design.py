@@ -20,23 +20,37 @@ from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
 from isocharge.common.resumable_run import refuse_finished, resume_parts
 from isocharge.simulate import Circle, load_sensor, noise_model, parse_probe
-from isocharge.simulate.artwork.design_folder import write_design
+from isocharge.simulate.artwork.design_folder import write_design, write_guard_design
 from isocharge.simulate.artwork.leads import straight_leads
 from isocharge.simulate.execution.code_version import code_fingerprint
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Nuisances, WeightMap, read_goal
 from isocharge.simulate.layout.design import Design, design
+from isocharge.simulate.layout.guard import GuardDesign, design_guard
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 
 
 def design_command(
     sensor: SensorArgument,
     output: NewFolderOption,
-    electrodes: Annotated[
-        int, typer.Option("--electrodes", metavar="N", help="Number of electrodes, 3 to 8, including kept ones.")
-    ],
     radius: Annotated[
         float, typer.Option("--radius", metavar="MM", help="Largest distance of a press from the film's centre, mm.")
     ],
+    electrodes: Annotated[
+        int | None,
+        typer.Option(
+            "--electrodes",
+            metavar="N",
+            help="Number of electrodes, 3 to 8, including kept ones. Required, except with --guard.",
+        ),
+    ] = None,
+    guard: Annotated[
+        bool,
+        typer.Option(
+            "--guard",
+            help="Keep all electrodes of SENSOR, and add one square with which presses outside the radius can be "
+            "noticed. (default: search all positions)",
+        ),
+    ] = False,
     goal: Annotated[
         str,
         typer.Option(
@@ -77,14 +91,26 @@ def design_command(
     The errors are Cramer-Rao limits in mm, with probe radius, pretension and gains as nuisance parameters. If the
     search is interrupted, the same command resumes it.
 
+    With --guard, the position of one further square is searched, and the errors in the folder are those of the noise
+    alone. The folder then also contains pictures of the mirror region without and with this square.
+
     Example: isocharge simulate design four-25um-biaxial --electrodes 4 --radius 15 -o over-15mm
+
+    Example: isocharge simulate design four-25um-biaxial --guard --radius 8 -o guarded
     """
     refuse_finished(output)
     footprint = parse_probe(probe)
     if not isinstance(footprint, Circle):
         raise InputError(f"--probe: expected circle:RADIUS, for which layouts are designed, got {probe}")
+    described_sensor = load_sensor(sensor)
+    if guard:
+        refuse_search_options(electrodes=electrodes, keep=keep, goal=goal, known=known)
+        electrodes = len(described_sensor.electrodes) + 1
+        keep = ",".join(described_sensor.electrode_names)
+    if electrodes is None:
+        raise InputError("--electrodes: expected the number of electrodes, got none; give it, or --guard")
     case = DesignCase(
-        load_sensor(sensor),
+        described_sensor,
         electrodes,
         radius,
         goal=read_goal(goal),
@@ -103,17 +129,64 @@ def design_command(
         "sensor": sensor_to_dict(case.sensor),
         "case": case.to_dict(),
         "weights": case.goal.table.tolist() if isinstance(case.goal, WeightMap) else None,
+        "guard": guard,
     }
     with (
         shown_run(output),
         resume_parts(output, identity, fresh=fresh) as run,
         executor_for(workers, None) as pool,
     ):
-        result = design(case, executor=run.storing_executor("design", pool))
-        write_design(result, output)
+        executor = run.storing_executor("design", pool)
+        if guard:
+            guard_design = design_guard(case, executor=executor)
+            write_guard_design(guard_design, output)
+        else:
+            result = design(case, executor=executor)
+            write_design(result, output)
+    if guard:
+        show(_guard_table(guard_design))
+        say(f"{guard_design.summary}; {straight_leads(guard_design.sensor).summary}; files in {output}")
+        return
     show(_table(result))
     caution = "" if result.unambiguous else "caution: "
     say(f"{caution}{result.summary}; {straight_leads(result.sensor).summary}; files in {output}")
+
+
+def refuse_search_options(*, electrodes: int | None, keep: str | None, goal: str, known: bool) -> None:
+    """Refuse options that have no meaning with `--guard`, which keeps all electrodes and minimises another quantity.
+
+    Args:
+        electrodes: Value of `--electrodes`; None if it was not given.
+        keep: Value of `--keep`; None if it was not given.
+        goal: Value of `--goal`; "worst" if it was not given.
+        known: Whether `--known` was given.
+
+    Raises:
+        InputError: If one of the options was given.
+    """
+    given = {"--electrodes": electrodes is not None, "--keep": keep is not None, "--goal": goal != "worst"}
+    names = [name for name, is_given in {**given, "--known": known}.items() if is_given]
+    if names:
+        raise InputError(
+            f"--guard: keeps all electrodes of the sensor and adds one, got {', '.join(names)} as well; leave "
+            f"{'it' if len(names) == 1 else 'them'} out"
+        )
+
+
+def _guard_table(found: GuardDesign) -> str:
+    """Return the position of the guard electrode, and what is computed without and with it, as a table."""
+    x, y = found.guard.centre
+    lines = [
+        f"{found.guard.name:<10} {x:9.3f} {y:9.3f} mm",
+        "                 not noticed   position error limit, mm: worst      rms",
+    ]
+    for title, region, limits in (
+        ("without guard", found.region_before, found.limits_before),
+        ("with guard", found.region_after, found.limits_after),
+    ):
+        share = f"{100.0 * region.total_share:.1f} %"
+        lines.append(f"{title:<15} {share:>12} {limits.worst:31.3f} {limits.rms:8.3f}")
+    return "\n".join(lines)
 
 
 def _table(result: Design) -> str:

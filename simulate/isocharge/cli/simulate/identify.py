@@ -77,7 +77,7 @@ def identify_command(
         with new_folder(output) as folder:
             (folder / PICTURE).write_bytes(picture_bytes(identification_picture(identification)))
             if identification.mirror is not None:
-                picture = mirror_picture(identification, identification.mirror)
+                picture = mirror_picture(described_sensor, identification.mirror)
                 (folder / MIRROR_PICTURE).write_bytes(picture_bytes(picture))
             (folder / RESULTS).write_bytes(json_module.dumps(results, indent=1).encode())
     if json:

@@ -140,10 +140,10 @@ def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
     """
     nearest_contact, residual = search(inside, charge, noise.sigma(charge), candidates=N_CANDIDATES)
     is_same_charge = np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS
-    return np.asarray(is_same_charge & _is_interior(inside.domain, nearest_contact))
+    return np.asarray(is_same_charge & is_interior(inside.domain, nearest_contact))
 
 
-def _is_interior(domain: Domain, contact: Array) -> Booleans:
+def is_interior(domain: Domain, contact: Array) -> Booleans:
     """Return which contacts, shape (n, 3), lie inside a domain and not on its edge, shape (n,)."""
     unit_x, unit_y, unit_log_force = domain.to_unit(contact).T
     is_position_inside = np.hypot(unit_x, unit_y) < INTERIOR

@@ -5,17 +5,17 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from isocharge.simulate.identifiability.identification import Identification
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_circle, draw_electrodes
+from isocharge.simulate.sensor.sensor import Sensor
 
 
-def mirror_picture(identification: Identification, mirror: MirrorRegion) -> Figure:
+def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
     """Draw the mirror region on the film, and its share as a function of the distance from the centre.
 
     Args:
-        identification: The identification of the sensor.
+        sensor: The sensor.
         mirror: Mirror region of the sensor.
 
     Returns:
@@ -23,25 +23,25 @@ def mirror_picture(identification: Identification, mirror: MirrorRegion) -> Figu
     """
     figure = new_figure(13.0, 5.8)
     film_axes, distance_axes = figure.subplots(1, 2)
-    shades = _draw_region(film_axes, identification, mirror)
+    shades = _draw_region(film_axes, sensor, mirror)
     figure.colorbar(shades, ax=film_axes, label="share of the forces that cannot be noticed", shrink=0.85)
     _draw_distance(distance_axes, mirror)
     min_force = mirror.forces[0]
     max_force = mirror.forces[-1]
     figure.suptitle(
-        f"{identification.sensor.name}: presses of {min_force:.2g} to {max_force:.2g} N with the charges of a press in "
+        f"{sensor.name}: presses of {min_force:.2g} to {max_force:.2g} N with the charges of a press in "
         "the working area",
         fontsize=13,
     )
     return figure
 
 
-def _draw_region(axes: Any, identification: Identification, mirror: MirrorRegion) -> Any:
+def _draw_region(axes: Any, sensor: Sensor, mirror: MirrorRegion) -> Any:
     """Draw the shares as colours, with the clamp, the working area and the electrodes to scale.
 
     Args:
         axes: Axes of matplotlib.
-        identification: The identification, which contains the sensor.
+        sensor: The sensor.
         mirror: Mirror region of the sensor.
 
     Returns:
@@ -54,10 +54,10 @@ def _draw_region(axes: Any, identification: Identification, mirror: MirrorRegion
     corner_x = np.outer(edge_radius, np.cos(edge_angle))
     corner_y = np.outer(edge_radius, np.sin(edge_angle))
     shades = axes.pcolormesh(corner_x, corner_y, mirror.share, vmin=0.0, vmax=1.0, cmap="Reds")
-    film_radius = identification.sensor.film.radius
+    film_radius = sensor.film.radius
     draw_circle(axes, film_radius, color=INK, lw=2.0)
     draw_circle(axes, mirror.inner, color=INK, ls="--", lw=1.6)
-    draw_electrodes(axes, identification.sensor)
+    draw_electrodes(axes, sensor)
     axis_limits = (-1.03 * film_radius, 1.03 * film_radius)
     title = f"dashed: working area, {mirror.inner:.3g} mm; solid: clamp, {film_radius:g} mm"
     axes.set(xlim=axis_limits, ylim=axis_limits, aspect="equal", xlabel="x, mm", ylabel="y, mm", title=title)

@@ -23,6 +23,10 @@ from isocharge.simulate.sensor.size_check import check_length
 Readout = Literal["area", "edge"]
 """Mean of the stress over the area of an electrode, or over its edges (Mirbagheri et al. 2007, eq. 2 and 3)."""
 
+Role = Literal["position", "guard"]
+"""Purpose of an electrode: to determine the contact, or to distinguish presses outside the working area from presses
+inside it. Models use the charges of both in the same way."""
+
 MAX_CORNERS = 256
 """Largest number of corners of a polygon."""
 
@@ -68,6 +72,7 @@ class Electrode:
         square: Whether `of_square` created the electrode. The edge readout accepts squares only.
         more: Further metal on the front, such as traces. Overlapping areas count once.
         back: Metal on the back. If empty, the back is completely covered with metal.
+        role: Purpose of the electrode.
     """
 
     name: str
@@ -75,6 +80,7 @@ class Electrode:
     square: bool = False
     more: tuple[Corners, ...] = ()
     back: tuple[Corners, ...] = ()
+    role: Role = "position"
 
     def __post_init__(self) -> None:
         for polygons in ("corners", "more", "back"):
@@ -304,6 +310,11 @@ class Sensor:
     def electrode_names(self) -> tuple[str, ...]:
         """Names of the electrodes, in the order of the charges."""
         return tuple(electrode.name for electrode in self.electrodes)
+
+    @property
+    def guard_names(self) -> tuple[str, ...]:
+        """Names of the electrodes with the role "guard"."""
+        return tuple(electrode.name for electrode in self.electrodes if electrode.role == "guard")
 
     @cached_property
     def coated_film(self) -> Film:

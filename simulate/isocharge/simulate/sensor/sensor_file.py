@@ -5,6 +5,7 @@ Unknown and missing keys are errors.
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,7 +28,7 @@ from isocharge.common.structs import (
 )
 from isocharge.common.toml_text import to_toml
 from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, Film, Piezo, Surface
-from isocharge.simulate.sensor.sensor import Calibration, Corners, Electrode, Readout, Sensor
+from isocharge.simulate.sensor.sensor import Calibration, Corners, Electrode, Readout, Role, Sensor
 from isocharge.simulate.sensor.size_check import tidy
 
 MAX_COORDINATE_mm = 1e6
@@ -117,9 +118,12 @@ class SensorTable(Settings, frozen=True):
     readout: Readout = "area"
     surface: Surface = "middle"
     calibration: CalibrationTable = CalibrationTable()
+    roles: dict[str, Role] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the section `electrodes`. Its keys are not declared, because they are the names of the electrodes.
+        """Check the section `electrodes` and the names of the section `roles`.
+
+        The keys of `electrodes` are not declared, because they are the names of the electrodes.
 
         Raises:
             WrongKey: If a value has the wrong type, or a key is missing.
@@ -138,6 +142,9 @@ class SensorTable(Settings, frozen=True):
             raise WrongKey(f"electrodes.{SIDE}", f"a number above 0 and at most {MAX_COORDINATE_mm:g}", side)
         if side is None and any(isinstance(value, tuple) for value in self.electrodes.values()):
             raise WrongKey(f"electrodes.{SIDE}")
+        for name in self.roles:
+            if name in (SIDE, COATING) or name not in self.electrodes:
+                raise WrongKey(f"roles.{name}", "the name of an electrode of the section `electrodes`", name)
 
 
 def built_in_sensors() -> tuple[str, ...]:
@@ -191,7 +198,7 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
             name=file.name,
             film=_film(file.film),
             piezo=Piezo(piezo.d31, piezo.d32, piezo.d33, piezo.pyro_uC_per_m2_K, piezo.d12),
-            electrodes=tuple(_electrodes(file.electrodes)),
+            electrodes=tuple(_electrodes(file.electrodes, file.roles)),
             coating=coating if isinstance(coating, float) else 0.0,
             readout=file.readout,
             surface=file.surface,
@@ -230,6 +237,7 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
             **({"d12": tidy(piezo.d12)} if piezo.d12 else {}),
         },
         "electrodes": _electrode_tables(sensor),
+        **({"roles": dict.fromkeys(sensor.guard_names, "guard")} if sensor.guard_names else {}),
         "calibration": {
             "gain": dict(calibration.gain),
             "shift_mm": [tidy(value) for value in calibration.shift],
@@ -405,17 +413,22 @@ def _expansion(table: FilmTable) -> tuple[float, float] | None:
     return coefficients / PPM, coefficients / PPM
 
 
-def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:
+def _electrodes(table: Mapping[str, float | Point | PolygonTable], roles: Mapping[str, Role]) -> Iterator[Electrode]:
     """Yield the electrodes of the section `electrodes`.
 
     A value of the section is a table of polygons, the centre of a square, or a number that applies to all electrodes.
+
+    Args:
+        table: The section `electrodes`.
+        roles: The section `roles`. An electrode that it does not contain determines the position.
     """
     side = table.get(SIDE)
     for name, value in table.items():
+        role = roles.get(name, "position")
         if isinstance(value, PolygonTable):
-            electrode = Electrode(name, value.polygon_mm, more=value.more_mm, back=value.back_mm)
+            electrode = Electrode(name, value.polygon_mm, more=value.more_mm, back=value.back_mm, role=role)
             if value.trace_mm:
                 electrode = electrode.with_trace(value.trace_mm, value.width_mm)
             yield electrode
         elif isinstance(value, tuple) and isinstance(side, float):
-            yield Electrode.of_square(name, value, side)
+            yield replace(Electrode.of_square(name, value, side), role=role)

@@ -1,0 +1,293 @@
+"""Position of a guard electrode: one further square with which presses outside the working area can be noticed.
+
+Electrodes on one circle give a press outside the circle nearly the charges of a press inside it (`mirror_region`). A
+further electrode at another distance from the centre has different charges under both presses. The search first finds
+the presses outside the working area that cannot be noticed, with the contacts inside it that have the same charges. For
+each position of the further square it then counts those for which a descent from this contact still finds a contact
+with the same charges. The mirror region of the best positions is computed by a search over the whole working area.
+"""
+
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE
+from isocharge.common.errors import InputError
+from isocharge.common.progress import track
+from isocharge.simulate.forward.charge_map import ChargeMap, Domain
+from isocharge.simulate.forward.charge_spline import ChargeSpline
+from isocharge.simulate.forward.forward_map import ForwardMap
+from isocharge.simulate.forward.whole_film import whole_film_map
+from isocharge.simulate.identifiability.cramer_rao import limits_at
+from isocharge.simulate.identifiability.mirror_region import DETECTABLE_SIGMAS, FORCE_RATIO, MirrorRegion, is_interior
+from isocharge.simulate.identifiability.nearest_contact import explain, search
+from isocharge.simulate.layout.case import NAMES, DesignCase
+from isocharge.simulate.layout.design import DECIMALS
+from isocharge.simulate.numerics.disk import Rings, square_grid, sunflower
+from isocharge.simulate.sensor.sensor import Electrode, Sensor
+
+GRID_STEPS = 6
+"""Number of steps of the grid of candidate positions from the centre to the rim."""
+
+N_OUTSIDE = 200
+"""Number of presses outside the working area with which candidate positions are compared."""
+
+N_FORCES = 3
+"""Number of different forces of these presses."""
+
+SHARE_TOLERANCE = 0.01
+"""Share of unnoticeable presses by which a position may exceed the smallest share and still be chosen for its smaller
+position errors, dimensionless."""
+
+MAX_CHECKED = 3
+"""Largest number of positions whose mirror region is computed."""
+
+LIMIT_RINGS = 20
+LIMIT_ANGLES = 36
+"""Numbers of rings and angles of the presses whose position errors are compared."""
+
+
+@dataclass(frozen=True)
+class PositionLimits:
+    """Cramer-Rao limits of the position over the working area for presses with the force of the case.
+
+    Attributes:
+        rms: Root mean square over the working area, mm.
+        worst: Largest limit, mm.
+    """
+
+    rms: float
+    worst: float
+
+    @classmethod
+    def of(cls, charges: ChargeMap, case: DesignCase) -> "PositionLimits":
+        """Compute the limits of a sensor.
+
+        Args:
+            charges: Charge map of the working area.
+            case: Radius of the working area, force and noise.
+        """
+        rings = Rings.spread(case.radius, LIMIT_RINGS, LIMIT_ANGLES)
+        limits = limits_at(charges, rings.contacts(case.force), case.noise).position
+        mean_square = np.average((rings.per_ring(limits) ** 2).mean(axis=1), weights=rings.distance)
+        return cls(float(np.sqrt(mean_square)), float(limits.max()))
+
+    def to_dict(self) -> dict[str, float]:
+        """Return the limits for JSON."""
+        return {"rms_mm": self.rms, "worst_mm": self.worst}
+
+
+@dataclass(frozen=True)
+class GuardDesign:
+    """Result of the search for a guard electrode.
+
+    Attributes:
+        case: Requirements. The electrodes of its sensor are kept, and one is added.
+        sensor: Sensor with the guard electrode.
+        region_before: Mirror region of the sensor without the guard electrode.
+        region_after: Mirror region of the sensor with it.
+        limits_before: Position limits of the sensor without the guard electrode.
+        limits_after: Position limits of the sensor with it.
+    """
+
+    case: DesignCase
+    sensor: Sensor
+    region_before: MirrorRegion
+    region_after: MirrorRegion
+    limits_before: PositionLimits
+    limits_after: PositionLimits
+
+    @property
+    def guard(self) -> Electrode:
+        """The guard electrode."""
+        (name,) = set(self.sensor.electrode_names) - set(self.case.keep)
+        return next(electrode for electrode in self.sensor.electrodes if electrode.name == name)
+
+    @property
+    def summary(self) -> str:
+        """Sentence about the share of presses that cannot be noticed, without and with the guard electrode."""
+        return (
+            f"presses outside the working area that cannot be noticed: {100.0 * self.region_before.total_share:.2g} % "
+            f"without electrode {self.guard.name}, {100.0 * self.region_after.total_share:.2g} % with it"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the case, the guard electrode, and the results without and with it, for JSON."""
+        return {
+            "case": self.case.to_dict(),
+            "sensor": self.sensor.name,
+            "guard": {"name": self.guard.name, "centre_mm": np.round(self.guard.centre, DECIMALS).tolist()},
+            "before": {"mirror_region": self.region_before.to_dict(), "position_limit": self.limits_before.to_dict()},
+            "after": {"mirror_region": self.region_after.to_dict(), "position_limit": self.limits_after.to_dict()},
+        }
+
+
+def guard_case(sensor: Sensor, radius: float, **settings: Any) -> DesignCase:
+    """Return the design case in which all electrodes of a sensor are kept and one square is added.
+
+    Args:
+        sensor: The sensor.
+        radius: Radius of the working area, mm.
+        settings: Further attributes of `DesignCase`.
+
+    Raises:
+        InputError: If a further electrode is not possible, or a setting is not allowed.
+        SceneError: If the film cannot be pressed as required.
+    """
+    return DesignCase(sensor, len(sensor.electrodes) + 1, radius, keep=sensor.electrode_names, **settings)
+
+
+def design_guard(case: DesignCase, *, executor: Executor | None = None) -> GuardDesign:
+    """Find the position of one further square with which the fewest presses outside the working area go unnoticed.
+
+    Among the positions with nearly the smallest share of such presses, the one with the smallest position limits in the
+    working area is chosen.
+
+    Args:
+        case: Case of `guard_case`.
+        executor: Executor that runs the solves; this process if absent.
+
+    Returns:
+        The sensor with the guard electrode, and what it improves.
+
+    Raises:
+        InputError: If no position is free.
+        SceneError: If the working area reaches the clamp.
+        SolveError: If an equilibrium is not reached.
+    """
+    sensors = [_with_guard(case, position) for position in _free_positions(case)]
+    inner_map = ForwardMap.build(case.sensor, case.probe, case.radius, DEFAULT_FORCE_RANGE, executor=executor)
+    outer_map = whole_film_map(case.sensor, case.probe, DEFAULT_FORCE_RANGE, executor=executor)
+    shares = _estimated_shares(case, inner_map, outer_map, sensors)
+
+    best = np.flatnonzero(shares <= shares.min() + SHARE_TOLERANCE)
+    limits = [PositionLimits.of(replace(inner_map, sensor=sensors[number]), case) for number in best]
+    order = np.argsort([limit.rms for limit in limits], kind="stable")[:MAX_CHECKED]
+    results: list[tuple[MirrorRegion, Sensor]] = []
+    for number in track(best[order].tolist(), "computing mirror regions"):
+        region = _mirror_region(case, inner_map, outer_map, sensors[number])
+        results.append((region, sensors[number]))
+        if region.total_share <= shares.min() + SHARE_TOLERANCE:
+            break
+    region_after, sensor = min(results, key=lambda result: result[0].total_share)
+    return GuardDesign(
+        case,
+        sensor,
+        region_before=_mirror_region(case, inner_map, outer_map, case.sensor),
+        region_after=region_after,
+        limits_before=PositionLimits.of(inner_map, case),
+        limits_after=PositionLimits.of(replace(inner_map, sensor=sensor), case),
+    )
+
+
+def _free_positions(case: DesignCase) -> Array:
+    """Return the positions of a square grid where a further square fits, shape (n, 2), mm.
+
+    Raises:
+        InputError: If there are none.
+    """
+    film_radius = case.sensor.film.radius
+    grid = square_grid(film_radius, film_radius / GRID_STEPS)
+    free = grid[case.clearance(grid) >= 0.0]
+    if not len(free):
+        raise InputError(f"side: no square of {case.square_side:g} mm fits between the electrodes; give a smaller side")
+    return np.asarray(free.round(DECIMALS))
+
+
+def _with_guard(case: DesignCase, position: Array) -> Sensor:
+    """Return the sensor of a case with a guard electrode at a position, shape (2,), mm."""
+    x, y = position.tolist()
+    name = next(name for name in NAMES if name not in case.sensor.electrode_names)
+    guard = replace(Electrode.of_square(name, (x, y), case.square_side), role="guard")
+    return replace(
+        case.sensor,
+        name=f"{case.sensor.name}-guard",
+        electrodes=(*case.sensor.electrodes, guard),
+    )
+
+
+def _mirror_region(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMap, sensor: Sensor) -> MirrorRegion:
+    """Compute the mirror region of a sensor whose film is that of both maps."""
+    charges = ChargeSpline.of(replace(inner_map, sensor=sensor))
+    return MirrorRegion.of(charges, case.radius, replace(outer_map, sensor=sensor), case.noise)
+
+
+def _estimated_shares(case: DesignCase, inner_map: ForwardMap, outer_map: ForwardMap, sensors: list[Sensor]) -> Array:
+    """Estimate the share of presses outside the working area that cannot be noticed, for several guard electrodes.
+
+    Args:
+        case: Radius of the working area and noise.
+        inner_map: Accurate forward map of the working area.
+        outer_map: Coarse forward map of the whole film.
+        sensors: Sensors whose last electrode is the guard electrode.
+
+    Returns:
+        Shape (n_sensor,), dimensionless.
+    """
+    presses = _presses_outside(case, outer_map)
+    charge = outer_map.charges(presses)
+    inner_charges = ChargeSpline.of(inner_map)
+    contact, residual = search(inner_charges, charge, case.noise.sigma(charge))
+    is_mirrored = (np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS) & is_interior(inner_charges.domain, contact)
+    if not is_mirrored.any():
+        return np.zeros(len(sensors))
+
+    mirrored_presses = presses[is_mirrored]
+    shares = []
+    for sensor in track(sensors, "comparing positions"):
+        guard_only = replace(case.sensor, electrodes=sensor.electrodes[-1:])
+        guard_charge = replace(outer_map, sensor=guard_only).charges(mirrored_presses)
+        charge_with_guard = np.concatenate([charge[is_mirrored], guard_charge], axis=1)
+        map_with_guard = JoinedMap(inner_charges, replace(inner_map, sensor=guard_only))
+        sigma = case.noise.sigma(charge_with_guard)
+        _, new_residual = explain(map_with_guard, charge_with_guard, sigma, contact[is_mirrored])
+        is_unnoticed = np.linalg.norm(new_residual, axis=1) < DETECTABLE_SIGMAS
+        shares.append(np.count_nonzero(is_unnoticed) / len(presses))
+    return np.array(shares)
+
+
+@dataclass(frozen=True)
+class JoinedMap:
+    """Charge map of the electrodes of two charge maps with the same domain.
+
+    Attributes:
+        first: Map of the first electrodes.
+        second: Map of the other electrodes.
+    """
+
+    first: ChargeMap
+    second: ChargeMap
+
+    @property
+    def domain(self) -> Domain:
+        """Contacts for which the map holds."""
+        return self.first.domain
+
+    @property
+    def electrodes(self) -> tuple[str, ...]:
+        """Names of the electrodes, in the order of the charges."""
+        return (*self.first.electrodes, *self.second.electrodes)
+
+    def charges(self, contact: Array) -> Array:
+        """Return the charges of contacts; see `ChargeMap`."""
+        return np.concatenate([self.first.charges(contact), self.second.charges(contact)], axis=1)
+
+    def derivatives(self, contact: Array) -> Array:
+        """Return the derivatives of the charges; see `ChargeMap`."""
+        return np.concatenate([self.first.derivatives(contact), self.second.derivatives(contact)], axis=1)
+
+
+def _presses_outside(case: DesignCase, outer_map: ForwardMap) -> Array:
+    """Return presses spread over the film outside the working area, shape (n, 3), mm and N.
+
+    Their forces repeat over those of the mirror region.
+    """
+    low, high = outer_map.domain.force_range
+    forces = np.geomspace(max(low, high / FORCE_RATIO), high, N_FORCES)
+    outer_radius = outer_map.domain.radius
+    pattern = sunflower(round(N_OUTSIDE / (1.0 - (case.radius / outer_radius) ** 2))) * outer_radius
+    position = pattern[np.abs(pattern) > case.radius]
+    return np.stack([position.real, position.imag, np.resize(forces, position.size)], axis=1)
