@@ -44,7 +44,7 @@ MIN_FACTOR = 0.05
 
 @dataclass(frozen=True)
 class FilmCharges:
-    """Forward maps of all films of a prior.
+    """Charges of all films of a prior, including the effects of imperfections, traces and discrepancy.
 
     Attributes:
         prior: Distribution of the films, which declares the parameters.
@@ -56,7 +56,7 @@ class FilmCharges:
 
     @cached_property
     def maps(self) -> FilmMaps:
-        """Forward maps of the films without modes, traces and discrepancy."""
+        """Forward maps of the films without imperfections, traces and discrepancy."""
         return FilmMaps(self.prior, self.family)
 
     @property
