@@ -15,19 +15,24 @@ HELD_S = T_S - 5.0
 
 
 def board(law, drift=0.0, until_s=18.0, scale=1.0):
-    """Values of three channels, one of them inverted: offsets, noise of 1, a press from 5 s on that fades by a law.
+    """Return the values of three channels, one of them inverted, with an offset, noise and a press after 5 s.
 
-    What changes linearly answers to a release as to the opposite press.
+    Args:
+        law: Function that returns the relative charge of the press at some times since its beginning, s.
+        drift: Slope of the channels, in 1/s.
+        until_s: End of the press, s. The system is linear, so a release has the effect of an opposite press.
+        scale: Factor of all values. Before it, the noise has the standard deviation 1.
     """
-    press = sum(
-        sign * np.where(since_s > 0.0, law(np.maximum(since_s, 0.005)), 0.0)
-        for sign, since_s in ((1.0, HELD_S), (-1.0, T_S - max(until_s, 5.0)))
-    )
-    charge = np.outer(press, (500.0, -400.0, 600.0)) + np.outer(drift * T_S, (1.0, -1.0, 1.0))
-    return scale * (charge + 300.0 + np.random.default_rng(0).normal(0.0, 1.0, charge.shape))
+    release_s = max(until_s, 5.0)
+    since_release_s = T_S - release_s
+    press = np.where(HELD_S > 0.0, law(np.maximum(HELD_S, 0.005)), 0.0)
+    release = np.where(since_release_s > 0.0, law(np.maximum(since_release_s, 0.005)), 0.0)
+    charge = np.outer(press - release, (500.0, -400.0, 600.0)) + np.outer(drift * T_S, (1.0, -1.0, 1.0))
+    noise = np.random.default_rng(0).normal(0.0, 1.0, charge.shape)
+    return scale * (charge + 300.0 + noise)
 
 
-def still(t):
+def constant(t):
     return np.ones_like(t)
 
 
@@ -35,7 +40,7 @@ def still(t):
 @pytest.mark.parametrize(
     ("law", "drift", "sections", "message"),
     [
-        (still, 0.0, {}, "keeps its charge for 13 s"),
+        (constant, 0.0, {}, "keeps its charge for 13 s"),
         (lambda t: np.exp(-t / 10.0), 0.0, {"leak": {"tau_s": 10.0}}, r"leaks: \[leak\] tau_s"),
         (lambda t: np.exp(-t / 40.0), 0.0, {"leak": {"tau_s": 40.0}}, r"leaks: \[leak\] tau_s"),
         (
@@ -51,7 +56,7 @@ def still(t):
             r"creeps by .* wait longer .* \[memory\] creep = .*, thermoelastic = ",
         ),
         (
-            still,
+            constant,
             -8.0,
             {"leak": {"tau_s": LEARNING_TAU_s}},
             r"the rest drifts, by -1.6 % .*keeps its charge .*\[leak\] tau_s = 100000",
@@ -68,16 +73,16 @@ def test_held_press_finds_leak_creep_or_drift(law, drift, sections, message, sca
 
 @pytest.mark.parametrize("until_s", [0.0, 7.0])
 def test_no_press_or_a_short_press_has_no_result(until_s):
-    assert find_held_press(board(still, until_s=until_s), T_S) is None
-    assert find_held_press(board(still)[:300], T_S[:300]) is None
+    assert find_held_press(board(constant, until_s=until_s), T_S) is None
+    assert find_held_press(board(constant)[:300], T_S[:300]) is None
 
 
 def test_proposed_file_has_the_leak_and_the_offset_before_the_press():
     values = board(lambda t: np.exp(-t / 10.0)) - 300.0
-    chunks = [
-        Chunk(encode_frame(Frame(k % 65536, 5000 * k, tuple(row.tolist()))), 1e9 + t, 0)
-        for k, (t, row) in enumerate(zip(T_S, values, strict=True))
-    ]
+    chunks = []
+    for number, (time_s, row) in enumerate(zip(T_S, values, strict=True)):
+        frame = Frame(number % 65536, 5000 * number, tuple(row.tolist()))
+        chunks.append(Chunk(encode_frame(frame), 1e9 + time_s, 0))
     report = examine_received(ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=20.0))
     assert device_from_table(report.device, "board").leak.tau_s == pytest.approx(10.0, rel=0.05)
     assert max(abs(channel.offset_pC) for channel in report.channels) < 1.0

@@ -1,4 +1,4 @@
-"""Touches while doctor measures the rest: presses are noticed, noise, drift and warming are not taken for presses."""
+"""Search for a touch at rest. Presses are found. Noise, drift and warming are not taken for presses."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,18 @@ PRESS_PC = np.array([150.0, 90.0, 110.0])
 
 
 def measured(level, seed, press, seconds=5.0, rate_Hz=200.0):
-    """Output of a simulated amplifier, shape (n, 3), pC, and the times, s; `press(t)` is the share of a press."""
+    """Simulate the output of an amplifier during a press.
+
+    Args:
+        level: Name of the amplifier.
+        seed: Seed of the noise.
+        press: Function that returns the force at some times, s, relative to the force of `PRESS_PC`.
+        seconds: Length, s.
+        rate_Hz: Number of frames per second, Hz.
+
+    Returns:
+        The output, shape (n, 3), pC, and the times, s.
+    """
     times_s = np.arange(round(seconds * rate_Hz)) / rate_Hz
     charges = np.multiply.outer(press(times_s), PRESS_PC)
     measure = load_amplifier(level).start(3, rate_Hz, np.random.default_rng(seed))
@@ -59,7 +70,7 @@ def test_press_of_0_05_N_is_found(level, press):
 
 
 def test_press_that_is_held_all_the_time_is_not_found():
-    """The limit of the search: constant charges may be the rest of an amplifier."""
+    """Constant charges may also be the rest level of an amplifier."""
     charges, times_s = measured("reference", 0, np.ones_like)
     assert find_touch(charges, times_s, unit_is_pC=True) is None
 

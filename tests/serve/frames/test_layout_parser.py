@@ -1,8 +1,6 @@
-"""Described frames: the documented layouts of three sensors that are sold, their bytes packed by hand, and damage.
+"""Frames whose layout a device file describes: parsing, encoding, damaged frames, and wrong descriptions.
 
-The layouts, as their makers document them, are in tests/data/frames.
-
-Descriptions of frames: what is read, what is refused, and the bytes of a frame.
+The folder tests/data/frames contains the layouts of three sensors, as their makers document them.
 """
 
 import binascii
@@ -25,7 +23,7 @@ FOLDER = Path(__file__).parents[2] / "data" / "frames"
 
 
 def layout(keys):
-    """Of the keys of `[frames]` in a device file, a table or a text."""
+    """Return the layout with the given keys of the section `[frames]`, which are a table or TOML text."""
     table = tomllib.loads(keys) if isinstance(keys, str) else keys
     return device_from_table({"frames": {"format": "described"} | table}, "device.toml").frames
 
@@ -34,7 +32,7 @@ LAYOUTS = {path.stem: layout(path.read_text("utf-8")) for path in FOLDER.glob("*
 
 
 def modbus_crc(data):
-    """Bit by bit, as the Modbus over serial line specification (V1.02, 6.2.2) puts it in words."""
+    """Compute the CRC bit by bit, as described in the Modbus over serial line specification (V1.02, 6.2.2)."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte
@@ -47,32 +45,41 @@ def test_frames_of_a_robotiq_sensor():
     data = bytes.fromhex("20 4E") + struct.pack("<6h", 1234, -567, 89, 1000, -2000, 3)
     (frame,) = SyncParser(LAYOUTS["robotiq_ft300"]).feed(data + modbus_crc(data))
     assert frame.values == pytest.approx((12.34, -5.67, 0.89, 1.0, -2.0, 0.003))
-    assert (frame.names, frame.seq, frame.t_us) == (("Fx", "Fy", "Fz", "Mx", "My", "Mz"), None, None)
+    assert frame.names == ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+    assert frame.seq is None
+    assert frame.t_us is None
 
 
 def test_frames_of_an_optoforce_sensor():
     data = bytes((170, 7, 8, 10)) + struct.pack(">HHhhh", 65535, 0, 100, -200, 16037)
     (frame,) = SyncParser(LAYOUTS["optoforce_omd"]).feed(data + struct.pack(">H", sum(data) & 0xFFFF))
-    assert (frame.seq, frame.values) == (65535, (100.0, -200.0, 16037.0))
+    assert frame.seq == 65535
+    assert frame.values == (100.0, -200.0, 16037.0)
 
 
 def test_frames_of_a_bota_force_sensor():
     body = struct.pack("<H6fIf", 0, 1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 123456, 23.5)
-    reflected = int(f"{binary_crc_of_reflected(body):016b}"[::-1], 2) ^ 0xFFFF
-    (frame,) = SyncParser(LAYOUTS["bota_sensone"]).feed(b"\xaa" + body + struct.pack("<H", reflected))
-    assert (frame.t_us, frame.values) == (123456, (1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 23.5))
+    data = b"\xaa" + body + struct.pack("<H", x_25(body))
+    (frame,) = SyncParser(LAYOUTS["bota_sensone"]).feed(data)
+    assert frame.t_us == 123456
+    assert frame.values == (1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 23.5)
 
 
-def binary_crc_of_reflected(data):
-    """X-25 is CCITT-FALSE of the bit-reversed bytes, reversed and inverted: from the standard library's crc_hqx."""
-    return binascii.crc_hqx(bytes(int(f"{byte:08b}"[::-1], 2) for byte in data), 0xFFFF)
+def x_25(data):
+    """Compute CRC-16/X-25 by the standard library.
+
+    The checksum is the CRC-16/CCITT-FALSE of the bytes in reversed bit order, in reversed bit order and inverted.
+    """
+    reversed_bytes = bytes(int(f"{byte:08b}"[::-1], 2) for byte in data)
+    crc = binascii.crc_hqx(reversed_bytes, 0xFFFF)
+    return int(f"{crc:016b}"[::-1], 2) ^ 0xFFFF
 
 
 COUNTS = st.lists(st.integers(-32768, 32767), min_size=7, max_size=7)
 
 
 def encoded(name, counts):
-    """The bytes of a frame whose channels have these counts."""
+    """Return the bytes of a frame whose channels have these values before the scaling."""
     layout = LAYOUTS[name]
     values = [count * field.scale for count, field in zip(counts, layout.channels, strict=False)]
     return layout.encode(Frame(abs(counts[0]), abs(counts[1]), tuple(values)))
@@ -82,10 +89,12 @@ def encoded(name, counts):
 @given(st.sampled_from(sorted(LAYOUTS)), COUNTS, st.data())
 def test_every_flipped_bit_is_detected_by_the_checksum(name, counts, data):
     good = encoded(name, counts)
-    at, bit = data.draw(st.integers(0, len(good) - 1)), data.draw(st.integers(0, 7))
-    if name == "bota_sensone" and at == 0:
-        return  # its header is not covered by the checksum, but without it there is no frame
-    bad = good[:at] + bytes([good[at] ^ 1 << bit]) + good[at + 1 :]
+    position = data.draw(st.integers(0, len(good) - 1))
+    bit = data.draw(st.integers(0, 7))
+    if name == "bota_sensone" and position == 0:
+        return  # the checksum does not cover the header, but without it there is no frame
+    flipped_byte = bytes([good[position] ^ 1 << bit])
+    bad = good[:position] + flipped_byte + good[position + 1 :]
     parser = SyncParser(LAYOUTS[name])
     assert parser.feed(bad + good + bytes(len(good))) == SyncParser(LAYOUTS[name]).feed(good)
 
@@ -93,11 +102,13 @@ def test_every_flipped_bit_is_detected_by_the_checksum(name, counts, data):
 @settings(derandomize=True)
 @given(st.lists(st.one_of(COUNTS, st.binary(max_size=20), st.just(b"\xaa\x07\x08")), max_size=12), st.integers(1, 50))
 def test_every_byte_is_a_part_of_a_frame_or_counted_as_dropped(parts, step):
-    """Nothing is held after the connection, and nothing is counted twice."""
+    """After a reset, no byte is stored, and no byte has been counted twice."""
     layout = LAYOUTS["optoforce_omd"]
     stream = b"".join(part if isinstance(part, bytes) else encoded("optoforce_omd", part) for part in parts)
     parser = SyncParser(layout)
-    frames = [frame for at in range(0, len(stream), step) for frame in parser.feed(stream[at : at + step])]
+    frames = []
+    for start in range(0, len(stream), step):
+        frames += parser.feed(stream[start : start + step])
     parser.reset()
     assert parser.counts.bytes_dropped == len(stream) - layout.length * len(frames)
     assert parser.counts.frames == len(frames)
@@ -106,10 +117,11 @@ def test_every_byte_is_a_part_of_a_frame_or_counted_as_dropped(parts, step):
 @pytest.mark.parametrize("name", ["seq", "t_s"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_counter_or_clock_that_is_nan_drops_only_its_frame(name, value):
-    """Without a checksum nothing else tells that the line was damaged."""
+    """Without a checksum, only this value shows that the frame is damaged."""
     fields = f'fields = [{{name = "{name}", type = "f32"}}, {{name = "A", type = "f32"}}]'
     described = layout(f'sync = "20 4E"\nlength = 10\n{fields}')
-    good, bad = (b"\x20\x4e" + struct.pack("<ff", number, 1.0) for number in (2.0, value))
+    good = b"\x20\x4e" + struct.pack("<ff", 2.0, 1.0)
+    bad = b"\x20\x4e" + struct.pack("<ff", value, 1.0)
     parser = SyncParser(described)
     assert [frame.values for frame in parser.feed(good + bad + good)] == [(1.0,), (1.0,)]
     assert (parser.counts.frames, parser.counts.malformed, parser.counts.bytes_dropped) == (2, 1, 10)
@@ -134,7 +146,7 @@ fields = [{{name = "A", type = "i24"}}, {{name = "B", type = "u24", scale = 0.5}
     st.sampled_from(["little", "big"]),
 )
 def test_numbers_of_three_bytes(a, b, c, order):
-    """Packed by int.to_bytes and crcmod; the checksum skips the sync and has a byte order of its own."""
+    """The checksum does not cover the sync, and has another byte order than the numbers."""
     described = layout(TRIPLES.format(order=order))
     body = a.to_bytes(3, order, signed=True) + b.to_bytes(3, order) + c.to_bytes(3, order, signed=True)
     data = b"\xa5\x5a" + body + struct.pack("<H", mkPredefinedCrcFun("xmodem")(body))
@@ -144,6 +156,7 @@ def test_numbers_of_three_bytes(a, b, c, order):
 
 
 def stuffed(framing, **others):
+    """Return the layout of frames with a byte stuffing, a counter, one channel and a CRC-32."""
     fields = [{"name": "seq", "type": "u8"}, {"name": "A", "type": "f32"}]
     return layout({"framing": framing, "length": 9, "checksum": "crc-32", "fields": fields} | others)
 
@@ -157,30 +170,38 @@ def stuffed(framing, **others):
     ],
 )
 def test_cobs_slip_and_hdlc_frames_are_read(framing, stuff):
-    """A damaged one costs itself; a piece of another length is no frame; chunks do not matter."""
-    datas = [struct.pack("<Bf", k, 0.1 * k) for k in range(256)]
-    sent = [stuff(data + struct.pack("<I", binascii.crc32(data))) for data in datas]
-    bad = stuff(datas[0] + struct.pack("<I", binascii.crc32(datas[1])))
-    stream = b"".join(sent[:9]) + bad + stuff(b"123") + b"".join(sent[9:])
+    """A frame with a wrong checksum and a piece of another length are dropped without damage to other frames."""
+    bodies = [struct.pack("<Bf", seq, 0.1 * seq) for seq in range(256)]
+    sent = [stuff(body + struct.pack("<I", binascii.crc32(body))) for body in bodies]
+    with_wrong_checksum = stuff(bodies[0] + struct.pack("<I", binascii.crc32(bodies[1])))
+    too_short = stuff(b"123")
+    stream = b"".join([*sent[:9], with_wrong_checksum, too_short, *sent[9:]])
     parser = stuffed(framing).parser()
-    frames = [frame for at in range(0, len(stream), 7) for frame in parser.feed(stream[at : at + 7])]
+    frames = []
+    for start in range(0, len(stream), 7):
+        frames += parser.feed(stream[start : start + 7])
     assert [frame.seq for frame in frames] == list(range(256))
     assert frames[3].values == struct.unpack("<f", struct.pack("<f", 0.1 * 3))
-    dropped = len(bad) + len(stuff(b"123")) - 2 * (framing == "hdlc")  # which begins with an idle delimiter
-    assert (parser.counts.crc_errors, parser.counts.malformed, parser.counts.bytes_dropped) == (1, 1, dropped)
+
+    first_delimiters = 2 if framing == "hdlc" else 0  # the delimiter before a frame is not counted
+    dropped_bytes = len(with_wrong_checksum) + len(too_short) - first_delimiters
+    counts = parser.counts
+    assert (counts.crc_errors, counts.malformed, counts.bytes_dropped) == (1, 1, dropped_bytes)
 
 
-def test_datagrams_hold_whole_frames():
+def test_datagrams_contain_whole_frames():
     parser = stuffed("datagram", sync="A5", length=6, checksum="none").parser()
-    one, two = (struct.pack("<BBf", 0xA5, k, k / 2) for k in (1, 2))
-    assert [frame.values for frame in parser.feed(one + two)] == [(0.5,), (1.0,)]
-    assert parser.feed(one[:3]) == []
-    assert [frame.values for frame in parser.feed(b"\x5a" + one[1:] + two)] == [(1.0,)]  # the first of another sync
+    first = struct.pack("<BBf", 0xA5, 1, 0.5)
+    second = struct.pack("<BBf", 0xA5, 2, 1.0)
+    first_with_another_sync = b"\x5a" + first[1:]
+    assert [frame.values for frame in parser.feed(first + second)] == [(0.5,), (1.0,)]
+    assert parser.feed(first[:3]) == []
+    assert [frame.values for frame in parser.feed(first_with_another_sync + second)] == [(1.0,)]
     assert (parser.counts.malformed, parser.counts.bytes_dropped) == (2, 9)
 
 
 def test_constant_bytes_are_checked():
-    """A length behind the number: frames of another kind begin alike, and are none of these."""
+    """The byte after the counter is the length of the frame. Frames of another kind differ in this byte."""
     text = """
 sync = "7E"
 length = 5
@@ -193,7 +214,7 @@ fields = [{name = "seq", type = "u8"}, {type = "pad", value = "02"}, {name = "A"
 
 
 def test_checksum_described_by_its_crc_parameters():
-    """CRC-16/GENIBUS by its parameters, against crcmod."""
+    """The parameters are those of CRC-16/GENIBUS, which crcmod also computes."""
     check = {"width": 16, "polynomial": "1021", "start": "FFFF", "final": "FFFF"}
     fields = [{"name": "A", "type": "u8"}]
     described = layout({"sync": "55", "length": 4, "byte_order": "big", "checksum": check, "fields": fields})

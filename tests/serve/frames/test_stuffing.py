@@ -1,8 +1,7 @@
-"""Byte stuffing against the documents that define it, and against another library.
+"""Byte stuffing, checksums and the binary frame, compared with their definitions and with other libraries.
 
-Checksums against crcmod, the standard library and the check values of Cook's catalogue (of b"123456789").
-
-The binary frame against others' code and figures, and its parser against damage.
+Checksums are compared with crcmod, the standard library, and the check values of Cook's catalogue, which are the
+checksums of b"123456789".
 """
 
 import binascii
@@ -31,11 +30,11 @@ EXAMPLES = [
     ("cobs", "00", "01 01"),
     ("cobs", "11 22 00 33", "03 11 22 02 33"),
 ]
-"""From RFC 1055, RFC 1662 (4.2) and Cheshire and Baker: data, stuffed."""
+"""Name of the stuffing, data, and data with stuffing, from RFC 1055, RFC 1662 (4.2), and Cheshire and Baker."""
 
 
 @pytest.mark.parametrize(("name", "data", "stuffed"), EXAMPLES)
-def test_cobs_examples_of_the_documentation(name, data, stuffed):
+def test_examples_of_the_documents_are_decoded(name, data, stuffed):
     assert STUFFINGS[name].decode(bytes.fromhex(stuffed)) == bytes.fromhex(data)
 
 
@@ -72,7 +71,7 @@ def test_cobs_refuses_what_the_cobs_package_refuses(data):
         assert cobs_decode(data) == expected
 
 
-CATALOGUE = {
+CHECK_VALUES = {
     "none": 0,
     "crc-8/sae-j1850": 0x4B,
     "sum-8": 0xDD,
@@ -82,8 +81,9 @@ CATALOGUE = {
     "sum-8/inverted": 0x22,
     "fletcher-16": 0x1EDE,
 }
+"""Check values of checksums that no other library computes."""
 
-OTHERS = {
+OTHER_LIBRARIES = {
     "crc-8": mkPredefinedCrcFun("crc-8"),
     "crc-8/maxim": mkPredefinedCrcFun("crc-8-maxim"),
     "crc-16/arc": mkPredefinedCrcFun("crc-16"),
@@ -96,33 +96,37 @@ OTHERS = {
     "crc-32/iscsi": mkPredefinedCrcFun("crc-32c"),
     "crc-32/mpeg-2": mkPredefinedCrcFun("crc-32-mpeg"),
 }
+"""Functions of other libraries that compute the same checksums."""
 
 
 @pytest.mark.parametrize("name", CHECKSUMS)
 def test_named_checksums_have_the_check_values_of_the_catalogue(name):
     compute = CHECKSUMS[name].compute
-    if name in CATALOGUE:
-        assert compute(b"123456789") == CATALOGUE[name]
+    if name in CHECK_VALUES:
+        assert compute(b"123456789") == CHECK_VALUES[name]
     else:
         for data in (b"", b"123456789", bytes(range(256)), b"\xff" * 31):
-            assert compute(data) == OTHERS[name](data)
+            assert compute(data) == OTHER_LIBRARIES[name](data)
 
 
 def piece(body):
-    """The bytes of a frame around its content: CRC-16/CCITT-FALSE and COBS by others."""
-    return cobs.encode(body + struct.pack("<H", binascii.crc_hqx(body, 0xFFFF))) + b"\0"
+    """Return a frame with a given content. Other libraries compute the CRC-16/CCITT-FALSE and the stuffing."""
+    crc = struct.pack("<H", binascii.crc_hqx(body, 0xFFFF))
+    return cobs.encode(body + crc) + b"\0"
 
 
 def test_binary_frame_has_the_documented_layout():
-    """Against the layout of the design, packed by hand."""
-    body = bytes([1]) + struct.pack("<H", 0x1234) + struct.pack("<I", 0x89ABCDEF) + bytes([3, 1])
+    version = bytes([1])
+    seq_and_time = struct.pack("<H", 0x1234) + struct.pack("<I", 0x89ABCDEF)
+    count_and_flags = bytes([3, 1])
+    charges = struct.pack("<fff", 1.0, -2.5, 848.25)
     frame = Frame(seq=0x1234, t_us=0x89ABCDEF, values=(1.0, -2.5, 848.25), flags=1)
-    assert encode_frame(frame) == piece(body + struct.pack("<fff", 1.0, -2.5, 848.25))
+    assert encode_frame(frame) == piece(version + seq_and_time + count_and_flags + charges)
 
 
-@pytest.mark.parametrize("n", [0, 1, 60, 61, 62, 255])
-def test_binary_frames_round_trip(n):
-    frame = Frame(0x0101, 0x01010101, struct.unpack("<f", b"long") * n, flags=1)  # no zeros
+@pytest.mark.parametrize("count", [0, 1, 60, 61, 62, 255])
+def test_binary_frames_round_trip(count):
+    frame = Frame(0x0101, 0x01010101, struct.unpack("<f", b"long") * count, flags=1)  # no zeros
     assert len(encode_frame(frame)) <= MAX_STUFFED_LENGTH + 1
     assert BinaryParser().feed(encode_frame(frame)) == [frame]
 
@@ -140,15 +144,18 @@ def test_binary_frames_round_trip(n):
 def test_piece_that_is_no_frame_is_counted(data, counter):
     parser = BinaryParser()
     assert parser.feed(data) == []
-    assert (getattr(parser.counts, counter), parser.counts.bytes_dropped) == (1, len(data))
+    assert getattr(parser.counts, counter) == 1
+    assert parser.counts.bytes_dropped == len(data)
 
 
 @pytest.mark.parametrize("size", [2 * MAX_STUFFED_LENGTH, 1_000_000])
 @pytest.mark.parametrize("step", [1, 700, 5000])
-def test_an_overlong_piece_is_counted_once_however_it_is_cut_and_the_next_frame_found(size, step):
-    data = b"\x01" * size + b"\0"  # sound stuffing of zeros, so that only its length is wrong
-    parser, frame = BinaryParser(), Frame(7, 8, (9.0,))
-    for at in range(0, len(data), step):
-        assert parser.feed(data[at : at + step]) == []
-    assert (parser.counts.malformed, parser.counts.crc_errors, parser.counts.bytes_dropped) == (1, 0, len(data))
+def test_overlong_piece_is_counted_once_and_the_next_frame_is_found(size, step):
+    data = b"\x01" * size + b"\0"  # valid stuffing of zeros, so that only the length is wrong
+    parser = BinaryParser()
+    frame = Frame(7, 8, (9.0,))
+    for start in range(0, len(data), step):
+        assert parser.feed(data[start : start + step]) == []
+    counts = parser.counts
+    assert (counts.malformed, counts.crc_errors, counts.bytes_dropped) == (1, 0, len(data))
     assert parser.feed(encode_frame(frame)) == [frame]

@@ -1,7 +1,4 @@
-"""Lines of text: documented examples of each notation, recognition, and damage.
-
-The format of a board is recognised from its bytes alone.
-"""
+"""Parsing of lines of text: examples of each notation, recognition of the layout, and damaged lines."""
 
 import math
 import pickle
@@ -32,7 +29,7 @@ README_OF_TELEPLOT = [
 
 @pytest.mark.parametrize(("text", "names", "values"), README_OF_TELEPLOT)
 def test_documented_teleplot_lines(text, names, values):
-    """On a serial port every telemetry line begins with >, says Teleplot's README."""
+    """According to the README of Teleplot, each line on a serial port begins with >."""
     assert parse_line(f">{text}\r".encode()) == (Notation.teleplot, names, values)
 
 
@@ -82,7 +79,7 @@ def test_damaged_line_of_text_is_refused_with_the_reason(text, reason):
 
 
 def feed(*lines, parser=None):
-    """Frames of whole lines: they begin with the end of another one."""
+    """Return the frames in whole lines. A line feed comes first, because a parser drops an incomplete first line."""
     return (parser or TextParser()).feed("".join(f"\n{line}" for line in lines).encode() + b"\n")
 
 
@@ -97,16 +94,18 @@ def test_layout_is_recognised_from_the_first_good_lines():
     frames = feed("801.2,799.2,803.2", "801.3,799.3,803.3", parser=parser)
     assert [frame.values[0] for frame in frames] == [801.0, 801.1, 801.2, 801.3]
     assert parser.format == "text, CSV: 3 columns without names"
-    assert (parser.counts.frames, parser.counts.malformed, parser.counts.resyncs) == (4, 2, 1)
+    counts = parser.counts
+    assert (counts.frames, counts.malformed, counts.resyncs) == (4, 2, 1)
 
 
 def test_header_names_the_columns():
-    frames = feed("seq,t_us,A,B,C", *(f"{k},{k * 1000},1,2,3" for k in range(4)))
+    rows = [f"{number},{number * 1000},1,2,3" for number in range(4)]
+    frames = feed("seq,t_us,A,B,C", *rows)
     assert frames[0] == Frame(0, 0, (1.0, 2.0, 3.0), names=("A", "B", "C"))
-    assert [(f.seq, f.t_us) for f in frames] == [(0, 0), (1, 1000), (2, 2000), (3, 3000)]
+    assert [(frame.seq, frame.t_us) for frame in frames] == [(0, 0), (1, 1000), (2, 2000), (3, 3000)]
 
 
-def test_header_that_comes_again_after_a_reset():
+def test_repeated_header_after_a_reset_of_the_board_is_ignored():
     frames = feed("A,B", "1,2", "3,4", "5,6", "A,B", "7,8")
     assert [frame.values for frame in frames] == [(1, 2), (3, 4), (5, 6), (7, 8)]
 
@@ -116,10 +115,18 @@ def test_columns_are_named_by_the_device_file():
     assert frames[1] == Frame(8, 13500, (801.0,), names=("A",))
 
 
-def test_cycle_of_lines_joined_in_the_middle():
-    """Whoever comes in the middle of A, B, C must not read B, C, A of two readings."""
-    lines = [f">{name}:{1000 + k}:{100 * k + j}" for k in range(6) for j, name in enumerate("ABC")]
-    frames = feed(*lines[1:])
+def cycles_of_lines(count):
+    """Return the lines of cycles A, B, C with increasing times, ms. Their values are 0, 1, 2, then 100, 101, 102."""
+    lines = []
+    for cycle in range(count):
+        for position, name in enumerate("ABC"):
+            lines.append(f">{name}:{1000 + cycle}:{100 * cycle + position}")
+    return lines
+
+
+def test_frames_are_complete_cycles_if_the_first_line_is_missing():
+    """A parser that starts with the line B must not join B and C of one cycle with A of the next cycle."""
+    frames = feed(*cycles_of_lines(6)[1:])
     assert [frame.values for frame in frames[-3:]] == [(300, 301, 302), (400, 401, 402), (500, 501, 502)]
     assert [frame.t_us for frame in frames[-3:]] == [1003000, 1004000, 1005000]
     assert all(frame.values[0] + 2 == frame.values[2] for frame in frames)
@@ -127,7 +134,7 @@ def test_cycle_of_lines_joined_in_the_middle():
 
 def test_lost_line_of_a_cycle_costs_its_cycle_only():
     parser = TextParser()
-    lines = [f"{name}:{100 * k + j}" for k in range(6) for j, name in enumerate("ABC")]
+    lines = cycles_of_lines(6)
     frames = feed(*lines[:12], *lines[13:], parser=parser)  # the fifth A is lost
     assert [frame.values[0] for frame in frames] == [0, 100, 200, 300, 500]
     assert parser.counts.malformed == 1
@@ -136,7 +143,8 @@ def test_lost_line_of_a_cycle_costs_its_cycle_only():
 def test_line_of_another_layout_is_dropped_and_counted():
     parser = TextParser()
     frames = feed("1,2,3", "1,2,3", "1,2,3", "1,2", "A:1", "1,2,3", parser=parser)
-    assert (len(frames), parser.counts.malformed, parser.counts.resyncs) == (4, 2, 1)
+    assert len(frames) == 4
+    assert (parser.counts.malformed, parser.counts.resyncs) == (2, 1)
 
 
 FRAMES = st.builds(
@@ -150,25 +158,25 @@ FRAMES = st.builds(
 @settings(derandomize=True)
 @given(FRAMES, st.sampled_from(sorted(TEXT_FORMATS)))
 def test_text_lines_round_trip_in_every_notation(frame, notation):
-    data = b"\n" + encode_text(frame, notation) * 3
-    got = TextParser().feed(data)
-    assert len(got) == 3
-    assert got[-1].values == pytest.approx(frame.values, rel=1e-6)
+    parsed = TextParser().feed(b"\n" + encode_text(frame, notation) * 3)
+    assert len(parsed) == 3
+    latest = parsed[-1]
+    assert latest.values == pytest.approx(frame.values, rel=1e-6)
     if notation != "csv":
-        assert got[-1].names == ("A", "B", "C")
-        assert (got[-1].seq, got[-1].t_us) == (frame.seq, frame.t_us)
+        assert latest.names == ("A", "B", "C")
+        assert (latest.seq, latest.t_us) == (frame.seq, frame.t_us)
 
 
 def test_unrecognised_lines_use_bounded_memory():
     parser = TextParser()
     parser.feed(b"8" * 100_000 + b"\n")
-    for k in range(3000):
-        parser.feed(f"A{k}:1\n".encode())
+    for number in range(3000):
+        parser.feed(f"A{number}:1\n".encode())
     assert len(pickle.dumps(parser)) < 20_000
     assert feed("1,2,3", "1,2,3", "1,2,3", parser=parser)[-1].values == (1.0, 2.0, 3.0)
 
 
-def test_number_cut_by_joining_late_is_not_taken():
+def test_first_line_without_its_beginning_is_dropped():
     parser = TextParser()
     frames = parser.feed(b"01.2,799,803\n801.2,799,803\n801.2,799,803\n801.2,799,803\n")
     assert [frame.values[0] for frame in frames] == [801.2] * 3
@@ -178,20 +186,24 @@ def test_number_cut_by_joining_late_is_not_taken():
 
 
 def sentence(content):
-    """As NMEA 0183 writes it: the xor of what stands between $ and *."""
-    check = 0
+    """Return a sentence as in NMEA 0183, with the exclusive or of the bytes between $ and * as its checksum."""
+    checksum = 0
     for byte in content.encode():
-        check ^= byte
-    return f"${content}*{check:02X}"
+        checksum ^= byte
+    return f"${content}*{checksum:02X}"
 
 
 def test_sentences_with_their_checksum():
     parser = TextParser()
-    frames = feed(
-        *(sentence(f"PZT,{k},801.2,-799.5") for k in range(4)), sentence("PZT,9,1,2")[:-1] + "g", parser=parser
-    )
-    assert [frame.values for frame in frames] == [(k, 801.2, -799.5) for k in range(4)]
-    assert feed(sentence("PZT,9,1,2").replace("9", "8"), "$PZT,9,1,2", parser=parser)[0].values == (9, 1, 2)
+    good_lines = [sentence(f"PZT,{number},801.2,-799.5") for number in range(4)]
+    line_with_invalid_checksum = sentence("PZT,9,1,2")[:-1] + "g"
+    frames = feed(*good_lines, line_with_invalid_checksum, parser=parser)
+    assert [frame.values for frame in frames] == [(number, 801.2, -799.5) for number in range(4)]
+
+    line_with_wrong_checksum = sentence("PZT,9,1,2").replace("9", "8")
+    line_without_checksum = "$PZT,9,1,2"
+    frames = feed(line_with_wrong_checksum, line_without_checksum, parser=parser)
+    assert frames[0].values == (9, 1, 2)
     assert parser.counts.malformed == 2
 
 
@@ -207,31 +219,37 @@ def test_sentences_with_their_checksum():
     ],
 )
 def test_clock_in_text_that_wraps(name, unit, modulus):
-    """Without a word on its width, as `millis()` in 16 bits: the time goes on."""
+    """The width of the clock is not stated, for example if `millis()` has 16 bits. The time still increases."""
     start = modulus - 300 * unit
-    parser, clock, times = TextParser(), DeviceClock(), []
-    for k in range(200):
-        frames = feed(f"{name}:{(start + 5 * k * unit) % modulus:.6f},A:1", parser=parser)
-        times += [clock.read(frame.t_us, parser.t_us_modulus, 0.0).device_us for frame in frames]
+    parser = TextParser()
+    clock = DeviceClock()
+    times_us = []
+    for number in range(200):
+        time = (start + 5 * number * unit) % modulus
+        frames = feed(f"{name}:{time:.6f},A:1", parser=parser)
+        times_us += [clock.read(frame.t_us, parser.t_us_modulus, 0.0).device_us for frame in frames]
     assert clock.restarts == 0
-    np.testing.assert_allclose(np.diff(times), 5000.0 if name != "t_us" else 5 * unit, atol=1.1)
+    step_us = 5 * unit if name == "t_us" else 5000.0
+    np.testing.assert_allclose(np.diff(times_us), step_us, atol=1.1)
 
 
 def test_clock_in_text_that_restarts_has_not_wrapped():
-    parser, clock = TextParser(), DeviceClock()
-    for k in [*range(1000, 1200), *range(20)]:
-        for frame in feed(f"t_ms:{5 * k},A:1", parser=parser):
+    parser = TextParser()
+    clock = DeviceClock()
+    for number in [*range(1000, 1200), *range(20)]:
+        for frame in feed(f"t_ms:{5 * number},A:1", parser=parser):
             clock.read(frame.t_us, parser.t_us_modulus, 0.0)
     assert clock.restarts == 1
 
 
 @pytest.mark.parametrize(
-    ("begin", "end", "restarts"), [*((m - 20, m, 0) for m in (100, 256, 1000, 65536)), (290, 301, 1)]
+    ("begin", "end", "restarts"), [*((modulus - 20, modulus, 0) for modulus in (100, 256, 1000, 65536)), (290, 301, 1)]
 )
 def test_frame_counter_in_text_that_wraps_or_restarts(begin, end, restarts):
-    parser, gaps = TextParser(), SequenceGaps()
-    for k in [*range(begin, end), *range(20)]:
-        for frame in feed(f"seq:{k},A:1", parser=parser):
+    parser = TextParser()
+    gaps = SequenceGaps()
+    for seq in [*range(begin, end), *range(20)]:
+        for frame in feed(f"seq:{seq},A:1", parser=parser):
             gaps.update(frame.seq, parser.seq_modulus)
     assert (gaps.lost, gaps.repeated, gaps.restarts) == (0, 0, restarts)
 
@@ -242,11 +260,12 @@ ENCODERS = {"binary": encode_frame} | {name: partial(encode_text, notation=name)
 @pytest.mark.parametrize("name", ENCODERS)
 @pytest.mark.parametrize("start", [0, 7, 19])
 def test_format_is_recognised_from_anywhere(name, start):
-    frames = [Frame(k, 1000 * k, (800.0 + k, -7.5, 3.25)) for k in range(20)]
+    frames = [Frame(seq, 1000 * seq, (800.0 + seq, -7.5, 3.25)) for seq in range(20)]
+    data = b"".join(map(ENCODERS[name], frames))
     parser = AutoParser()
-    got = parser.feed(b"".join(map(ENCODERS[name], frames))[start:])
-    assert len(got) >= 17
-    assert [frame.values[0] for frame in got] == [frame.values[0] for frame in frames][-len(got) :]
+    parsed = parser.feed(data[start:])
+    assert len(parsed) >= 17
+    assert [frame.values[0] for frame in parsed] == [frame.values[0] for frame in frames[-len(parsed) :]]
     assert ("binary" if name == "binary" else "text") in parser.format
 
 
@@ -259,6 +278,8 @@ def test_bytes_before_recognition_count_as_dropped():
 
 def test_moduli_are_those_of_the_recognised_text():
     parser = AutoParser()
-    for k in range(12):
-        parser.feed(b"seq:%d,t_ms:%d,A:1\n" % ((250 + k) % 256, 65_530 + k & 0xFFFF))
+    for number in range(12):
+        seq = (250 + number) % 256
+        t_ms = (65_530 + number) % 65_536
+        parser.feed(b"seq:%d,t_ms:%d,A:1\n" % (seq, t_ms))
     assert (parser.seq_modulus, parser.t_us_modulus) == (256, 65_536_000)

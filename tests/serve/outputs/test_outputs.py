@@ -1,4 +1,4 @@
-"""Records as CSV that the csv module reads back, and as datagrams that nobody waits for."""
+"""Outputs of records: CSV, which is read by the csv module, and datagrams, which may have no receiver."""
 
 import csv
 import io
@@ -19,24 +19,36 @@ ELECTRODES = ("A", "B")
 
 
 def test_csv_has_the_fields_of_a_record(contract, record):
-    row_of = record(tare_pC={"A": 1.0, "B": -2.5}, contact=True, seq=7, flags=("gap", "outside"))
-    table = io.StringIO(csv_header(ELECTRODES) + "\n" + csv_row(row_of, ELECTRODES) + "\n")
+    written = record(tare_pC={"A": 1.0, "B": -2.5}, contact=True, seq=7, flags=("gap", "outside"))
+    table = io.StringIO(csv_header(ELECTRODES) + "\n" + csv_row(written, ELECTRODES) + "\n")
     (row,) = csv.DictReader(table)
-    flat = [name for name in contract if not name.endswith("_pC")]
-    assert [name for name in row if "." not in name] == flat
-    expected = {"seq": "7", "x_mm": "1.234568", "y_mm": "", "contact": "true", "flags": "gap outside"}
-    expected |= {"charge_pC.A": "800.062500", "charge_pC.B": "", "tare_pC.A": "1.000000", "tare_pC.B": "-2.500000"}
-    assert (expected | {"charge_raw_pC.A": ""}).items() <= row.items()
+    single_fields = [name for name in contract if not name.endswith("_pC")]
+    assert [name for name in row if "." not in name] == single_fields
+    expected = {
+        "seq": "7",
+        "x_mm": "1.234568",
+        "y_mm": "",
+        "contact": "true",
+        "flags": "gap outside",
+        "charge_pC.A": "800.062500",
+        "charge_pC.B": "",
+        "charge_raw_pC.A": "",
+        "tare_pC.A": "1.000000",
+        "tare_pC.B": "-2.500000",
+    }
+    assert expected.items() <= row.items()
 
 
 @pytest.mark.parametrize("name", ["mine, left hand", 'the "good" one', "two\nlines", "cr\rlf", " blank "])
 def test_csv_quotes_electrode_names(name, record):
-    """Electrodes too may have any name."""
+    """Electrodes and films may have any names."""
     electrodes = ("A", name)
-    charges = {"A": 1.0, name: 2.0}
-    lines = csv_header(electrodes) + "\n" + csv_row(record(frame_id=name, charge_pC=charges), electrodes) + "\n"
+    written = record(frame_id=name, charge_pC={"A": 1.0, name: 2.0})
+    lines = csv_header(electrodes) + "\n" + csv_row(written, electrodes) + "\n"
     (row,) = csv.DictReader(io.StringIO(lines, newline=""), strict=True)
-    assert (row["frame_id"], row[f"charge_pC.{name}"], row["model"]) == (name, "2.000000", "linear/1")
+    assert row["frame_id"] == name
+    assert row[f"charge_pC.{name}"] == "2.000000"
+    assert row["model"] == "linear/1"
     assert None not in row
 
 
@@ -46,11 +58,12 @@ def test_csv_has_no_quotes_in_an_ordinary_row(record):
     )
 
 
-def test_contacts_and_films_that_are_followed_are_the_last_columns(record):
+def test_tracked_contact_and_followed_film_are_the_last_columns(record):
     film = FollowedFilm(0.7, 0.05, 12)
-    followed = record(tracking=Tracking(TrackedContact(*map(float, range(9))), "tap"), film=film)
+    tracked = TrackedContact(*map(float, range(9)))
+    touched = record(tracking=Tracking(tracked, "tap"), film=film)
     header = csv_header(ELECTRODES, with_tracking=True, with_film=True)
-    (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_row(followed, ELECTRODES) + "\n"))
+    (row,) = csv.DictReader(io.StringIO(header + "\n" + csv_row(touched, ELECTRODES) + "\n"))
     assert header.removeprefix(csv_header(ELECTRODES)).startswith(",tracked.x_mm,tracked.y_mm,")
     assert (row["tracked.vy_mm_s"], row["tracked.moving"], row["event"]) == ("7.000000", "8.000000", "tap")
     assert (row["film.pretension_MPa"], row["film.touches"]) == ("0.700000", "12")
@@ -60,19 +73,25 @@ def test_contacts_and_films_that_are_followed_are_the_last_columns(record):
 
 
 def test_close_waits_for_a_slow_consumer():
-    """It takes longer for all lines than it may take for one."""
+    """The consumer needs more time for all lines than it may need for one line."""
     written = []
-    with WriterQueue(lambda line: written.append(time.sleep(0.4) or line)) as queue:
+
+    def write_slowly(line):
+        time.sleep(0.4)
+        written.append(line)
+
+    with WriterQueue(write_slowly) as queue:
         for line in "abcd":
             queue.put(line)
-    assert (written, queue.lost) == (list("abcd"), 0)
+    assert written == ["a", "b", "c", "d"]
+    assert queue.lost == 0
 
 
 def test_datagrams_without_a_receiver_are_dropped(record):
-    """A refused datagram shows up as an error of the next one: it is dropped, and later ones arrive all the same."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        address = taken.getsockname()
+    """The system reports a refused datagram as an error of the next datagram, which is dropped. Later ones arrive."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as temporary:
+        temporary.bind(("127.0.0.1", 0))
+        address = temporary.getsockname()
     with closing(UdpOutput(f"127.0.0.1:{address[1]}")) as output:
         for number in range(3):
             output.write(record(seq=number))

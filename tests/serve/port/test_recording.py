@@ -1,4 +1,4 @@
-"""The file of a recording: what it holds, what ends it, what is refused."""
+"""Files of recordings: their content, incomplete last lines, and files that are refused."""
 
 import json
 
@@ -8,18 +8,22 @@ from isocharge.common.errors import OutputError, OutputExists, RecordingError
 from isocharge.serve import Chunk, RecordedClock, Recorder, Recording
 from isocharge.serve.port.recording import Event, Marker, NewModel
 
-CHUNKS = [Chunk(bytes([k, 255 - k]), 1e9 + 0.1 * k, 1000 * k, 1.5 if k == 3 else 0.0) for k in range(5)]
+CHUNKS = [
+    Chunk(bytes([number, 255 - number]), 1e9 + 0.1 * number, 1000 * number, outage_s=1.5 if number == 3 else 0.0)
+    for number in range(5)
+]
 
 
 @pytest.fixture
 def recorded(tmp_path):
-    """A recording of five chunks with 0 to 4 records and, before the third chunk, a request for a new tare."""
+    """Return a recording of five chunks with 0 to 4 records. Before the third chunk, a new tare is requested."""
     path = tmp_path / "touch.rec"
     with Recorder(path, "linear/1", "every", {"tare": {"frames": 10}}) as recorder:
         for number, chunk in enumerate(CHUNKS):
             if number == 2:
                 recorder.tare()
-            recorder.chunk(chunk, [f'{{"timestamp": 1.0, "latency_us": {10.0 * k}}}' for k in range(number)])
+            records = [f'{{"timestamp": 1.0, "latency_us": {10.0 * record}}}' for record in range(number)]
+            recorder.chunk(chunk, records)
     return path
 
 
@@ -30,21 +34,22 @@ def test_events_are_those_that_were_recorded(recorded):
 
 
 def test_clock_of_a_replay_repeats_the_recorded_latencies(recorded):
+    events = list(Recording(recorded).events())
     clock = RecordedClock()
-    clock.set(list(Recording(recorded).events())[3])
+    clock.set(events[3])
     assert [clock(), clock(), clock()] == [2000, 2000 + 10_000, 2000]
 
 
 @pytest.mark.parametrize("cut", [1, 10, 30])
 def test_unfinished_line_is_ignored(recorded, cut):
-    whole = list(Recording(recorded).events())
+    complete_events = list(Recording(recorded).events())
     recorded.write_bytes(recorded.read_bytes()[:-cut])
-    *events, last = Recording(recorded).events()
-    assert events == whole[:-1]
-    assert last == (CHUNKS[-1], whole[-1].latencies_us[:-1])
+    *events, last_event = Recording(recorded).events()
+    assert events == complete_events[:-1]
+    assert last_event == (CHUNKS[-1], complete_events[-1].latencies_us[:-1])
 
 
-def test_recorder_overwrites_nothing(tmp_path):
+def test_recorder_does_not_overwrite_a_file(tmp_path):
     path = tmp_path / "touch.rec"
     path.write_text("mine")
     with pytest.raises(OutputExists), Recorder(path, "m/1", "every", {}):
@@ -58,6 +63,7 @@ def test_recorder_in_a_missing_folder_is_refused(tmp_path):
 
 
 HEADER = '"model": "m/1", "policy": "every", "device": {}'
+"""Keys of the first line of a recording besides its version."""
 
 
 @pytest.mark.parametrize(
@@ -86,10 +92,10 @@ def test_file_that_is_no_recording_is_refused(tmp_path, first):
     assert len(str(caught.value)) < 600
 
 
-PATHS = ["/any/path", "../x", "models/m/1", "m/../../x", "m", "m/1\n", "file://m/1", "~/m"]
+NOT_LABELS = ["/any/path", "../x", "models/m/1", "m/../../x", "m", "m/1\n", "file://m/1", "~/m"]
 
 
-@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("path", NOT_LABELS)
 def test_recording_whose_model_is_a_path_is_refused(tmp_path, path):
     recording = tmp_path / "touch.rec"
     header = {"isocharge_recording": 1, "model": path, "policy": "every", "device": {}}
@@ -98,7 +104,7 @@ def test_recording_whose_model_is_a_path_is_refused(tmp_path, path):
         Recording(recording)
 
 
-@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("path", NOT_LABELS)
 def test_recording_whose_next_model_is_a_path_is_refused(recorded, path):
     with recorded.open("a") as file:
         file.write(json.dumps({"use": path}) + "\n")
@@ -133,7 +139,7 @@ def test_recording_of_another_version_is_refused(tmp_path):
         '{"chunk": [1e9, 5, 0.0, "' + "A" * 3_000_000 + '"]}',
     ],
 )
-def test_a_damaged_line_is_named(recorded, line):
+def test_error_message_contains_the_number_of_a_damaged_line(recorded, line):
     lines = recorded.read_text().split("\n")
     recorded.write_text("\n".join([*lines[:5], line, *lines[5:]]))
     with pytest.raises(RecordingError, match="line 6: damaged") as caught:

@@ -1,7 +1,4 @@
-"""Samples by number: the latest of a stream, all of a recording.
-
-The link between the processes: the reader never waits, and what arrives is whole.
-"""
+"""Samples of the live page: storage in a tape, transmission between the processes, and the position of a replay."""
 
 import time
 from contextlib import closing
@@ -13,27 +10,31 @@ from isocharge.serve.viewer.hub import MAX_PIECES, Playhead, RecordedTape, Tape
 from isocharge.serve.viewer.link import make_link
 from isocharge.serve.viewer.messages import Play, SampleFormat
 
-FORM = SampleFormat(("A",))
+FORMAT = SampleFormat(("A",))
 
 
 @pytest.fixture
 def recorded():
-    with closing(RecordedTape(FORM.dtype)) as tape:
+    """Return an empty tape of a recording."""
+    with closing(RecordedTape(FORMAT.dtype)) as tape:
         yield tape
 
 
 def samples(times, force_N=0.0):
-    rows = np.zeros(len(times), FORM.dtype)
+    """Return samples with times, s, and forces, N."""
+    rows = np.zeros(len(times), FORMAT.dtype)
     rows["timestamp"] = times
     rows["force_N"] = force_N
     return rows
 
 
 def test_live_tape_stores_the_latest_samples():
-    tape = Tape(FORM.dtype, capacity=10)
+    tape = Tape(FORMAT.dtype, capacity=10)
     for first in range(0, 35, 7):
         tape.append(samples(np.arange(first, first + 7.0)))
-    assert (tape.oldest, tape.total, tape.index(30.5)) == (25, 35, 31)
+    assert tape.oldest == 25
+    assert tape.total == 35
+    assert tape.index(30.5) == 31
     assert tape.samples(0, 35)["timestamp"].tolist() == list(range(25, 35))
     tape.append(samples(np.arange(35.0, 60.0)))
     assert tape.samples(tape.oldest, tape.total)["timestamp"].tolist() == list(range(50, 60))
@@ -44,7 +45,9 @@ def test_recorded_tape_stores_all_samples(recorded):
     assert tape.span() == (0.0, 0.0)
     for first in range(0, 3000, 1000):
         tape.append(samples(1e9 + 0.01 * np.arange(first, first + 1000)))
-    assert (tape.total, len(tape.samples(0, 3000)), tape.span()) == (3000, 3000, (1e9, 1e9 + 29.99))
+    assert tape.total == 3000
+    assert len(tape.samples(0, 3000)) == 3000
+    assert tape.span() == (1e9, 1e9 + 29.99)
     assert tape.index(1e9 + 15.001) == 1501
 
 
@@ -76,9 +79,12 @@ def test_link_delivers_complete_samples_in_order():
     for number in range(100):
         reader.send_sample(bytes([number]) * 64)
     assert page.receive_samples(64) == b"".join(bytes([number]) * 64 for number in range(100))
-    for piece, whole in ((SAMPLE + SAMPLE[:40], SAMPLE), (b"", b""), (SAMPLE[40:], SAMPLE)):
-        reader.send_sample(piece)
-        assert page.receive_samples(64) == whole
+
+    reader.send_sample(SAMPLE + SAMPLE[:40])
+    assert page.receive_samples(64) == SAMPLE
+    assert page.receive_samples(64) == b""
+    reader.send_sample(SAMPLE[40:])
+    assert page.receive_samples(64) == SAMPLE
     assert page.is_open
     reader.close()
     page.close_here()
@@ -86,23 +92,26 @@ def test_link_delivers_complete_samples_in_order():
 
 def test_reader_does_not_wait_for_a_page_that_reads_nothing():
     reader, page = make_link()
-    began = time.perf_counter()
+    begin_s = time.perf_counter()
     for _ in range(40_000):
         reader.send_sample(SAMPLE)
     sent_count = sum(reader.send_message(counters={"frames": 1}, note="x" * 500) for _ in range(2000))
-    assert time.perf_counter() - began < 5.0
+    assert time.perf_counter() - begin_s < 5.0
     assert reader.dropped > 0
     assert sent_count < 2000
-    taken = len(b"".join(iter(lambda: page.receive_samples(64), b""))) // 64
-    assert taken + reader.dropped == 40_000
+    received = b"".join(iter(lambda: page.receive_samples(64), b""))
+    assert len(received) // 64 + reader.dropped == 40_000
     assert len(page.receive_messages()) == sent_count
     reader.close()
     page.close_here()
 
 
 def test_replay_stops_at_the_end_and_play_restarts_it():
-    """It waits at the end of what is known so far."""
-    head, ends = Playhead(speed=4.0), ((10.0, True), (3.0, False), (3.0, True), (3.0, True))
-    assert [head.advance(0.5, end_s, is_complete=known) for end_s, known in ends] == [False, False, True, False]
-    head.apply(Play(), 3.0)
-    assert head == Playhead(speed=4.0)
+    """While the recording is still being read, the replay waits at the end of the samples that are known so far."""
+    playhead = Playhead(speed=4.0)
+    assert not playhead.advance(0.5, 10.0, is_complete=True)
+    assert not playhead.advance(0.5, 3.0, is_complete=False)
+    assert playhead.advance(0.5, 3.0, is_complete=True)
+    assert not playhead.advance(0.5, 3.0, is_complete=True)
+    playhead.apply(Play(), 3.0)
+    assert playhead == Playhead(speed=4.0)

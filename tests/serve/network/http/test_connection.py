@@ -11,8 +11,10 @@ from isocharge.serve.network.http.connection import Connection
 from isocharge.serve.network.protocol.response import response_of
 
 INNER = b"POST /one HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3\r\n\r\nabc"
+"""A complete request, which is also used as the body of another request."""
 
 TRAILED = b"POST /one HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n3\r\nabc\r\n"
+"""Beginning of a request in chunks, after which further chunks or trailers may follow."""
 
 
 class Echo:
@@ -35,7 +37,8 @@ class Wire(asyncio.Transport):
 
     def __init__(self):
         super().__init__()
-        self.sent, self.closed = bytearray(), False
+        self.sent = bytearray()
+        self.closed = False
 
     def write(self, data):
         self.sent += data
@@ -58,9 +61,11 @@ class Wire(asyncio.Transport):
 
 
 def request(method, path, header, body, *, chunked):
+    """Return the bytes of a request, whose body is sent as one chunk if `chunked` is true."""
     if chunked:
         framing = b"Transfer-Encoding: chunked\r\n"
-        body = (b"%x\r\n%s\r\n" % (len(body), body) if body else b"") + b"0\r\n\r\n"
+        chunk = b"%x\r\n%s\r\n" % (len(body), body) if body else b""
+        body = chunk + b"0\r\n\r\n"
     else:
         framing = b"Content-Length: %d\r\n" % len(body)
     return b"%s %s HTTP/1.1\r\nHost: localhost\r\n%s%s\r\n%s" % (method, path, header, framing, body)
@@ -74,12 +79,12 @@ REQUESTS = st.builds(
     st.sampled_from([b"", b"abc", b"xyz", b"\r\n\r\n", INNER, b"\r\n\r\n" + INNER]),
     chunked=st.booleans(),
 )
-"""Few, so that they repeat; some bodies hold a request themselves."""
+"""Requests with few different parts, so that heads are repeated. Some bodies contain a request."""
 
 
 @pytest.fixture(scope="module")
 def connect():
-    """A function that gives a fresh connection and its wire."""
+    """Return a function that creates a connection and its wire."""
     with asyncio.Runner() as runner:
 
         def start():
@@ -92,40 +97,49 @@ def connect():
 
 
 def answers(connect, pieces):
-    protocol, wire = connect()
+    """Return the sent bytes without `100 Continue`, and whether the connection was closed."""
+    connection, wire = connect()
     for piece in pieces:
-        protocol.data_received(piece)
+        connection.data_received(piece)
     return bytes(wire.sent).replace(b"HTTP/1.1 100 Continue\r\n\r\n", b""), wire.closed
 
 
 def byte_by_byte(data):
-    return [data[at : at + 1] for at in range(len(data))]
+    return split(data, 1)
+
+
+def split(data, size):
+    """Return pieces of a number of bytes."""
+    return [data[start : start + size] for start in range(0, len(data), size)]
 
 
 @given(requests=st.lists(REQUESTS, min_size=1, max_size=6), prefix=st.sampled_from([b"", b"\r\n"]))
 @settings(max_examples=60, deadline=None)
-def test_a_request_in_one_piece_is_answered_as_byte_by_byte(connect, requests, prefix):
-    """A known head is not parsed again, a byte is no head: both give the same answers."""
-    requests = [prefix + each for each in requests for _ in range(2)]
-    assert answers(connect, requests) == answers(connect, byte_by_byte(b"".join(requests)))
+def test_repeated_requests_in_one_piece_have_the_same_answers_as_single_bytes(connect, requests, prefix):
+    """The head of a repeated request in one piece is not parsed again. Single bytes are always parsed."""
+    repeated = [prefix + each for each in requests for _ in range(2)]
+    assert answers(connect, repeated) == answers(connect, byte_by_byte(b"".join(repeated)))
 
 
 @given(requests=st.lists(REQUESTS, min_size=1, max_size=6), cuts=st.lists(st.integers(1, 120), max_size=30))
 @settings(max_examples=60, deadline=None)
 def test_requests_split_at_any_byte_are_answered(connect, requests, cuts):
     data = b"".join(each for each in requests for _ in range(2))
-    pieces, rest = [], data
+    pieces = []
+    rest = data
     for size in cuts:
         pieces.append(rest[:size])
         rest = rest[size:]
-    assert answers(connect, [*filter(None, [*pieces, rest])]) == answers(connect, byte_by_byte(data))
+    pieces.append(rest)
+    nonempty_pieces = [piece for piece in pieces if piece]
+    assert answers(connect, nonempty_pieces) == answers(connect, byte_by_byte(data))
 
 
 def test_body_that_looks_like_an_earlier_request_is_not_answered_as_a_request(connect):
     """The second part of the request equals a complete request that was answered before."""
     outer = request(b"POST", b"/two", b"", b"first\r\n\r\n" + INNER, chunked=False)
-    at = outer.index(INNER)
-    sent, _ = answers(connect, [INNER, outer[:at], outer[at:], INNER])
+    inner_start = outer.index(INNER)
+    sent, _ = answers(connect, [INNER, outer[:inner_start], outer[inner_start:], INNER])
     assert sent.count(b"HTTP/1.1 200 OK") == 3
     assert sent.count(b"'/two'") == 1
 
@@ -133,7 +147,9 @@ def test_body_that_looks_like_an_earlier_request_is_not_answered_as_a_request(co
 def test_end_of_an_earlier_request_alone_is_refused(connect):
     """The bytes that completed a request are not a request themselves."""
     sent, closed = answers(connect, [INNER[:1], INNER[1:], INNER[1:]])
-    assert (sent.count(b"HTTP/1.1 200"), sent.count(b"HTTP/1.1 400"), closed) == (1, 1, True)
+    assert sent.count(b"HTTP/1.1 200") == 1
+    assert sent.count(b"HTTP/1.1 400") == 1
+    assert closed
 
 
 @pytest.mark.parametrize("blank", [b"\r\n\r\n", b"\n\r\n\r\n"])
@@ -143,9 +159,11 @@ def test_blank_lines_before_a_request_are_ignored(connect, blank):
 
 
 def test_trailers_are_not_headers(connect):
-    """Of a request that is answered, and of the next one."""
+    """The trailers of a request appear neither in its headers nor in the headers of the next request."""
     sent, _ = answers(connect, [TRAILED + b"0\r\nHost: y\r\nA: b\r\n\r\n", INNER])
-    assert [sent.count(part) for part in (b"HTTP/1.1 200", b"b'y'", b"b'a'")] == [2, 0, 0]
+    assert sent.count(b"HTTP/1.1 200") == 2
+    assert b"b'y'" not in sent
+    assert b"b'a'" not in sent
 
 
 @pytest.mark.parametrize(
@@ -153,13 +171,15 @@ def test_trailers_are_not_headers(connect):
     [TRAILED + b"0\r\n" + b"a: b\r\n" * 9000, TRAILED + b"0\r\na: " + b"b" * 50_000, TRAILED + b"1;" + b"x" * 50_000],
     ids=["trailers", "one trailer", "chunk extension"],
 )
-@pytest.mark.parametrize("piece", [1, 100, 4096])
-def test_trailers_and_chunk_extensions_have_the_limit_of_headers(connect, endless, piece):
-    sent, closed = answers(connect, [endless[at : at + piece] for at in range(0, len(endless), piece)])
-    assert (sent[:12], closed) == (b"HTTP/1.1 431", True)
+@pytest.mark.parametrize("size", [1, 100, 4096])
+def test_trailers_and_chunk_extensions_have_the_limit_of_headers(connect, endless, size):
+    sent, closed = answers(connect, split(endless, size))
+    assert sent.startswith(b"HTTP/1.1 431")
+    assert closed
 
 
 def test_many_small_chunks_are_one_body(connect):
-    data = TRAILED[: TRAILED.index(b"3\r\n")] + b"1\r\nx\r\n" * 20_000 + b"0\r\n\r\n"
-    sent, _ = answers(connect, [data[at : at + 4096] for at in range(0, len(data), 4096)])
+    head = TRAILED[: TRAILED.index(b"3\r\n")]
+    data = head + b"1\r\nx\r\n" * 20_000 + b"0\r\n\r\n"
+    sent, _ = answers(connect, split(data, 4096))
     assert b"x" * 20_000 in sent
