@@ -1,18 +1,16 @@
 """Fixtures for the tests of this folder: a small dataset, a network after a short training, and a film."""
 
-from functools import partial
-
 import pytest
 
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Sweep, load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
-from isocharge.simulate.forward.whole_film import whole_film_map
 from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, TrainingData, fit
 from isocharge.train.data import outside_presses
 from isocharge.train.training import correlation
 from isocharge.train.training import fit as fit_module
 from isocharge.train.training.fit import train_network
 from kept import kept
+from whole_films import whole_film_map_solved_once
 
 QUICK = FitConfig(
     network=NetworkConfig(hidden=(32, 32), misfit_hidden=(24, 24)),
@@ -21,10 +19,10 @@ QUICK = FitConfig(
 
 
 @pytest.fixture(scope="session", autouse=True)
-def kept_map_of_the_whole_film():
-    """Solve the coarse map of a whole film once for all trainings of a film, because it takes several seconds."""
+def whole_films_are_solved_once():
+    """Solve the coarse map of a whole film once for all trainings with this film."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(outside_presses, "whole_film_map", partial(kept, whole_film_map))
+        patch.setattr(outside_presses, "whole_film_map", whole_film_map_solved_once)
         yield
 
 
