@@ -153,7 +153,7 @@ def test_contacts_far_apart_with_the_same_charges_are_a_caution():
     field, presses = fit_field(charges_along_a_nodal_cubic)
     domain, (caution,) = invertible_domain(field, presses, REFERENCE)
     assert domain.radius == 8.0
-    assert caution.startswith("contacts far apart can have the same charges: 0.05 N at (")
+    assert caution.startswith("contacts far apart can have the same charges: the charges of 0.05 N at (")
     x_mm = [float(x) for x in re.findall(r"at \((\S+),", caution)]
     assert sorted(x_mm) == pytest.approx([-3.0, 3.0], abs=0.5)
 
