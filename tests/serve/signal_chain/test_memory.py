@@ -15,7 +15,8 @@ from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Contact, Frame, TouchStream, device_from_table, encode_frame
 from isocharge.serve.prediction.contact import Sensitivity
 from isocharge.serve.signal_chain.chain import SignalChain
-from isocharge.serve.signal_chain.memory import CREEP_LAW_DEVIATION, DECADES_S, LEARN_S, WARMTH_CHANGE_PC
+from isocharge.serve.signal_chain.memory import CREEP_LAW_DEVIATION, LEARN_S, WARMTH_CHANGE_PC
+from isocharge.serve.signal_chain.memory_state import DECADES_S
 from isocharge.train.export_c.folder import device_header
 
 RATE_HZ = 200.0

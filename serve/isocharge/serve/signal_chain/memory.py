@@ -27,7 +27,6 @@ warmth may have caused since the touch began.
 """
 
 import math
-from functools import lru_cache
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -35,38 +34,16 @@ from msgspec import Meta
 
 from isocharge.common.arrays import Array
 from isocharge.serve.signal_chain.leak import Leak, LeakRule, in_touch, learn_inflow
-from isocharge.serve.signal_chain.rule import Rule, Share, TimeConstant
-
-DECADES_S = 10.0 ** np.arange(-3, 5)
-"""Time constants of the creep terms, s. They represent creep from 1 ms to some minutes."""
-
-WARMTH_ROW = -3
-SLOPE_ROW = -2
-CHARGE_ROW = -1
-"""Rows of the warmth d, of its slope and of the touch charge q in the state.
-
-The first rows of the state are the creep terms and the thermoelastic term.
-"""
-
-WARMTH_ROWS = slice(WARMTH_ROW, CHARGE_ROW)
-"""Rows of the warmth and of its slope."""
-
-INITIAL_PROPAGATION = np.diag([*np.ones(len(DECADES_S) + 3), 0.0])
-"""Propagation of the state over a time of 0, shape (rows, rows).
-
-The row of the touch charge is 0, because the touch charge of the next frame is not known yet.
-"""
-
-SCALE_RESPONSE = np.array(
-    [
-        [*-np.ones(len(DECADES_S)), 0.0, 0.0, 0.0, -np.expm1(-1.0 / DECADES_S).sum()],
-        [*np.zeros(len(DECADES_S)), -1.0, 0.0, 0.0, 1.0],
-    ]
+from isocharge.serve.signal_chain.memory_state import (
+    CHARGE_ROW,
+    INITIAL_PROPAGATION,
+    SCALE_RESPONSE,
+    SLOPE_ROW,
+    WARMTH_ROW,
+    WARMTH_ROWS,
+    state_propagation,
 )
-"""Contribution of each row of the state to the charge of the film, shape (2, rows).
-
-The first line is for `creep = 1`, and the second line for `thermoelastic = 1`.
-"""
+from isocharge.serve.signal_chain.rule import Rule, Share, TimeConstant
 
 LEARN_S = 5.0
 """Time after a release in which the scale factors of the film are updated, s."""
@@ -117,35 +94,6 @@ class MemoryRule(Rule, frozen=True, kw_only=True):
     warmth_s: TimeConstant = 2.5
     known: Share = 0.2
     settle_s: TimeConstant = 0.1
-
-
-@lru_cache(maxsize=8)
-def _relaxation(warmth_s: float) -> tuple[Array, Array]:
-    """Return the two matrices from which the propagation of the state over any time is computed.
-
-    Args:
-        warmth_s: Time constant with which the film follows the temperature of the air, s.
-
-    Returns:
-        Time constant of each row of the state, shape (rows, 1), s; and the propagation over a very long time, shape
-        (rows, rows). After such a time, the creep terms and the thermoelastic term equal the touch charge, and the
-        slope of the warmth has changed the warmth by `warmth_s` times the slope.
-    """
-    steady_state = np.zeros_like(INITIAL_PROPAGATION)
-    steady_state[:WARMTH_ROW, CHARGE_ROW] = 1.0
-    steady_state[WARMTH_ROW, WARMTH_ROW] = 1.0
-    steady_state[WARMTH_ROW, SLOPE_ROW] = warmth_s
-    # The rows after the creep terms (thermoelastic term, warmth, slope and charge) have the time constant of the air.
-    time_constants_s = np.array([*DECADES_S, warmth_s, warmth_s, warmth_s, warmth_s])
-    return time_constants_s[:, np.newaxis], steady_state
-
-
-@lru_cache(maxsize=256)
-def _propagation(warmth_s: float, dt_s: float) -> Array:
-    """Return the matrix that advances the state by a time dt_s, shape (rows, rows)."""
-    time_constants_s, steady_state = _relaxation(warmth_s)
-    decay = np.exp(-dt_s / time_constants_s)
-    return np.asarray(steady_state + decay * (INITIAL_PROPAGATION - steady_state))
 
 
 class ScaleVariances(NamedTuple):
@@ -280,7 +228,7 @@ def undo_memory(
         film_pC = memory.film_pC + surplus_pC
 
     # Solve the equation of the film for the touch charge.
-    propagation = _propagation(rule.warmth_s, dt_s)
+    propagation = state_propagation(rule.warmth_s, dt_s)
     rows_pC = propagation.dot(memory.rows_pC)
     residual_pC = film_pC - film.response.dot(rows_pC)
     charge_pC = residual_pC / film.step_response
@@ -449,7 +397,7 @@ def begin_touch(rule: MemoryRule, memory: Memory) -> Memory:
     film = memory.film
     age_s = memory.trusted_s
     rows_pC = memory.rows_pC.copy()
-    warmth_propagation = _propagation(rule.warmth_s, age_s)[WARMTH_ROWS, WARMTH_ROWS]
+    warmth_propagation = state_propagation(rule.warmth_s, age_s)[WARMTH_ROWS, WARMTH_ROWS]
     rows_pC[WARMTH_ROWS] = warmth_propagation.dot(memory.trusted_pC)
     rows_pC[CHARGE_ROW] = 0.0
     charge_pC = (memory.film_pC - film.response.dot(rows_pC)) / film.step_response

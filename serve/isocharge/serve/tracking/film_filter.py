@@ -18,7 +18,6 @@ touches, because a warm hand may come or go (an interacting multiple model, Blom
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +25,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.model.film_directions import FilmDirections
 from isocharge.serve.model.pretensions import Pretensions
+from isocharge.serve.tracking.film_unknowns import UnknownsLayout
 from isocharge.serve.tracking.pretension_grid import (
     GRID_STEP_MPa,
     evenly_spaced,
@@ -83,39 +83,6 @@ NO_OFFSET_PROBABILITY = 0.9
 
 LEVEL_CHANGE_PROBABILITY = 0.0003
 """Probability that the level of the offsets changes between two touches."""
-
-
-@dataclass(frozen=True)
-class UnknownsLayout:
-    """Positions of the linear unknowns in a vector.
-
-    Attributes:
-        electrodes: Number of electrodes.
-        direction_count: Number of directions in which the film is uncertain.
-    """
-
-    electrodes: int
-    direction_count: int
-
-    @property
-    def gains(self) -> slice:
-        """Deviations of the gains from one, in units of GAIN_STD, one for each electrode."""
-        return slice(0, self.electrodes)
-
-    @property
-    def offset(self) -> int:
-        """Mean of the common offset, pC."""
-        return self.electrodes
-
-    @property
-    def directions(self) -> slice:
-        """Coordinates along the directions in which the film is uncertain, in standard deviations."""
-        return slice(self.electrodes + 1, self.size)
-
-    @property
-    def size(self) -> int:
-        """Number of linear unknowns."""
-        return self.electrodes + 1 + self.direction_count
 
 
 class TouchResiduals(NamedTuple):

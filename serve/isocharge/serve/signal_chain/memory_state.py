@@ -1,0 +1,67 @@
+"""State of the memory of a film: the meaning of its rows, and their propagation in time; see `memory`."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+
+DECADES_S = 10.0 ** np.arange(-3, 5)
+"""Time constants of the creep terms, s. They represent creep from 1 ms to some minutes."""
+
+WARMTH_ROW = -3
+SLOPE_ROW = -2
+CHARGE_ROW = -1
+"""Rows of the warmth d, of its slope and of the touch charge q in the state.
+
+The first rows of the state are the creep terms and the thermoelastic term.
+"""
+
+WARMTH_ROWS = slice(WARMTH_ROW, CHARGE_ROW)
+"""Rows of the warmth and of its slope."""
+
+INITIAL_PROPAGATION = np.diag([*np.ones(len(DECADES_S) + 3), 0.0])
+"""Propagation of the state over a time of 0, shape (rows, rows).
+
+The row of the touch charge is 0, because the touch charge of the next frame is not known yet.
+"""
+
+SCALE_RESPONSE = np.array(
+    [
+        [*-np.ones(len(DECADES_S)), 0.0, 0.0, 0.0, -np.expm1(-1.0 / DECADES_S).sum()],
+        [*np.zeros(len(DECADES_S)), -1.0, 0.0, 0.0, 1.0],
+    ]
+)
+"""Contribution of each row of the state to the charge of the film, shape (2, rows).
+
+The first line is for `creep = 1`, and the second line for `thermoelastic = 1`.
+"""
+
+
+@lru_cache(maxsize=8)
+def _relaxation(warmth_s: float) -> tuple[Array, Array]:
+    """Return the two matrices from which the propagation of the state over any time is computed.
+
+    Args:
+        warmth_s: Time constant with which the film follows the temperature of the air, s.
+
+    Returns:
+        Time constant of each row of the state, shape (rows, 1), s; and the propagation over a very long time, shape
+        (rows, rows). After such a time, the creep terms and the thermoelastic term equal the touch charge, and the
+        slope of the warmth has changed the warmth by `warmth_s` times the slope.
+    """
+    steady_state = np.zeros_like(INITIAL_PROPAGATION)
+    steady_state[:WARMTH_ROW, CHARGE_ROW] = 1.0
+    steady_state[WARMTH_ROW, WARMTH_ROW] = 1.0
+    steady_state[WARMTH_ROW, SLOPE_ROW] = warmth_s
+    # The rows after the creep terms (thermoelastic term, warmth, slope and charge) have the time constant of the air.
+    time_constants_s = np.array([*DECADES_S, warmth_s, warmth_s, warmth_s, warmth_s])
+    return time_constants_s[:, np.newaxis], steady_state
+
+
+@lru_cache(maxsize=256)
+def state_propagation(warmth_s: float, dt_s: float) -> Array:
+    """Return the matrix that advances the state by a time dt_s, shape (rows, rows)."""
+    time_constants_s, steady_state = _relaxation(warmth_s)
+    decay = np.exp(-dt_s / time_constants_s)
+    return np.asarray(steady_state + decay * (INITIAL_PROPAGATION - steady_state))
