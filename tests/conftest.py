@@ -1,4 +1,4 @@
-"""What tests of several stages share."""
+"""Fixtures and hooks that the tests of several packages share."""
 
 import gc
 import os
@@ -19,22 +19,23 @@ from isocharge.common.extras import PACKAGES
 ROOT = Path(__file__).parents[1]
 
 LONGEST = ("tests/train", "tests/cli", "tests/test_pages", "tests/test_examples", "tests/test_flags", "tests/test_pip")
+"""Folders and files with the longest tests, which begin first."""
 
-settings.register_profile("patient", deadline=None)  # a busy machine is no fault of an example
+settings.register_profile("patient", deadline=None)  # an example may take long on a busy machine
 settings.load_profile("patient")
 
-gc.disable()  # what is imported and collected stays: there is nothing to look for until the tests run
+gc.disable()  # imports and the collection of the tests create no garbage, so the collector would only cost time
 
-signal.signal(
-    signal.SIGINT, signal.default_int_handler
-)  # a run in the background ignores it, and so would its commands
+# A shell starts background processes with SIGINT ignored, and the commands that tests start would inherit this.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark the later cases of a test with `first_cases(n)` as slow, before slow tests are left out.
+    """Mark all but the first n cases of a test with `first_cases(n)` as slow, before slow tests are deselected.
 
-    Files that take longest begin first, so that no worker is left with one of them at the end.
+    The files that take longest begin first. Otherwise, one worker could still run such a file when all other workers
+    have finished.
     """
     items.sort(key=lambda item: not item.path.relative_to(ROOT).as_posix().startswith(LONGEST))
     seen = Counter()
@@ -50,7 +51,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture
 def command(monkeypatch, capsys):
-    """Run `isocharge ...` in this process: (exit code, stdout, stderr)."""
+    """Function that runs `isocharge ...` in this process and returns (exit code, stdout, stderr)."""
 
     def run(*words):
         monkeypatch.setattr(sys, "argv", ["isocharge", *map(str, words)])
@@ -64,7 +65,11 @@ def command(monkeypatch, capsys):
 
 @pytest.fixture
 def refused(command):
-    """Run `isocharge ...`, which must refuse: an exit code, nothing on stdout, and the reason, lines joined."""
+    """Function that runs `isocharge ...` and checks that the command refuses its input.
+
+    The command must end with the given exit code, write nothing to stdout, and write the message to stderr, without a
+    traceback. Line breaks in stderr are ignored.
+    """
 
     def run(*words, message, code=2):
         got, out, err = command(*words)
@@ -76,7 +81,7 @@ def refused(command):
 
 @pytest.fixture
 def start_command():
-    """Start `isocharge ...` in a process of its own, which ends with the test."""
+    """Function that starts `isocharge ...` in a new process. The process is killed at the end of the test."""
     started = []
 
     def start(*words):
@@ -105,12 +110,15 @@ class Absent:
 
 sys.meta_path.insert(0, Absent())
 """
-"""Runs when Python starts: packages that an install does not have are not there."""
+"""Python code that runs at the start of Python and makes the packages of `ABSENT_PACKAGES` impossible to import."""
 
 
 @pytest.fixture(scope="session")
 def installed(tmp_path_factory):
-    """The environment variables of programs that find only some extras of pyproject.toml, as `pip install '.[x]'`."""
+    """Function that returns the environment variables for an installation with some extras, `pip install '.[x]'`.
+
+    Programs that run with these variables cannot import the packages of the other extras of pyproject.toml.
+    """
     folder = tmp_path_factory.mktemp("absent")
     (folder / "sitecustomize.py").write_text(ABSENT)
 
@@ -129,7 +137,10 @@ def installed(tmp_path_factory):
 
 @pytest.fixture
 def run_example():
-    """Run a Python example of a page: each print prints what the comment on its line says, to the letter."""
+    """Function that runs a Python example of a page.
+
+    Each print must print exactly the text of the comment on its line.
+    """
 
     def run(example, folder, environment):
         done = _run([sys.executable, "-c", example], folder, environment, timeout=3600)
@@ -145,7 +156,10 @@ def run_example():
 
 @pytest.fixture
 def run_commands():
-    """Run a shell example of a page in a folder; what it starts in the background ends with it, outputs are there."""
+    """Function that runs a shell example of a page in a folder and returns its stdout.
+
+    Its background processes end with it. The files that its options name as output must exist afterwards.
+    """
 
     def run(example, folder, environment, timeout=280):
         script = f"trap 'kill $(jobs -p) || true; wait' EXIT\n{example}"
@@ -165,14 +179,15 @@ def _run(words, folder, environment, timeout):
 
 
 class PageExample(NamedTuple):
-    """A python or sh block of a page; blocks of a page run in their order, in one folder.
+    """A block of Python or shell code on a page. The blocks of a page run in their order, in one folder.
 
     Attributes:
-        page: Its path in the project.
-        language: python or sh.
-        text: The block.
-        extras: What is installed, as the page says: `pip install '.[extra]'` in the lines before the block, or else in
-            the first lines of the page, or else in those of the README beside it; ("base",) without extras.
+        page: Path of the page in the project.
+        language: "python" or "sh".
+        text: Text of the block.
+        extras: Extras that are installed; ("base",) for an installation without extras. They are read from the command
+            `pip install '.[extra]'` in the section before the block. Without such a command, they are read from the
+            first lines of the page, or else from the first lines of the README of its package.
     """
 
     page: str
@@ -182,7 +197,10 @@ class PageExample(NamedTuple):
 
 
 def pytest_generate_tests(metafunc):
-    """Give `page_example` every block of the pages in a module's EXAMPLE_PAGES; `is_slow` of the module marks some."""
+    """Run a test with an argument `page_example` once for each block of the pages in EXAMPLE_PAGES of its module.
+
+    The function `is_slow` of the module determines which blocks are marked as slow.
+    """
     if "page_example" in metafunc.fixturenames:
         module, parameters = metafunc.module, []
         for page in module.EXAMPLE_PAGES:
@@ -193,7 +211,7 @@ def pytest_generate_tests(metafunc):
 
 
 def examples_of(page):
-    """The examples of a page, in their order."""
+    """Return the examples of a page, in their order."""
     text = page.read_text("utf-8")
     readme = page.parent / "README.md" if page.parent.name != "docs" else page.parents[1] / "README.md"
     general = _extras(_opening(text)) or _extras(_opening(readme.read_text("utf-8"))) or ("base",)
@@ -212,11 +230,15 @@ def examples_of(page):
 
 
 def _opening(text):
-    """What stands above the first example and the first section."""
+    """Return the text above the first example and the first section."""
     return re.split(r"^(?:```|## )", text, maxsplit=1, flags=re.MULTILINE)[0]
 
 
 def _extras(text):
-    """The extras of the first install command in a text: ("base",) for none of them; empty without a command."""
+    """Return the extras of the first install command in a text.
+
+    Returns:
+        The extras; ("base",) if the command names none; () if the text contains no install command.
+    """
     command = re.search(r"pip install (?:'\.\[([\w,]+)\]'|\.(?=[`\s]))", text)
     return () if command is None else tuple((command[1] or "base").split(","))

@@ -1,4 +1,7 @@
-"""Results that take long to make: made once, kept in build/kept, shared by the workers of a run and by later runs."""
+"""Cache for results that take long to compute.
+
+The results are stored in build/kept. The workers of a test run share them, and later runs use them again.
+"""
 
 import hashlib
 import inspect
@@ -12,8 +15,8 @@ from filelock import FileLock
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "build" / "kept"
-MOST_VERSIONS = 4
-"""Versions of the code whose results are kept."""
+MAX_VERSIONS = 4
+"""Largest number of versions of the code whose results are kept."""
 
 SOURCES = {
     "simulate": ("serve/isocharge/common", "simulate/isocharge/simulate"),
@@ -22,14 +25,19 @@ SOURCES = {
 
 
 def kept(make, *arguments, **options):
-    """`make(*arguments, **options)`, or what it gave before, if neither they nor the code that it runs has changed.
+    """Return `make(*arguments, **options)`, computed now or stored by an earlier call.
 
-    `make` is a function of simulate, train or their tests; what it gives can be pickled.
+    A stored result is used if the arguments, the source of `make` and the source of the packages are the same.
+
+    Args:
+        make: Function of simulate, train or their tests. Its result can be pickled.
+        arguments: Its positional arguments.
+        options: Its keyword arguments.
     """
     where = Path(inspect.getsourcefile(make)).relative_to(ROOT).parts
     folder = FOLDER / _code("simulate" if "simulate" in where else "train")
-    wanted = pickle.dumps((inspect.getsource(make), *map(_fields, (arguments, tuple(sorted(options.items()))))))
-    path = folder / f"{make.__name__}-{hashlib.sha256(wanted).hexdigest()[:16]}.pickle"
+    key = pickle.dumps((inspect.getsource(make), *map(_fields, (arguments, tuple(sorted(options.items()))))))
+    path = folder / f"{make.__name__}-{hashlib.sha256(key).hexdigest()[:16]}.pickle"
     FOLDER.mkdir(parents=True, exist_ok=True)
     with FileLock(FOLDER / f"{path.name}.lock"):
         if not path.exists():
@@ -42,7 +50,10 @@ def kept(make, *arguments, **options):
 
 
 def _fields(value):
-    """A value without what a dataclass has cached beside its fields, which would be another key."""
+    """Return a value in which dataclasses are replaced by their fields.
+
+    A dataclass may also contain cached properties. They do not belong to the key, because they depend on earlier use.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         return type(value).__name__, [_fields(getattr(value, field.name)) for field in fields(value)]
     return [*map(_fields, value)] if isinstance(value, tuple) else value
@@ -50,7 +61,7 @@ def _fields(value):
 
 @cache
 def _code(packages):
-    """A name for the present source of some packages."""
+    """Return a name that identifies the present source of some packages."""
     digest = hashlib.sha256()
     for source in SOURCES[packages]:
         for path in sorted((ROOT / source).rglob("*.py")):
@@ -59,9 +70,9 @@ def _code(packages):
 
 
 def _make_room(folder):
-    """The folder of this code; those of the oldest code go."""
+    """Create the folder of the present code, and delete the folders of the oldest versions."""
     folder.mkdir(exist_ok=True)
     versions = sorted((path for path in FOLDER.iterdir() if path.is_dir()), key=lambda path: path.stat().st_mtime)
-    for old in versions[: -2 * MOST_VERSIONS]:
-        if old != folder:
-            shutil.rmtree(old, ignore_errors=True)
+    for old_folder in versions[: -2 * MAX_VERSIONS]:  # each version has a folder for simulate and one for train
+        if old_folder != folder:
+            shutil.rmtree(old_folder, ignore_errors=True)

@@ -26,24 +26,31 @@ def project(tmp_path):
 
 
 def blocks(recipe, language):
-    """File and text of each block of a language, whose first line names the file."""
+    """Return the file and the text of each block of a language. The first line of a block names the file."""
     return re.findall(rf"^```{language}\n# (\S+)\n(.*?)^```", recipe, re.DOTALL | re.MULTILINE)
 
 
 def hunks(lines):
-    """(old, new) texts of a difference: lines to find, one after the other, then lines to add."""
+    """Return pairs (old text, new text) of the changes of a diff.
+
+    A change begins with lines that are in the file, and ends with its added lines.
+    """
     old, new = [], []
     for line in lines:
-        if not line.startswith("+") and any(added not in old for added in new):
+        is_added = line.startswith("+")
+        has_added_lines = any(new_line not in old for new_line in new)
+        if has_added_lines and not is_added:
             yield "\n".join(old), "\n".join(new)
             old, new = [], []
-        old += [line[1:]] * (not line.startswith("+"))
-        new += [line[1:]] * (not line.startswith("-"))
+        if not is_added:
+            old.append(line[1:])
+        if not line.startswith("-"):
+            new.append(line[1:])
     yield "\n".join(old), "\n".join(new)
 
 
 def follow(recipe, project):
-    """Write the new files and change the others."""
+    """Follow a recipe in a copy of the project: write its new files, and apply its diffs to the other files."""
     for name, text in blocks(recipe, "python"):
         assert not (project / name).exists(), name
         (project / name).write_text(text, "utf-8")

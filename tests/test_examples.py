@@ -1,4 +1,7 @@
-"""The scripts of the gallery run, and find what they say; `make docs` runs all of them and draws their pictures."""
+"""The scripts of the gallery run, and their results agree with their texts.
+
+`make docs` runs all scripts of the gallery and draws their pictures.
+"""
 
 import re
 import runpy
@@ -15,7 +18,7 @@ from kept import ROOT, kept
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    """A function that runs a script without a window: what it printed. It draws one picture."""
+    """Function that runs a script without a window and returns its stdout. The script must draw one picture."""
     monkeypatch.setattr(plt, "show", lambda: None)
 
     def run(script, *arguments):
@@ -30,29 +33,30 @@ def run(monkeypatch, capsys):
 
 
 def numbers(line):
+    """Return the numbers in a line of text."""
     return [float(number) for number in re.findall(r"-?\d+\.?\d*", line)]
 
 
-def test_a_press_charges_the_nearest_electrode_most(run):
+def test_the_nearest_electrode_has_the_largest_charge(run):
     charges = {line[0]: numbers(line)[0] for line in run("simulate/examples/press.py").splitlines()}
-    assert charges["A"] > charges["B"] > charges["C"] > 600.0  # by distance
+    assert charges["A"] > charges["B"] > charges["C"] > 600.0  # A is the nearest electrode, and C the farthest
 
 
-def test_a_thicker_and_a_tauter_film_give_less_charge(run):
+def test_the_charge_decreases_with_thickness_and_pretension(run):
     rows = np.array([numbers(line) for line in run("simulate/examples/thickness.py").splitlines()[1:]])
-    by_thickness = rows[:, 2].reshape(3, 5)
-    assert (np.diff(by_thickness, axis=0) < 0.0).all()
-    assert (np.diff(by_thickness, axis=1) < 0.0).all()
+    charge = rows[:, 2].reshape(3, 5)
+    assert (np.diff(charge, axis=0) < 0.0).all()
+    assert (np.diff(charge, axis=1) < 0.0).all()
 
 
 @pytest.mark.slow
 def test_effects_of_the_bench_agree_with_an_independent_linear_inverse(run):
-    """Position errors by another solver: 1.4, 3.2, 5.1 mm for a closed cavity, 0.24, 1.7, 0.9 mm for a kelvin."""
+    """The position errors by a closed cavity and by a warmer film are those of another solver."""
     lines = run("simulate/examples/bench_effects.py").splitlines()
-    closed = [float(re.search(r": ([\d.]+) mm", line)[1]) for line in lines if "cavity" in line]
-    warm = [float(re.search(r": ([\d.]+) mm", line)[1]) for line in lines if "warmer" in line]
-    np.testing.assert_allclose(closed, [1.4, 3.2, 5.1], atol=0.06)
-    np.testing.assert_allclose(warm, [0.24, 1.7, 0.9], rtol=0.2)
+    cavity_errors = [float(re.search(r": ([\d.]+) mm", line)[1]) for line in lines if "cavity" in line]
+    warming_errors = [float(re.search(r": ([\d.]+) mm", line)[1]) for line in lines if "warmer" in line]
+    np.testing.assert_allclose(cavity_errors, [1.4, 3.2, 5.1], atol=0.06)
+    np.testing.assert_allclose(warming_errors, [0.24, 1.7, 0.9], rtol=0.2)
 
 
 def test_a_lamp_is_switched_by_each_hard_press(run, monkeypatch):
@@ -62,5 +66,5 @@ def test_a_lamp_is_switched_by_each_hard_press(run, monkeypatch):
     assert min(numbers(line)[0] for line in lines) >= 0.5
 
 
-def test_frames_that_nobody_described_are_read(run):
+def test_frames_of_an_unknown_format_are_read(run):
     assert "400 of 400 frames are read" in run("serve/examples/foreign_board.py")

@@ -1,5 +1,4 @@
-"""Configuration of the site, which contains the pages, the example scripts with their pictures, and a reference of all
-modules.
+"""Configuration of the site: the pages, the example scripts with their pictures, and a reference of all modules.
 
     python -m sphinx -W --keep-going -c .ci/docs . build/docs
 
@@ -48,7 +47,7 @@ html_copy_source = html_show_sphinx = html_show_copyright = False
 html_title = project
 suppress_warnings = ["ref.python"]  # attributes of one name in many classes are not linked
 
-# Workers that have grown are renewed, and that is said in a warning.
+# loky replaces worker processes whose memory has grown, and prints a warning.
 warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
 sphinx_gallery_conf = {
     "examples_dirs": [f"{name}/examples" for name in PORTIONS],

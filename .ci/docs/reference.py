@@ -13,17 +13,23 @@ DOTTED = re.compile(r"`(isocharge(?:\.\w+)+)`")
 
 
 def modules() -> list[str]:
-    """Every module of the namespace packages, private ones left out."""
+    """Return the names of all modules of isocharge except private ones."""
     packages = [import_module(name) for name in ("isocharge", "isocharge.cli")]
     names = {entry.name for package in packages for entry in walk_packages(package.__path__, f"{package.__name__}.")}
     return sorted(name for name in names if "._" not in name)
 
 
 def check_docstrings(names: list[str]) -> None:
-    """Every dotted name in backticks is a module, or an attribute of one, and an example is indented, so it is code.
+    """Check the names and the examples in the docstrings of modules.
+
+    A dotted name in backticks must be a module or an attribute of a module. An example must be indented, because only
+    indented lines are shown as code.
+
+    Args:
+        names: Names of the modules.
 
     Raises:
-        SystemExit: If one is not.
+        SystemExit: If a name or an example is wrong.
     """
     for name in names:
         if re.search(r"^(from \w+ import|>>>|\w+ = \w+\()", import_module(name).__doc__ or "", re.MULTILINE):
@@ -35,9 +41,13 @@ def check_docstrings(names: list[str]) -> None:
 
 
 def write_pages(names: list[str], folder: Path) -> None:
-    """Each module has a page, and one page lists all modules.
+    """Write a page for each module, and one page that lists all modules.
 
-    The pages of the modules are in no table of contents, because each page of the site repeats the tables.
+    No table of contents contains the pages of the modules, because every page of the site repeats these tables.
+
+    Args:
+        names: Names of the modules.
+        folder: Folder for the pages.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
@@ -51,7 +61,7 @@ def write_pages(names: list[str], folder: Path) -> None:
             "   :members:",
             "   :show-inheritance:",
         ]
-        if hasattr(import_module(name), "__all__"):  # a package's public names are explained where they are defined
+        if hasattr(import_module(name), "__all__"):  # the index refers to the module that defines a public name
             lines += ["   :imported-members:", "   :no-index:"]
         _write(folder / f"{name}.rst", lines)
     lines = ["Modules", "=======", "", "The public names are those of these packages:", ""]
@@ -80,15 +90,17 @@ def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, li
 
     Indented lines after a blank line become code.
     """
-    shown, code = [], False
-    for before, line in zip(["", *lines], lines, strict=False):
+    shown = []
+    is_code = False
+    for previous_line, line in zip(["", *lines], lines, strict=False):
         if line.strip():
-            was_code, code = code, line.startswith("    ") and (code or not before.strip())
-            if code and not was_code:
+            was_code = is_code
+            is_code = line.startswith("    ") and (was_code or not previous_line.strip())
+            if is_code and not was_code:
                 shown += ["::", ""]
-        shown.append(line if code else _escaped(line))
+        shown.append(line if is_code else _escaped(line))
     if kind in ("attribute", "data"):
-        shown.insert(0, "\\ ")  # what is before a colon in the first line would be taken for a type
+        shown.insert(0, "\\ ")  # otherwise, Sphinx would interpret text before a colon in the first line as a type
     lines[:] = shown
 
 
@@ -118,6 +130,8 @@ def list_attributes(_app: Any, _kind: str, _name: str, _object: Any, _options: A
 
 
 def _escaped(line: str) -> str:
-    parts = line.split("`")
+    """Return a line in which the characters outside backticks have no special meaning in reStructuredText."""
+    parts = line.split("`")  # every second part is a quoted name
     parts[::2] = [re.sub(r"([*|\\]|_(?=\W|$))", r"\\\1", part) for part in parts[::2]]
-    return re.sub(r"(`[^`]*`)(?=\w)", r"\1\ ", "`".join(parts))  # what is quoted ends before a letter
+    # A quoted name that is followed by a letter, as in `press`es, must be separated from the letter by a backslash.
+    return re.sub(r"(`[^`]*`)(?=\w)", r"\1\ ", "`".join(parts))

@@ -1,4 +1,4 @@
-"""What the simulator's tests share: films, meshes, random fields, forward maps."""
+"""Fixtures that the tests of the simulator share: films, meshes, random fields, equilibria and forward maps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -43,7 +43,7 @@ def film() -> Film:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A template in its place on a film of unit radius."""
+    """A template that is placed on a film of unit radius."""
 
     template: Template
     placement: Placement
@@ -53,11 +53,14 @@ class Mesh:
 
     @property
     def inside(self) -> np.ndarray:
-        """Which nodes are not on the rim, shape (n_node,)."""
+        """True for the nodes that are not on the rim, shape (n_node,)."""
         return ~self.template.on_rim
 
     def random_field(self, seed: int, components: int = 3) -> np.ndarray:
-        """Random nodal values, fixed where the film is: as rough as the mesh can carry, shape (n_node, components)."""
+        """Return independent random values at the nodes, shape (n_node, components).
+
+        Components that the boundary conditions fix on the rim and on the axis are zero.
+        """
         field = 0.1 * np.random.default_rng(seed).standard_normal((self.template.n_node, components))
         field[self.template.on_rim, :3] = 0.0
         field[self.template.on_axis, 1:2] = 0.0
@@ -72,7 +75,7 @@ def _mesh(probe: Probe, at: tuple[float, float], resolution: Resolution) -> Mesh
 
 @pytest.fixture(scope="session")
 def mesh_of() -> Callable[[Probe, tuple[float, float], Resolution], Mesh]:
-    """A mesh for a probe, its position (film radii) and a resolution."""
+    """Function that returns a mesh for a probe, its position in film radii, and a resolution."""
     return _mesh
 
 
@@ -86,26 +89,28 @@ PROBES = {
 
 @pytest.fixture(scope="session", params=PROBES.values(), ids=PROBES.keys())
 def mesh(request: pytest.FixtureRequest) -> Mesh:
-    """A small mesh far from any symmetry, with thin rings at the rim, for every kind of template."""
+    """A small mesh for each kind of template, with thin rings at the rim and a probe away from the centre."""
     return _mesh(request.param, (0.4, 0.0), Resolution(3, 8, 2, 1))
 
 
 def assembled(mesh: Template, matrix: np.ndarray) -> np.ndarray:
-    """The whole matrix, entry by entry, no cleverness."""
+    """Return the dense matrix of the mesh, which is the sum of the matrices of its elements."""
     components = matrix.shape[2]
-    unknown = (components * mesh.nodes[..., None] + np.arange(components)).reshape(mesh.n_element, -1)
+    unknowns = (components * mesh.nodes[..., None] + np.arange(components)).reshape(mesh.n_element, -1)
+    element_matrices = matrix.reshape(mesh.n_element, unknowns.shape[1], -1)
     dense = np.zeros((components * mesh.n_node, components * mesh.n_node))
-    for numbers, block in zip(unknown, matrix.reshape(mesh.n_element, unknown.shape[1], -1), strict=True):
-        dense[np.ix_(numbers, numbers)] += block
+    for element_unknowns, element_matrix in zip(unknowns, element_matrices, strict=True):
+        dense[np.ix_(element_unknowns, element_unknowns)] += element_matrix
     return dense
 
 
 @pytest.fixture(scope="session")
 def made_up() -> Callable[..., Equilibrium]:
-    """A made-up equilibrium with a given field.
+    """Function that returns an equilibrium with a given displacement field, without a solve.
 
-    `field` is a function of (X1, X2), shape (n, 2), in the frame of the press and in film radii, that returns
-    (U1, U2, W), shape (n, 3); polygonal probes have no symmetry to keep.
+    Its argument `field` is a function of points (X1, X2), shape (n, 2), in film radii in the frame of the press. It
+    returns the displacements (U1, U2, W), shape (n, 3). The default probe is a rectangle, because a field under a
+    polygon need not be symmetric.
     """
 
     def make(
@@ -144,7 +149,7 @@ def made_up() -> Callable[..., Equilibrium]:
 
 @pytest.fixture(scope="session")
 def three_map() -> ForwardMap:
-    """The forward map of the released model's sensor."""
+    """Forward map of the sensor three-25um-biaxial."""
     return kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0))
 
 
@@ -161,5 +166,5 @@ def solve_side_forces(sensor: Sensor) -> SideForceMap:
 
 @pytest.fixture(scope="session")
 def small_dataset(three_map: ForwardMap, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of 500 samples; not to be written to."""
+    """A dataset of 500 samples. Tests must not change it."""
     return write_sweep(tmp_path_factory.mktemp("data") / "presses", (three_map,), Sweep(samples=500, seed=7))

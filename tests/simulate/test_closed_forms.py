@@ -1,6 +1,7 @@
-"""Rung 4 of the ladder: solutions on paper.
+"""Solutions of the simulator compared with closed forms and with ordinary differential equations.
 
-For the linear theories Green's function of the disk is known, and a disk that presses is an integral of it.
+For the linear theories, Green's function of a clamped disk is known. The deflection under a circular probe is an
+integral of this function.
 """
 
 from collections.abc import Callable
@@ -33,17 +34,17 @@ SLACK = Film(radius=45.0, thickness=0.025, young=3000.0, poisson=0.34)
 TAUT = replace(SLACK, pretension=1.0)
 THICK = replace(SLACK, thickness=1.0)
 TINY = 1e-6
-"""A force (N) that changes neither a taut film's tension nor a plate."""
+"""A force (N) that is too small to change the tension of a film with pretension or the shape of a plate."""
 
 
 def ring(radius: float, count: int = 7) -> np.ndarray:
-    """Points on a circle about the origin, shape (count, 2)."""
+    """Return points on a circle about the origin, shape (count, 2)."""
     angle = 0.3 + 2.0 * np.pi * np.arange(count) / count
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def radial_and_hoop(stress: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(s_r, s_theta, s_r_theta) about the origin."""
+    """Return the stress in polar coordinates about the origin, (s_r, s_theta, s_r_theta), shapes (n,)."""
     c, s = (points / np.linalg.norm(points, axis=1, keepdims=True)).T
     s11, s22, s12 = stress.T
     return (
@@ -54,7 +55,7 @@ def radial_and_hoop(stress: np.ndarray, points: np.ndarray) -> tuple[np.ndarray,
 
 
 def plate_stiffness(film: Film) -> float:
-    """D = E h^3 / 12 (1 - nu^2)."""
+    """Return the bending stiffness D = E h^3 / (12 (1 - nu^2)), N mm."""
     return film.young * film.thickness**3 / (12.0 * (1.0 - film.poisson**2))
 
 
@@ -62,7 +63,10 @@ def plate_stiffness(film: Film) -> float:
 
 
 def test_schwerin_point_load():
-    """w = k (1 - (r/a)^(2/3)), N_r = 3 F / (4 pi k) (r/a)^(-2/3), N_theta = N_r / 3, away from a small probe."""
+    """Away from a small probe, the deflection and the stress resultants are those of Schwerin's point load.
+
+    The solution is w = k (1 - (r/a)^(2/3)), N_r = 3 F / (4 pi k) (r/a)^(-2/3) and N_theta = N_r / 3.
+    """
     film = replace(SLACK, poisson=1.0 / 3.0)
     force = TINY
     solved = press(
@@ -79,23 +83,27 @@ def test_schwerin_point_load():
         np.testing.assert_allclose(shear, 0.0, atol=1e-5 * expected)
 
 
-# Green's functions of the disk, in film radii; z where it is read, c where a point presses
+# Green's functions of the disk. Positions are complex numbers x + i y in film radii: z is the position of the
+# deflection, and c is the position of the point load.
 
 
 def harmonic(z: np.ndarray, c: complex) -> np.ndarray:
-    """Of a taut membrane, times F / T: the source and its image."""
+    """Return the deflection of a membrane with a large tension T, in units of F / T: the load and its image."""
     return np.log(np.abs((1.0 - np.conj(c) * z) / (z - c))) / (2.0 * np.pi)
 
 
 def michell(z: np.ndarray, c: complex) -> np.ndarray:
-    """Of a clamped plate, times F a^2 / D (Michell 1902)."""
-    apart = np.abs(z - c) ** 2
-    log = np.log(apart / np.abs(1.0 - np.conj(c) * z) ** 2)
-    return ((1.0 - np.abs(z) ** 2) * (1.0 - abs(c) ** 2) + apart * log) / (16.0 * np.pi)
+    """Return the deflection of a clamped plate, in units of F a^2 / D (Michell 1902)."""
+    squared_distance = np.abs(z - c) ** 2
+    log = np.log(squared_distance / np.abs(1.0 - np.conj(c) * z) ** 2)
+    return ((1.0 - np.abs(z) ** 2) * (1.0 - abs(c) ** 2) + squared_distance * log) / (16.0 * np.pi)
 
 
 def michell_under_a_disk(z: np.ndarray, c: complex, radius: float) -> np.ndarray:
-    """Its mean over a disk: a function f with lap lap f = 0 has the mean f + R^2 / 8 lap f, exactly."""
+    """Return the mean of `michell` over a disk of loads.
+
+    A function f with lap lap f = 0 has exactly the mean f + R^2 / 8 lap f over a disk of radius R.
+    """
     log = np.log(np.abs((z - c) / (1.0 - np.conj(c) * z)) ** 2)
     image = 4.0 * 2.0 * ((c - z) * np.conj(z) / (1.0 - np.conj(z) * c)).real
     laplace = -4.0 * (1.0 - np.abs(z) ** 2) + 8.0 + 4.0 * log + image
@@ -103,14 +111,16 @@ def michell_under_a_disk(z: np.ndarray, c: complex, radius: float) -> np.ndarray
 
 
 def read_outside(film: Film, probe: Probe, at: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Points (x, y) all over the film but not under the probe, and the same as z in film radii."""
+    """Return points (x, y) on the film outside the probe, mm, and the same points as complex numbers in film radii."""
     rng = np.random.default_rng(0)
-    near = at + 3.0 * probe.reach * rng.uniform(-1.0, 1.0, (30, 2))
-    points = np.concatenate(
-        [ring(0.5 * film.radius), ring(0.95 * film.radius), rng.uniform(-25.0, 25.0, (30, 2)), near]
+    near_probe = at + 3.0 * probe.reach * rng.uniform(-1.0, 1.0, (30, 2))
+    candidates = np.concatenate(
+        [ring(0.5 * film.radius), ring(0.95 * film.radius), rng.uniform(-25.0, 25.0, (30, 2)), near_probe]
     )
-    keep = (np.hypot(*(points - at).T) > probe.reach) & (np.hypot(*points.T) < film.radius)
-    return points[keep], points[keep] @ np.array([1.0, 1j]) / film.radius
+    is_outside_probe = np.hypot(*(candidates - at).T) > probe.reach
+    is_on_film = np.hypot(*candidates.T) < film.radius
+    points = candidates[is_outside_probe & is_on_film]
+    return points, points @ np.array([1.0, 1j]) / film.radius
 
 
 PLACES = [(0.0, 0.0), (8.0, -5.0), (-20.0, 10.0), (-3.0, 36.0)]
@@ -121,7 +131,7 @@ PLACES = [(0.0, 0.0), (8.0, -5.0), (-20.0, 10.0), (-3.0, 36.0)]
 
 @pytest.mark.parametrize(("at", "radius"), list(zip(PLACES, (4.0, 1.0, 4.0, 1.0), strict=True)))
 def test_taut_membrane_under_a_disk(at, radius):
-    """Green's function is harmonic, so a disk pulls like a point."""
+    """Green's function is harmonic. Outside the probe, the deflection is therefore that of a point load."""
     probe = Circle(radius)
     theory = MEMBRANE if at == PLACES[1] else Theory(False, False, True)
     solved = press(TAUT, probe, at, TINY, SolveSettings(accuracy=1e-5, theory=theory))
@@ -135,7 +145,7 @@ def test_taut_membrane_under_a_disk(at, radius):
 
 @pytest.mark.parametrize(("at", "radius"), list(zip(PLACES, (4.0, 0.2, 4.0, 0.2), strict=True)))
 def test_plate_under_a_disk(at, radius):
-    """Small: Michell's point load. Large: the same, corrected for its size."""
+    """The deflection is that of a disk of point loads, and under a small probe nearly that of one point load."""
     probe = Circle(radius)
     theory = FULL if at == PLACES[1] else Theory(False, True, False)
     solved = press(THICK, probe, at, TINY, SolveSettings(accuracy=1e-4, theory=theory))
@@ -150,27 +160,36 @@ def test_plate_under_a_disk(at, radius):
 
 @pytest.mark.parametrize("tension_MPa", [0.01, 10.0])
 def test_taut_plate_under_a_centred_disk(tension_MPa):
-    """D lap lap w - N lap w = q: logarithm, parabola and modified Bessel functions, joined at the footprint's edge."""
+    """The deflection is the solution of D lap lap w - N lap w = q for a pressure q on a disk.
+
+    Inside and outside the footprint, the solution consists of a parabola, a logarithm and modified Bessel functions. At
+    the edge of the footprint, the deflection and its first three derivatives are continuous.
+    """
     film = replace(SLACK, thickness=0.3, pretension=tension_MPa)
     tension = film.pretension * film.thickness
     c = 0.1
     k = film.radius * np.sqrt(tension / plate_stiffness(film))
 
-    def ladder(r: float) -> tuple[np.ndarray, np.ndarray]:
-        """Value and three derivatives of 1, I0, then of 1, ln, I0, K0 (scaled to one at r = c or r = 1)."""
-        grow, fall = (np.array([k**n * derivative(0, k * r, n) for n in range(4)]) for derivative in (ivp, kvp))
+    def basis(r: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the value and three derivatives of the basis functions at a radius in film radii.
+
+        Inside the footprint they are 1 and I0, and outside 1, ln, I0 and K0, shapes (4, 2) and (4, 4). The Bessel
+        functions are divided by their values at r = c or r = 1.
+        """
+        i0, k0 = (np.array([k**n * derivative(0, k * r, n) for n in range(4)]) for derivative in (ivp, kvp))
         one = np.array([1.0, 0, 0, 0])
         log = np.array([np.log(r), 1 / r, -1 / r**2, 2 / r**3])
         return (
-            np.stack([one, grow / iv(0, k * c)], axis=1),
-            np.stack([one, log, grow / iv(0, k), fall / kv(0, k * c)], axis=1),
+            np.stack([one, i0 / iv(0, k * c)], axis=1),
+            np.stack([one, log, i0 / iv(0, k), k0 / kv(0, k * c)], axis=1),
         )
 
-    inner, outer = ladder(c)
-    _, rim = ladder(1.0)
+    inner, outer = basis(c)
+    _, rim = basis(1.0)
     parabola = -np.array([c**2, 2 * c, 2.0, 0.0]) / (4.0 * np.pi * c**2)  # in units of F / N: q a^2 / N = 1 / pi c^2
-    matrix = np.block([[inner, -outer], [np.zeros((2, 2)), rim[:2]]])
-    weights = np.linalg.solve(matrix, np.concatenate([-parabola, [0.0, 0.0]]))
+    continuity = [inner, -outer]
+    clamped_rim = [np.zeros((2, 2)), rim[:2]]
+    weights = np.linalg.solve(np.block([continuity, clamped_rim]), np.concatenate([-parabola, [0.0, 0.0]]))
     scale = TINY / tension
     for theory in (Theory(False, True, True), Theory(True, True, True)):
         solved = press(
@@ -183,33 +202,50 @@ def test_taut_plate_under_a_centred_disk(tension_MPa):
         centre = deflection(solved, np.zeros((1, 2)))[0]
         assert centre == pytest.approx(scale * (weights[0] + weights[1] / iv(0, k * c)), rel=2e-5)
         for r in (0.2, 0.6, 0.95):
-            expected = scale * (ladder(r)[1][0] @ weights[2:])
+            expected = scale * (basis(r)[1][0] @ weights[2:])
             np.testing.assert_allclose(deflection(solved, ring(r * film.radius)), expected, atol=2e-5 * centre)
 
 
 def charge_of_a(radius: float, stress: Callable[[float], tuple[float, float]]) -> float:
-    """Charge of electrode A of "four-25um-uniaxial", pC, from (s_r, s_theta), MPa, at r / a, by scipy's integral."""
+    """Return the charge of electrode A of "four-25um-uniaxial", pC, by numerical integration.
+
+    Args:
+        radius: Radius of the film, mm.
+        stress: Function that returns (s_r, s_theta), MPa, at a radius in film radii.
+    """
 
     def density(y: float, x: float) -> float:
         r = np.hypot(x, y)
-        c2 = x**2 / (x**2 + y**2)
+        cos2 = x**2 / (x**2 + y**2)
         radial, hoop = stress(r / radius)
-        return 20.0 * (radial * c2 + hoop * (1 - c2)) + 2.0 * (radial * (1 - c2) + hoop * c2)
+        s11 = radial * cos2 + hoop * (1 - cos2)
+        s22 = radial * (1 - cos2) + hoop * cos2
+        return 20.0 * s11 + 2.0 * s22
 
     return dblquad(density, 8.5, 11.5, -1.5, 1.5)[0]
 
 
 def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float, at: np.ndarray) -> np.ndarray:
-    """Scaled deflection, radial and hoop stress at the radii r / a, shape (3, n).
+    """Return the scaled deflection and the radial and hoop stress of a membrane at radii in film radii, shape (3, n).
 
-    Solves for (u, phi = r S_r (1 + A^2 u'), w) in the scaled variables of mechanics.energy, load one. Radial balance is
-    phi' = S_theta (1 + A^2 u / r), vertical balance r S_r w' = - min(1, (r / R)^2) / 2 pi.
+    The unknowns are u, phi = r S_r (1 + A^2 u') and w in the scaled variables of mechanics.energy, for the load one.
+    The radial balance is phi' = S_theta (1 + A^2 u / r). The vertical balance is r S_r w' = - min(1, (r / R)^2) / 2 pi.
+
+    Args:
+        share: Radius R of the probe in film radii.
+        amplitude2: Square A^2 of the scale of the slope.
+        poisson: Poisson's ratio.
+        tension: Scaled pretension.
+        at: Radii, shape (n,).
     """
     plane = 1.0 / (1.0 - poisson**2)
     start = 1e-4
 
     def fields(r: np.ndarray, u: np.ndarray, phi: np.ndarray) -> tuple[np.ndarray, ...]:
-        """u', w', S_r, S_theta: one scalar equation per radius, by Newton from von Karman's answer."""
+        """Return u', w', S_r and S_theta, shapes (n,).
+
+        The slope u' is the solution of one equation for each radius. Newton's method begins at u' = 0.
+        """
         hoop_strain = u / r + 0.5 * amplitude2 * (u / r) ** 2
         tilt = -np.minimum(1.0, (r / share) ** 2) / (2.0 * np.pi * phi)  # w' over 1 + A^2 u'
         slope = np.zeros_like(r)
@@ -227,7 +263,10 @@ def axisymmetric(share: float, amplitude2: float, poisson: float, tension: float
         return np.stack([slope, hoop * (1.0 + amplitude2 * y[0] / r), fall])
 
     def ends(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
-        """At the centre radial and hoop stretch are one; the rim is clamped."""
+        """Return the residuals of the boundary conditions.
+
+        At the centre, the radial and the hoop stretch are equal. The rim is clamped.
+        """
         slope = fields(np.array([start]), inner[:1], inner[1:2])[0][0]
         return np.array([slope - inner[0] / start, outer[0], outer[2]])
 
@@ -268,8 +307,11 @@ def test_axisymmetric_membrane(share, force, poisson, tension):
 
 
 def test_hencky():
-    """A probe over the whole film is a uniform dead pressure q: N_r(0) = b0 / 4 (q^2 a^2 E h)^(1/3) with
-    b0 = 1.7244 at Poisson 0.3 (Hencky 1915; digits of Fichter 1997)."""
+    """The stress in the centre under a uniform pressure agrees with Hencky's series.
+
+    A probe over the whole film exerts a uniform pressure q. Then N_r(0) = b0 / 4 (q^2 a^2 E h)^(1/3), with b0 = 1.7244
+    for Poisson's ratio 0.3 (Hencky 1915; digits of Fichter 1997).
+    """
     film = replace(SLACK, poisson=0.3)
     force = 1e-6
     radius = 0.9999 * SLACK.radius
@@ -281,7 +323,7 @@ def test_hencky():
 
 
 def test_charge_of_a_centred_press_is_the_integral_of_the_boundary_value_problem():
-    """The output itself: electrode A integrated over from scipy's stresses, no code of ours but the solve."""
+    """The charge of electrode A is the integral of the stress that scipy computes, without code of isocharge."""
     sensor = load_sensor("four-25um-uniaxial")
     force = 1.0
     amplitude2 = np.cbrt(force / (SLACK.young * SLACK.thickness * SLACK.radius)) ** 2
