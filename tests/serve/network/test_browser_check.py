@@ -1,4 +1,4 @@
-"""Requests that a page of another site makes a browser send are refused: Host, Origin and Sec-Fetch-Site."""
+"""Check of Host, Origin and Sec-Fetch-Site, which refuses requests of browsers for pages of other sites."""
 
 import contextlib
 import http.server
@@ -26,6 +26,7 @@ UNLOAD = "/v2/repository/models/linear/unload"
 
 
 def headers_of(**headers):
+    """Return headers as bytes. An underscore in a name stands for a hyphen."""
     return {name.replace("_", "-").encode(): value.encode() for name, value in headers.items()}
 
 
@@ -148,7 +149,7 @@ async function attack() {{
 
 @pytest.fixture
 def attacking_page():
-    """Serve a page of another origin that sends requests to `target`; yield the port and the page's settings."""
+    """Serve a page of another origin that sends requests to `target`, and yield its port and its settings."""
     page = {"target": ""}
 
     class Page(http.server.BaseHTTPRequestHandler):
@@ -211,8 +212,8 @@ def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_
     np.testing.assert_equal(len(store.loaded_versions()), 2)
 
 
-def test_a_page_on_another_port_of_an_allowed_host_is_refused():
-    """It belongs to another server; behind a proxy that replaces the `Host`, a page of the allowed host is accepted."""
+def test_page_on_another_port_of_an_allowed_host_is_refused():
+    """The page belongs to another server. Behind a proxy that replaces the `Host`, the page is accepted."""
     check = BrowserCheck("127.0.0.1", ["film.example.org"])
     page = {b"origin": b"http://film.example.org:3000"}
     with pytest.raises(OriginError, match="Origin: expected a page of this server"):

@@ -1,4 +1,4 @@
-"""`/metrics`: read by the stock parser, exact under load, behind the token; what clients invent makes no series."""
+"""The metrics of the server, read by the parser of prometheus_client: counts, labels, and access by the token."""
 
 import json
 import math
@@ -21,6 +21,7 @@ MODEL = "three-25um-biaxial"
 
 
 def body(charges, **more):
+    """Return the body of a request with charges."""
     charges = np.atleast_2d(charges)
     tensor = {"name": "charge_pC", "datatype": "FP32", "shape": list(charges.shape), "data": charges.ravel().tolist()}
     return json.dumps({"inputs": [tensor]} | more).encode()
@@ -31,7 +32,7 @@ def families(text):
 
 
 def scrape(handler):
-    """All samples: name and sorted labels to value."""
+    """Return the value of each sample by its name and its sorted labels."""
     status, headers, text, _ = handler.answer("GET", "/metrics", [], b"")
     assert status == 200
     assert dict(headers)[b"content-type"].startswith(b"text/plain; version=0.0.4")
@@ -45,16 +46,12 @@ def value(samples, name, **labels):
     return samples[(f"isocharge_{name}", *sorted(labels.items()))]
 
 
-def test_the_stock_parser_reads_types_and_help(handler):
-    read = families(handler.answer("GET", "/metrics", [], b"").body)
-    assert {
-        name: family.type for name, family in read.items() if "inference_seconds" in name or "requests" in name
-    } == {
-        "isocharge_requests": "counter",
-        "isocharge_inference_seconds": "histogram",
-    }
-    assert all(family.documentation for family in read.values())
-    assert "process_resident_memory_bytes" in read
+def test_metrics_have_types_and_descriptions(handler):
+    read_families = families(handler.answer("GET", "/metrics", [], b"").body)
+    assert read_families["isocharge_requests"].type == "counter"
+    assert read_families["isocharge_inference_seconds"].type == "histogram"
+    assert all(family.documentation for family in read_families.values())
+    assert "process_resident_memory_bytes" in read_families
 
 
 def test_requests_are_counted_by_route_and_status(handler):
@@ -72,8 +69,8 @@ def test_requests_are_counted_by_route_and_status(handler):
     assert value(samples, "inferences_refused_total", model="linear", version="2") == 2
 
 
-def test_clients_cannot_invent_series(handler):
-    """Any number of paths, models, versions and methods."""
+def test_clients_cannot_create_series(handler):
+    """The number of series stays small with any number of paths, models, versions and methods."""
     rng = np.random.default_rng(0)
     before = len(scrape(handler))
     for number in range(500):
@@ -87,8 +84,9 @@ def test_clients_cannot_invent_series(handler):
 
 
 def test_latency_histogram_counts_the_durations():
-    """Against numpy's counting of the same durations."""
-    rng, counters = np.random.default_rng(1), Statistics()
+    """The expected numbers are counted by numpy."""
+    rng = np.random.default_rng(1)
+    counters = Statistics()
     stages = np.round(np.exp(rng.uniform(np.log(1e3), np.log(2e7), (2000, 3)))).astype(int)
     stages[:3] = [[10_000, 0, 0], [9_999, 1, 1], [20_000_000, 0, 1]]  # on a bound, and just beyond
     for row in stages.tolist():
@@ -99,23 +97,26 @@ def test_latency_histogram_counts_the_durations():
 
 
 def test_misfit_alarms_are_the_flags_of_records():
-    """Of single presses, of batches, and of requests that do not ask for the misfit."""
-    handler, folder = Handler(open_model_store(find_model(MODEL).parents[1])), find_model(MODEL)
+    """Single presses and batches are sent, with and without the misfit among the requested outputs."""
+    folder = find_model(MODEL)
+    handler = Handler(open_model_store(folder.parents[1]))
     charges = np.random.default_rng(2).uniform(300.0, 1500.0, (300, 3)).astype(np.float32)
     predictor = Predictor(folder)
     flags = Validity.of(predictor.metadata).batch_flags(predictor.predict_batch(charges))
-    alarms = [MISFIT in of for of in flags]
+    alarms = [MISFIT in press_flags for press_flags in flags]
     assert 20 < sum(alarms) < 280
-    path, contact_only = f"/v2/models/{MODEL}/infer", {"outputs": [{"name": "contact"}]}
+    path = f"/v2/models/{MODEL}/infer"
+    contact_only = {"outputs": [{"name": "contact"}]}
     handler.answer("POST", path, [], body(charges))  # 300 checked
     for row in charges[:50]:
         handler.answer("POST", path, [], body(row))  # 50 checked
-        handler.answer("POST", path, [], body(row, **contact_only))  # 50 checked: a press is always computed whole
-    handler.answer("POST", path, [], body(charges, **contact_only))  # of a batch, only what is asked for
-    samples, of = scrape(handler), {"model": MODEL, "version": "1"}
-    stats = json.loads(handler.answer("GET", f"/v2/models/{MODEL}/stats", [], b"").body)["model_stats"][0][
-        "inference_stats"
-    ]
+        # 50 checked, because all outputs of a single press are computed
+        handler.answer("POST", path, [], body(row, **contact_only))
+    handler.answer("POST", path, [], body(charges, **contact_only))  # not checked
+    samples = scrape(handler)
+    of = {"model": MODEL, "version": "1"}
+    stats_body = handler.answer("GET", f"/v2/models/{MODEL}/stats", [], b"").body
+    stats = json.loads(stats_body)["model_stats"][0]["inference_stats"]
     seconds = [
         value(samples, "inference_stage_seconds_total", stage="compute_infer", **of),
         value(samples, "inference_seconds_sum", **of),
@@ -166,14 +167,15 @@ BEARER = [(b"authorization", b"Bearer yes")]
 
 
 def test_health_ready_states_the_reason(film, tmp_path):
-    """To everybody, so in numbers; the body is the protocol's. The index has the reasons for those who may know."""
+    """The answer needs no token, and therefore contains only numbers. The index, which needs it, has the reasons."""
     film.write(tmp_path)
     (film.write(tmp_path, version=2) / "golden.json").unlink()
     handler = Handler(open_model_store(tmp_path), token=Token("yes"))
     assert handler.answer("GET", "/v2/health/ready", [], b"").body == b'{"ready":true}'
     handler.answer("POST", "/v2/repository/models/linear/unload", BEARER, b"")
     status, _, body, _ = handler.answer("GET", "/v2/health/ready", [], b"")
-    assert (status, "(versions refused: 0, unloaded: 1)" in json.loads(body)["error"]) == (400, True)
+    assert status == 400
+    assert "(versions refused: 0, unloaded: 1)" in json.loads(body)["error"]
     (tmp_path / "linear/1/golden.json").unlink()
     handler.answer("POST", "/v2/repository/models/linear/load", BEARER, b"")
     assert b"(versions refused: 2, unloaded: 0)" in handler.answer("GET", "/v2/health/ready", [], b"").body

@@ -1,7 +1,4 @@
-"""The page's server, asked by the stock WebSocket client and by others that mean no good.
-
-Who may follow a film: the token, and pages of this server.
-"""
+"""Server of the live page: samples for viewers, hostile clients, and access by the token and by pages of the server."""
 
 import asyncio
 import base64
@@ -26,33 +23,35 @@ from isocharge.serve.viewer.server import MAX_BURST_BYTES, MAX_VIEWERS, Access, 
 
 
 def put(page, record, count, **changes):
-    """Records 5 ms apart, ending now."""
-    end = time.time()
-    for k in range(count):
-        changed = {"timestamp": end - 0.005 * (count - 1 - k), "seq": k} | changes
-        page.reader.send_sample(page.form.pack(record(**changed)))
+    """Send records at intervals of 5 ms, the last of which has the present time."""
+    end_s = time.time()
+    for number in range(count):
+        fields = {"timestamp": end_s - 0.005 * (count - 1 - number), "seq": number} | changes
+        page.reader.send_sample(page.form.pack(record(**fields)))
 
 
 def test_new_viewer_receives_the_last_seconds(page, record, viewer):
     async def talk(client):
-        seen, headers = 0, []
-        while seen < 1000:
+        record_count = 0
+        headers = []
+        while record_count < 1000:
             header, rows = await client.samples()
             headers.append(header)
-            seen += rows["records"].sum()
+            record_count += rows["records"].sum()
             assert len(rows) <= 600
         return headers
 
     put(page, record, 1000)
     headers = viewer(page, talk)
-    assert [header[6] for header in headers] == [1, *[0] * (len(headers) - 1)]  # the first one says: begin anew
+    begins_anew = [bool(header[6]) for header in headers]
+    assert begins_anew == [True, *[False] * (len(headers) - 1)]
 
 
 @pytest.mark.parametrize("turns", [20, 200])
 def test_viewer_receives_samples_only_after_confirming_earlier_ones(page, record, viewer, turns):
-    """Two messages that are not confirmed: then nothing, and what came meanwhile in one, few samples for all or most.
+    """A viewer with two unconfirmed messages receives nothing. All later samples then come coalesced in one message.
 
-    What was too much to be kept is counted.
+    Samples that could not be stored are counted as missed.
     """
 
     async def talk(client):
@@ -81,15 +80,17 @@ def test_stalled_viewer_delays_neither_the_reader_nor_other_viewers(page, record
     async def talk(client):
         async with connect(page.live) as stalled:
             stalled.transport.pause_reading()
-            seen = 0
+            record_count = 0
             await client.samples()
             for _ in range(50):
                 put(page, record, 10)
-                seen += (await client.samples())[1]["records"].sum()
-            while seen < 500:
-                seen += (await client.samples())[1]["records"].sum()
+                _, rows = await client.samples()
+                record_count += rows["records"].sum()
+            while record_count < 500:
+                _, rows = await client.samples()
+                record_count += rows["records"].sum()
             stalled.transport.resume_reading()
-            return seen
+            return record_count
 
     assert viewer(page, talk) == 500
     assert page.reader.dropped == 0
@@ -106,9 +107,9 @@ def test_state_messages_are_sent_to_the_viewer(page, viewer):
                 return state
 
     state = viewer(page, talk)
-    assert (
-        state.items() >= {"counters": {"frames": 7}, "recording": "x.rec", "markers": [[1.0, ""], [2.0, "b"]]}.items()
-    )
+    assert state["counters"] == {"frames": 7}
+    assert state["recording"] == "x.rec"
+    assert state["markers"] == [[1.0, ""], [2.0, "b"]]
 
 
 @pytest.mark.parametrize(
@@ -144,11 +145,11 @@ FLOODS = {
     "pongs": b"\x8a\x80" + MASK,
     "empty continuations": b"\x00\x80" + MASK,
 }
-"""Frames by their bytes; their first byte is kind and end, the second the length and that they are masked."""
+"""Bytes of WebSocket frames. The first byte is the kind, and the second byte is the length with the bit of the mask."""
 
 
-def followed(place):
-    """A socket on which a stream is followed, by hand."""
+def open_websocket(place):
+    """Return a socket with an open WebSocket connection to the live stream."""
     client = socket.create_connection((place.hostname, place.port), timeout=20)
     client.sendall(
         b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -159,9 +160,9 @@ def followed(place):
 
 
 def test_reading_is_paused_while_the_client_reads_no_responses(start_page, monkeypatch):
-    """Pongs that nobody takes would fill the memory."""
+    """Otherwise, pongs that the client does not read would fill the memory."""
     monkeypatch.setattr(server, "MAX_BURST_BYTES", 1 << 40)
-    with followed(urlsplit(start_page().url)) as hostile:
+    with open_websocket(urlsplit(start_page().url)) as hostile:
         hostile.settimeout(1.0)
         with pytest.raises(TimeoutError):
             hostile.sendall(FLOODS["long pings"] * 200_000)  # 26 MB, more than the system's buffers
@@ -169,11 +170,11 @@ def test_reading_is_paused_while_the_client_reads_no_responses(start_page, monke
 
 @pytest.mark.parametrize("kind", FLOODS)
 def test_too_much_data_in_any_kind_of_frame_ends_the_connection(page, record, viewer, kind):
-    """Also of one that is no message, and a good viewer gets its samples beside."""
+    """The limit also applies to frames that are no messages. Another viewer still receives its samples."""
     place = urlsplit(page.url)
 
     def flood():
-        with followed(place) as hostile:
+        with open_websocket(place) as hostile:
             first = b"\x01\x80" + MASK if kind == "empty continuations" else b""
             sent = 0
             with suppress(OSError):
@@ -197,8 +198,12 @@ def test_too_much_data_in_any_kind_of_frame_ends_the_connection(page, record, vi
 
 def test_rate_limit_refills_with_time():
     limit = RateLimit(10.0, 5.0, 0.0)
-    spends = [limit.allows(size, at_s) for size, at_s in ((5, 0), (5, 0), (5, 0), (4, 2), (10, 100), (11, 200))]
-    assert spends == [True, True, False, True, True, False]
+    assert limit.allows(5, 0)
+    assert limit.allows(5, 0)
+    assert not limit.allows(5, 0)
+    assert limit.allows(4, 2)
+    assert limit.allows(10, 100)
+    assert not limit.allows(11, 200)
 
 
 def test_number_of_viewers_is_limited(page, viewer):
@@ -228,7 +233,7 @@ def test_number_of_viewers_is_limited(page, viewer):
     ids=["trailers", "headers", "address", "body", "noise"],
 )
 def test_wrong_http_request_is_refused(page, request_):
-    """It is refused or answered before it is read to its end, whatever its length."""
+    """A request of any length is refused or answered before it has been read completely."""
     place = urlsplit(page.url)
     with socket.create_connection((place.hostname, place.port), timeout=20) as connection:
         with suppress(OSError):
@@ -252,7 +257,7 @@ def test_websocket_from_a_page_of_another_site_is_refused(page, viewer):
 
 def test_description_and_websocket_need_the_token(start_page, viewer):
     page = start_page(token="s3cret")
-    assert page.get("/")[0] == 200  # the page itself says nothing of a film
+    assert page.get("/")[0] == 200  # the page itself contains nothing about the film
     with pytest.raises(urllib.error.HTTPError, match="401"):
         page.get("/session.json")
     assert page.get("/session.json", Authorization="Bearer s3cret")[0] == 200
@@ -265,8 +270,9 @@ def test_description_and_websocket_need_the_token(start_page, viewer):
         await client.samples()
         return client.socket.subprotocol
 
-    as_a_page = {"subprotocols": ["isocharge.live.1", "bearer.czNjcmV0"]}
-    for options in ({"additional_headers": {"Authorization": "Bearer s3cret"}}, as_a_page):
+    token_in_header = {"additional_headers": {"Authorization": "Bearer s3cret"}}
+    token_in_subprotocol = {"subprotocols": ["isocharge.live.1", "bearer.czNjcmV0"]}
+    for options in (token_in_header, token_in_subprotocol):
         assert viewer(page, talk, **options) == "isocharge.live.1"
 
 
@@ -290,9 +296,11 @@ def test_unknown_path_is_not_found(page, path):
 
 
 def test_files_of_the_page_are_served(page):
-    """Every file that the page names is served, loads nothing from elsewhere, and a browser is told to see to it."""
+    """Each file that the page names is served. The headers forbid the browser to load files from other servers."""
     status, headers, body = page.get("/")
-    assert (status, headers["X-Content-Type-Options"], headers["Referrer-Policy"]) == (200, "nosniff", "no-referrer")
+    assert status == 200
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    assert headers["Referrer-Policy"] == "no-referrer"
     policy = headers["Content-Security-Policy"]
     assert "default-src 'none'" in policy
     assert "script-src 'self'" in policy
@@ -304,6 +312,7 @@ def test_files_of_the_page_are_served(page):
 
 
 def bearer(token):
+    """Return the subprotocol that contains a token."""
     return "bearer." + base64.urlsafe_b64encode(token.encode()).decode().rstrip("=")
 
 
@@ -321,16 +330,17 @@ def test_access_refuses_pages_of_other_sites(origin):
 
 
 def test_access_refuses_a_rebound_host_name():
-    """DNS rebinding: the page and the server then have the same name, and it is not ours."""
+    """After DNS rebinding, the page and the server have the same name, which is not a name of this server."""
     headers = {b"host": b"evil.example:8001", b"origin": b"http://evil.example:8001"}
     with pytest.raises(OriginError, match=r"expected an IP address or one of 127\.0\.0\.1, localhost"):
         Access().check(headers)
-    Access(host="evil.example").check(headers)  # that is the name on which it was told to listen
-    Access(Token("secret")).check(headers | {b"authorization": b"Bearer secret"})  # nobody has it by accident
+    Access(host="evil.example").check(headers)  # the server listens on this name
+    Access(Token("secret")).check(headers | {b"authorization": b"Bearer secret"})  # the page knows the token
 
 
 def test_access_takes_the_token_from_header_or_subprotocol():
-    access, headers = Access(Token("s3cret?>~")), {b"host": b"127.0.0.1:1"}
+    access = Access(Token("s3cret?>~"))
+    headers = {b"host": b"127.0.0.1:1"}
     access.check(headers | {b"authorization": b"Bearer s3cret?>~"})
     access.check(headers, ["isocharge.live.1", bearer("s3cret?>~")])
     for offered in ([], ["isocharge.live.1"], [bearer("other")], ["bearer.***"], ["bearer."], ["bearer.\u00e9"]):

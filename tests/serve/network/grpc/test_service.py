@@ -1,7 +1,4 @@
-"""What the stock gRPC client does not reach: numbers that are not raw, token, TLS, limits, ports, compiled messages.
-
-Clients that open calls and say nothing: refused or bounded by what their metadata say, they hold nobody up.
-"""
+"""gRPC service: numbers that are not raw contents, token, TLS, limits, silent clients, and the compiled messages."""
 
 import itertools
 import socket
@@ -29,19 +26,20 @@ PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inferenc
 
 @pytest.fixture
 def serve(store):
-    """Start servers with limits of the test's; a function that makes channels to them."""
+    """Return a function that starts a server with given limits, and returns a function that opens channels to it."""
     with ExitStack() as stack:
 
         def start(token=None, **limits):
             handler = Handler(store, ServerLimits(**limits), token=token)
             url = stack.enter_context(grpc_server(handler, "127.0.0.1", 0)).removeprefix("grpc://")
-            # a separate connection for each channel
+            # Each channel has its own connection.
             return lambda: stack.enter_context(grpc.insecure_channel(url, [("grpc.use_local_subchannel_pool", 1)]))
 
         yield start
 
 
 def call(channel, name, /, metadata=None, **fields):
+    """Call a method with the fields of its request, and return the response."""
     request, response = METHODS[name]
     method = channel.unary_unary(
         f"/{SERVICE}/{name}",
@@ -52,6 +50,7 @@ def call(channel, name, /, metadata=None, **fields):
 
 
 def tensor(charges, datatype="FP32", **fields):
+    """Return the fields of an input tensor with charges."""
     contents = {"FP32": "fp32_contents", "FP64": "fp64_contents"}[datatype]
     values = {"contents": {contents: np.ravel(charges).tolist()}}
     return {"name": "charge_pC", "datatype": datatype, "shape": list(np.shape(charges)), **values, **fields}
@@ -61,19 +60,23 @@ def tensor(charges, datatype="FP32", **fields):
 def test_charges_as_fp32_contents(serve, film, predictor, datatype):
     answer = call(serve()(), "ModelInfer", model_name="linear", id="7", inputs=[tensor(film.golden_pC(), datatype)])
     contact, std, misfit = answer.outputs
-    assert (answer.id, list(answer.raw_output_contents)) == ("7", [])
+    assert answer.id == "7"
+    assert list(answer.raw_output_contents) == []
     assert [output.name for output in answer.outputs] == ["contact", "contact_std", "misfit"]
     expected = np.column_stack(predictor.predict_batch(film.golden_pC()))
     for output, columns in ((contact, slice(0, 3)), (std, slice(3, 6)), (misfit, slice(6, 7))):
-        got = np.float32(output.contents.fp32_contents).reshape(output.shape)
-        np.testing.assert_array_equal(got, expected[:, columns])
+        rows = np.float32(output.contents.fp32_contents).reshape(output.shape)
+        np.testing.assert_array_equal(rows, expected[:, columns])
 
 
 def test_flags_as_bytes_contents(serve):
     far = tensor([[-3.0, 900.0, 900.0], [800.0, 800.0, 800.0]])
     (flags,) = call(serve()(), "ModelInfer", model_name="linear", inputs=[far], outputs=[{"name": "flags"}]).outputs
     first, second = flags.contents.bytes_contents
-    assert (flags.datatype, flags.shape, first[:7], second) == ("BYTES", [2, 1], b"outside", b"")
+    assert flags.datatype == "BYTES"
+    assert flags.shape == [2, 1]
+    assert first.startswith(b"outside")
+    assert second == b""
 
 
 @pytest.mark.parametrize(
@@ -122,7 +125,8 @@ def test_message_above_the_size_limit_is_refused(serve):
 
 def test_calls_need_the_token(serve):
     ask = partial(call, serve(token=Token("open sesame"))())
-    assert all((ask("ServerLive").live, ask("ServerReady").ready))
+    assert ask("ServerLive").live
+    assert ask("ServerReady").ready
     assert ask("ModelMetadata", metadata=[("authorization", "Bearer open sesame")], name="linear").name == "linear"
     for metadata in ([], [("authorization", "Bearer sesame")]):
         with pytest.raises(grpc.RpcError, match="this server's token") as caught:
@@ -157,17 +161,21 @@ def test_message_of_an_internal_error_is_logged_and_not_sent(serve, store, monke
 
 def test_compiled_protocol_file_equals_the_source(tmp_path):
     """Only the descriptors are compared, because compilers differ in details."""
-    made = tmp_path / "made.binpb"
-    words = [sys.executable, "-m", "grpc_tools.protoc", f"-I{PROTO.parent}", f"--descriptor_set_out={made}", PROTO.name]
-    subprocess.run(words, check=True)
-    kept, new = (FileDescriptorSet.FromString(path.read_bytes()) for path in (PROTO.with_suffix(".binpb"), made))
-    assert kept == new
+    compiled = tmp_path / "new.binpb"
+    options = [f"-I{PROTO.parent}", f"--descriptor_set_out={compiled}"]
+    subprocess.run([sys.executable, "-m", "grpc_tools.protoc", *options, PROTO.name], check=True)
+    stored_set = FileDescriptorSet.FromString(PROTO.with_suffix(".binpb").read_bytes())
+    assert stored_set == FileDescriptorSet.FromString(compiled.read_bytes())
 
 
 @pytest.fixture
 def silent_call():
-    """Open calls of a method whose client sends nothing until the test ends."""
-    over = Event()
+    """Return a function that opens a call, sends some messages, and then nothing until the test ends."""
+    test_ended = Event()
+
+    def wait_for_end():
+        test_ended.wait()
+        yield from ()
 
     def open_call(channel, name, messages=()):
         method = channel.stream_stream(
@@ -175,13 +183,14 @@ def silent_call():
             request_serializer=lambda message: message if isinstance(message, bytes) else message.SerializeToString(),
             response_deserializer=METHODS[name][1].FromString,
         )
-        return method(itertools.chain(messages, (over.wait() for _ in range(1) if not over.wait())))
+        return method(itertools.chain(messages, wait_for_end()))
 
     yield open_call
-    over.set()
+    test_ended.set()
 
 
 def is_served(channel):
+    """Return whether the server answers a call."""
     method = channel.unary_unary(
         f"/{SERVICE}/ServerMetadata", response_deserializer=METHODS["ServerMetadata"][1].FromString
     )
@@ -189,13 +198,14 @@ def is_served(channel):
 
 
 def refusal(call):
+    """Return the name of the status with which the server ends a call."""
     with pytest.raises(grpc.RpcError) as caught:
         next(call)
     return caught.value.code().name
 
 
 def test_stream_without_a_token_is_refused(serve, silent_call):
-    """The token is in the metadata: no message need come for a refusal."""
+    """The token is in the metadata, so that a call is refused before its first message."""
     connect = serve(token=Token("sesame"))
     channel = connect()
     assert [refusal(silent_call(channel, "ModelStreamInfer")) for _ in range(8)] == ["UNAUTHENTICATED"] * 8
@@ -204,7 +214,7 @@ def test_stream_without_a_token_is_refused(serve, silent_call):
 
 @pytest.mark.parametrize(("name", "messages"), [("ModelInfer", 0), ("ModelStreamInfer", 0), ("ModelStreamInfer", 1)])
 def test_silent_calls_are_closed(serve, silent_call, name, messages):
-    """Within the time for headers if no message came, and within that between requests if one did."""
+    """The limit is `header_seconds` before the first message, and `idle_seconds` after it."""
     connect = serve(header_seconds=0.3, idle_seconds=0.3)
     call = silent_call(connect(), name, [METHODS[name][0]()] * messages)
     for _ in range(messages):
@@ -213,7 +223,7 @@ def test_silent_calls_are_closed(serve, silent_call, name, messages):
 
 
 def test_silent_connection_is_closed(store):
-    """Within the time for headers, not gRPC's own two minutes."""
+    """The limit is `header_seconds`, not the default of gRPC, which is two minutes."""
     with grpc_server(Handler(store, ServerLimits(header_seconds=0.1)), "127.0.0.1", 0) as url:
         host, port = url.removeprefix("grpc://").split(":")
         with socket.create_connection((host, int(port)), timeout=6.0) as silent:
@@ -223,19 +233,21 @@ def test_silent_connection_is_closed(store):
 
 def test_new_call_replaces_the_call_that_waits_longest(serve, silent_call):
     connect = serve(connections=5)
-    silent, busy = connect(), connect()
-    calls = [silent_call(silent, "ModelStreamInfer") for _ in range(5)]
+    silent_channel = connect()
+    busy_channel = connect()
+    silent_calls = [silent_call(silent_channel, "ModelStreamInfer") for _ in range(5)]
     time.sleep(0.3)
-    assert all(is_served(busy) for _ in range(3))
-    deadline = time.monotonic() + 60.0
-    while not any(call.done() for call in calls) and time.monotonic() < deadline:
-        time.sleep(0.01)  # the client learns of it a moment later
-    assert refusal(next(call for call in calls if call.done())) == "DEADLINE_EXCEEDED"
-    assert not all(call.done() for call in calls)
+    assert all(is_served(busy_channel) for _ in range(3))
+    deadline_s = time.monotonic() + 60.0
+    while not any(call.done() for call in silent_calls) and time.monotonic() < deadline_s:
+        time.sleep(0.01)  # the end of a call reaches the client a moment later
+    ended_call = next(call for call in silent_calls if call.done())
+    assert refusal(ended_call) == "DEADLINE_EXCEEDED"
+    assert not all(call.done() for call in silent_calls)
 
 
 def test_bytes_that_are_no_message_are_refused(serve, silent_call):
-    """The client's mistake, not the server's."""
+    """The status states a mistake of the client, not of the server."""
     channel = serve()()
     assert refusal(silent_call(channel, "ModelInfer", [b"\xff\xff\xff"])) == "INVALID_ARGUMENT"
     assert refusal(silent_call(channel, "ModelStreamInfer", [b"\xff\xff\xff"])) == "INVALID_ARGUMENT"
