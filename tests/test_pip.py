@@ -127,6 +127,7 @@ def test_a_missing_extra_says_so_in_python_too(base, tmp_path, stage):
     assert f"pip install 'isocharge[{stage}]'" in done.stderr
 
 
+@pytest.mark.first_cases(2)
 @pytest.mark.parametrize(
     ("words", "extra"),
     [

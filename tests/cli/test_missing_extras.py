@@ -80,6 +80,14 @@ The processes are forked after torch and SciPy are imported, because this import
 """
 
 
+ABSENT_PACKAGES = {extra: packages - {"google"} for extra, packages in PACKAGES.items()}
+"""Packages that are absent without an extra; "every extra" for the base install. protobuf comes with onnxruntime."""
+ABSENT_PACKAGES["every extra"] = frozenset().union(*ABSENT_PACKAGES.values())
+
+IN_A_PROCESS = BASE_COMMANDS | {"demo", "serve http", "simulate point", "train fit"}
+"""Commands that run in a process of the base install in `make test`: those of the base install, one of each extra."""
+
+
 def extra_of(command):
     group = command.split()[0]
     return EXTRAS.get(command, "train" if group == "demo" else group)
@@ -107,7 +115,9 @@ def run(words, environment, folder):
     return done
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    "command", [pytest.param(name, marks=[] if name in IN_A_PROCESS else [pytest.mark.slow]) for name in COMMANDS]
+)
 def test_a_command_in_the_base_install_runs_or_names_the_install_command(command, installed, tmp_path):
     done = run(example_of(command), installed(), tmp_path)
     if command in BASE_COMMANDS:
@@ -128,7 +138,7 @@ def test_an_option_in_the_base_install_names_the_install_command(line, extra, in
 @pytest.fixture(scope="module")
 def outcomes_without(installed):
     """The message of each command, or "" if it is imported, for each extra that is missing."""
-    absent = {extra: sorted(packages - {"google"}) for extra, packages in PACKAGES.items()}
+    absent = {extra: sorted(packages) for extra, packages in ABSENT_PACKAGES.items()}
     done = subprocess.run(
         [sys.executable, "-c", LOAD_ALL, json.dumps(absent)],
         env=installed("all"),
@@ -141,15 +151,17 @@ def outcomes_without(installed):
     return dict(json.loads(line) for line in done.stdout.splitlines())
 
 
-@pytest.mark.parametrize("missing", PACKAGES)
+@pytest.mark.parametrize("missing", ABSENT_PACKAGES)
 def test_commands_are_imported_or_name_the_one_extra_that_is_missing(missing, outcomes_without):
-    """Every command in an install that has all packages but those of one extra."""
+    """Every command in an install that has all packages but those of one extra, and in the base install."""
     outcomes = outcomes_without[missing]
     assert outcomes.keys() == COMMANDS.keys()
     for command, message in outcomes.items():
         if message:
             assert f"pip install 'isocharge[{extra_of(command)}]'" in message
-            assert PACKAGES[extra_of(command)] & PACKAGES[missing]
+            assert PACKAGES[extra_of(command)] & ABSENT_PACKAGES[missing]
+    if missing == "every extra":
+        assert {command for command, message in outcomes.items() if not message} == BASE_COMMANDS
 
 
 def test_the_base_install_writes_the_playground(installed, tmp_path):
