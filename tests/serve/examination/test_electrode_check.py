@@ -23,7 +23,7 @@ PRESS_S = 0.6
 
 
 def press_script(directions, rest_s=REST_S, first_rest_s=REST_S):
-    """Presses of 0.3 N, 8 mm from the centre in some directions, with a rest before each."""
+    """Return a script of presses of 0.3 N, 8 mm from the centre in some directions, with a rest before each press."""
     seconds, points = [0.0], [(0.0, 0.0, 0.0)]
     for number, (x, y) in enumerate(directions):
         begin_s = seconds[-1] + (rest_s if number else first_rest_s)
@@ -43,7 +43,7 @@ def noise(charge_pC, rng):
 
 
 def sensor_with_wiring(charges, directions, wiring, gain=1.0, **options):
-    """A virtual sensor whose channel k is connected to electrode `wiring[k]`."""
+    """Return a virtual sensor. Its channel i is connected to electrode `wiring[i]`."""
     wired = lambda contact: np.asarray(gain) * charges(contact)[:, list(wiring)]  # noqa: E731
     return VirtualSensor(wired, press_script(directions, **options), noise=noise, offset_pC=[20.0] * len(wiring))
 
@@ -76,7 +76,7 @@ def test_channels_of_three_electrodes(film, wiring, sentence):
 
 
 def test_swapped_channels_of_the_simulated_film():
-    """With the charges of the simulator, gains that differ by a factor of two, and one that inverts."""
+    """The charges are those of the simulator. The gains differ by a factor of two, and one gain is negative."""
     sensor = load_sensor("three-25um-biaxial")
     forward_map = kept(ForwardMap.build, sensor, Circle(1.0))
     places = np.array([electrode.centre for electrode in sensor.electrodes])
@@ -132,7 +132,7 @@ def test_settings_of_single_electrodes_move_with_their_channels():
 
 
 def test_doctor_writes_the_order_of_the_channels_found_by_presses(film, models, command, tmp_path):
-    """From swapped wires to the right contact, with nothing but the file that doctor writes."""
+    """The wires of two electrodes are swapped. The file that doctor writes assigns the right channels."""
     path = tmp_path / "board.toml"
     with sensor_with_wiring(film.charges, film.directions, (1, 0, 2), first_rest_s=4.0) as sensor:
         words = ("--port", sensor.url, "--seconds", 1, "--check-electrodes", "--write", path)

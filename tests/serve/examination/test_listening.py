@@ -1,10 +1,11 @@
-"""Listening at one speed after the other, on ports whose speed, echo or silence is not known."""
+"""Listening to a port at several baud rates, and detection of the echo of requests."""
 
 import os
 import socket
 import threading
 import tty
 from contextlib import suppress
+from typing import ClassVar
 
 import pytest
 
@@ -17,7 +18,7 @@ from isocharge.serve.port.source import Chunk
 
 @pytest.fixture
 def pty():
-    """A pseudo-terminal: the descriptor of the board's end, and the path of the reader's."""
+    """Return the descriptor of the board's end of a pseudo-terminal, and the path of the reader's end."""
     board, reader = os.openpty()
     tty.setraw(reader)
     os.set_blocking(board, False)
@@ -28,8 +29,9 @@ def pty():
 
 @pytest.fixture
 def run(pty):  # noqa: ARG001 - the threads end before the pseudo-terminal does
-    """Call a function in a thread again and again, until the test ends."""
-    stop, threads = threading.Event(), []
+    """Return a function that calls another function repeatedly in a thread until the test ends."""
+    stop = threading.Event()
+    threads = []
 
     def start(function, pause_s=0.0):
         def loop():
@@ -46,13 +48,15 @@ def run(pty):  # noqa: ARG001 - the threads end before the pseudo-terminal does
 
 
 class PortOfOneSpeed:
-    """A serial port that gives lines at 57600 bit/s, other bytes at other speeds; a read moves a clock of its own."""
+    """A serial port that returns lines at 57600 bit/s, and other bytes at other speeds. A read advances its clock."""
 
-    echo_share, opened = 0.0, []
+    echo_share = 0.0
+    opened: ClassVar[list] = []
     now_s = 0.0
 
     def __init__(self, url, *, baud, request, wait):  # noqa: ARG002
-        self.baud, self.lines = baud, 0
+        self.baud = baud
+        self.lines = 0
         self.opened.append((url, baud, request))
 
     def __enter__(self):
@@ -64,13 +68,14 @@ class PortOfOneSpeed:
     def read(self, timeout_s):
         type(self).now_s += min(timeout_s, 0.01)
         self.lines += 2
-        data = b"".join(b"A:%d.5,B:%d.25,C:7.5\n" % (k % 7, k % 5) for k in (self.lines, self.lines + 1))
+        numbers = (self.lines, self.lines + 1)
+        data = b"".join(b"A:%d.5,B:%d.25,C:7.5\n" % (number % 7, number % 5) for number in numbers)
         return Chunk(data if self.baud == 57600 else b"\xf8\x80\xfe\xff", 1e9 + self.now_s, 0)
 
 
 @pytest.fixture
 def opened(monkeypatch):
-    """(url, speed, request) of the ports that were opened."""
+    """Return the list of the URLs, baud rates and requests of the ports that are opened."""
     monkeypatch.setattr(listening, "Port", PortOfOneSpeed)
     monkeypatch.setattr(listening.time, "monotonic", lambda: PortOfOneSpeed.now_s)
     monkeypatch.setattr(PortOfOneSpeed, "opened", [])
@@ -88,7 +93,9 @@ def opened(monkeypatch):
 )
 def test_baud_rate_is_found(opened, bauds, tried, good):
     report = examine("/dev/ttyUSB9", bauds=bauds, seconds=2.0)
-    assert (report.baud, report.good, report.seconds) == (tried[-1], pytest.approx(good, abs=3), pytest.approx(2.0))
+    assert report.baud == tried[-1]
+    assert report.good == pytest.approx(good, abs=3)
+    assert report.seconds == pytest.approx(2.0)
     assert [baud for _, baud, _ in opened] == tried
     assert good or "another baud rate" in report.missing[0]
 
@@ -107,7 +114,7 @@ def test_echo_of_a_request_is_detected(run, pty, echo):
     assert received.request == Request(b"?\n", 100.0, echo=echo)
     lines = b"".join(received.data).split(b"\n")
     assert set(lines) <= {b"1,2", b"", b"?"}
-    assert lines.count(b"?") < lines.count(b"1,2")  # one of a late answer, on a busy machine
+    assert lines.count(b"?") < lines.count(b"1,2")  # on a busy machine, an echo may arrive late
 
 
 def test_each_datagram_is_a_chunk(run):
@@ -116,7 +123,7 @@ def test_each_datagram_is_a_chunk(run):
         url = f"udp://127.0.0.1:{sender.getsockname()[1] + 1}"
 
         def send():
-            with suppress(OSError):  # closed before the last turn
+            with suppress(OSError):  # the socket may be closed before the thread ends
                 sender.sendto(b"\x01\x02\x03", ("127.0.0.1", int(url.rpartition(":")[2])))
 
         run(send, 0.01)
@@ -126,6 +133,6 @@ def test_each_datagram_is_a_chunk(run):
 
 
 def test_time_span_of_a_burst():
-    chunks = [Chunk(b"x", 100.0 + 0.1 * k, 0) for k in range(5)]
+    chunks = [Chunk(b"x", 100.0 + 0.1 * number, 0) for number in range(5)]
     assert ReceivedData("x", 1, chunks=chunks, seconds=3.0).span_s == pytest.approx(0.5)
     assert ReceivedData("x", 1, chunks=chunks[:1], seconds=3.0).span_s == 3.0

@@ -1,7 +1,4 @@
-"""What the port check finds in the bytes of boards whose faults are known.
-
-Offset, noise, drift and hum of channels against the values that they were computed from.
-"""
+"""Port check of simulated boards with known faults, and health of channels with known noise, drift and hum."""
 
 import json
 import re
@@ -26,30 +23,32 @@ AT_REST = device_from_table({"leak": {"tau_s": 10.0}}, "test")
 
 
 def received(encode, n=400, **options):
-    """What came of a board that sends `encode(number)` 200 times a second."""
-    chunks = [Chunk(encode(k), 1.7e9 + k / RATE_HZ, 0) for k in range(n)]
+    """Return the bytes of a board that sends `encode(number)` 200 times per second."""
+    chunks = [Chunk(encode(number), 1.7e9 + number / RATE_HZ, 0) for number in range(n)]
     return ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=n / RATE_HZ, **options)
 
 
 def charges(*, offset=(5.0, -6.0, 7.0), noise=0.3, hum=0.0, drift=0.0, encode=encode_frame):
-    """A board of three electrodes, which sends charges in pC."""
+    """Return a function that returns the frames of a board with three electrodes, which sends charges in pC."""
     rng = np.random.default_rng(0)
 
-    def frame(k):
-        wave = hum * np.sin(2 * np.pi * 50 * k / RATE_HZ + 0.5) + drift * k / RATE_HZ
-        values = np.array(offset) + wave + rng.normal(0.0, noise, 3)
-        return encode(Frame(k, 5000 * k, tuple(values.tolist())))
+    def frame(number):
+        time_s = number / RATE_HZ
+        change = hum * np.sin(2 * np.pi * 50 * time_s + 0.5) + drift * time_s
+        values = np.array(offset) + change + rng.normal(0.0, noise, 3)
+        return encode(Frame(number, 5000 * number, tuple(values.tolist())))
 
     return frame
 
 
 def row(number):
-    """Counts: four inputs that live about 300, two that do not."""
-    q = [300 + (7 * number * (k + 3)) % 11 for k in range(4)]
-    return f"{q[0]},0,{q[1]},{q[2]},4095,{q[3]}\n".encode()
+    """Return a line of counts: four inputs that vary near 300, and two constant inputs."""
+    first, second, third, fourth = (300 + (7 * number * (column + 3)) % 11 for column in range(4))
+    return f"{first},0,{second},{third},4095,{fourth}\n".encode()
 
 
 def missing(report):
+    """Return all sentences about missing settings as one text."""
     return " / ".join(report.missing)
 
 
@@ -62,7 +61,7 @@ def test_check_of_a_healthy_board():
 
 
 def test_check_uses_no_stage_that_is_switched_off():
-    """A gain that is off multiplies nothing, and a leak that is off is missing."""
+    """A gain that is switched off is not applied. A leak that is switched off is reported as missing."""
     off = {"gain": {"on": False, "pC_per_unit": 2.0}, "leak": {"on": False, "tau_s": 10.0}}
     report = examine_received(received(charges()), device=device_from_table(off, "test"))
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]
@@ -70,7 +69,7 @@ def test_check_uses_no_stage_that_is_switched_off():
 
 
 def test_check_of_a_channel_without_a_number():
-    """A board prints `nan` where an amplifier is missing; the others are reported as ever, in valid JSON too."""
+    """A board sends `nan` for a missing amplifier. The other channels are reported as usual, also as valid JSON."""
     report = examine_received(received(lambda _: b"A:nan,B:1.5,C:2.5\n"))
     assert [(c.name, c.offset_pC) for c in report.channels] == [("A", None), ("B", 1.5), ("C", 2.5)]
     assert report.channels[0].unusable == report.good == 400
@@ -127,7 +126,7 @@ def test_too_few_used_channels_for_the_model():
 
 
 def test_channels_of_most_similar_noise_are_proposed():
-    """Side by side; the first input is a temperature, far quieter in pC than the film."""
+    """The first input is a temperature, whose noise is much smaller than that of the film."""
     rng = np.random.default_rng(0)
     board = lambda _: ",".join(f"{x:.3f}" for x in rng.normal(0.0, [0.05, 3.0, 3.0, 3.0])).encode() + b"\n"  # noqa: E731
     assert examine_received(received(board), electrodes=("A", "B", "C")).device["channels"] == {
@@ -145,7 +144,7 @@ def test_channels_that_the_device_file_omits_are_ignored():
 
 
 def test_proposed_device_file_reads_the_same_charges():
-    """What doctor says of the board, its file says again."""
+    """A check with the proposed file gives the same result as the check that has proposed the file."""
     gain = {"pC_per_unit": {"A": 0.5, "B": -0.5, "C": 0.5, "D": 0.5}}
     first = examine_received(received(row), electrodes=FOUR, gain=gain)
     assert first.device["gain"]["offset"] == pytest.approx(305, abs=10)

@@ -1,9 +1,7 @@
-"""One list of what every parser must do, over all parsers and formats.
+"""Properties that the parsers of all formats must have, and gaps, repeats and restarts of frame numbers.
 
-Chunks never change frames or counters; what stands between two intact frames costs none of them, and a planted fault
-that does is caught; damage gives no wrong frame where there is a checksum.
-
-Frame numbers: gaps, repeats and restarts.
+The division into chunks never changes frames or counters. Bytes between two intact frames never damage a frame. With a
+checksum, damaged bytes never result in a wrong frame.
 """
 
 from collections.abc import Callable
@@ -37,15 +35,15 @@ STUFFED = {"format": "described", "framing": "slip", "length": 20, "checksum": "
 
 
 class Format(NamedTuple):
-    """A parser and what it reads.
+    """A format of frames.
 
     Attributes:
-        parser: A new parser.
-        encode: The bytes of a frame.
-        frames: Strategy of frames that the format can carry.
-        junk: Strategy of bytes that may stand before a frame without damage to it.
+        parser: Function that returns a new parser.
+        encode: Function that returns the bytes of a frame.
+        frames: Strategy of frames that the format can contain.
+        junk: Strategy of bytes before a frame that do not damage the frame.
         lead: Bytes after which the format is recognised.
-        tail: Bytes after which the last frame is complete whatever stood before it.
+        tail: Bytes after which the last frame is complete, independently of the bytes before it.
     """
 
     parser: Callable[[], Parser]
@@ -57,10 +55,11 @@ class Format(NamedTuple):
 
 
 class SkipsAFrame:
-    """The planted fault, for any parser: after dropped bytes it skips a whole frame to resynchronise."""
+    """A parser with a fault: after dropped bytes, it skips the next frame."""
 
     def __init__(self, make):
-        self._parser, self._skips = make(), False
+        self._parser = make()
+        self._skips = False
 
     def feed(self, data):
         frames = []
@@ -69,12 +68,14 @@ class SkipsAFrame:
             new = self._parser.feed(bytes([byte]))
             self._skips |= self._parser.counts.bytes_dropped > dropped
             if new and self._skips:
-                new, self._skips = new[1:], False
+                new = new[1:]
+                self._skips = False
             frames += new
         return frames
 
 
-SEQ, T_US = st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
+SEQ = st.integers(0, 2**16 - 1)
+T_US = st.integers(0, 2**32 - 1)
 THREE = st.builds(Frame, seq=SEQ, t_us=T_US, values=st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 3))
 PIECES = st.binary(min_size=1, max_size=40).map(lambda data: data.replace(b"\0", b"\x01") + b"\0")
 LINES = st.binary(max_size=20).map(lambda data: b"\x80" + data.replace(b"\n", b"\r") + b"\n")
@@ -93,7 +94,7 @@ def text(notation, make=TextParser):
 
 
 def described(table):
-    """Noise before its frames often has the sync pattern in it."""
+    """Return a described format. The bytes before its frames often contain the sync pattern."""
     layout = device_from_table({"frames": table}, "test").frames
     values = st.tuples(*[st.integers(-32768, 32767).map(float)] * 3)
     noise = st.one_of(st.just(layout.sync), st.just(layout.sync[:1]), st.binary(max_size=6))
@@ -107,7 +108,7 @@ def described(table):
 
 
 def slip(frame):
-    """As RFC 1055 stuffs it."""
+    """Return a frame with the byte stuffing of RFC 1055."""
     data = device_from_table({"frames": STUFFED}, "test").frames.encode(frame)
     return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
 
@@ -135,22 +136,26 @@ def test_chunks_never_change_frames_or_counters(name, data):
     pieces = data.draw(st.lists(st.one_of(form.frames.map(form.encode), form.junk, ANY_BYTES), max_size=12))
     stream = data.draw(st.sampled_from([b"", form.lead])) + b"".join(pieces)
     cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=10))
-    whole, cut, bytewise = form.parser(), form.parser(), form.parser()
-    frames = whole.feed(stream)
-    assert [f for a, b in pairwise([0, *sorted(cuts), len(stream)]) for f in cut.feed(stream[a:b])] == frames
-    assert [f for i in range(len(stream)) for f in bytewise.feed(stream[i : i + 1])] == frames
-    assert whole.counts == cut.counts == bytewise.counts
+    whole_parser = form.parser()
+    frames = whole_parser.feed(stream)
+    for edges in ([0, *sorted(cuts), len(stream)], range(len(stream) + 1)):
+        parser = form.parser()
+        frames_of_chunks = []
+        for start, stop in pairwise(edges):
+            frames_of_chunks += parser.feed(stream[start:stop])
+        assert frames_of_chunks == frames
+        assert parser.counts == whole_parser.counts
 
 
 def alone(form, frame):
-    """What a parser reads that gets nothing but this frame."""
+    """Return the frames that a parser reads from the bytes of a single frame."""
     parser = form.parser()
     parser.feed(form.lead)
     return parser.feed(form.encode(frame))
 
 
 def loses_no_intact_frame(form, make):
-    """The property: whatever stands between two frames damages nothing but itself."""
+    """Check that bytes between two frames damage no frame."""
 
     @settings(derandomize=True, database=None, phases=[Phase.generate], max_examples=40)
     @given(st.lists(st.tuples(st.none() | form.junk, form.frames), min_size=1, max_size=8))
@@ -171,15 +176,16 @@ def test_intact_frames_are_never_lost(name):
 
 
 @every_format
-def test_planted_fault_is_caught(name):
+def test_parser_that_skips_a_frame_fails_the_check(name):
     with pytest.raises(AssertionError):
         loses_no_intact_frame(FORMATS[name], partial(SkipsAFrame, FORMATS[name].parser))
 
 
 @every_format
 def test_reset_drops_an_unfinished_frame(name):
-    """The first half of one frame and the second half of another make no frame."""
-    form, frame = FORMATS[name], Frame(1, 2, (100.0,) * 3)
+    """The first part of a frame and the last part of another frame are not a frame."""
+    form = FORMATS[name]
+    frame = Frame(1, 2, (100.0,) * 3)
     parser = form.parser()
     parser.feed(form.lead + form.encode(frame)[:-3])
     before = parser.counts.frames
@@ -191,24 +197,30 @@ def test_reset_drops_an_unfinished_frame(name):
 
 def frames_of_three(n, seed):
     values = np.random.default_rng(seed).normal(0, 800, (n, 3)).astype(np.float32)
-    return [Frame(k % 65536, 1000 * k, tuple(row)) for k, row in enumerate(values.tolist())]
+    return [Frame(number % 65536, 1000 * number, tuple(row)) for number, row in enumerate(values.tolist())]
 
 
 @pytest.mark.parametrize("name", ["binary", "described", "auto binary"])
 def test_damage_of_one_percent_of_bytes(name):
-    """No wrong frame is taken, and none is lost that is intact between intact neighbours."""
+    """No wrong frame is read, and no intact frame between intact frames is lost."""
     form = FORMATS[name]
-    rng, sent = np.random.default_rng(0), frames_of_three(2000, 0)
+    rng = np.random.default_rng(0)
+    sent = frames_of_three(2000, 0)
     damaged = [corrupt(form.encode(frame), 0.01, rng) for frame in sent]
-    got = {(f.seq, f.t_us, f.values) for f in form.parser().feed(b"".join(damaged) + form.encode(sent[0]))}
-    after_intact_end = [True, *(data.endswith(b"\0") or name == "described" for data in damaged)]
-    intact = {
-        (f.seq, f.t_us, f.values)
-        for f, data, ok in zip(sent, damaged, after_intact_end, strict=False)
-        if ok and data == form.encode(f)
-    }
+    read_frames = form.parser().feed(b"".join(damaged) + form.encode(sent[0]))
+    is_after_intact_end = [True, *(data.endswith(b"\0") or name == "described" for data in damaged)]
+    intact_frames = [
+        frame
+        for frame, data, is_separate in zip(sent, damaged, is_after_intact_end, strict=False)
+        if is_separate and data == form.encode(frame)
+    ]
+
+    def contents(frames):
+        return {(frame.seq, frame.t_us, frame.values) for frame in frames}
+
+    intact = contents(intact_frames)
     assert 1000 < len(intact) < 1900
-    assert intact <= got <= {(f.seq, f.t_us, f.values) for f in sent}
+    assert intact <= contents(read_frames) <= contents(sent)
 
 
 @pytest.mark.parametrize(
@@ -222,7 +234,7 @@ def test_damage_of_one_percent_of_bytes(name):
     ids=["wrap", "gaps, a repeat and a restart", "one byte", "some without a number"],
 )
 def test_sequence_gaps_repeats_and_restarts(numbers, modulus, counts, flags):
-    """Numbers of two bytes, unless it is said otherwise."""
+    """Without a modulus, the frame numbers have two bytes."""
     gaps = SequenceGaps()
     assert [gaps.update(seq, *modulus) for seq in numbers] == flags
     assert (gaps.lost, gaps.repeated, gaps.restarts) == counts

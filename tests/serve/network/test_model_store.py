@@ -1,7 +1,4 @@
-"""What serves, what is refused, and how one takes the other's place while requests are under way.
-
-The log of a server: every line is JSON, one for each request, whatever clients send; and none says a secret.
-"""
+"""Store of models: broken versions, loading and unloading during requests. Log: one line of JSON for each request."""
 
 import json
 import logging
@@ -33,7 +30,7 @@ from isocharge.serve.network.traffic import MAX_TEXT_CHARACTERS, RequestLog, Tra
 
 @pytest.fixture
 def folder(store, tmp_path):  # noqa: ARG001
-    """The folder of the model that the store holds in two versions."""
+    """Return the folder of the model of the store, which has two versions."""
     return tmp_path / "models/linear"
 
 
@@ -46,14 +43,14 @@ def labels(store):
 
 
 def put_in_place(version, graph):
-    """Another graph, with a checksum that fits."""
+    """Replace the graph of a version, and its checksum."""
     (version / "model.onnx").write_bytes(graph)
     content = json.loads((version / "golden.json").read_text())
     (version / "golden.json").write_text(json.dumps(content | {"sha256": sha256_of(graph)}))
 
 
 def a_failing_graph(version):
-    """A graph that declares the right shapes and cannot be run on the golden charges."""
+    """Replace the graph by one that declares the right shapes, but fails with the golden charges."""
     model = onnx.load_from_string((version / "model.onnx").read_bytes())
     model.graph.initializer.append(numpy_helper.from_array(np.array([99], dtype=np.int64), "row 99"))
     node = next(node for node in model.graph.node if "contact" in node.output)
@@ -64,7 +61,7 @@ def a_failing_graph(version):
 
 
 def golden(change):
-    """A fault in the answers of contacts."""
+    """Return a function that changes the golden contacts of a version."""
 
     def spoil(version):
         content = json.loads((version / "golden.json").read_text())
@@ -94,7 +91,7 @@ FAULTS = {
 @pytest.mark.parametrize("how", FAULTS)
 @pytest.mark.timeout(60)
 def test_broken_version_leaves_other_versions_available(film, store, folder, how):
-    """While it is loaded, its old files serve on; at the start, the others serve."""
+    """A loaded version stays available with its old files. After a start, only the other versions are available."""
     spoil, message = FAULTS[how]
     film.write(folder.parent, name="other")
     before = store.get("linear")
@@ -161,7 +158,7 @@ def test_model_name_is_not_taken_as_a_path(store, name):
 
 
 def test_model_name_with_html_is_refused_and_escaped(film, tmp_path):
-    """They would stand in pages and messages: the model is refused, and its folder's name escaped."""
+    """The model is refused. The page and the messages contain the name of its folder, which is escaped."""
     film.write(tmp_path)
     name = '"><svg onload=alert(1)>'
     folder = tmp_path / name / "1"
@@ -256,7 +253,7 @@ def test_client_cannot_forge_a_log_line_or_log_a_secret(released, method, path, 
 
 
 def test_log_has_the_messages_of_python_loggers(lines):
-    """With tracebacks, line feeds, halves of surrogates, secrets, and far too much text."""
+    """The messages contain tracebacks, line feeds, single surrogates, secrets, and too much text."""
     log = RequestLog(lines.append, secret=SECRET)
     logger = logging.Logger("isocharge.test")
     logger.addHandler(log)
@@ -276,9 +273,10 @@ def test_log_has_the_messages_of_python_loggers(lines):
 
 
 def test_log_has_a_line_for_each_grpc_call(store, lines):
-    """About no model, about one by its name and version, without a tensor, and without the token."""
+    """The calls have no model, a model, no tensor, and a wrong token."""
     app = Handler(store, None, Traffic(RequestLog(lines.append, secret=SECRET)), Token(SECRET))
-    with_secret, forged = ([("authorization", value)] for value in (f"Bearer {SECRET}", FORGED.replace("\n", " ")))
+    with_secret = [("authorization", f"Bearer {SECRET}")]
+    forged = [("authorization", FORGED.replace("\n", " "))]
     with (
         grpc_server(app, "127.0.0.1", 0) as url,
         grpc.insecure_channel(url.removeprefix("grpc://")) as channel,
@@ -302,7 +300,7 @@ def test_log_has_a_line_for_each_grpc_call(store, lines):
 
 
 def test_log_has_a_line_for_an_unreadable_request(app, lines, start_http):
-    """Over a real socket: rubbish, then a request of which headers are too long."""
+    """The first request is not HTTP, and the headers of the second request are too long."""
     place = start_http(app).url.removeprefix("http://").split(":")
     for sent in (b"rubbish\r\n\r\n", b"GET / HTTP/1.1\r\nx: " + b"a" * 20_000 + b"\r\n\r\n"):
         with socket.create_connection((place[0], int(place[1])), timeout=20) as connection:
@@ -315,7 +313,7 @@ def test_log_has_a_line_for_an_unreadable_request(app, lines, start_http):
 
 
 def test_half_copied_version_keeps_the_loaded_version(film, store, folder, tmp_path):
-    """The old version folders are gone when the new one is loaded, and the new one is not complete yet."""
+    """When the model is loaded, the folders of the old versions are missing, and the new version is incomplete."""
     served = store.get("linear")
     film.write(tmp_path / "new", version=3)
     shutil.rmtree(folder / "1")
@@ -328,7 +326,7 @@ def test_half_copied_version_keeps_the_loaded_version(film, store, folder, tmp_p
 
     shutil.copy(tmp_path / "new/linear/3/golden.json", folder / "3")
     store.load("linear")
-    assert labels(store) == ["linear/3"]  # now the versions whose folders are gone end
+    assert labels(store) == ["linear/3"]  # the versions without folders have been removed
 
 
 def test_model_folder_without_versions_keeps_the_loaded_versions(store, folder, monkeypatch):

@@ -1,11 +1,4 @@
-"""Ports that exist, do not, fall silent and vanish.
-
-Files, pipes and ports by one name.
-
-UDP sockets as ports: datagrams are chunks, and lines without an end get one.
-
-Boards that are asked: when, and what comes back.
-"""
+"""Sources of bytes: serial ports, TCP and UDP sockets, and files. Ports may be silent, disappear, or need requests."""
 
 import os
 import socket
@@ -33,20 +26,21 @@ def board():
 
 
 def test_chunk_has_the_bytes_unchanged_and_the_time_of_arrival(board):
-    board.write_whole(b"stale: what is there at opening is forgotten")
+    board.write_whole(b"bytes before the opening are dropped")
     time.sleep(0.02)
-    everything, got = bytes(range(256)), []
+    all_bytes = bytes(range(256))
+    chunks = []
     with Port(board.url) as port:
-        sent = time.time()
-        board.write_whole(everything)
+        sent_s = time.time()
+        board.write_whole(all_bytes)
         for chunk in port:
-            got.append(chunk)
-            if sum(len(chunk.data) for chunk in got) >= 256:
+            chunks.append(chunk)
+            if sum(len(chunk.data) for chunk in chunks) >= 256:
                 break
-    assert b"".join(chunk.data for chunk in got) == everything
-    assert sent <= got[0].timestamp <= time.time()
-    assert 0 <= time.perf_counter_ns() - got[-1].clock_ns < 60e9
-    assert got[0].outage_s == 0.0
+    assert b"".join(chunk.data for chunk in chunks) == all_bytes
+    assert sent_s <= chunks[0].timestamp <= time.time()
+    assert 0 <= time.perf_counter_ns() - chunks[-1].clock_ns < 60e9
+    assert chunks[0].outage_s == 0.0
 
 
 @pytest.mark.parametrize(
@@ -103,15 +97,15 @@ def test_unplugged_port_raises_port_lost():
             next(iter(port))
 
 
-def test_a_port_without_a_descriptor_is_read_by_pyserial():
-    """pyserial's loop answers with what it is asked."""
+def test_port_without_a_descriptor_is_read_by_pyserial():
+    """The port `loop://` of pyserial returns the bytes of each request."""
     with Port("loop://", request=Request(b"1,2\n", 100.0)) as port:
         assert next(iter(port)).data == b"1,2\n"
 
 
 @pytest.fixture
 def server():
-    """A TCP server for one client at a time; `server.accept()` waits for the client."""
+    """Return a listening TCP socket, whose method `accept` waits for a client."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         listening.settimeout(10.0)
         yield listening
@@ -128,21 +122,23 @@ def test_socket_returns_all_bytes_until_it_is_closed(server, scheme):
             next(iter(port))
 
 
-def talk(board, word, heard):
-    """Say it until it is heard: what comes before a port is open is lost."""
-    while not heard.wait(0.02):
-        board.write_whole(word)
+def write_until(has_arrived, board, data):
+    """Write the same bytes until they have arrived, because bytes before the opening of the port are lost."""
+    while not has_arrived.wait(0.02):
+        board.write_whole(data)
 
 
 def test_outage_is_measured_and_logged_once(tmp_path, caplog):
-    """A device that is away for longer than several tries."""
-    link, board, heard = tmp_path / "film", PseudoPort(), threading.Event()
+    """The port is tried several times while the device is unplugged."""
+    link = tmp_path / "film"
+    board = PseudoPort()
+    has_arrived = threading.Event()
 
     def plug_in():
-        back = PseudoPort()
-        link.symlink_to(back.url)
-        talk(back, b"after", heard)
-        back.close()
+        new_board = PseudoPort()
+        link.symlink_to(new_board.url)
+        write_until(has_arrived, new_board, b"after")
+        new_board.close()
 
     link.symlink_to(board.url)
     with Port(str(link), reconnect=True) as port:
@@ -151,15 +147,16 @@ def test_outage_is_measured_and_logged_once(tmp_path, caplog):
         assert next(chunks) == (b"before", mock.ANY, mock.ANY, 0.0)
         board.close()
         link.unlink()
-        again = threading.Timer(0.5, plug_in)
-        again.start()
-        chunk = next(chunks)
+        plugging = threading.Timer(0.5, plug_in)
+        plugging.start()
+        first_chunk = next(chunks)
         assert next(chunks).outage_s == 0.0
-        heard.set()
-        again.join()
-    assert chunk.data[:5] == b"after"
-    assert 0.4 < chunk.outage_s < 30.0
-    assert (port.outages, len(caplog.records)) == (1, 1)
+        has_arrived.set()
+        plugging.join()
+    assert first_chunk.data.startswith(b"after")
+    assert 0.4 < first_chunk.outage_s < 30.0
+    assert port.outages == 1
+    assert len(caplog.records) == 1
 
 
 def test_source_of_a_dash_is_stdin(monkeypatch):
@@ -182,14 +179,14 @@ def test_file_without_read_permission_is_refused(tmp_path, monkeypatch):
 
 @pytest.fixture
 def address():
-    """An address that nobody uses."""
+    """Return a UDP address that is not in use."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()
 
 
 def received(address, *datagrams):
-    """What a port reads of datagrams that a board sends."""
+    """Return the chunks that a port reads from datagrams of a board."""
     with (
         Port(f"udp://127.0.0.1:{address[1]}", silence_s=10.0) as port,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board,
@@ -200,7 +197,8 @@ def received(address, *datagrams):
         return [next(chunks).data for datagram in datagrams if datagram]
 
 
-TEXT, BYTES = (b'{"A": 1}', b"A:1\tB:2", "1 µC".encode()), (b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f")
+TEXT = (b'{"A": 1}', b"A:1\tB:2", "1 µC".encode())
+BYTES = (b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f")
 
 
 @pytest.mark.parametrize(
@@ -229,7 +227,7 @@ def test_udp_address_in_use_is_refused(address):
 
 
 class Clock:
-    """A clock that is set by hand."""
+    """A clock whose time the test sets."""
 
     def __init__(self):
         self.now_s = 100.0
@@ -275,8 +273,9 @@ def test_echo_is_removed_however_it_is_split(request_bytes, answer, cuts):
     requester = Requester(Request(request_bytes, echo=True))
     requester.next_request()
     stream = request_bytes + answer
-    at = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
-    assert b"".join(requester.remove_echo(stream[a:b]) for a, b in pairwise(at)) == answer
+    edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
+    pieces = [requester.remove_echo(stream[start:stop]) for start, stop in pairwise(edges)]
+    assert b"".join(pieces) == answer
     assert requester.echo_share == 1.0
 
 
@@ -287,11 +286,12 @@ def test_echo_is_removed_however_it_is_split(request_bytes, answer, cuts):
 def test_unexpected_echo_is_counted_and_not_removed(request_bytes, echo, answer, share):
     requester = Requester(Request(request_bytes, echo=echo))
     requester.next_request()
-    assert (requester.remove_echo(answer), requester.echo_share) == (answer, share)
+    assert requester.remove_echo(answer) == answer
+    assert requester.echo_share == share
 
 
 def test_request_is_sent_for_each_frame():
-    """A pseudo-terminal that answers each request with a line of its own, echo first."""
+    """The board answers each request with the echo of the request and a line."""
     board, reader = os.openpty()
     tty.setraw(reader)
 
@@ -303,11 +303,12 @@ def test_request_is_sent_for_each_frame():
     answering = threading.Thread(target=answer)
     answering.start()
     with Port(os.ttyname(reader), request=Request(b"?", 200.0, echo=True), silence_s=5.0) as port:
-        got, chunks = b"", iter(port)
-        while got.count(b"\n") < 10:
-            got += next(chunks).data
+        received_bytes = b""
+        chunks = iter(port)
+        while received_bytes.count(b"\n") < 10:
+            received_bytes += next(chunks).data
         assert port.echo_share == 1.0
     answering.join()
     os.close(board)
     os.close(reader)
-    assert got.split(b"\n")[:10] == [b"%d" % k for k in range(10)]
+    assert received_bytes.split(b"\n")[:10] == [b"%d" % number for number in range(10)]

@@ -1,6 +1,6 @@
-"""The virtual sensor behaves like a board: whole frames on time, faults as asked, indifferent to whether anybody reads.
+"""Virtual sensor: complete frames at their times, requested faults, and independence of readers.
 
-What it sends is looked at without a port and without a clock, as far as that goes.
+Most tests examine the frames without a port and without waiting for their times.
 """
 
 import time
@@ -20,7 +20,7 @@ def steady(n=10, rate_Hz=200.0, force_N=1.0):
 
 
 def sent(sensor, count):
-    """The next frames of a sensor without its port; None for those that it does not send."""
+    """Return the next frames of a sensor without its port; None for a frame that is not sent."""
     return [next(iter(BinaryParser().feed(data)), None) for data in islice(sensor.frames(), count)]
 
 
@@ -29,10 +29,11 @@ def test_frames_contain_script_charges_noise_and_offset(film):
     noise = lambda charge_pC, rng: charge_pC + rng.integers(1, 2, charge_pC.shape)  # noqa: E731
     frames = sent(VirtualSensor(film.charges, script, noise=noise, offset_pC=[10.0, 20.0, 30.0]), 4)
     press = film.charge_pC([1.0], [2.0], [0.5])[0]
-    for k, frame in enumerate(frames):
-        clean = press if k % 2 == 0 else np.zeros(3)
+    for number, frame in enumerate(frames):
+        clean = press if number % 2 == 0 else np.zeros(3)
         np.testing.assert_allclose(frame.values, clean + np.array([11.0, 21.0, 31.0]), rtol=1e-6)
-        assert (frame.seq, frame.t_us) == (k, k * 2000)
+        assert frame.seq == number
+        assert frame.t_us == number * 2000
 
 
 def test_default_offset_is_small_and_not_zero(film):
@@ -41,7 +42,7 @@ def test_default_offset_is_small_and_not_zero(film):
 
 
 def test_amplifier_receives_the_repeated_script_in_the_order_of_time(film):
-    """One with a memory: it counts the rows that it has been given."""
+    """The amplifier of this test counts the rows that it has received."""
     seen = []
 
     def noise(charge_pC, _):
@@ -56,7 +57,7 @@ def test_amplifier_receives_the_repeated_script_in_the_order_of_time(film):
 
 
 def test_frame_number_and_clock_overflow(film):
-    """At a frame a second, the 32 bits of a clock in us last for 4294.97 s."""
+    """The clock in us has 32 bits and wraps after 4294.97 s. The sensor sends one frame per second."""
     frames = []
     sensor = VirtualSensor(film.charges, steady(10, 1.0), encode=lambda frame: bytes(frames.append(frame) or 1))
     assert sum(map(len, islice(sensor.frames(), 65_540))) == 65_540
@@ -80,17 +81,19 @@ def test_forward_map_with_wrong_charges_is_refused(charges):
 )
 def test_faults_gap_unplug_and_lose_suppress_frames(film, faults, silent):
     frames = sent(VirtualSensor(film.charges, steady(rate_Hz=512.0), faults=faults), 300)
-    assert [k for k, frame in enumerate(frames) if frame is None] == silent
-    assert [k for k in range(300) if faults.is_unplugged(k / 512.0)] == (silent if faults.unplug_every_s else [])
+    assert [number for number, frame in enumerate(frames) if frame is None] == silent
+    unplugged = [number for number in range(300) if faults.is_unplugged(number / 512.0)]
+    assert unplugged == (silent if faults.unplug_every_s else [])
 
 
 def test_clock_drift(film):
     frames = sent(VirtualSensor(film.charges, steady(rate_Hz=1000.0), faults=Faults(clock_ppm=500.0)), 100)
-    assert [frame.t_us for frame in frames] == [round(k * 1000.5) for k in range(100)]
+    assert [frame.t_us for frame in frames] == [round(number * 1000.5) for number in range(100)]
 
 
 def test_corrupt_flips_drops_and_adds_bytes():
-    data, rng = bytes(1000), np.random.default_rng(0)
+    data = bytes(1000)
+    rng = np.random.default_rng(0)
     lengths = [len(corrupt(data, 0.01, rng)) for _ in range(200)]
     assert np.mean(lengths) == pytest.approx(1000, abs=1.0)
     assert np.std(lengths) == pytest.approx(np.sqrt(1000 * 0.01 * 2 / 3), rel=0.2)
@@ -98,7 +101,7 @@ def test_corrupt_flips_drops_and_adds_bytes():
 
 
 def read(url, count):
-    """The next frames from a port."""
+    """Return the next frames from a port, and the counters of the parser."""
     parser = BinaryParser()
     with Port(url, silence_s=10.0) as port:
         frames = list(islice((frame for chunk in port for frame in parser.feed(chunk.data)), count))
@@ -117,11 +120,11 @@ def test_frames_are_sent_on_time_with_their_truth(film):
         assert truth.x_mm == pytest.approx(script.x_mm[frame.seq % 2000], nan_ok=True)
         np.testing.assert_allclose(frame.values, truth.charge_pC, atol=21.0)
     late_s = np.array([truth.sent_s - frame.seq / 1000.0 for frame, truth in zip(frames, truths, strict=True)])
-    assert late_s[-300:].min() - late_s[:300].min() < 0.02  # 0.05 if it slept between frames, not until deadlines
+    assert late_s[-300:].min() - late_s[:300].min() < 0.02  # 0.05 if it slept for the time between two frames
 
 
-def test_frames_are_withheld_while_nobody_reads(film):
-    """What does not fit is withheld whole: a late reader sees a gap at most, and no damaged frame."""
+def test_frames_are_withheld_without_a_reader(film):
+    """Frames that do not fit into the buffer are withheld completely. A later reader receives no damaged frame."""
     with VirtualSensor(film.charges, steady(rate_Hz=2000.0)) as sensor:
         while sensor.withheld < 100:
             time.sleep(0.01)
@@ -133,7 +136,9 @@ def test_frames_are_withheld_while_nobody_reads(film):
             assert (counts.crc_errors, counts.malformed, gaps.repeated, gaps.restarts) == (0, 0, 0, 0)
         assert sensor.sent >= 400
     with sensor:
-        assert (sensor.withheld, read(sensor.url, 3)[0][0].seq < 1000) == (0, True)
+        assert sensor.withheld == 0
+        frames, _ = read(sensor.url, 3)
+        assert frames[0].seq < 1000
     with pytest.raises(PortError, match="does not play"):
         sensor.url  # noqa: B018
 
@@ -145,6 +150,8 @@ def test_unplugged_port_returns_under_the_same_link(film):
         with Port(sensor.url, reconnect=True) as port:
             outages_s = list(islice((chunk.outage_s for chunk in port if chunk.outage_s > 0.0), 2))
         assert sensor.unplugged >= 2
-        assert sensor.sent < 0.7 * (sensor.sent + sensor.withheld + sensor.lost)  # away for three eighths of the time
+        assert sensor.sent < 0.7 * (
+            sensor.sent + sensor.withheld + sensor.lost
+        )  # unplugged for three eighths of the time
     assert min(outages_s) > 0.1
     assert port.outages == 2

@@ -1,4 +1,4 @@
-"""The HTTP server on real sockets: bounds, slow and rude clients, TLS, token, a graceful stop."""
+"""The HTTP server on real sockets: limits, slow clients, TLS, token, and finishing requests at the stop."""
 
 import http.client
 import json
@@ -34,7 +34,7 @@ def connect(server):
 
 
 def everything(connection):
-    """What the server says until it hangs up, politely or not."""
+    """Return all bytes that the server sends until it closes or resets the connection."""
     data = bytearray()
     with suppress(ConnectionResetError):
         while piece := connection.recv(1 << 16):
@@ -43,21 +43,21 @@ def everything(connection):
 
 
 def send(connection, data, piece=1 << 30):
-    """Send in pieces, as long as the server listens."""
+    """Send data in pieces until the server closes the connection."""
     with suppress(OSError):
-        for at in range(0, len(data), piece):
-            connection.sendall(data[at : at + piece])
+        for start in range(0, len(data), piece):
+            connection.sendall(data[start : start + piece])
 
 
 def drip(connection, data, count, pause=0.0):
-    """Send the same again and again."""
+    """Send the same bytes repeatedly."""
     for _ in range(count):
         connection.sendall(data)
         time.sleep(pause)
 
 
 def exchange(server, data, piece=1 << 30):
-    """The answers to bytes after which the server hangs up."""
+    """Send data on a new connection, and return the answers until the server closes the connection."""
     with connect(server) as connection:
         send(connection, data, piece)
         return everything(connection)
@@ -68,7 +68,7 @@ def statuses(data):
 
 
 def refused(data):
-    """Status and error of one answer after which the server hung up."""
+    """Return the status and the error of an answer after which the server closes the connection."""
     head, _, body = data.partition(b"\r\n\r\n")
     assert b"connection: close" in head
     return int(head.split(b" ")[1]), json.loads(body)["error"]
@@ -93,7 +93,7 @@ def wait_until(condition):
 
 @pytest.fixture
 def limited(store, start_http):
-    """Start a server with limits of the test's."""
+    """Return a function that starts a server with given limits."""
     return lambda **limits: start_http(Handler(store, ServerLimits(**limits)))
 
 
@@ -103,7 +103,7 @@ def server(limited):
 
 
 def test_requests_of_a_stock_http_client(server, predictor):
-    """One connection, bodies with a length and in chunks, GET and HEAD."""
+    """The client sends bodies with a length and in chunks, and GET and HEAD requests, on one connection."""
     client = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=60)
     for body in (BODY, iter([BODY[:10], BODY[10:]])):
         client.request("POST", INFER, body)
@@ -144,13 +144,14 @@ def test_headers_above_the_limit_are_refused(limited, head, end, piece):
 
 
 def test_body_above_the_limit_is_refused(limited):
-    """One that says it is, one that never ends, and one that says more than a number holds."""
+    """The first body states its length, the second body has no end, and the others state lengths that are too large."""
     server = limited(body_bytes=1000, body_seconds=0.3)
     status, error = refused(exchange(server, infer(LAST, bytes(1001))))
-    assert (status, "at most 1000 bytes" in error) == (413, True)
+    assert status == 413
+    assert "at most 1000 bytes" in error
     chunks = b"100\r\n" + bytes(256) + b"\r\n"
     endless = b"POST / HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n" + chunks * 10_000
-    assert set(statuses(exchange(server, endless))) <= {413}  # or it hung up in the middle of a piece
+    assert set(statuses(exchange(server, endless))) <= {413}  # no answer arrives if the connection was reset
     for declared in (10**6, 10**18, 10**30):
         head = b"POST / HTTP/1.1\r\nContent-Length: %d\r\n\r\n{" % declared
         assert refused(exchange(server, head))[0] in (400, 408, 413)
@@ -189,7 +190,7 @@ def test_connections_above_the_limit_are_refused(limited):
 
 
 def test_slow_clients_delay_no_other_client(limited):
-    """They never finish a request; when all places are taken, the oldest of them gives its own."""
+    """The slow clients never finish a request. A new connection replaces the oldest connection of a slow client."""
     server = limited(connections=200)
     with ExitStack() as stack:
         for number in range(200):
@@ -208,7 +209,7 @@ def test_client_that_does_not_read_is_disconnected(limited):
 @pytest.mark.parametrize("protocol", ["h2c", "websocket"])
 @pytest.mark.parametrize("piece", [1 << 20, 7])
 def test_upgrade_header_is_ignored(server, protocol, piece):
-    """As HTTP lets a server do (RFC 9110, 7.8): the request is answered, and so is the next one."""
+    """HTTP allows a server to ignore the header (RFC 9110, 7.8). This request and the next request are answered."""
     upgrade = f"Connection: Upgrade, HTTP2-Settings\r\nUpgrade: {protocol}\r\nHTTP2-Settings: AAMAAABkAAQAAP__\r\n"
     bodiless = b"GET /v2 HTTP/1.1\r\nHost: localhost\r\n%s\r\n" % upgrade.encode()
     requests = infer(upgrade.encode()) + bodiless + infer(b"Connection: close, upgrade\r\nUpgrade: h2c\r\n")
@@ -231,7 +232,7 @@ def test_expect_100_continue(server):
 
 
 def test_pipelined_requests_are_answered_in_order(server, store, monkeypatch):
-    """What is answered on the spot does not overtake what takes long, on one connection."""
+    """Requests that are answered at once wait for an earlier request of the same connection that takes long."""
     load = store.load
     monkeypatch.setattr(store, "load", lambda name: (time.sleep(0.3), load(name)))
     rest = b"".join(b"GET %s HTTP/1.1\r\n\r\n" % path for path in (b"/v2/health/live", b"/nope", b"/v2/health/ready"))
@@ -246,8 +247,10 @@ def test_pipelined_requests_are_answered_in_order(server, store, monkeypatch):
 
 @pytest.fixture
 def slow_load(store, monkeypatch):
-    """Loads wait: an event that says that one has begun, and one that lets it go on."""
-    began, go_on, load = Event(), Event(), store.load
+    """Let loads wait; return an event that is set when a load begins, and an event that lets the load continue."""
+    began = Event()
+    go_on = Event()
+    load = store.load
     monkeypatch.setattr(store, "load", lambda name: (began.set(), go_on.wait(60), load(name)))
     yield began, go_on
     go_on.set()
@@ -264,7 +267,7 @@ def test_loading_a_model_delays_no_other_request(server, slow_load):
 
 
 def test_stop_finishes_requests_that_have_begun(server, slow_load):
-    """A load, and a request that is still coming; idle connections end, and no request comes after."""
+    """A load and an incomplete request are finished. Idle connections and later connections are refused."""
     began, go_on = slow_load
     with connect(server) as loads, connect(server) as begun, connect(server) as idle:
         loads.sendall(LOAD)
@@ -300,7 +303,7 @@ def open_files():
 
 
 def test_number_of_unfinished_tls_handshakes_is_limited(store, start_http, tls_files, trusted):
-    """In number and in time; a client that finishes its own is served meanwhile."""
+    """The time of handshakes is limited, too. A client that finishes its handshake is still served."""
     handler = Handler(store, ServerLimits(connections=20, header_seconds=1.0))
     server = start_http(handler, tls=Tls(tls_files / "both.pem"))
     hello = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"
@@ -310,13 +313,13 @@ def test_number_of_unfinished_tls_handshakes_is_limited(store, start_http, tls_f
             secure.sendall(infer(LAST))
             return statuses(everything(secure)) == [200]
 
-    assert is_answered()  # so the server has opened what it needs
+    assert is_answered()  # the server has now opened all files that it needs
     before = open_files()
     with ExitStack() as stack:
         half = [stack.enter_context(connect(server)) for _ in range(60)]
         for number, connection in enumerate(half):
             send(connection, hello[: number % 11])
-        assert is_answered()  # the oldest gives its place away
+        assert is_answered()  # the oldest handshake is cancelled
         wait_until(lambda: open_files() - before <= 60 + 20)
         assert not any(b"HTTP" in everything(connection) for connection in half)
         assert is_answered()
