@@ -1,4 +1,4 @@
-"""The stock Triton clients - HTTP, HTTP with asyncio, gRPC - with their defaults, against our servers."""
+"""The clients of Triton for HTTP and gRPC with their default settings, connected to the servers of isocharge."""
 
 import json
 
@@ -32,7 +32,7 @@ def module(client):
 
 
 def plain(answer):
-    """JSON from either kind of client."""
+    """Return an answer of a client of either kind as a JSON value."""
     return json.loads(tritonclient.grpc._client.MessageToJson(answer)) if hasattr(answer, "DESCRIPTOR") else answer
 
 
@@ -47,7 +47,7 @@ def tensor(module, values, datatype="FP32"):
 
 
 def expected(tmp_path, values):
-    """What the same model answers in process."""
+    """Return the outputs that the same model computes in this process."""
     columns = np.column_stack(Predictor(tmp_path / "models/linear").predict_batch(values))
     return {"contact": columns[:, :3], "contact_std": columns[:, 3:6], "misfit": columns[:, 6:7]}
 
@@ -65,7 +65,7 @@ def test_tritonclient_infer_with_defaults(client, module, film, tmp_path):
 @pytest.mark.parametrize("n", [1, 5])
 @pytest.mark.parametrize("binary", [True, False])
 def test_tritonclient_output_flags(client, module, tmp_path, n, binary):
-    """As in process, beside an output; the charges of a press far outside, and of one that no press gives."""
+    """The flags equal those computed in this process, for a press far outside and for charges that no press gives."""
     values = np.resize(np.float32([[800.0, 10.0, 10.0], [-3.0, 900.0, 900.0], [800.0, 800.0, 800.0]]), (n, 3))
     if module is tritonclient.grpc:
         outputs = [module.InferRequestedOutput(name) for name in ("flags", "contact")]
@@ -83,7 +83,8 @@ def test_tritonclient_output_flags(client, module, tmp_path, n, binary):
 def test_tritonclient_repository_index_unload_and_load(client, module, film):
     def index():
         rows = plain(client.get_model_repository_index())
-        return [(r["name"], r["version"], r["state"]) for r in (rows["models"] if isinstance(rows, dict) else rows)]
+        rows = rows["models"] if isinstance(rows, dict) else rows
+        return [(row["name"], row["version"], row["state"]) for row in rows]
 
     both = [("linear", "1"), ("linear", "2")]
     assert index() == [(*version, "READY") for version in both]
@@ -131,7 +132,8 @@ def test_tritonclient_statistics(client, module, film):
 
 
 def test_tritonclient_stream_infer(handler, film, tmp_path):
-    values, answers = charges(film), []
+    values = charges(film)
+    answers = []
     with grpc_server(handler, "127.0.0.1", 0) as url:
         client = tritonclient.grpc.InferenceServerClient(url.removeprefix("grpc://"))
         client.start_stream(lambda result, error: answers.append((result, error)))

@@ -1,4 +1,4 @@
-"""Recordings, records, tables, MCAP and Parquet files that are given as a port: the message names the right command."""
+"""Recordings, records, tables, MCAP and Parquet files given as a port, whose messages state the right command."""
 
 import pyarrow as pa
 import pytest
@@ -42,7 +42,7 @@ FOREIGN = {
 
 @pytest.mark.parametrize("name", FOREIGN)
 @pytest.mark.parametrize("make", [open_source, Port])
-def test_a_foreign_file_as_a_port_names_the_command_that_reads_it(name, make, tmp_path):
+def test_foreign_file_as_a_port_is_refused_with_the_command_that_reads_it(name, make, tmp_path):
     write, message = FOREIGN[name]
     write(tmp_path / name)
     with pytest.raises(InputError, match=message), make(str(tmp_path / name)):
@@ -91,7 +91,7 @@ def test_lines_of_a_board_in_a_csv_file_are_read_from_stdin(tmp_path):
         assert [chunk.data for chunk in FileSource(file.fileno(), "-")] == [b"A,B,C\n1,2,3\n"]
 
 
-def test_a_file_of_bytes_is_no_port_for_the_doctor(tmp_path):
+def test_file_of_bytes_is_refused_as_a_port(tmp_path):
     path = tmp_path / "frames.bin"
     path.write_bytes(b"\x01\x02")
     with pytest.raises(InputError, match="expected a port, got a file; only `isocharge serve stream`"), Port(str(path)):

@@ -1,4 +1,4 @@
-"""The page's server in a thread, fed by hand."""
+"""Fixtures that run the server of the live page in a thread, and connect viewers to it."""
 
 import asyncio
 import json
@@ -21,25 +21,26 @@ NAMES = ("A", "B", "C")
 
 @pytest.fixture(scope="module")
 def chromium():
-    """A headless browser."""
+    """Return a headless browser."""
     with start_chromium() as browser:
         yield browser
 
 
 class RunningPage:
-    """A running page.
+    """A live page whose server runs in a thread.
 
     Attributes:
-        reader: The reader's end of the link.
-        url: Of the page.
-        form: Of the samples.
+        reader: End of the link that sends samples and messages to the page.
+        url: URL of the page.
+        form: Format of the samples.
     """
 
     def __init__(self, metadata, **settings):
         self.form = SampleFormat(NAMES)
         self.reader, end = make_link()
         page = Page(end, describe_film("a film", metadata, None), Address(), **settings)
-        self.url, self._listens = "", Event()
+        self.url = ""
+        self._listens = Event()
         self._thread = Thread(target=run_page, args=(page, self._announce))
         self._thread.start()
         assert self._listens.wait(20)
@@ -65,7 +66,7 @@ class RunningPage:
 
 @pytest.fixture
 def start_page(film):
-    """Start pages; they are stopped when the test ends."""
+    """Return a function that starts a page. The pages are stopped when the test ends."""
     started = []
 
     def start(**settings):
@@ -83,13 +84,14 @@ def page(start_page):
 
 
 class Client:
-    """The stock WebSocket client, with what a page does."""
+    """A WebSocket client that confirms messages as the page does."""
 
     def __init__(self, socket, form):
-        self.socket, self.form = socket, form
+        self.socket = socket
+        self.form = form
 
     async def samples(self, confirm=True):
-        """The next message of samples: (header, rows); texts are passed over."""
+        """Return the header and the samples of the next message with samples. Text messages are ignored."""
         while True:
             data = await asyncio.wait_for(self.socket.recv(), 20)
             if isinstance(data, bytes):
@@ -99,7 +101,7 @@ class Client:
                 return header, np.frombuffer(data, self.form.dtype, offset=HEADER.size)
 
     async def text(self, key):
-        """Wait for a text message with a key."""
+        """Wait for a text message with a key, and return the value of the key."""
         while True:
             data = await asyncio.wait_for(self.socket.recv(), 20)
             if isinstance(data, bytes):
@@ -118,7 +120,7 @@ class Client:
 
 @pytest.fixture
 def viewer():
-    """Run a coroutine function with a client of a page."""
+    """Return a function that runs a coroutine function with a client of a page."""
 
     def run(page, talk, **options):
         async def follow():
