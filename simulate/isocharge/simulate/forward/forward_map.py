@@ -59,6 +59,9 @@ SKIP_RATIO = 10.0
 """Ratio of the error to `INTERPOLATION_ERROR` above which the next entry of `NODE_COUNTS` is skipped, because it would
 not be sufficient either, dimensionless."""
 
+MIN_CLAMP_DISTANCE = 8.0
+"""Smallest distance of a press from the clamp for the rule for far electrodes, in units of the probe's reach."""
+
 MAX_RING_RATIO = 2.0
 """Largest ratio of the radii of successive rings of the mesh at which the integration rule for far electrodes is used,
 dimensionless. On coarser meshes the stress is not smooth enough across an electrode. Meshes that are chosen
@@ -452,7 +455,8 @@ class ForwardMap:
             distance_of_parts = np.abs(position[:, None] - part_centres) / part_radii
             relative_distances.append(distance_of_parts.min(axis=1))
         is_distant = np.stack(relative_distances, axis=1) > FAR_DISTANCE
-        is_far = ~is_near & is_distant & self._has_smooth_far_field
+        is_inner = self.sensor.film.radius - np.abs(position) >= MIN_CLAMP_DISTANCE * self.probe.reach
+        is_far = ~is_near & is_distant & is_inner[:, None] & self._has_smooth_far_field
         is_between = ~is_near & ~is_far
         return (self._fine_readout, is_near), (self._coarse_readout, is_between), (self._far_readout, is_far)
 
